@@ -14,6 +14,7 @@ from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .car_judge import cars_past, judge
+from .car_motion import CarMotion
 from .car_tracks import CarTracks
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
@@ -88,6 +89,10 @@ class CuePass:
     def restart(self) -> None:
         """Know nothing of the cars before."""
         self._before = self._tracks = None
+
+    def followed(self) -> list[CarMotion]:
+        """The cars of the newest frame, where they are followed over frames."""
+        return [] if self._tracks is None else self._tracks.longer()
 
     def notes(self) -> Counter[str]:
         """Frames in which crossing and parked cars could not be computed, by reason."""

@@ -73,6 +73,26 @@ def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float],
     )
 
 
+def outlines(
+    camera: Camera, regions: Regions, place: Place | None, size_px: tuple[int, int]
+) -> tuple[Floats | None, ...]:
+    """Corners of the left, straight and right region in the picture, shape (4, 2) each.
+
+    None for one at or behind the camera, or where no range is known.
+    """
+    if place is None or camera.focal_px is None or camera.z_m <= 0.0:
+        return None, None, None
+    return tuple(
+        None if one[0] - camera.x_m < NEAREST_M else project(_corners(one), camera, size_px)
+        for one, _ in rectangles(regions, place)
+    )
+
+
+def _corners(one: Rectangle) -> Floats:
+    first, last, rightmost, leftmost = one
+    return np.array([(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)])
+
+
 def project(points_m: Floats, camera: Camera, size_px: tuple[int, int]) -> Floats:
     """Points on level ground in the picture.
 
@@ -103,16 +123,14 @@ def _fraction(
     place_sd_m: float,
 ) -> float:
     """Fraction of road pixels in one rectangle; NaN where it is not seen."""
-    first, last, rightmost, leftmost = one
-    away_m = first - camera.x_m
+    away_m = one[0] - camera.x_m
     if away_m < NEAREST_M or camera.z_m <= 0.0:
         return math.nan
     doubt_m = math.hypot(place_sd_m, away_m**2 * camera.pitch_sd_rad / camera.z_m)
     if doubt_m > margin_m:
         return math.nan
-    corners = np.array([(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)])
     scale = np.array(road.mask_size_px) / np.array(road.size_px)
-    polygon = project(corners, camera, road.size_px) * scale
+    polygon = project(_corners(one), camera, road.size_px) * scale
     if polygon[:2, 1].mean() - polygon[2:, 1].mean() < regions.min_rows:
         return math.nan
     inside = _inside(polygon, is_road.shape)

@@ -49,13 +49,14 @@ def save(
 
     from .drive_time import time_of
     from .layout import Shown, blueprint
-    from .scene_rows import scene_rows
+    from .scene_rows import longest_m, scene_rows
 
     pose = _pose(run)
     scene = scene_rows(run)
     camera = camera_of(run)
     has_scene = any(part is not None for part in (scene.cues, scene.ranges, scene.belief))
-    shown = Shown(None if camera is None else camera.topic.name, pose, truth is not None, has_scene)
+    topic = None if camera is None else camera.topic.name
+    shown = Shown(topic, pose, truth is not None, has_scene, longest_m(scene))
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
 
@@ -111,6 +112,7 @@ def _log_marks(
 ) -> None:
     from crosscue.eval.runs.tables.stored_frames import stored_frames
 
+    from .anchored import Anchored
     from .marks import FRAMES_HELD, Marks, log_styles
 
     detected = manifest.detected
@@ -118,9 +120,11 @@ def _log_marks(
         return
     log_styles(recording)
     marks = Marks(manifest.settings)
+    anchored = Anchored(run, manifest, marks)
     frames = stored_frames(run, detected.detectors, with_road_masks=True)
     for number, frame in enumerate(frames):
         marks.add(frame)
+        anchored.add(frame)
         if number % FRAMES_HELD == FRAMES_HELD - 1:
             marks.send(recording, time)
     marks.send(recording, time)

@@ -28,12 +28,14 @@ class Shown:
         pose: Columns of the pose, or None.
         has_truth: The true track is drawn.
         has_scene: There are ranges, beliefs or cues.
+        longest_m: The largest range, with its band.
     """
 
     camera: str | None
     pose: Mapping[str, Floats] | None
     has_truth: bool
     has_scene: bool
+    longest_m: float = FAR_M
 
 
 def blueprint(shown: Shown) -> rrb.Blueprint:
@@ -71,7 +73,9 @@ def _scene(shown: Shown) -> rrb.Container:
         origin="/".join(RANGE),
         name="Range to the intersection (m), 2-sigma band",
         axis_x=rrb.TimeAxis(view_range=_whole()),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+        # Ranges fall from the top left to the bottom right, and none is below zero for long.
+        axis_y=rrb.ScalarAxis(range=(0.0, shown.longest_m)),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftBottom),
     )
     tabs: list[rrb.View] = [_notes()]
     if shown.pose is not None:

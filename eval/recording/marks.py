@@ -84,7 +84,7 @@ class Marks:
         if isinstance(seen.road, RoadMask):
             for line in road_lines(seen.road):
                 self.road.add(line, ROAD)
-        # What is anchored to the road or followed over frames is not where these rules would be.
+        # What is anchored to the road or followed over frames is drawn by ``anchored``.
         if self.vehicle.regions.kind != "ground":
             self._regions(seen.road, frame.size_px)
         if seen.objects and self.vehicle.cars.kind != "tracks":

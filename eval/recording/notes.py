@@ -14,7 +14,10 @@ from crosscue.replay.base import visible
 COLOURS: Final = (
     "- camera: cars blue, stop signs red, traffic lights yellow, sign windows magenta, what is "
     "too uncertain to be a cue grey; road hatched in teal, regions of interest green while they "
-    "hold road; arrows: orange cars cross, violet ones are parked and point where their nose does",
+    "hold road (on the ground only where a detector looks for road; grey ones hold none or are not "
+    "seen); arrows: orange cars cross, violet ones are parked and point where their nose does, "
+    "white ones go along the road, green ones beyond the intersection; an arrow on the road is the "
+    "way of one second, with the ego vehicle's own motion removed",
     "- ahead of the car: red bar the start, yellow bar the end of the intersection with its "
     "2-sigma band, green the truth; blue dots and white lines are the Mobileye's",
     "- map: blue the estimated path, orange its 2-sigma ellipse, green the truth",

@@ -50,6 +50,15 @@ def scene_rows(run: RunFolder) -> SceneRows:
     )
 
 
+def longest_m(scene: SceneRows) -> float:
+    """The largest range with its 2-sigma band, in whole tens of metres; 100 m without any."""
+    if scene.ranges is None:
+        return 100.0
+    range_m = scene.ranges["range_m"].to_numpy()
+    highest = range_m + 2.0 * np.sqrt(scene.ranges["var_m2"].to_numpy())
+    return 10.0 * float(np.ceil(0.1 * np.nanmax(highest)))
+
+
 def _table(run: RunFolder, name: str) -> pa.Table | None:
     if not run.file(f"{name}.parquet").exists():
         return None

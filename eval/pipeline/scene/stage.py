@@ -25,16 +25,16 @@ from crosscue.eval.pipeline.outcome import (
     report_time,
     unwatched_time,
 )
+from crosscue.eval.pipeline.scene.ego_motion import EgoMotion, Restarts
 from crosscue.eval.pipeline.scene.looked_for import not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
 from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
-from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
+from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import Approaches, PastCues, RangeRow, Step
 from crosscue.fusion.belief import begin, probabilities
-from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
@@ -88,10 +88,10 @@ def estimate_scene(
     scene = _Scene(
         vehicle,
         Approaches(graph, vehicle.fusion, vehicle.range_filter),
-        odometer_of(run),
+        EgoMotion(odometer_of(run)),
         _Rows(sink, features_of(vehicle), gives_reasons(vehicle)),
     )
-    restarts = _Restarts(vehicle, timeline)
+    restarts = Restarts(vehicle, timeline)
     regions = vehicle.regions
     fresh_regions = regions.kind == "ground" or detected.settings.regions != regions
     for frame in stored_frames(run, detected.detectors, with_road_masks=fresh_regions):
@@ -108,7 +108,7 @@ def estimate_scene(
         dict(sorted(scene.positive.items())),
         tuple(scene.summaries.values()),
         scene.approaches.counts + scene.motion.counts + scene.cues.notes(),
-        scene.without_odometry,
+        scene.ego.without_odometry,
         scene.tally.by_cue,
         scene.signs.by_cue,
         not_looked_for(
@@ -118,32 +118,10 @@ def estimate_scene(
 
 
 @dataclass(slots=True)
-class _Restarts:
-    """Follows the segments along the frames."""
-
-    vehicle: Vehicle
-    timeline: Timeline
-    _number: int = 0
-
-    def before(self, t_ns: int) -> int | None:
-        """Where the new segment begins if a frame at ``t_ns`` is the first after a long gap."""
-        segments, found = self.timeline.segments, None
-        limit_ns = round(self.vehicle.time.restart_after_s * 1e9)
-        while self._number + 1 < len(segments):
-            following = segments[self._number + 1]
-            if following.begins_ns > t_ns:
-                break
-            self._number += 1
-            if following.gap_ns is None or following.gap_ns > limit_ns:
-                found = following.begins_ns
-        return found
-
-
-@dataclass(slots=True)
 class _Scene:
     vehicle: Vehicle
     approaches: Approaches
-    odometer: Odometer
+    ego: EgoMotion
     rows: _Rows
     cues: CuePass = field(init=False)
     tally: CueTally = field(init=False)
@@ -151,11 +129,9 @@ class _Scene:
     motion: MotionRanges = field(init=False)
     priors: Mapping[str, float] = field(init=False)
     frames: int = 0
-    without_odometry: int = 0
     positive: Counter[str] = field(default_factory=Counter)
     looked: set[str] = field(default_factory=set)
     summaries: dict[int, ApproachSummary] = field(default_factory=dict)
-    _last_ns: int | None = None
     _before: Seen | None = None
     _ranges: tuple[RangeRow, ...] = ()
 
@@ -169,12 +145,7 @@ class _Scene:
 
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
-        gap_ns = 0 if self._last_ns is None else seen.t_ns - self._last_ns
-        seconds = max(gap_ns, 0) * 1e-9
-        evidence = self._motion(seen.t_ns)
-        ego = Motion(
-            evidence.travelled_m, evidence.travelled_var_m2, evidence.turned_rad or 0.0, seconds
-        )
+        evidence, ego = self.ego(seen.t_ns)
         found = self.cues(seen, ego, self._place(ego))
         counts = {cue: count for cue, count in found.counts.items() if cue not in without}
         signs = tuple(
@@ -183,7 +154,7 @@ class _Scene:
             if _MEASURES[sign.reference] not in without
         )
         evidence = replace(evidence, counts=counts, signs=signs)
-        posteriors = self.motion(evidence, seconds, seen.objects, frame.heights_px, without)
+        posteriors = self.motion(evidence, ego.seconds, seen.objects, frame.heights_px, without)
         evidence = replace(evidence, posteriors=posteriors, is_new_picture=self._is_new(seen))
         self.rows.add_objects(seen.t_ns, self.motion.objects)
         step = (
@@ -217,28 +188,11 @@ class _Scene:
     def restart(self, t_ns: int) -> None:
         """Know nothing of what was before ``t_ns``."""
         self.approaches.restart()
-        self.odometer.skip_to(t_ns)
+        self.ego.restart(t_ns)
         self.cues.restart()
         self.motion.restart()
-        self._last_ns = self._before = None
+        self._before = None
         self._ranges = ()
-
-    def _motion(self, t_ns: int) -> FrameEvidence:
-        """Evidence that holds only how the ego vehicle moved."""
-        way = self.odometer.until(t_ns)
-        gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
-        is_covered = way.covered_ns >= 0.9 * gap_ns
-        self.without_odometry += way.covered_ns - way.assumed_ns < 0.9 * gap_ns
-        self._last_ns = t_ns if self._last_ns is None else max(t_ns, self._last_ns)
-        return FrameEvidence(
-            t_ns=t_ns,
-            travelled_m=way.distance_m if is_covered else None,
-            travelled_var_m2=way.var_m2,
-            signs=(),
-            counts={},
-            turned_rad=way.turn_rad if is_covered else None,
-            assumed_m=way.assumed_m,
-        )
 
     def _sum_up(self, step: Step) -> None:
         if step.approach is None:

@@ -1,0 +1,132 @@
+"""What is anchored to the road, drawn over the pictures: regions on the ground, cars' own motion.
+
+Both need odometry and the believed place of the intersection, so they are computed once more along
+the frames, as the scene stage did.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.cues.car_judge import along, crossing, is_past, parked
+from crosscue.detectors.cues.car_motion import CarMotion
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.road_ground import outlines
+from crosscue.eval.pipeline.scene.ego_motion import EgoMotion, Restarts
+from crosscue.eval.pipeline.scene.stage import place_of
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DriveManifest
+from crosscue.eval.runs.tables.stored_frames import StoredFrame
+from crosscue.eval.runs.tables.travelled import odometer_of
+from crosscue.fusion.approaches import RangeRow
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.columns import Floats
+
+from .columns import Colour
+from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, SIDES, Marks
+
+ALONG: Final = (235, 235, 235)
+PAST: Final = (60, 190, 70)
+ARROW_S: Final = 1.0
+NEAREST_M: Final = 1.0
+NOSE: Final = 0.04
+"""Length of a parked car's arrow, in fractions of the picture's width."""
+
+
+@dataclass(slots=True)
+class Anchored:
+    """Follows cars and regions along the frames; draws into the marks of the same frame.
+
+    Attributes:
+        run: With odometry and ranges.
+        manifest: Of the run.
+        marks: Where to draw.
+    """
+
+    run: RunFolder
+    manifest: DriveManifest
+    marks: Marks
+    _cues: CuePass = field(init=False)
+    _ego: EgoMotion = field(init=False)
+    _restarts: Restarts = field(init=False)
+    _ranges: dict[int, list[RangeRow]] = field(init=False)
+    _before: list[RangeRow] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        vehicle = self.manifest.settings
+        self._cues = CuePass(vehicle)
+        self._ego = EgoMotion(odometer_of(self.run))
+        self._restarts = Restarts(vehicle, self.manifest.timeline)
+        self._ranges = _ranges_of(self.run)
+
+    def add(self, frame: StoredFrame) -> None:
+        """Draw one frame, which the marks have begun."""
+        seen, vehicle = frame.seen, self.manifest.settings
+        fresh_ns = self._restarts.before(seen.t_ns)
+        if fresh_ns is not None:
+            self._ego.restart(fresh_ns)
+            self._cues.restart()
+            self._before = []
+        _, ego = self._ego(seen.t_ns)
+        place = None
+        if ego.way_m is not None:
+            place = place_of(self._before, ego.way_m, vehicle.fusion.length_m)
+        self._before = self._ranges.get(seen.t_ns, [])
+        found = self._cues(seen, ego, place)
+        if vehicle.regions.kind == "ground" and isinstance(seen.road, RoadMask):
+            shares = found.road
+            polygons = outlines(vehicle.camera, vehicle.regions, place, frame.size_px)
+            for side, corners in zip(SIDES, polygons, strict=True):
+                share = float("nan") if shares is None else getattr(shares, side)
+                if corners is not None:
+                    self._region(side, corners, share)
+        if vehicle.cars.kind == "tracks":
+            for car in self._cues.followed():
+                self._car(car, frame.size_px, place)
+
+    def _region(self, side: str, corners: Floats, share: float) -> None:
+        is_road = share > self.manifest.settings.cues.road_fraction
+        said = "not seen" if np.isnan(share) else f"{100.0 * share:.0f} %"
+        colour = REGION_WITH_ROAD if is_road else REGION
+        self.marks.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {said}")
+
+    def _car(self, car: CarMotion, size_px: tuple[int, int], place: Place | None) -> None:
+        cars, camera = self.manifest.settings.cars, self.manifest.settings.camera
+        if parked([car], cars):
+            nose = np.array([NOSE * size_px[0] * np.sign(car.nose), 0.0])
+            self._arrow(car, nose, PARKED, "parked")
+        elif crossing([car], cars):
+            self._arrow(car, self._way(car, size_px), CROSSING, "crossing")
+        elif along([car], cars):
+            way = "outgoing" if car.ahead_mps > 0.0 else "oncoming"
+            is_beyond = place is not None and is_past(car, camera, place)
+            colour = PAST if is_beyond else ALONG
+            self._arrow(car, self._way(car, size_px), colour, f"{way} {abs(car.ahead_mps):.0f} m/s")
+
+    def _arrow(self, car: CarMotion, way_px: Floats, colour: Colour, label: str) -> None:
+        self.marks.cars.add(np.concatenate([car.center_px, way_px]), colour, label)
+
+    def _way(self, car: CarMotion, size_px: tuple[int, int]) -> Floats:
+        """Where the middle of a car would move in the picture, did the camera stand."""
+        camera = self.manifest.settings.camera
+        center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
+        now_px = np.array(car.center_px) - center
+        then_m = max(car.distance_m + ARROW_S * car.ahead_mps, NEAREST_M)
+        sideways_px = np.array([(camera.focal_px or 0.0) * ARROW_S * car.right_mps / then_m, 0.0])
+        return np.asarray(now_px * (car.distance_m / then_m) + sideways_px - now_px, np.float64)
+
+
+def _ranges_of(run: RunFolder) -> dict[int, list[RangeRow]]:
+    """Ranges by time of frame."""
+    found: dict[int, list[RangeRow]] = {}
+    if run.file("range.parquet").exists():
+        table = run.table("range").select(["t_ns", "reference", "range_m", "var_m2"])
+        for row in table.to_pylist():
+            one = RangeRow(Reference(row["reference"]), row["range_m"], row["var_m2"], None)
+            found.setdefault(row["t_ns"], []).append(one)
+    return found
