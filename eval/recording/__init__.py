@@ -120,11 +120,13 @@ def _log_marks(
         return
     log_styles(recording)
     marks = Marks(manifest.settings)
-    anchored = Anchored(run, manifest, marks)
+    has_odometry = run.file("measurements.parquet").exists()
+    anchored = Anchored(run, manifest, marks) if has_odometry else None
     frames = stored_frames(run, detected.detectors, with_road_masks=True)
     for number, frame in enumerate(frames):
         marks.add(frame)
-        anchored.add(frame)
+        if anchored is not None:
+            anchored.add(frame)
         if number % FRAMES_HELD == FRAMES_HELD - 1:
             marks.send(recording, time)
     marks.send(recording, time)

@@ -26,6 +26,7 @@ from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.vehicle import Camera
 
 from .columns import Colour
 from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, SIDES, Marks
@@ -101,24 +102,26 @@ class Anchored:
             nose = np.array([NOSE * size_px[0] * np.sign(car.nose), 0.0])
             self._arrow(car, nose, PARKED, "parked")
         elif crossing([car], cars):
-            self._arrow(car, self._way(car, size_px), CROSSING, "crossing")
+            self._arrow(car, way_px(car, camera, size_px), CROSSING, "crossing")
         elif along([car], cars):
             way = "outgoing" if car.ahead_mps > 0.0 else "oncoming"
             is_beyond = place is not None and is_past(car, camera, place)
             colour = PAST if is_beyond else ALONG
-            self._arrow(car, self._way(car, size_px), colour, f"{way} {abs(car.ahead_mps):.0f} m/s")
+            self._arrow(
+                car, way_px(car, camera, size_px), colour, f"{way} {abs(car.ahead_mps):.0f} m/s"
+            )
 
     def _arrow(self, car: CarMotion, way_px: Floats, colour: Colour, label: str) -> None:
         self.marks.cars.add(np.concatenate([car.center_px, way_px]), colour, label)
 
-    def _way(self, car: CarMotion, size_px: tuple[int, int]) -> Floats:
-        """Where the middle of a car would move in the picture, did the camera stand."""
-        camera = self.manifest.settings.camera
-        center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
-        now_px = np.array(car.center_px) - center
-        then_m = max(car.distance_m + ARROW_S * car.ahead_mps, NEAREST_M)
-        sideways_px = np.array([(camera.focal_px or 0.0) * ARROW_S * car.right_mps / then_m, 0.0])
-        return np.asarray(now_px * (car.distance_m / then_m) + sideways_px - now_px, np.float64)
+
+def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> Floats:
+    """Where the middle of a car would move in the picture within a second, did the camera stand."""
+    center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
+    now_px = np.array(car.center_px) - center
+    then_m = max(car.distance_m + ARROW_S * car.ahead_mps, NEAREST_M)
+    sideways_px = np.array([(camera.focal_px or 0.0) * ARROW_S * car.right_mps / then_m, 0.0])
+    return np.asarray(now_px * (car.distance_m / then_m - 1.0) + sideways_px, np.float64)
 
 
 def _ranges_of(run: RunFolder) -> dict[int, list[RangeRow]]:

@@ -1,0 +1,53 @@
+"""What is anchored to the road is drawn where the road is, and arrows go where the car goes."""
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.cues.car_motion import CarMotion
+from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.road_ground import outlines
+from crosscue.eval.recording.anchored import way_px
+from crosscue.replay.vehicle.vehicle import Camera, Regions
+
+SIZE = (1280, 720)
+CAMERA = Camera(x_m=1.7, z_m=1.4, focal_px=700.0, center_px=(640.0, 360.0))
+BOX = (700.0, 380.0, 740.0, 400.0)
+
+
+def car(right_mps: float, ahead_mps: float) -> CarMotion:
+    """One below and to the right of the optical axis, 40 m away."""
+    seen = CarMotion(1, 10, 40.0, 0.1, right_mps, 0.1, ahead_mps, 0.1, True, 2.0, 0.0)
+    return seen._replace(box_px=BOX)
+
+
+def test_a_standing_car_has_no_way_whatever_its_image_does() -> None:
+    assert not way_px(car(0.0, 0.0)._replace(step_px=(9.0, 3.0)), CAMERA, SIZE).any()
+
+
+def test_an_oncoming_car_goes_away_from_the_axis_and_an_outgoing_one_towards_it() -> None:
+    assert (way_px(car(0.0, -10.0), CAMERA, SIZE) > 0.0).all()
+    assert (way_px(car(0.0, 10.0), CAMERA, SIZE) < 0.0).all()
+
+
+def test_a_crossing_car_goes_sideways_as_far_as_a_pinhole_sees_it() -> None:
+    np.testing.assert_allclose(way_px(car(8.0, 0.0), CAMERA, SIZE), [700.0 * 8.0 / 40.0, 0.0])
+
+
+def test_a_car_that_would_pass_the_camera_has_a_finite_way() -> None:
+    assert np.isfinite(way_px(car(0.0, -60.0), CAMERA, SIZE)).all()
+
+
+def test_regions_lie_below_the_horizon_and_mirror_each_other() -> None:
+    left, straight, right = outlines(CAMERA, Regions(kind="ground"), Place(20.0, 36.0, 0.5), SIZE)
+
+    assert left is not None and straight is not None and right is not None
+    for corners in (left, straight, right):
+        assert (corners[:, 1] > 360.0).all()
+    mirrored = np.sort(1280.0 - right[:, 0])
+    np.testing.assert_allclose(np.sort(left[:, 0]), mirrored)
+    assert left[:, 0].max() < straight[:, 0].min() < straight[:, 0].max() < right[:, 0].min()
+
+
+@pytest.mark.parametrize("place", [None, Place(-30.0, -14.0, 1.0)])
+def test_what_has_no_known_place_or_lies_behind_is_not_drawn(place: Place | None) -> None:
+    assert outlines(CAMERA, Regions(kind="ground"), place, SIZE)[0] is None
