@@ -33,6 +33,10 @@ from .standard_sizes import SizePrior
 class HeightErrors:
     """How far a box's height is off, before anything is known of this track.
 
+    Measured about the straight line of 1 / height against the way, 70 to 160 observations each: 2.1
+    and 2.7 % at 38 and 60 px (two lights, yolox-nano, real), 3.3 to 7.4 % at 20 to 30 px (three
+    lights, embedded network, simulated).
+
     Attributes:
         fraction: Standard deviation as a fraction of the height.
         edges_px: Standard deviation in pixels, added in squares.
@@ -40,7 +44,7 @@ class HeightErrors:
         worth: How many independent observations this prior of the errors' scale counts for.
     """
 
-    fraction: float = 0.04
+    fraction: float = 0.02
     edges_px: float = 1.0
     resemble_m: float = 1.0
     worth: float = 8.0

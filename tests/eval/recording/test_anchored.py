@@ -40,7 +40,9 @@ def test_a_car_that_would_pass_the_camera_has_a_finite_way() -> None:
 def test_regions_lie_below_the_horizon_and_mirror_each_other() -> None:
     left, straight, right = outlines(CAMERA, Regions(kind="ground"), Place(20.0, 36.0, 0.5), SIZE)
 
-    assert left is not None and straight is not None and right is not None
+    assert left is not None
+    assert straight is not None
+    assert right is not None
     for corners in (left, straight, right):
         assert (corners[:, 1] > 360.0).all()
     mirrored = np.sort(1280.0 - right[:, 0])
