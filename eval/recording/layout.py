@@ -71,11 +71,11 @@ def _scene(shown: Shown) -> rrb.Container:
     )
     ranges = rrb.TimeSeriesView(
         origin="/".join(RANGE),
-        name="Range to the intersection (m), 2-sigma band",
+        name="Range (m): start red, end yellow, 2-sigma bands thin, truth green",
         axis_x=rrb.TimeAxis(view_range=_whole()),
-        # Ranges fall from the top left to the bottom right, and none is below zero for long.
+        # A legend of eight lines would cover them.
         axis_y=rrb.ScalarAxis(range=(0.0, shown.longest_m)),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftBottom),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
     tabs: list[rrb.View] = [_notes()]
     if shown.pose is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -104,12 +104,15 @@ def draw_belief(
 ) -> Markup:
     """Probability against true distance over one approach, with the cues found on the way.
 
+    Against time, where no true distance is known.
+
     Args:
         curve: Of the approach.
         cues: Of the same drive.
         threshold: Above it a feature is detected.
         gaps: Of the drive; shaded.
     """
+    curve, cues, label = _placed(curve, cues)
     shown = [
         (one, found)
         for one in cues
@@ -123,14 +126,11 @@ def draw_belief(
     drawing = Drawing(
         WIDTH + 24,
         lanes.bottom + 8,
-        f"Probability against distance: {curve.intersection}",
-        "Probability of each feature over the true distance still to go, and below it at which "
-        "distances each cue was found: "
-        + "; ".join(_report_text(name, curve, threshold) for name in curve.features),
+        f"Probability against {label}: {curve.intersection}",
+        f"Probability of each feature over {label}, and below it where each cue was found: "
+        + "; ".join(_report_text(name, curve, threshold, label[-2]) for name in curve.features),
     )
-    drawing.axes(
-        panel, "true distance to the intersection (m)", "", y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0]
-    )
+    drawing.axes(panel, label, "", y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0])
     drawing.rule(panel.left, panel.y(threshold), panel.right, panel.y(threshold), "line dash")
     t_ns, distance_m = _way(curve, cues)
     for gap, row in _between_rows(gaps, t_ns):
@@ -143,6 +143,16 @@ def draw_belief(
     for lane, (one, found) in enumerate(shown):
         _lane(drawing, lanes, lanes.top + 14.0 * lane, one, found, gaps)
     return drawing.svg()
+
+
+def _placed(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Curve, Sequence[CueFrames], str]:
+    """The same with seconds to the last step as distances where none is known, and the axis."""
+    if np.isfinite(curve.distance_m).any() or not len(curve.t_ns):
+        return curve, cues, "true distance to the intersection (m)"
+    last_ns = curve.t_ns[-1]
+    timed = [replace(one, distance_m=(last_ns - one.t_ns) * 1e-9) for one in cues]
+    to_last_s = (last_ns - curve.t_ns) * 1e-9
+    return replace(curve, distance_m=to_last_s), timed, "time to the last step (s)"
 
 
 def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Int64s, Floats]:
@@ -170,11 +180,11 @@ def _shade(drawing: Drawing, panel: Panel, ends: Floats, text: str) -> None:
     drawing.text((left + right) / 2.0, panel.top + 11, text, "halo")
 
 
-def _report_text(name: str, curve: Curve, threshold: float) -> str:
+def _report_text(name: str, curve: Curve, threshold: float, unit: str) -> str:
     above = np.flatnonzero(curve.features[name] > threshold)
     if not len(above):
         return f"{name} stays below {threshold:g}"
-    return f"{name} exceeds {threshold:g} from {curve.distance_m[above[0]]:.0f} m on"
+    return f"{name} exceeds {threshold:g} from {curve.distance_m[above[0]]:.0f} {unit} on"
 
 
 def _lane(

@@ -291,6 +291,20 @@ def test_charts_say_in_words_what_they_show(tmp_path: Path) -> None:
     assert "bias 0.50 m, rms error 0.50 m" in charts[2]
 
 
+def test_without_true_distances_belief_is_drawn_over_time(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    assert one.judged.approaches is not None
+    (curve,) = one.judged.approaches.curves
+    unknown = replace(curve, distance_m=np.full_like(curve.distance_m, np.nan))
+
+    chart = draw_belief(unknown, one.judged.cues)
+
+    assert "time to the last step (s)" in chart
+    assert "true distance" not in chart
+    assert re.search(r"intersection exceeds 0.9 from \d+ s on", chart)
+    assert chart.count("<polyline") + chart.count("<path") >= len(curve.features)
+
+
 def test_the_claimed_interval_fits_into_the_chart_of_ranges(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     scores = scores_of([one])

@@ -49,6 +49,15 @@ def test_distances_are_those_at_the_first_step_above_the_threshold() -> None:
     assert len(judged.curves[0].t_ns) == 40
 
 
+def test_a_feature_that_nothing_spoke_of_is_not_seen_rather_than_improbable() -> None:
+    steps = {**BELIEF, "left": dict.fromkeys(range(45), 0.5)}
+    steps["right"] = {frame: 0.5 + 0.001 * frame for frame in range(45)}
+    judged = judge_approaches(tables(belief=belief_table(steps)), truth())
+
+    assert judged is not None
+    assert judged.results[0].why_not_full == "never probable enough: right; not seen: left"
+
+
 def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None:
     late = tables(belief=belief_table(BELIEF), ranges=range_table(22, 45))
     never = tables(belief=belief_table(BELIEF))

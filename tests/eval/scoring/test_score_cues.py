@@ -129,6 +129,19 @@ def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
     assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
 
 
+def test_what_a_truth_of_things_leaves_open_is_not_judged_by_features() -> None:
+    found = {"parked_left": {3: 1}, "cross_traffic_left": {3: 1}}
+    of_things = score_cues(match_cues(tables(found), truth([span("parked_left", 0, 20)])))
+    of_features = score_cues(match_cues(tables(found), truth([])))
+
+    assert of_things["parked_left"].scored > 0
+    assert (of_things["cross_traffic_left"].reading, of_things["cross_traffic_left"].scored) == (
+        "object",
+        0,
+    )
+    assert of_features["cross_traffic_left"].reading == "feature"
+
+
 def test_a_cue_of_ones_own_is_scored_and_reported_where_nothing_looked_for_it() -> None:
     drive = truth([span("zebra", 0, 10), span("zebra", 10, 40, present=False), span("gate", 0, 40)])
     scores = score_cues(match_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
