@@ -44,7 +44,7 @@ class HeightErrors:
         worth: How many independent observations this prior of the errors' scale counts for.
     """
 
-    fraction: float = 0.02
+    fraction: float = 0.04
     edges_px: float = 1.0
     resemble_m: float = 1.0
     worth: float = 8.0
