@@ -32,6 +32,12 @@ TRACES: Final = 12
 """More approaches than this are shown as bins alone."""
 
 
+AXES: Final[Mapping[str, str]] = {
+    "distance": "true distance to the intersection (m)",
+    "time": "time to the last step (s)",
+}
+
+
 def style_of(feature: str) -> str:
     """A user's own features share one colour."""
     return STYLES.get(feature, "s4")
@@ -112,7 +118,8 @@ def draw_belief(
         threshold: Above it a feature is detected.
         gaps: Of the drive; shaded.
     """
-    curve, cues, label = _placed(curve, cues)
+    curve, cues, kind = _placed(curve, cues)
+    label = AXES[kind]
     shown = [
         (one, found)
         for one in cues
@@ -126,7 +133,7 @@ def draw_belief(
     drawing = Drawing(
         WIDTH + 24,
         lanes.bottom + 8,
-        f"Probability against {label}: {curve.intersection}",
+        f"Probability against {kind}: {curve.intersection}",
         f"Probability of each feature over {label}, and below it where each cue was found: "
         + "; ".join(_report_text(name, curve, threshold, label[-2]) for name in curve.features),
     )
@@ -146,13 +153,13 @@ def draw_belief(
 
 
 def _placed(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Curve, Sequence[CueFrames], str]:
-    """The same with seconds to the last step as distances where none is known, and the axis."""
+    """The same with seconds to the last step as distances where none is known; which it is."""
     if np.isfinite(curve.distance_m).any() or not len(curve.t_ns):
-        return curve, cues, "true distance to the intersection (m)"
+        return curve, cues, "distance"
     last_ns = curve.t_ns[-1]
     timed = [replace(one, distance_m=(last_ns - one.t_ns) * 1e-9) for one in cues]
     to_last_s = (last_ns - curve.t_ns) * 1e-9
-    return replace(curve, distance_m=to_last_s), timed, "time to the last step (s)"
+    return replace(curve, distance_m=to_last_s), timed, "time"
 
 
 def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Int64s, Floats]:

@@ -160,8 +160,9 @@ class Regions(Section):
     """The road straight ahead, so far beyond the intersection's end."""
     half_width_m: Positive = 2.0
     """And so far to either side of the ego vehicle's way."""
-    min_rows: Positive = 3.0
-    """A region that spans fewer rows of the segmentation is not seen."""
+    min_rows: Positive = 6.0
+    """A region that spans fewer rows of the segmentation is not seen: where a road ends, the
+    embedded network's mask runs on for up to five."""
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
