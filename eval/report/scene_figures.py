@@ -34,7 +34,7 @@ TRACES: Final = 12
 
 AXES: Final[Mapping[str, str]] = {
     "distance": "true distance to the intersection (m)",
-    "time": "time to the last step (s)",
+    "time": "time to the last frame (s)",
 }
 
 
@@ -153,10 +153,11 @@ def draw_belief(
 
 
 def _placed(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Curve, Sequence[CueFrames], str]:
-    """The same with seconds to the last step as distances where none is known; which it is."""
+    """The same with seconds to the last frame as distances where none is known; which it is."""
     if np.isfinite(curve.distance_m).any() or not len(curve.t_ns):
         return curve, cues, "distance"
-    last_ns = curve.t_ns[-1]
+    mine = [one.t_ns[one.approach == curve.approach] for one in cues]
+    last_ns = np.concatenate([curve.t_ns, *mine]).max()
     timed = [replace(one, distance_m=(last_ns - one.t_ns) * 1e-9) for one in cues]
     to_last_s = (last_ns - curve.t_ns) * 1e-9
     return replace(curve, distance_m=to_last_s), timed, "time"

@@ -299,7 +299,7 @@ def test_without_true_distances_belief_is_drawn_over_time(tmp_path: Path) -> Non
 
     chart = draw_belief(unknown, one.judged.cues)
 
-    assert "time to the last step (s)" in chart
+    assert "time to the last frame (s)" in chart
     assert "true distance" not in chart
     assert re.search(r"intersection exceeds 0.9 from \d+ s on", chart)
     assert chart.count("<polyline") + chart.count("<path") >= len(curve.features)
