@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol, Self, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Protocol, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Floats
+
+MIN_SCORE: Final = 0.5
+"""A detection is a cue above this score, where neither vehicle file nor detector says more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,8 @@ class Detections:
             where the detector gives only a box.
         lenses: N names of the lit lens (``crosscue.detectors.ranging.lens``), empty for what is no
             traffic light; no entries at all where nobody looked.
+        min_scores: Shape (N,): the score that each has to exceed to be a cue, as its detector says;
+            None where it says nothing.
     """
 
     t_ns: int
@@ -78,6 +83,7 @@ class Detections:
     labels: tuple[str, ...]
     masks: tuple[bytes, ...]
     lenses: tuple[str, ...] = ()
+    min_scores: Floats | None = None
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up, and numbers that are none.
@@ -94,6 +100,8 @@ class Detections:
             raise ValueError(f"masks: expected {n}, got {len(self.masks)}")
         if len(self.lenses) not in (0, n):
             raise ValueError(f"lenses: expected {n} or none, got {len(self.lenses)}")
+        if self.min_scores is not None and self.min_scores.shape != (n,):
+            raise ValueError(f"min_scores: expected ({n},), got {self.min_scores.shape}")
         if not (np.isfinite(self.boxes_px).all() and np.isfinite(self.scores).all()):
             raise ValueError("boxes_px, scores: expected finite numbers")
 
@@ -113,6 +121,22 @@ class Detections:
         """The detections with a score of at least ``score``, in the same order."""
         return self.taken(self.scores >= score)
 
+    def are_sure(self, setting: float | None) -> NDArray[np.bool_]:
+        """Which detections are sure enough to be a cue, shape (N,).
+
+        Args:
+            setting: The vehicle file's threshold; without one the detector's holds.
+        """
+        least = self.min_scores if setting is None else setting
+        return np.asarray(self.scores > (MIN_SCORE if least is None else least))
+
+    def with_min_scores(self, by_label: Mapping[str, float]) -> Self:
+        """The same detections with the thresholds that their detector has for their labels."""
+        if not by_label:
+            return self
+        least = [by_label.get(label, MIN_SCORE) for label in self.labels]
+        return replace(self, min_scores=np.array(least, np.float64))
+
     def taken(self, is_taken: NDArray[np.bool_]) -> Self:
         """The detections that shape (N,) marks, in the same order."""
         keep = np.flatnonzero(is_taken)
@@ -124,6 +148,7 @@ class Detections:
             tuple(self.labels[i] for i in keep),
             tuple(self.masks[i] for i in keep),
             tuple(self.lenses[i] for i in keep) if self.lenses else (),
+            None if self.min_scores is None else self.min_scores[keep],
         )
 
 
@@ -156,7 +181,8 @@ class Detector(Protocol):
     """From frames to what is in each; no memory of earlier frames (that is a tracker).
 
     It may have ``labels``, a tuple of all class names that it can report: none for one of road. A
-    cue whose labels no detector can report is not looked for; without ``labels`` it may be any.
+    cue whose labels no detector can report is not looked for; without ``labels`` it may be any. It
+    may have ``min_scores``, from label to the score above which a detection is a cue.
     """
 
     @property
@@ -177,6 +203,18 @@ class Detector(Protocol):
 def is_calibrated(detector: Detector) -> bool:
     """Whether a detector says that its scores are probabilities (``is_calibrated = True``)."""
     return bool(getattr(detector, "is_calibrated", False))
+
+
+def min_scores_of(detector: Detector) -> dict[str, float]:
+    """From label to the score above which a detection is a cue, as far as the detector says."""
+    found: Mapping[str, float] = getattr(detector, "min_scores", {})
+    return dict(found)
+
+
+def calibrated_labels(detector: Detector) -> tuple[str, ...]:
+    """Labels whose scores a fitted calibration has turned into probabilities, sorted."""
+    labels: Sequence[str] = getattr(detector, "calibrated_labels", ())
+    return tuple(sorted(labels))
 
 
 def reportable(detector: Detector) -> tuple[str, ...] | None:

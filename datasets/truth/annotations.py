@@ -45,6 +45,7 @@ class Thing:
         track: The same number in several pictures is the same thing; None unknown.
         segmentation: COCO's polygons or runs, or None.
         place: Where it stands in its file, for errors.
+        range_m: From the camera, or None where the file does not say.
     """
 
     label: str
@@ -54,6 +55,7 @@ class Thing:
     track: int | None = None
     segmentation: Any = None
     place: str = ""
+    range_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,6 +110,9 @@ def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
     visible, track = row.get("visible"), row.get("track_id")
     if visible is not None and not (_is_number(visible) and 0.0 <= visible <= 1.0):
         raise AnnotationError(f"{path}: {where}: visible {visible!r}: expected 0 to 1; correct it")
+    range_m = row.get("range_m")
+    if range_m is not None and not (_is_number(range_m) and range_m >= 0.0):
+        raise AnnotationError(f"{path}: {where}: range_m {range_m!r}: expected metres; correct it")
     return Thing(
         label=label,
         box_px=(x, y, x + w, y + h),
@@ -118,6 +121,7 @@ def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
         track=None if track is None else _key(track),
         segmentation=row.get("segmentation"),
         place=where,
+        range_m=None if range_m is None else float(range_m),
     )
 
 

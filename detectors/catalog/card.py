@@ -32,6 +32,7 @@ from crosscue.replay.vehicle.validation_errors import explain
 from crosscue.replay.vehicle.vehicle import tuples
 
 from .architectures import WEIGHTS_SUFFIXES, ArchitectureName
+from .class_scores import ClassScores
 
 MAX_BYTES: Final = 2048 * MIB
 """Largest weights read."""
@@ -144,6 +145,8 @@ class ModelCard(Settings):
     labels: dict[str, str] = Field(default_factory=dict)
     """What a class means to crosscue, where its own name says something else: the cues count
     "stop sign", "traffic light", "car", "truck", "bus", "one way left" and so on."""
+    scores: dict[str, ClassScores] = Field(default_factory=dict)
+    """By label, that is by the class's meaning: thresholds and calibrations, as fitted."""
     is_calibrated: bool = False
     """Its scores are probabilities: so often a detection is right. Of an object that two detectors
     found, a calibrated score is kept before one that is not."""
@@ -163,6 +166,10 @@ class ModelCard(Settings):
         unknown = [name for name in self.labels if name not in classes]
         if unknown:
             raise ValueError(f"labels: {unknown[0]!r} is not one of output.classes")
+        meanings = set(map(self.meaning, range(len(classes))))
+        others = [name for name in self.scores if name not in meanings]
+        if others:
+            raise ValueError(f"scores: {others[0]!r} is no label of its classes")
         return self
 
     @model_validator(mode="after")

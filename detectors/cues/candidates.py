@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from crosscue.detectors.base import Detections
+from crosscue.detectors.base import MIN_SCORE, Detections
 
 SAME_OBJECT: Final = "found by another detector with a better score"
 BELOW_SCORE: Final = "below score"
@@ -36,7 +36,7 @@ class Candidates:
     Attributes:
         unit: What is counted: detections with the cue's labels, or frames with road in its region.
         setting: Where the threshold stands in the vehicle file; None where it has none.
-        threshold: Only a higher score counts.
+        threshold: Only a higher score counts; the lowest, where detectors differ.
         seen: How many there were.
         used: How many became the cue or the range.
         skipped: How many did not, by reason.
@@ -50,6 +50,11 @@ class Candidates:
     used: int = 0
     skipped: dict[str, int] = field(default_factory=dict)
     max_score: float | None = None
+
+    def meet(self, thresholds: Sequence[float]) -> None:
+        """Keep the lowest threshold that a candidate was held to."""
+        met = [*thresholds, *(() if self.threshold is None else (self.threshold,))]
+        self.threshold = min(met, default=None)
 
     def take(self, scores: Sequence[float], skipped: Mapping[str, int]) -> None:
         """Count candidates with these scores, of which so many were skipped."""
@@ -69,5 +74,28 @@ def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]
         score
         for found in boxes
         for label, score in zip(found.labels, found.scores.tolist(), strict=True)
+        if label in labels
+    ]
+
+
+def unsure_of(boxes: Sequence[Detections], labels: Sequence[str], setting: float | None) -> int:
+    """How many detections with one of the labels are not sure enough for a cue."""
+    return sum(
+        label in labels and not is_sure
+        for found in boxes
+        for label, is_sure in zip(found.labels, found.are_sure(setting).tolist(), strict=True)
+    )
+
+
+def thresholds_met(
+    boxes: Sequence[Detections], labels: Sequence[str], setting: float | None
+) -> list[float]:
+    """The thresholds that detections with one of the labels are held to."""
+    if setting is not None:
+        return [setting]
+    return [
+        MIN_SCORE if found.min_scores is None else float(found.min_scores[i])
+        for found in boxes
+        for i, label in enumerate(found.labels)
         if label in labels
     ]

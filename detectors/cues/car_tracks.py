@@ -124,8 +124,8 @@ class CarTracks:
         rows = [
             (detections, i)
             for detections in found
-            for i, label in enumerate(detections.labels)
-            if label in self._settings.labels and detections.scores[i] > self._settings.score
+            for i in np.flatnonzero(detections.are_sure(self._settings.score)).tolist()
+            if detections.labels[i] in self._settings.labels
         ]
         boxes_px = np.array([found.boxes_px[i] for found, i in rows]).reshape(-1, 4)
         cars = []

@@ -88,14 +88,14 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
     rows = [
         (box, mask)
         for detections in found
-        for label, score, box, mask in zip(
+        for label, is_sure, box, mask in zip(
             detections.labels,
-            detections.scores.tolist(),
+            detections.are_sure(settings.score).tolist(),
             detections.boxes_px.tolist(),
             detections.masks,
             strict=True,
         )
-        if label in settings.labels and score > settings.score and _is_long(box, settings)
+        if label in settings.labels and is_sure and _is_long(box, settings)
     ]
     boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
     # Counting pixels by column gives both area and nose from one reading of the runs.

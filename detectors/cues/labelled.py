@@ -15,10 +15,10 @@ def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
     return count_labels(boxes, vehicle.labels_of(cue), least or 0.0)
 
 
-def count_labels(boxes: Sequence[Detections], labels: tuple[str, ...], score: float) -> int:
-    """How many detections have one of ``labels`` and more than ``score``."""
+def count_labels(boxes: Sequence[Detections], labels: tuple[str, ...], score: float | None) -> int:
+    """How many detections with one of ``labels`` are sure enough, see ``Detections.are_sure``."""
     return sum(
-        label in labels and bool(s > score)
+        label in labels and is_sure
         for found in boxes
-        for label, s in zip(found.labels, found.scores.tolist(), strict=True)
+        for label, is_sure in zip(found.labels, found.are_sure(score).tolist(), strict=True)
     )

@@ -27,6 +27,8 @@ from .candidates import (
     Candidates,
     Unit,
     scores_of,
+    thresholds_met,
+    unsure_of,
 )
 from .observed import Judged, RoadShares, of_side
 
@@ -57,15 +59,20 @@ class CueTally:
             labels = self.vehicle.labels_of(cue) if cue.observed_by == observed_by else ()
             if labels and cue.name in counts:
                 setting, threshold = self.vehicle.threshold_of(cue)
-                self._count(cue.name, scores_of(boxes, labels), setting, threshold, counts)
+                low = 0 if setting is None else unsure_of(boxes, labels, threshold)
+                self._count(cue.name, scores_of(boxes, labels), low, counts, setting)
+                if setting is not None:
+                    self.by_cue[cue.name].meet(thresholds_met(boxes, labels, threshold))
 
     def own(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
         """Of the user's cues."""
         for name, cue in self.vehicle.cues.own.items():
             if name not in counts:
                 continue
-            scores = scores_of(boxes, cue.labels)
-            self._count(name, scores, f"[cues.own.{name}] score", cue.score, counts)
+            scores, setting = scores_of(boxes, cue.labels), f"[cues.own.{name}] score"
+            low = unsure_of(boxes, cue.labels, cue.score)
+            self._count(name, scores, low, counts, setting)
+            self.by_cue[name].meet([cue.score])
 
     def cars(
         self, boxes: Sequence[Detections], shapes: int, pairs: int, counts: Mapping[str, int]
@@ -78,12 +85,10 @@ class CueTally:
             pairs: Cars of these that were in the frame before, too.
             counts: What came out.
         """
-        cars = self.vehicle.cars
-        scores = scores_of(boxes, cars.labels)
-        low = sum(score <= cars.score for score in scores)
+        scores, low = self._cars(boxes)
         for cue in CUES.values():
             if cue.observed_by == "car pairs" and cue.group != "cars_past":
-                self._of(cue.name, "detections", "[cars] score", cars.score).take(
+                self._of_cars(cue, boxes).take(
                     scores,
                     {
                         BELOW_SCORE: low,
@@ -103,18 +108,16 @@ class CueTally:
             judged: What became of the cars among them.
             counts: What came out, of all cues.
         """
-        cars = self.vehicle.cars
-        scores = scores_of(boxes, cars.labels)
-        low = sum(score <= cars.score for score in scores)
+        scores, low = self._cars(boxes)
         for cue in CUES.values():
             if cue.group == "cars_past" and cue.name in counts:
-                self._of(cue.name, "detections", "[cars] score", cars.score).take(
+                self._of_cars(cue, boxes).take(
                     scores,
                     {BELOW_SCORE: low, NOT_PAST: len(scores) - low - counts[cue.name]},
                 )
             if cue.group in ("cross_traffic", "parked"):
                 here, there = _judged(judged, cue)
-                self._of(cue.name, "detections", "[cars] score", cars.score).take(
+                self._of_cars(cue, boxes).take(
                     scores,
                     {
                         BELOW_SCORE: low,
@@ -158,14 +161,24 @@ class CueTally:
         self,
         name: str,
         scores: Sequence[float],
-        setting: str | None,
-        threshold: float | None,
+        low: int,
         counts: Mapping[str, int],
+        setting: str | None,
     ) -> None:
-        low = 0 if threshold is None else sum(score <= threshold for score in scores)
         high = len(scores) - low
         skipped = {BELOW_SCORE: low, NOT_COUNTED: high - min(counts[name], high)}
-        self._of(name, "detections", setting, threshold).take(scores, skipped)
+        self._of(name, "detections", setting, None).take(scores, skipped)
+
+    def _cars(self, boxes: Sequence[Detections]) -> tuple[list[float], int]:
+        """Scores of all cars, and how many are too low."""
+        cars = self.vehicle.cars
+        return scores_of(boxes, cars.labels), unsure_of(boxes, cars.labels, cars.score)
+
+    def _of_cars(self, cue: CueSpec, boxes: Sequence[Detections]) -> Candidates:
+        cars = self.vehicle.cars
+        counted = self._of(cue.name, "detections", "[cars] score", cars.score)
+        counted.meet(thresholds_met(boxes, cars.labels, cars.score))
+        return counted
 
     def _of(
         self, name: str, unit: Unit, setting: str | None, threshold: float | None

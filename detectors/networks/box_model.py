@@ -70,6 +70,17 @@ class BoxModel:
         return self.card.is_calibrated
 
     @property
+    def min_scores(self) -> dict[str, float]:
+        """The card's thresholds by label."""
+        known = {label: one.threshold for label, one in self.card.scores.items()}
+        return {label: score for label, score in known.items() if score is not None}
+
+    @property
+    def calibrated_labels(self) -> tuple[str, ...]:
+        """Labels that the card has a calibration for."""
+        return tuple(label for label, one in self.card.scores.items() if one.calibration)
+
+    @property
     def view(self) -> View:
         """No finer than the network's input; the full size for tiles, or if it scales itself."""
         if self.card.tiles is not None or self.card.input.fit == "network":
@@ -170,14 +181,24 @@ class BoxModel:
         inside = np.clip(boxes * np.tile(frame.scale, 2), 0.0, [width, height, width, height])
         is_seen = (inside[keep, 2:] > inside[keep, :2]).all(axis=1)
         keep = keep[is_seen]
+        labels = tuple(self.card.meaning(i) for i in classes[keep].tolist())
         return Detections(
             frame.t_ns,
             frame.size_px,
             inside[keep],
-            np.clip(scores[keep], 0.0, 1.0),
-            tuple(self.card.meaning(i) for i in classes[keep].tolist()),
+            self._calibrated(np.clip(scores[keep], 0.0, 1.0), labels),
+            labels,
             tuple(masks[i] for i in keep.tolist()),
         )
+
+    def _calibrated(self, scores: Floats, labels: Sequence[str]) -> Floats:
+        """Scores as the card's calibrations turn them into probabilities."""
+        for label in self.calibrated_labels:
+            mine = np.array([one == label for one in labels], np.bool_)
+            by = self.card.scores[label].calibration
+            if by is not None and mine.any():
+                scores[mine] = by.probabilities(scores[mine])
+        return scores
 
 
 def _fraction(outputs: Mapping[str, Array], number: int, count: int) -> dict[str, Array]:

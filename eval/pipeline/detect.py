@@ -13,11 +13,14 @@ import numpy as np
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import (
+    MIN_SCORE,
     Choice,
     Detections,
     Found,
     RoadMask,
+    calibrated_labels,
     is_calibrated,
+    min_scores_of,
     reportable,
 )
 from crosscue.detectors.cues.frame import CuePass
@@ -185,6 +188,7 @@ def detect_into(
         notices = (
             *gaps_text(timeline.segments),
             *_simulated_only(choices, logs),
+            *_without_thresholds(named, vehicle),
             *tables.notices,
         )
         write_manifest(
@@ -205,6 +209,8 @@ def detect_into(
                         role=tables.roles.get(one.name),
                         labels=reportable(one.detector),
                         settings=dict(choice.settings),
+                        min_scores=min_scores_of(one.detector),
+                        calibrated=calibrated_labels(one.detector),
                     )
                     for one, choice in zip(named, choices, strict=True)
                 ),
@@ -248,6 +254,31 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
     ]
 
 
+def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
+    """Detectors that lack a fitted threshold for a label, and the vehicle file says none."""
+    cues, cars = vehicle.cues, vehicle.cars
+    open_labels = {
+        label
+        for labels, score in (
+            (cues.stop_sign_labels, cues.stop_sign_score),
+            (cues.traffic_light_labels, cues.traffic_light_score),
+            (cars.labels, cars.score),
+        )
+        if score is None
+        for label in labels
+    }
+    notices = []
+    for one in named:
+        missing = open_labels.intersection(reportable(one.detector) or ())
+        missing -= min_scores_of(one.detector).keys()
+        if missing:
+            notices.append(
+                f"{one.name}: no threshold fitted for {', '.join(sorted(missing))}: they count "
+                f"above {MIN_SCORE:.2f}; crosscue fit detector fits one to labelled images"
+            )
+    return notices
+
+
 def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
     for result in runner(block):
         tables.add(result)
@@ -277,6 +308,7 @@ class _Tables:
     _size: tuple[int, int] | None = None
     _frame: int = -1
     _meanings: dict[str, str] = field(default_factory=dict)
+    _min_scores: list[dict[str, float]] = field(default_factory=list)
     _labels: frozenset[str] | None = None
     """What the detectors that give boxes can report; known from the first frame on."""
 
@@ -308,6 +340,7 @@ class _Tables:
         self._frame += 1
         if self._frame == 0:
             self._meanings = meanings(self.vehicle)
+            self._min_scores = [min_scores_of(one.detector) for one in self.detectors]
             self._labels = all_labels(
                 reportable(named.detector)
                 for named, found in zip(self.detectors, result.found, strict=True)
@@ -375,7 +408,9 @@ class _Tables:
         same = same_objects(boxes, self._meanings, calibrated)
         again = dict(zip(numbers, same, strict=True))
         once = [
-            one.taken(again[k] == KEPT) if isinstance(one, Detections) else one
+            one.taken(again[k] == KEPT).with_min_scores(self._min_scores[k])
+            if isinstance(one, Detections)
+            else one
             for k, one in enumerate(found)
         ]
         names = {k: np.where(one == KEPT, KEPT, np.take(numbers, one)) for k, one in again.items()}

@@ -102,23 +102,26 @@ class Marks:
 
     def _objects(self, found: Detections) -> None:
         for box, text, row in _report_text(found):
-            colour = self._colour(found.labels[row], float(found.scores[row]))
+            colour = self._colour(found, row)
             is_far = box[2] - box[0] < LABELLED * found.size_px[0]
             (self.far if is_far else self.objects).add(box, colour, text)
             for line in outline(found.masks[row], found.size_px, box):
                 self.outlines.add(line, colour)
 
-    def _colour(self, label: str, score: float) -> Colour:
+    def _colour(self, found: Detections, row: int) -> Colour:
         """Grey for what is too unsure to be a cue."""
         cues, cars = self.vehicle.cues, self.vehicle.cars
+        label = found.labels[row]
         for labels, least, colour in (
             (cars.labels, cars.score, CAR),
             (cues.stop_sign_labels, cues.stop_sign_score, STOP_SIGN),
             (cues.traffic_light_labels, cues.traffic_light_score, TRAFFIC_LIGHT),
         ):
-            if label in labels and score > least:
+            if label in labels and found.are_sure(least)[row]:
                 return colour
-        is_own = any(label in one.labels and score > one.score for one in cues.own.values())
+        is_own = any(
+            label in one.labels and found.are_sure(one.score)[row] for one in cues.own.values()
+        )
         return OWN if is_own else UNSURE
 
     def _regions(self, road: RoadMask | RoadShares | None, size_px: tuple[int, int]) -> None:

@@ -71,10 +71,12 @@ def _text_of(one: CandidateRow) -> str:
     threshold = "" if one.threshold is None else f"{one.threshold:.2f}"
     low = one.skipped.get(BELOW_SCORE, 0) + one.skipped.get(TOO_LITTLE_ROAD, 0)
     if low == one.seen and one.max_score is not None:
-        what = one.unit if one.unit == "detections" else "frames with road"
+        what, fit = "frames with road", ""
+        if one.unit == "detections":
+            what, fit = one.unit, "see crosscue fit detector, or "
         return (
             f"{one.seen:,} {what}, none above {threshold} (highest {one.max_score:.2f}); "
-            f"lower {one.setting}"
+            f"{fit}lower {one.setting}"
         )
     reasons = ", ".join(
         f"{number:,} {why}" + (f" ({threshold})" if why == BELOW_SCORE else "")

@@ -116,6 +116,10 @@ class DetectorRow(Record):
     labels: tuple[str, ...] | None
     """All class names that it can report: none for road, None where it does not say."""
     settings: dict[str, Any]
+    min_scores: dict[str, float] = Field(default_factory=dict)
+    """From label to the score above which a detection is a cue, as far as the detector says."""
+    calibrated: tuple[str, ...] = ()
+    """Labels whose scores a fitted calibration has turned into probabilities."""
 
 
 class DetectCounts(Record):

@@ -187,12 +187,15 @@ That a log is simulated is known from the file beside it, see ``crosscue.replay.
 
 
 class Cues(Section):
-    """When a detection is a cue; the numbers are the source's for Mask R-CNN."""
+    """When a detection is a cue."""
 
     stop_sign_labels: tuple[str, ...] = ("stop sign",)
-    stop_sign_score: Proportion = 0.9
+    stop_sign_score: Proportion | None = None
+    """Only higher scores count. Left out: the detector's own threshold, which ``crosscue fit
+    detector`` writes into its card, or 0.5; the source's network has the source's 0.9."""
     traffic_light_labels: tuple[str, ...] = ("traffic light",)
-    traffic_light_score: Proportion = 0.9
+    traffic_light_score: Proportion | None = None
+    """As ``stop_sign_score``."""
     road_fraction: Proportion = 0.2
     """More road than this in a region is a cue (eq. 14)."""
     own: dict[Name, OwnCue] = Field(default_factory=dict)
@@ -215,7 +218,8 @@ class Cars(Section):
     road over three frames and more, the ego vehicle's taken out; needs ``camera.focal_px`` and
     odometry. Left out: ``pairs`` in a simulated car's file, ``tracks`` in every other."""
     labels: tuple[str, ...] = ("car",)
-    score: Proportion = 0.95
+    score: Proportion | None = None
+    """As ``cues.stop_sign_score``; the source's network has the source's 0.95."""
     length_per_height: Positive = 2.0
     """Only cars seen from the side: longer than so many times their height."""
     area_change: Proportion = 0.03
@@ -369,11 +373,14 @@ class Vehicle(Section):
         return () if cue.label is None else SAME_SIGN.get(cue.label, (cue.label,))
 
     def threshold_of(self, cue: CueSpec) -> tuple[str | None, float | None]:
-        """Where a cue's least score stands in the file, and the score; None without one."""
+        """Where a cue's least score stands in the file, and the score if one is given there.
+
+        Without a place every score counts; without a score the detector's threshold holds.
+        """
         if cue.settings is None:
             return None, None
         name = f"{cue.settings}_score"
-        score: float = getattr(self.cues, name)
+        score: float | None = getattr(self.cues, name)
         return f"[cues] {name}", score
 
     def cue_labels(self) -> dict[str, tuple[str, ...]]:

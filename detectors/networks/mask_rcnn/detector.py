@@ -79,6 +79,11 @@ def build(**given: Any) -> Detector:
     return detector_of(checkpoint_named(settings.network), settings, device)
 
 
+SOURCE_SCORES: Final = {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
+"""The source's thresholds, for its network: the embedded one stands in for it, and torchvision's
+of COCO is it. Scores of any other network mean something else."""
+
+
 def checkpoint_named(name: str) -> Checkpoint:
     """The embedded checkpoint, one that torchvision fetches, or one from a file.
 
@@ -157,6 +162,12 @@ class MaskRcnnDetector:
     def labels(self) -> tuple[str, ...]:
         """The checkpoint's classes."""
         return tuple(name for name in self.checkpoint.facts.plan.classes if name)
+
+    @property
+    def min_scores(self) -> dict[str, float]:
+        """The source's thresholds, for the source's network only."""
+        is_source = self.settings.network in (EMBEDDED, *COCO_NETWORKS)
+        return dict(SOURCE_SCORES) if is_source else {}
 
     @property
     def view(self) -> View:

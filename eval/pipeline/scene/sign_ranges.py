@@ -8,9 +8,16 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, Candidates, scores_of
+from crosscue.detectors.cues.candidates import (
+    BELOW_SCORE,
+    NO_CURVE,
+    Candidates,
+    scores_of,
+    thresholds_met,
+)
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.fusion.evidence import SignRange
 from crosscue.fusion.intersection_range import Reference
@@ -67,16 +74,18 @@ class SignRanges:
         ranges: list[SignRange] = []
         skipped: Counter[str] = Counter()
         for detections, heights in zip(found, heights_px, strict=True):
+            are_sure = detections.are_sure(threshold)
             for i, label in enumerate(detections.labels):
                 if label not in labels:
                     continue
-                why = _why_not(detections, heights, i, threshold or 0.0, source)
+                why = _why_not(detections, heights, i, are_sure, source)
                 if why is not None:
                     skipped[why] += 1
                 elif curve is not None and source == "curve":
                     range_m = float(range_of(np.array([heights[i]]), curve)[0])
                     ranges.append(SignRange(reference, range_m, curve.residual_sd_m**2))
         counted = self.by_cue.setdefault(cue.name, Candidates("detections", setting, threshold))
+        counted.meet(thresholds_met(found, labels, threshold))
         counted.take(scores_of(found, labels), skipped)
         return ranges
 
@@ -90,10 +99,14 @@ def source_of(vehicle: Vehicle, cue: str) -> Source | None:
 
 
 def _why_not(
-    found: Detections, heights_px: Floats, i: int, score: float, source: Source | None
+    found: Detections,
+    heights_px: Floats,
+    i: int,
+    are_sure: NDArray[np.bool_],
+    source: Source | None,
 ) -> str | None:
     """Why a detection gives no range; None where it gives one, or belongs to a track that does."""
-    if found.scores[i] <= score:
+    if not are_sure[i]:
         return BELOW_SCORE
     if heights_px[i] <= 0.0:
         return NO_HEIGHT
@@ -124,12 +137,14 @@ def usable(
     """Detections of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
     cue, _ = MEASURED[row]
     labels = vehicle.labels_of(cue)
-    score = vehicle.threshold_of(cue)[1] or 0.0
+    _, score = vehicle.threshold_of(cue)
     some = [
         (detections.boxes_px[i], float(heights[i]), *(detections.lenses[i : i + 1] or ("",)))
-        for detections, heights in zip(found, heights_px, strict=True)
+        for detections, heights, are_sure in zip(
+            found, heights_px, (one.are_sure(score) for one in found), strict=True
+        )
         for i, label in enumerate(detections.labels)
-        if label in labels and _why_not(detections, heights, i, score, "motion") is None
+        if label in labels and _why_not(detections, heights, i, are_sure, "motion") is None
     ]
     boxes = np.array([box for box, _, _ in some]).reshape(-1, 4)
     heights = np.array([height for _, height, _ in some])

@@ -97,6 +97,7 @@ def stored_frames(
     Raises:
         RunError: A table is missing or damaged.
     """
+    least = {d.name: d.min_scores for d in detectors}
     objects = [d.name for d in detectors if d.role == Role.OBJECTS]
     signs = [d.name for d in detectors if d.role == Role.SIGNS]
     labels = all_labels(d.labels for d in detectors if d.role in (Role.OBJECTS, Role.SIGNS))
@@ -114,12 +115,18 @@ def stored_frames(
             for row in found.of(frame):
                 (by_name if row[10] is None else again).setdefault(row[0], []).append(row)
             shares = road.of(frame) if has_road else []
-            some = tuple(_detections(t_ns, size, by_name.get(name, [])) for name in objects)
+            some, others = (
+                tuple(
+                    _detections(t_ns, size, by_name.get(name, [])).with_min_scores(least[name])
+                    for name in names
+                )
+                for names in (objects, signs)
+            )
             yield StoredFrame(
                 Seen(
                     t_ns,
                     some,
-                    tuple(_detections(t_ns, size, by_name.get(name, [])) for name in signs),
+                    others,
                     _road(t_ns, size, shares[0], with_road_masks) if shares else None,
                     labels,
                     tuple(_detections(t_ns, size, rows) for rows in again.values()),

@@ -81,11 +81,11 @@ AFTER_CAMERA: Final = """\
 # [detectors.yolox-nano]  # after: crosscue model fetch yolox-nano; others: crosscue model list
 # kind = "yolox-nano"  # a network of your own: crosscue model init NET.onnx, then card = "NET.toml"
 
-# [cues]  # thresholds of the published network; scores of another network mean something else
-# stop_sign_score = 0.9
-# traffic_light_score = 0.9
+# [cues]  # left out: each detector's own thresholds, see crosscue fit detector
+# stop_sign_score = 0.5
+# traffic_light_score = 0.5
 # [cars]
-# score = 0.95
+# score = 0.5
 """
 
 

@@ -126,7 +126,7 @@ def test_every_candidate_is_explained_in_manifest_and_summary(
         assert one["seen"] == one["used"] + sum(one["skipped"].values())
     cars = scene["candidates"]["parked_left"]
     assert cars["seen"] == cars["skipped"]["below score"] > 0
-    highest = f"none above 1.00 (highest {cars['max_score']:.2f}); lower [cars] score"
+    highest = f"none above 1.00 (highest {cars['max_score']:.2f})"
     assert f"parked_right: {cars['seen']:,} detections, {highest}" in printed
     signs = scene["ranged"]["stop_sign"]["skipped"]["no range curve"]
     assert f"range: {signs:,} stop signs measured, no curve" in printed

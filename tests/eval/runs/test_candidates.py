@@ -23,7 +23,7 @@ def test_a_threshold_that_nothing_reaches_is_named_with_the_highest_score() -> N
 
     assert line == (
         "traffic_light: 87 detections, none above 0.90 (highest 0.62); "
-        "lower [cues] traffic_light_score"
+        "see crosscue fit detector, or lower [cues] traffic_light_score"
     )
 
 

@@ -1,0 +1,321 @@
+"""Labelled boxes of pictures: COCO, YOLO, Pascal VOC and KITTI.
+
+* COCO: a ``.json`` file. ``iscrowd`` marks regions that are not judged; ``t_ns`` and ``range_m``
+  (of an annotation, metres) are used where they are given.
+* YOLO: a folder of ``.txt`` files, ``class x y width height`` in fractions of the picture. Class
+  names come from ``classes.txt``, ``obj.names`` or ``data.yaml`` there or one folder above.
+* Pascal VOC: a folder of ``.xml`` files. The first pixel is 1 and the last one belongs to the box;
+  objects marked ``difficult`` are not judged.
+* KITTI: a folder of ``.txt`` files with 15 columns. ``DontCare`` regions are not judged; the range
+  is the distance ahead of the camera.
+
+A file without boxes says that its picture has none; a picture without a file is not labelled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.base import (
+    MIB,
+    AnnotationError,
+    EmptyResultError,
+    Floats,
+    UsageError,
+    read_at_most,
+)
+
+from .coco import read_coco
+from .voc import read_voc
+
+LabelFormat: TypeAlias = Literal["coco", "yolo", "voc", "kitti"]
+FORMATS: Final[tuple[LabelFormat, ...]] = ("coco", "yolo", "voc", "kitti")
+MAX_TEXT_BYTES: Final = 16 * MIB
+NAME_FILES: Final = ("classes.txt", "obj.names", "data.yaml")
+DONT_CARE: Final = "DontCare"
+OUTSIDE: Final = "boxes outside the picture, or without area"
+CUT: Final = "boxes cut off at the picture's edge"
+_KITTI_COLUMNS: Final = 15
+
+
+@dataclass(frozen=True, slots=True)
+class LabelBox:
+    """One labelled object.
+
+    Attributes:
+        label: As annotated; empty for a region of anything.
+        box: x0, y0, x1, y1, in pixels or in fractions of the picture.
+        is_ignored: Neither to be found nor wrong when found.
+        range_m: From the camera, NaN unknown.
+    """
+
+    label: str
+    box: tuple[float, float, float, float]
+    is_ignored: bool = False
+    range_m: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class LabelPicture:
+    """One labelled picture.
+
+    Attributes:
+        name: File name of the picture, or of its labels.
+        boxes: None is an answer, too.
+        size_px: Width and height; None where the format does not say.
+        t_ns: Log time, where the file says.
+        is_in_fractions: Boxes are in fractions of the picture, not in pixels.
+    """
+
+    name: str
+    boxes: tuple[LabelBox, ...]
+    size_px: tuple[int, int] | None = None
+    t_ns: int | None = None
+    is_in_fractions: bool = False
+
+    def inside(self, size_px: tuple[int, int], left_out: Counter[str]) -> list[LabelBox]:
+        """Its boxes in pixels within a picture; what is outside is counted in ``left_out``."""
+        width, height = size_px
+        factor = np.array([width, height] * 2) if self.is_in_fractions else np.ones(4)
+        found = []
+        for one in self.boxes:
+            whole = np.array(one.box) * factor
+            cut = np.clip(whole, 0.0, [width, height, width, height])
+            if cut[2] - cut[0] < 1.0 or cut[3] - cut[1] < 1.0:
+                left_out[OUTSIDE] += 1
+                continue
+            if np.abs(cut - whole).max() > 1.0:
+                left_out[CUT] += 1
+            x0, y0, x1, y1 = cut.tolist()
+            found.append(LabelBox(one.label, (x0, y0, x1, y1), one.is_ignored, one.range_m))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class BoxLabels:
+    """Labels of any number of pictures.
+
+    Attributes:
+        where: The file or folder.
+        format: What it was read as.
+        classes: All that annotators could choose from, as far as the labels say.
+        pictures: All that were labelled.
+        left_out: What was not read, by reason.
+    """
+
+    where: str
+    format: LabelFormat
+    classes: tuple[str, ...]
+    pictures: tuple[LabelPicture, ...]
+    left_out: Mapping[str, int] = field(default_factory=dict)
+
+
+def read_box_labels(
+    path: Path, kind: str | None = None, class_names: Sequence[str] = ()
+) -> BoxLabels:
+    """Read labelled boxes.
+
+    Args:
+        path: A COCO file, or a folder of the other formats.
+        kind: One of ``FORMATS``; recognised if left out.
+        class_names: In YOLO's order; of the other folders, all that annotators could choose from.
+
+    Raises:
+        UsageError: Another format, or YOLO without class names.
+        AnnotationError: It cannot be read; with the place.
+        EmptyResultError: Not one labelled picture.
+    """
+    if kind not in (None, *FORMATS):
+        raise UsageError(f"--format {kind}: expected one of {', '.join(FORMATS)}")
+    files = _files(path)
+    known = kind or _recognised(path, files)
+    if known == "coco":
+        found = _coco(path)
+    elif known == "voc":
+        found = _voc(path, [file for file in files if file.suffix == ".xml"], class_names)
+    elif known == "kitti":
+        found = _kitti(path, _texts(files), class_names)
+    else:
+        found = _yolo(path, _texts(files), tuple(class_names) or _names_of(path))
+    if not found.pictures:
+        raise EmptyResultError(f"{path}: not one labelled image in it; give labels of the run")
+    return found
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_dir():
+        return sorted(one for one in path.iterdir() if one.is_file())
+    if not path.exists():
+        raise AnnotationError(f"{path}: No such file or directory; give labels of the run's images")
+    return [path]
+
+
+def _texts(files: Sequence[Path]) -> list[Path]:
+    return [one for one in files if one.suffix == ".txt" and one.name not in NAME_FILES]
+
+
+def _recognised(path: Path, files: Sequence[Path]) -> LabelFormat:
+    if path.is_file() and path.suffix == ".json":
+        return "coco"
+    if path.is_dir() and any(one.suffix == ".xml" for one in files):
+        return "voc"
+    if path.is_dir() and _texts(files):
+        for one in _texts(files):
+            words = _lines(one)[:1]
+            if words:
+                return "kitti" if len(words[0].split()) >= _KITTI_COLUMNS else "yolo"
+        return "yolo"
+    raise AnnotationError(
+        f"{path}: no labels of boxes; expected a COCO .json, or a folder of YOLO .txt, Pascal VOC "
+        ".xml or KITTI .txt files"
+    )
+
+
+def _coco(path: Path) -> BoxLabels:
+    found = read_coco(path)
+    pictures = tuple(
+        LabelPicture(
+            one.name,
+            tuple(
+                LabelBox(
+                    thing.label,
+                    thing.box_px,
+                    thing.is_crowd,
+                    math.nan if thing.range_m is None else thing.range_m,
+                )
+                for thing in one.things
+                if thing.box_px is not None
+            ),
+            one.size_px,
+            one.t_ns,
+        )
+        for one in found.pictures
+    )
+    return BoxLabels(str(path), "coco", found.labels, pictures)
+
+
+def _voc(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> BoxLabels:
+    pictures = []
+    for file in files:
+        name, size, things = read_voc(file)
+        boxes = tuple(LabelBox(label, box, is_hard) for label, box, is_hard in things)
+        pictures.append(LabelPicture(name, boxes, size))
+    return BoxLabels(str(path), "voc", _classes(pictures, class_names), tuple(pictures))
+
+
+def _kitti(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> BoxLabels:
+    pictures = []
+    for file in files:
+        boxes = []
+        for number, line in enumerate(_lines(file), 1):
+            words = line.split()
+            where = f"{file}:{number}"
+            if len(words) < _KITTI_COLUMNS:
+                raise AnnotationError(
+                    f"{where}: {len(words)} columns; expected KITTI's {_KITTI_COLUMNS}, the class "
+                    "first; correct the line"
+                )
+            box, ahead_m = _numbers(words[4:8], where), _numbers(words[13:14], where)[0]
+            is_any = words[0] == DONT_CARE
+            boxes.append(
+                LabelBox(
+                    "" if is_any else words[0],
+                    (box[0], box[1], box[2], box[3]),
+                    is_any,
+                    ahead_m if ahead_m > 0.0 else math.nan,
+                )
+            )
+        pictures.append(LabelPicture(file.name, tuple(boxes)))
+    return BoxLabels(str(path), "kitti", _classes(pictures, class_names), tuple(pictures))
+
+
+def _classes(pictures: Sequence[LabelPicture], class_names: Sequence[str]) -> tuple[str, ...]:
+    """All that were used, and those that a file lists besides."""
+    used = {box.label for one in pictures for box in one.boxes if box.label}
+    return (*class_names, *sorted(used.difference(class_names)))
+
+
+def _yolo(path: Path, files: Sequence[Path], names: Sequence[str]) -> BoxLabels:
+    pictures = []
+    for file in files:
+        boxes = []
+        for number, line in enumerate(_lines(file), 1):
+            words, where = line.split(), f"{file}:{number}"
+            if len(words) != 5 or not words[0].isdecimal():
+                raise AnnotationError(
+                    f"{where}: expected a class number and x, y, width, height as fractions; "
+                    "correct the line"
+                )
+            if int(words[0]) >= len(names):
+                raise AnnotationError(
+                    f"{where}: class {words[0]}, but {len(names)} class names from 0; correct one"
+                )
+            x, y, w, h = _numbers(words[1:], where)
+            box = (x - 0.5 * w, y - 0.5 * h, x + 0.5 * w, y + 0.5 * h)
+            boxes.append(LabelBox(names[int(words[0])], box))
+        pictures.append(LabelPicture(file.name, tuple(boxes), is_in_fractions=True))
+    return BoxLabels(str(path), "yolo", tuple(names), tuple(pictures))
+
+
+def _names_of(path: Path) -> tuple[str, ...]:
+    for folder in (path, path.parent):
+        for name in NAME_FILES:
+            file = folder / name
+            if file.is_file():
+                return _yaml_names(file) if file.suffix == ".yaml" else tuple(_lines(file))
+    raise UsageError(
+        f"{path}: YOLO labels without class names (no {', '.join(NAME_FILES)}); give a file with "
+        "one a line: --class-names FILE"
+    )
+
+
+def _yaml_names(file: Path) -> tuple[str, ...]:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        names = YAML(typ="safe").load("\n".join(_lines(file, is_whole=True)))["names"]
+        listed = list(names.values()) if isinstance(names, dict) else list(names)
+    except (YAMLError, KeyError, TypeError):
+        raise AnnotationError(f"{file}: expected class names under names") from None
+    return tuple(map(str, listed))
+
+
+def _lines(file: Path, *, is_whole: bool = False) -> list[str]:
+    """Lines that are not empty, stripped; or all as they are."""
+    try:
+        content = read_at_most(file, MAX_TEXT_BYTES)
+        if content is None:
+            raise AnnotationError(f"{file}: over {MAX_TEXT_BYTES // MIB} MiB; these are no labels")
+        lines = content.decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise AnnotationError(f"{file}: {why}; give labels as text") from None
+    return lines if is_whole else [line.strip() for line in lines if line.strip()]
+
+
+def _numbers(words: Sequence[str], where: str) -> list[float]:
+    try:
+        found = [float(word) for word in words]
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        raise AnnotationError(f"{where}: {' '.join(words)}: expected numbers; correct the line")
+    return found
+
+
+def as_arrays(boxes: Sequence[LabelBox]) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Boxes of shape (N, 4), which are ignored, and their ranges in metres."""
+    return (
+        np.array([one.box for one in boxes], np.float64).reshape(-1, 4),
+        np.array([one.is_ignored for one in boxes], np.bool_),
+        np.array([one.range_m for one in boxes], np.float64),
+    )
