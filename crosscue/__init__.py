@@ -117,6 +117,8 @@ _EXPORTS: Final = {
     "ImportedTruth": "eval.fit.truth_check",
     "score_runs": "eval.interface.runs.scores",
     "ScoredRuns": "eval.interface.runs.scores",
+    "score_detector": "eval.interface.runs.detector_scores",
+    "DetectorScore": "eval.interface.runs.detector_scores",
     "simulate_approaches": "eval.interface.simulate",
     "SimulatedDrives": "eval.interface.simulate",
     "draw_contact_sheet": "eval.interface.simulate",
@@ -248,6 +250,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.batch import ReplayedDrives as ReplayedDrives
     from crosscue.eval.interface.runs.batch import find_drives as find_drives
     from crosscue.eval.interface.runs.batch import replay_drives as replay_drives
+    from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
+    from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
     from crosscue.eval.interface.runs.run import Run as Run
     from crosscue.eval.interface.runs.run import ScoredRun as ScoredRun
     from crosscue.eval.interface.runs.run import compare_runs as compare_runs

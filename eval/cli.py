@@ -39,6 +39,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "estimate": ("runs.estimate", "repeat the estimate of a run from its stored detections"),
     "replay": ("runs.replay", "detect and estimate: from a log to a run folder"),
     "score": ("runs.score", "score runs against truth: metrics, figures, report, gates"),
+    "score detector": (
+        "runs.score_detector",
+        "score a detector of a run against labelled boxes of its images",
+    ),
     "compare": ("runs.compare", "compare two runs, with tolerances"),
     "merge": ("runs.merge", "merge the runs of several batches into one folder of tables"),
     "view": ("runs.view", "show a run in Rerun"),

@@ -22,13 +22,11 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.replay.base import (
     MIB,
     AnnotationError,
     EmptyResultError,
-    Floats,
     UsageError,
     read_at_most,
 )
@@ -310,12 +308,3 @@ def _numbers(words: Sequence[str], where: str) -> list[float]:
     if not all(map(math.isfinite, found)):
         raise AnnotationError(f"{where}: {' '.join(words)}: expected numbers; correct the line")
     return found
-
-
-def as_arrays(boxes: Sequence[LabelBox]) -> tuple[Floats, NDArray[np.bool_], Floats]:
-    """Boxes of shape (N, 4), which are ignored, and their ranges in metres."""
-    return (
-        np.array([one.box for one in boxes], np.float64).reshape(-1, 4),
-        np.array([one.is_ignored for one in boxes], np.bool_),
-        np.array([one.range_m for one in boxes], np.float64),
-    )

@@ -55,7 +55,7 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
         warn_of(ledger)
         if size is None:
             raise LogError(f"{path}: {topic.name}: not one picture; annotations need them")
-        names = _names(log)
+        names = picture_names(log)
     return LogPictures(str(path), np.unique(np.concatenate(times)), size, names)
 
 
@@ -108,7 +108,7 @@ def log_span(path: Path, limits: Limits = DEFAULT_LIMITS) -> LogSpan:
     return LogSpan(first, last + 1, any(watch.set_backs for watch in watches.values()))
 
 
-def _names(log: Log) -> Mapping[str, int]:
+def picture_names(log: Log) -> Mapping[str, int]:
     """From file name to time, for a folder of pictures."""
     if log.format != "images":
         return {}

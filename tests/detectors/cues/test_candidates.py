@@ -48,7 +48,7 @@ def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
 
 
 def test_lights_below_the_threshold_are_counted_with_the_best_score_of_all() -> None:
-    cues, tally = _pass()
+    cues, tally = _pass(Vehicle(version=1, cues=Cues(traffic_light_score=0.9)))
     for t, score in enumerate((0.41, 0.62, 0.3)):
         cues(Seen(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
 

@@ -20,7 +20,7 @@ from crosscue.detectors.cues.observed import Sides, nose_of
 from crosscue.replay.vehicle.vehicle import Cars
 
 SIZE = (400, 200)
-RULES = Cars()
+RULES = Cars(score=0.95)
 
 
 def _car(

@@ -1,0 +1,57 @@
+"""Options of commands that compare a detector with labelled boxes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from crosscue.replay.base import UsageError
+
+FORMATS = ("coco", "yolo", "voc", "kitti")
+
+
+def add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--format``, ``--class-names``, ``--map``, ``--detector`` and ``--overlap``."""
+    parser.add_argument(
+        "--format", choices=FORMATS, help="format of the labels (default: recognised)"
+    )
+    parser.add_argument(
+        "--class-names",
+        type=Path,
+        default=(),
+        metavar="FILE",
+        help="class names, one a line: of YOLO in its order, of VOC and KITTI all there could be",
+    )
+    parser.add_argument(
+        "--map",
+        nargs="+",
+        default=[],
+        metavar="NAME=CLASS",
+        help="class that a name of the labels or the detector counts as; NAME= judges it nowhere",
+    )
+    parser.add_argument(
+        "--detector", metavar="NAME", help="name of the detector, where several ran"
+    )
+    parser.add_argument(
+        "--overlap",
+        type=float,
+        default=0.5,
+        metavar="IOU",
+        help="min IoU with a label of a right detection (default: 0.5)",
+    )
+
+
+def meanings_of(texts: Sequence[str]) -> dict[str, str]:
+    """What ``--map`` says.
+
+    Raises:
+        UsageError: Not ``NAME=CLASS``.
+    """
+    found = {}
+    for text in texts:
+        name, equals, means = text.rpartition("=")
+        if not equals or not name:
+            raise UsageError(f"--map {text}: expected NAME=CLASS")
+        found[name] = means
+    return found

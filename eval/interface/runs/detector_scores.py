@@ -1,0 +1,306 @@
+"""A detector's boxes in a run, scored against labelled boxes of its pictures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crosscue.datasets.truth.box_labels import BoxLabels, read_box_labels
+from crosscue.eval.report.detector_page import write_detector_page
+from crosscue.eval.report.worst_boxes import worst_pictures
+from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
+from crosscue.eval.scoring.boxes.matching import match
+from crosscue.eval.scoring.boxes.reliability import Reliability, reliability
+from crosscue.eval.scoring.boxes.scores import SEED, Measured, PartScore, score_parts
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    MIB,
+    Limits,
+    UsageError,
+    read_at_most,
+    strict_json,
+    visible,
+    write_text,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from .run import Run
+
+FOLDER: Final = "score"
+MEASURES: Final = ("ap50", "ap", "precision", "recall")
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DetectorScore:
+    """A detector beside labelled boxes; printed as ``crosscue score detector`` prints it.
+
+    Attributes:
+        labelled: What was compared.
+        labels: As they were read.
+        scores: Of each class and part.
+        calibration: Of each class.
+        block_s: Pictures within so many seconds were resampled together.
+        report: The page that shows it.
+    """
+
+    labelled: LabelledRun
+    labels: BoxLabels
+    scores: tuple[PartScore, ...]
+    calibration: tuple[Reliability, ...]
+    block_s: float
+    report: Path
+
+    @property
+    def parts(self) -> pa.Table:
+        """A row for each class and part, with 95 % intervals."""
+        import pyarrow as pa
+
+        return pa.Table.from_pylist([_row(one) for one in self.scores])
+
+    @property
+    def bins(self) -> pa.Table:
+        """A row for each class and tenth of the score: detections, and how many are right."""
+        import pyarrow as pa
+
+        return pa.Table.from_pylist(
+            [
+                {
+                    "class": one.label,
+                    "score_from": each.low,
+                    "score_to": each.high,
+                    "detections": each.detections,
+                    "right": each.right,
+                    "mean_score": each.mean_score,
+                    "fraction_right": each.fraction,
+                }
+                for one in self.calibration
+                for each in one.bins
+            ]
+        )
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue score detector --json`` prints."""
+        of = self.labelled
+        return {
+            "run": str(of.run.path),
+            "detector": of.detector.name,
+            "labels": self.labels.where,
+            "format": self.labels.format,
+            "images": len(of.names),
+            "images_labelled": len(self.labels.pictures),
+            "frames": of.frames,
+            "placed": of.rule,
+            "left_out": dict(of.left_out),
+            "not_judged": dict(of.not_judged),
+            "classes": {name: list(of.members[name]) for name in of.classes},
+            "parts": [_row(one) for one in self.scores],
+            "calibration": [asdict(one) for one in self.calibration],
+            "report": str(self.report),
+        }
+
+    def __repr__(self) -> str:
+        of = self.labelled
+        asked = int((~of.truth.is_ignored).sum())
+        lines = [
+            f"run        {visible(str(of.run.path))}",
+            f"detector   {visible(of.detector.name)}",
+            f"labels     {visible(self.labels.where)} ({self.labels.format}): {len(of.names)} of "
+            f"{len(self.labels.pictures)} images in the run, {of.rule};",
+            f"           {asked:,} boxes to be found, {len(of.truth) - asked:,} not judged; "
+            f"{of.frames - len(of.names):,} frames without labels",
+            *(f"left out   {count:,} {visible(why)}" for why, count in of.left_out.items()),
+        ]
+        others = ", ".join(f"{n:,} {visible(label)}" for label, n in of.not_judged.items())
+        if others:
+            lines.append(f"not judged {others}: the labels have no such class")
+        lines += [
+            "",
+            f"{'class':14} {'part':11} {'labels':>6} {'AP50':>6} {'AP':>6}   above  "
+            f"{'precision':>17} {'recall':>17}",
+            *map(_line, self.scores),
+            "",
+        ]
+        lines += [
+            f"calibration error {one.error:.3f} of {visible(one.label)}, "
+            f"{one.detections:,} detections"
+            for one in self.calibration
+            if one.detections
+        ]
+        together = f"in stretches of {self.block_s:g} s" if self.block_s > 0.0 else "each alone"
+        lines.append(f"intervals  95 %, images drawn again {together}, seed {SEED}")
+        lines.append(f"written to {visible(str(self.report))}")
+        return "\n".join(lines)
+
+
+def _line(one: PartScore) -> str:
+    threshold = _number(one.threshold)
+    return (
+        f"{visible(one.label)[:14]:14} {one.part:11} {one.labels:6,} {_number(one.ap50.value):>6} "
+        f"{_number(one.ap.value):>6}  {threshold:>6}  {_span(one.precision):>17} "
+        f"{_span(one.recall):>17}"
+    )
+
+
+def _number(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.3f}"
+
+
+def _span(one: Measured) -> str:
+    if np.isnan(one.value):
+        return "-"
+    ends = "" if np.isnan(one.low) else f" ({one.low:.2f}-{one.high:.2f})"
+    return f"{one.value:.3f}{ends}"
+
+
+def _row(one: PartScore) -> dict[str, object]:
+    row: dict[str, object] = {
+        "class": one.label,
+        "part": one.part,
+        "labels": one.labels,
+        "right": one.right,
+        "wrong": one.wrong,
+        "threshold": one.threshold,
+    }
+    for name in MEASURES:
+        found: Measured = getattr(one, name)
+        row |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+    return row
+
+
+def score_detector(
+    run: Run | Path | str,
+    labels: Path | str,
+    output: Path | str | None = None,
+    *,
+    detector: str | None = None,
+    kind: str | None = None,
+    class_names: Sequence[str] | Path | str = (),
+    meanings: Mapping[str, str] | None = None,
+    overlap: float = 0.5,
+    block_s: float = 1.0,
+    draw: int = 8,
+    logs: Path | str | None = None,
+    without_images: bool = False,
+    has_figures: bool = True,
+    limits: Limits = DEFAULT_LIMITS,
+) -> DetectorScore:
+    """Score a detector's boxes in a run against labelled boxes.
+
+    Args:
+        run: With stored detections.
+        labels: A COCO file, or a folder of YOLO, Pascal VOC or KITTI files.
+        output: Folder for the page and its numbers; ``RUN/score`` if left out.
+        detector: Its name, where several ran.
+        kind: Format of the labels; recognised if left out.
+        class_names: Of YOLO labels in their order, or a file with one a line.
+        meanings: From a class of the labels or of the detector to the class that it counts as;
+            empty for one that is neither to be found nor wrong.
+        overlap: That makes a detection right, for precision, recall and calibration.
+        block_s: Pictures within so many seconds are resampled together, for they show the same.
+        draw: So many of the worst pictures.
+        logs: Where the run's logs have moved to, if they have.
+        without_images: Draw none; the logs may be gone.
+        has_figures: Draw the reliability diagram, for which matplotlib is imported.
+        limits: What the logs are read with.
+
+    Raises:
+        UsageError: A value out of range, no such detector, or a class that nobody has.
+        AnnotationError: The labels cannot be read.
+        SchemaError: They do not belong to the run.
+        EmptyResultError: No labelled box of a class that the detector reports.
+        RunError: No run, damaged, or its log is gone.
+    """
+    if not 0.0 < overlap <= 1.0:
+        raise UsageError(f"--overlap {overlap}: expected above 0, at most 1")
+    if not 0.0 <= block_s < 1e6:
+        raise UsageError(f"--block-s {block_s}: expected seconds from 0")
+    if draw < 0:
+        raise UsageError(f"--draw {draw}: expected 0 or more")
+    folder = open_run(_path_of(run), _maybe(logs), without_images=without_images, limits=limits)
+    read = read_box_labels(Path(labels), kind, names_given(class_names))
+    of = labelled_run(folder, read, detector, meanings)
+    scores = score_parts(
+        of.truth,
+        of.found,
+        of.classes,
+        {name: of.threshold(name) for name in of.classes},
+        of.blocks(block_s),
+        overlap,
+    )
+    place = folder.file(FOLDER) if output is None else Path(output)
+    stem = "detector_" + re.sub(r"[^\w.-]", "_", of.detector.name)
+    found = DetectorScore(
+        of, read, tuple(scores), calibration_of(of, overlap), block_s, place / f"{stem}.html"
+    )
+    worst = [] if without_images else worst_pictures(of, overlap, draw)
+    content: dict[str, Any] = {
+        "detector": of.detector.name,
+        "run": str(folder.path),
+        "labels": read.where,
+        "format": read.format,
+        "rule": of.rule,
+        "images": len(of.names),
+        "boxes": int((~of.truth.is_ignored).sum()),
+        "ignored": int(of.truth.is_ignored.sum()),
+        "left_out": of.left_out,
+        "not_judged": of.not_judged,
+        "parts": scores,
+        "lowest": float(of.found.scores.min(initial=1.0)),
+        "overlap": overlap,
+        "block_s": block_s,
+        "seed": SEED,
+        "worst": worst,
+    }
+    place.mkdir(parents=True, exist_ok=True)
+    write_detector_page(found.report, content, found.calibration, has_figures=has_figures)
+    write_text(place / f"{stem}.json", strict_json(found.as_dict()) + "\n")
+    return found
+
+
+def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
+    """How far the scores of each class are probabilities."""
+    found = []
+    for k, name in enumerate(of.classes):
+        matched = match(of.truth, of.found, k, overlaps=np.array([overlap]))
+        judged = ~matched.is_out[0]
+        found.append(reliability(name, matched.scores[judged], matched.is_right[0][judged]))
+    return tuple(found)
+
+
+def names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
+    """Class names, or those of a file with one a line.
+
+    Raises:
+        UsageError: The file cannot be read, or is empty.
+    """
+    if not isinstance(given, Path | str):
+        return tuple(given)
+    path = Path(given)
+    try:
+        content = read_at_most(path, MIB)
+        if content is None:
+            raise UsageError(f"{path}: over 1 MiB; give class names, one a line")
+        lines = content.decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise UsageError(f"{path}: {why}; give class names, one a line") from None
+    names = tuple(line.strip() for line in lines if line.strip())
+    if not names:
+        raise UsageError(f"{path}: no name in it; give class names, one a line")
+    return names
+
+
+def _path_of(run: Run | Path | str) -> Path:
+    return Path(run) if isinstance(run, Path | str) else run.path
+
+
+def _maybe(path: Path | str | None) -> Path | None:
+    return None if path is None else Path(path)

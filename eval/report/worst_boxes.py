@@ -1,0 +1,134 @@
+"""The pictures in which a detector is most wrong: false boxes and misses, drawn."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from crosscue.detectors.base import View
+from crosscue.detectors.images import Encoded, decode
+from crosscue.detectors.overlay import GREEN, write_label
+from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
+from crosscue.eval.scoring.boxes.labelled_run import LabelledRun
+from crosscue.eval.scoring.boxes.matching import match
+from crosscue.replay.base import Bytes, CrosscueError, Floats
+
+APART_NS: Final = 1_000_000_000
+"""Pictures closer than this show the same mistakes; the worst of them is shown."""
+WIDTH_PX: Final = 960
+QUALITY: Final = 80
+RED: Final = (60, 60, 250)
+AMBER: Final = (0, 190, 255)
+GREY: Final = (150, 150, 150)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """A box to draw."""
+
+    box_px: Floats
+    colour: tuple[int, int, int]
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorstPicture:
+    """One picture.
+
+    Attributes:
+        name: In the labels.
+        t_ns: Of the frame.
+        wrong: Detections above the threshold on no label.
+        missed: Labels that no detection above the threshold is on.
+        picture: JPEG in base64, or None where it cannot be read.
+    """
+
+    name: str
+    t_ns: int
+    wrong: int
+    missed: int
+    picture: str | None = None
+
+
+def worst_pictures(labelled: LabelledRun, overlap: float, most: int) -> list[WorstPicture]:
+    """The pictures with most mistakes, those of one moment once.
+
+    Raises:
+        RunError: The log with the pictures is not found.
+        LogError: That log cannot be opened.
+    """
+    marks = _marks(labelled, overlap)
+    order = sorted(
+        (i for i in range(len(marks)) if any(one.colour in (RED, AMBER) for one in marks[i])),
+        key=lambda i: (-sum(one.colour in (RED, AMBER) for one in marks[i]), i),
+    )
+    chosen: list[int] = []
+    for i in order:
+        if len(chosen) < most and all(
+            abs(int(labelled.t_ns[i] - labelled.t_ns[k])) >= APART_NS for k in chosen
+        ):
+            chosen.append(i)
+    camera = camera_of(labelled.run) if chosen else None
+    return [
+        WorstPicture(
+            labelled.names[i],
+            int(labelled.t_ns[i]),
+            sum(one.colour == RED for one in marks[i]),
+            sum(one.colour == AMBER for one in marks[i]),
+            _picture(camera, int(labelled.t_ns[i]), marks[i]),
+        )
+        for i in chosen
+    ]
+
+
+def _marks(labelled: LabelledRun, overlap: float) -> list[list[Drawn]]:
+    """By picture: what is ignored, right, missed and wrong."""
+    truth, found = labelled.truth, labelled.found
+    marks: list[list[Drawn]] = [[] for _ in labelled.names]
+    for row in np.flatnonzero(truth.is_ignored).tolist():
+        marks[truth.picture[row]].append(Drawn(truth.boxes_px[row], GREY, ""))
+    for k, name in enumerate(labelled.classes):
+        matched = match(truth, found, k, overlaps=np.array([overlap]))
+        sure = matched.scores > labelled.threshold(name)
+        hit = set(matched.took[0][sure].tolist())
+        for row in np.flatnonzero((truth.label == k) & ~truth.is_ignored).tolist():
+            if row not in hit:
+                missed = Drawn(truth.boxes_px[row], AMBER, f"missed {name}")
+                marks[truth.picture[row]].append(missed)
+        for is_some, colour in ((matched.is_right[0], GREEN), (matched.is_wrong[0], RED)):
+            for i in np.flatnonzero(is_some & sure).tolist():
+                row = matched.row[i]
+                text = f"{name} {matched.scores[i]:.2f}"
+                marks[found.picture[row]].append(Drawn(found.boxes_px[row], colour, text))
+    return marks
+
+
+def _picture(camera: StoredCamera | None, t_ns: int, marks: Sequence[Drawn]) -> str | None:
+    if camera is None:
+        return None
+    try:
+        found = picture_at(camera, t_ns)
+        return None if found is None else _drawn(found, marks)
+    except CrosscueError:
+        # One picture of the log: the page says that it cannot be read.
+        return None
+
+
+def _drawn(picture: Encoded, marks: Sequence[Drawn]) -> str | None:
+    import cv2
+
+    pixels, whole = decode(picture, View(min_width_px=WIDTH_PX))
+    size = (WIDTH_PX, round(whole[1] * WIDTH_PX / whole[0]))
+    canvas: Bytes = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    for one in marks:
+        x0, y0, x1, y1 = np.rint(one.box_px * (size[0] / whole[0])).astype(int).tolist()
+        thick = 1 if one.colour in (GREY, GREEN) else 2
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), one.colour, thick)
+        if thick == 2:
+            write_label(canvas, one.text, (x0, max(y0 - 4, 12)), one.colour, 0.4)
+    ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return base64.b64encode(jpeg.tobytes()).decode() if ok else None

@@ -1,0 +1,1 @@
+"""Detections against labelled boxes: matching, precision and recall, calibration."""

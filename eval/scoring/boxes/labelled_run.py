@@ -1,0 +1,356 @@
+"""A run's detections beside labelled boxes of its pictures.
+
+Pictures of the labels find their frames by file name, where the log is a folder of images; else by
+log time (``t_ns`` of a COCO file, or a file name that is a time in nanoseconds), the nearest frame;
+else by the number that a file name ends in, the first frame being 0. What belongs to no frame is
+counted and left out, and frames without labels are not judged.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
+from crosscue.detectors.base import MIN_SCORE
+from crosscue.detectors.catalog.class_names import meaning_of
+from crosscue.detectors.cues.frame import Role
+from crosscue.eval.fit.log_images import picture_names
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.logs import reopened
+from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
+from crosscue.replay.base import EmptyResultError, Int64s, SchemaError, UsageError
+
+from .matching import NOBODY, Boxes
+
+OTHER_LOG: Final = "images that are not in the run"
+OTHER_CLASS: Final = "boxes of classes that the detector does not report"
+FAR: Final = 0.4
+"""Fraction of the time between frames that a picture may be off the frame it belongs to."""
+_FOUND: Final = ("log_t_ns", "detector", "label", "score", "x0", "y0", "x1", "y1", "range_m")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledRun:
+    """One detector's boxes and the labelled ones, over the labelled frames of a run.
+
+    Attributes:
+        run: Where it comes from.
+        detector: As it ran.
+        classes: That both know.
+        members: From class to the detector's labels that mean it.
+        truth: Labelled boxes.
+        found: Detections.
+        t_ns: Shape (P,): times of the labelled frames in the run's tables, growing.
+        sizes_px: Width and height of each.
+        names: Of each in the labels.
+        rule: How labels found their frames, for people.
+        frames: All frames of the run.
+        left_out: What of the labels was left out or repaired, by reason.
+        not_judged: Detections of classes that the labels do not have, by label.
+    """
+
+    run: RunFolder
+    detector: DetectorRow
+    classes: tuple[str, ...]
+    members: Mapping[str, tuple[str, ...]]
+    truth: Boxes
+    found: Boxes
+    t_ns: Int64s
+    sizes_px: tuple[tuple[int, int], ...]
+    names: tuple[str, ...]
+    rule: str
+    frames: int
+    left_out: Mapping[str, int]
+    not_judged: Mapping[str, int]
+
+    def blocks(self, block_s: float) -> Int64s:
+        """Shape (P,): pictures taken within so many seconds have the same number."""
+        if block_s <= 0.0:
+            return np.arange(len(self.t_ns))
+        return np.asarray((self.t_ns - self.t_ns[0]) // int(block_s * 1e9), np.int64)
+
+    def threshold(self, name: str) -> float:
+        """Of a class, as the detector says; the highest of its labels."""
+        least = self.detector.min_scores
+        return max(least.get(label, MIN_SCORE) for label in self.members[name])
+
+    def part(self, is_chosen: np.typing.NDArray[np.bool_]) -> tuple[Boxes, Boxes]:
+        """Labels and detections of some pictures, shape (P,), under their numbers there."""
+        return (
+            self.truth.taken(is_chosen[self.truth.picture]),
+            self.found.taken(is_chosen[self.found.picture]),
+        )
+
+
+def labelled_run(
+    run: RunFolder,
+    labels: BoxLabels,
+    detector: str | None = None,
+    meanings: Mapping[str, str] | None = None,
+) -> LabelledRun:
+    """Put labels beside a run's detections.
+
+    Args:
+        run: With the tables of the detect stage.
+        labels: Of its pictures.
+        detector: Its name; may be left out where only one finds objects.
+        meanings: From a class of the labels or of the detector to the class that it counts as;
+            empty for one that is neither to be found nor wrong.
+
+    Raises:
+        UsageError: No such detector, several and none named, or a class that nobody has.
+        SchemaError: No picture is in the run, no class is common, or pictures of another size.
+        RunError: A table is missing or damaged.
+    """
+    detected = run.drive_manifest().detected
+    if detected is None:
+        raise UsageError(f"{run.path}: no detector ran; replay with one")
+    chosen = _detector(run, detected, detector)
+    table = run.table("frames", ["log_t_ns", "t_ns", "width_px", "height_px"])
+    columns = (one.to_pylist() for one in table.columns)
+    frames = {
+        log_t_ns: (t_ns, (width, height))
+        for log_t_ns, t_ns, width, height in zip(*columns, strict=True)
+    }
+    left_out: Counter[str] = Counter(labels.left_out)
+    placed, rule = _placed(run, detected, labels, np.array(sorted(frames), np.int64), left_out)
+    classes, of_labels, of_found = _classes(labels, chosen, dict(meanings or {}))
+    order = sorted(placed, key=lambda t: frames[t][0])
+    sizes = [frames[t][1] for t in order]
+    truth = _truth([placed[t] for t in order], sizes, of_labels, left_out)
+    numbers = {name: k for k, name in enumerate(classes)}
+    found, not_judged = _found(run, chosen.name, order, of_found, numbers)
+    return LabelledRun(
+        run,
+        chosen,
+        classes,
+        {
+            name: tuple(label for label, means in of_found.items() if means == name)
+            for name in classes
+        },
+        _as_boxes(truth, numbers),
+        found,
+        np.array([frames[t][0] for t in order], np.int64),
+        tuple(sizes),
+        tuple(placed[t].name for t in order),
+        rule,
+        len(frames),
+        dict(left_out),
+        not_judged,
+    )
+
+
+def _detector(run: RunFolder, detected: DetectManifest, asked: str | None) -> DetectorRow:
+    some = [one for one in detected.detectors if one.role in (Role.OBJECTS, Role.SIGNS)]
+    named = [one for one in some if one.name == asked] if asked is not None else some
+    if len(named) == 1:
+        return named[0]
+    there = ", ".join(one.name for one in some) or "none that finds objects"
+    if asked is not None:
+        raise UsageError(f"--detector {asked}: not in {run.path}; there are: {there}")
+    raise UsageError(f"{run.path}: name one detector with --detector; there are: {there}")
+
+
+def _placed(
+    run: RunFolder,
+    detected: DetectManifest,
+    labels: BoxLabels,
+    t_ns: Int64s,
+    left_out: Counter[str],
+) -> tuple[dict[int, LabelPicture], str]:
+    """From a frame's log time to its labels, and how they were found."""
+    found, rule = _times(run, detected, labels, t_ns)
+    inside = set(t_ns.tolist())
+    placed: dict[int, LabelPicture] = {}
+    for picture, t in zip(labels.pictures, found, strict=True):
+        if t is None or t not in inside:
+            left_out[OTHER_LOG] += 1
+        elif t in placed:
+            raise SchemaError(
+                f"{labels.where}: {placed[t].name} and {picture.name} belong to one frame, {t} ns "
+                f"({rule}); give each its own name or time"
+            )
+        else:
+            placed[t] = picture
+    if not placed:
+        raise SchemaError(
+            f"{labels.where}: none of its {len(labels.pictures)} images is in {run.path} ({rule}); "
+            "give labels of the log that was replayed"
+        )
+    return placed, rule
+
+
+def _times(
+    run: RunFolder, detected: DetectManifest, labels: BoxLabels, t_ns: Int64s
+) -> tuple[list[int | None], str]:
+    """The log time of each labelled picture; None for one that belongs to no frame."""
+    log = detected.logs[detected.camera_log]
+    if log.format == "images" and not run.without_images:
+        with reopened(run, log) as opened:
+            names = {re.sub(r"\.[^.]*$", "", name): t for name, t in picture_names(opened).items()}
+        found = [names.get(_stem(one.name)) for one in labels.pictures]
+        if any(t is not None for t in found):
+            return found, "by file name"
+    asked = [_time_of(one) for one in labels.pictures]
+    if all(t is not None for t in asked):
+        wanted = np.array(asked, np.int64)
+        after = np.clip(np.searchsorted(t_ns, wanted), 0, len(t_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        is_before = np.abs(wanted - t_ns[before]) < np.abs(wanted - t_ns[after])
+        nearest = t_ns[np.where(is_before, before, after)]
+        period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 1e9
+        near = np.abs(nearest - wanted) <= FAR * period
+        times = [int(t) if ok else None for t, ok in zip(nearest, near, strict=True)]
+        return times, "by time"
+    part = detected.selection
+    if part.start_ns is not None or part.end_ns is not None:
+        raise UsageError(
+            f"{labels.where}: numbers its images, but {run.path} is a part of its log; "
+            "replay the whole log, or label by time"
+        )
+    numbers = [re.search(r"([0-9]{1,9})$", _stem(one.name)) for one in labels.pictures]
+    return [
+        int(t_ns[int(one[1])]) if one is not None and int(one[1]) < len(t_ns) else None
+        for one in numbers
+    ], "by number, the first frame being 0"
+
+
+def _stem(name: str) -> str:
+    """Without folders and ending."""
+    return re.sub(r"\.[^.]*$", "", re.split(r"[/\\]", name)[-1])
+
+
+def _time_of(picture: LabelPicture) -> int | None:
+    if picture.t_ns is not None:
+        return picture.t_ns
+    stem = _stem(picture.name)
+    # Nanoseconds since 1970 have nineteen digits, and no frame's number has.
+    return int(stem) if re.fullmatch(r"[0-9]{16,19}", stem) else None
+
+
+def _classes(
+    labels: BoxLabels, detector: DetectorRow, meanings: dict[str, str]
+) -> tuple[tuple[str, ...], dict[str, str | None], dict[str, str | None]]:
+    """Classes that both know; from a name in the labels, and in the detections, to a class.
+
+    Names that are missing there are not judged; None is neither to be found nor wrong.
+    """
+    reported = detector.labels or ()
+    for name, means in meanings.items():
+        if name not in (*labels.classes, *reported):
+            raise UsageError(
+                f"--map {name}={means}: no such class; the labels have {_listed(labels.classes)}; "
+                f"{detector.name} reports {_listed(reported)}"
+            )
+    of_found = {name: meanings.get(name, name) or None for name in reported}
+    plain = {_plain(name): name for name in reported}
+    of_labels: dict[str, str | None] = {}
+    for name in labels.classes:
+        if name in meanings:
+            of_labels[name] = meanings[name] or None
+            continue
+        same = plain.get(_plain(name)) or meaning_of(name)
+        if same in of_found and of_found[same] is not None:
+            of_labels[name] = of_found[same]
+    both = {one for one in of_labels.values() if one} & {one for one in of_found.values() if one}
+    if not both:
+        raise SchemaError(
+            f"{labels.where}: no class that {detector.name} reports; the labels have "
+            f"{_listed(labels.classes)}; say what they mean with --map NAME=CLASS"
+        )
+    return tuple(sorted(both)), of_labels, of_found
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:12]) or "none"
+    return f"{shown}, ..." if len(names) > 12 else shown
+
+
+def _truth(
+    pictures: Sequence[LabelPicture],
+    sizes: Sequence[tuple[int, int]],
+    of_labels: Mapping[str, str | None],
+    left_out: Counter[str],
+) -> list[tuple[int, str | None, tuple[float, float, float, float], bool, float]]:
+    """Picture, class (None for a region of anything), box, whether it is ignored, and range."""
+    rows = []
+    for number, (picture, size) in enumerate(zip(pictures, sizes, strict=True)):
+        if picture.size_px not in (None, size):
+            raise SchemaError(
+                f"{picture.name}: labelled at {picture.size_px} pixels, the run's image has "
+                f"{size}; label images as recorded"
+            )
+        for one in picture.inside(size, left_out):
+            if one.label and one.label not in of_labels:
+                left_out[f"{OTHER_CLASS} ({one.label})"] += 1
+                continue
+            means = of_labels[one.label] if one.label else None
+            rows.append((number, means, one.box, one.is_ignored or means is None, one.range_m))
+    if not rows:
+        raise EmptyResultError(
+            f"{pictures[0].name} and {len(pictures) - 1} other labelled images: no box of a class "
+            "that the detector reports; give labels with some"
+        )
+    return rows
+
+
+def _as_boxes(
+    rows: Sequence[tuple[int, str | None, tuple[float, float, float, float], bool, float]],
+    numbers: Mapping[str, int],
+) -> Boxes:
+    picture, means, boxes, is_ignored, range_m = zip(*rows, strict=True)
+    label = [NOBODY if one is None else numbers.get(one, NOBODY - 1) for one in means]
+    found = Boxes(
+        np.array(picture, np.int64),
+        np.array(label, np.int64),
+        np.array(boxes, np.float64).reshape(-1, 4),
+        np.ones(len(rows)),
+        np.array(is_ignored, np.bool_),
+        np.array(range_m, np.float64),
+    )
+    return found.taken(found.label >= NOBODY)
+
+
+def _found(
+    run: RunFolder,
+    detector: str,
+    times: Sequence[int],
+    of_found: Mapping[str, str | None],
+    numbers: Mapping[str, int],
+) -> tuple[Boxes, dict[str, int]]:
+    """The detector's boxes in labelled frames, also those of objects that another found better."""
+    place = {t: i for i, t in enumerate(times)}
+    rows = []
+    not_judged: Counter[str] = Counter()
+    for batch in run.batches("detections", list(_FOUND)):
+        for t, name, label, *rest in zip(*(batch[c].to_pylist() for c in _FOUND), strict=True):
+            if name != detector or t not in place:
+                continue
+            means = of_found.get(label, label)
+            if means is None:
+                continue
+            if means not in numbers:
+                not_judged[label] += 1
+                continue
+            rows.append((place[t], numbers[means], *rest))
+    columns = np.array([[np.nan if v is None else v for v in row] for row in rows], np.float64)
+    columns = columns.reshape(-1, 8)
+    boxes = Boxes(
+        columns[:, 0].astype(np.int64),
+        columns[:, 1].astype(np.int64),
+        columns[:, 3:7],
+        columns[:, 2],
+        np.zeros(len(columns), np.bool_),
+        columns[:, 7],
+    )
+    return boxes, dict(not_judged.most_common())

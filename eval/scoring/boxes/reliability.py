@@ -1,0 +1,88 @@
+"""Do scores mean what they say? Detections by score, and how many of them are right.
+
+The expected calibration error is the mean distance of both over ten bins of the score, weighted by
+detections (Naeini et al., AAAI 2015).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from crosscue.eval.scoring.intervals import Interval, wilson
+from crosscue.replay.columns import Floats
+
+from .matching import Bools
+
+BINS: Final = 10
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreBin:
+    """Detections with about the same score.
+
+    Attributes:
+        low: Scores from here.
+        high: Up to here.
+        detections: How many.
+        right: Of these.
+        mean_score: NaN for none.
+        interval: Of the fraction right, as if detections were independent.
+    """
+
+    low: float
+    high: float
+    detections: int
+    right: int
+    mean_score: float
+    interval: Interval
+
+    @property
+    def fraction(self) -> float:
+        """Right of detections; NaN for none."""
+        return self.right / self.detections if self.detections else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Reliability:
+    """Of one class.
+
+    Attributes:
+        label: The class.
+        bins: Ten of equal width.
+        error: Expected calibration error; NaN without detections.
+        detections: How many it is made of.
+    """
+
+    label: str
+    bins: tuple[ScoreBin, ...]
+    error: float
+    detections: int
+
+
+def reliability(label: str, scores: Floats, is_right: Bools) -> Reliability:
+    """Bin detections by score.
+
+    Args:
+        label: Their class.
+        scores: Shape (N,), in [0, 1].
+        is_right: Shape (N,).
+    """
+    edges = np.linspace(0.0, 1.0, BINS + 1)
+    which = np.clip(np.searchsorted(edges, scores, side="right") - 1, 0, BINS - 1)
+    bins = []
+    for k in range(BINS):
+        mine = which == k
+        n, right = int(mine.sum()), int(is_right[mine].sum())
+        mean = float(scores[mine].mean()) if n else math.nan
+        bins.append(ScoreBin(edges[k], edges[k + 1], n, right, mean, wilson(right, n)))
+    error = (
+        sum(one.detections * abs(one.fraction - one.mean_score) for one in bins if one.detections)
+        / len(scores)
+        if len(scores)
+        else math.nan
+    )
+    return Reliability(label, tuple(bins), error, len(scores))

@@ -1,0 +1,206 @@
+"""Precision and recall of boxes: pycocotools is the judge, and cases that a hand can check."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+
+import numpy as np
+import pytest
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from crosscue.eval.scoring.boxes.matching import ALL, NOBODY, OVERLAPS, SIZES, Boxes, match
+from crosscue.eval.scoring.boxes.reliability import reliability
+from crosscue.eval.scoring.boxes.scores import average_precision, drawn, score_parts
+
+
+def boxes(
+    *rows: tuple[int, int, tuple[float, float, float, float]],
+    scores: list[float] | None = None,
+    ignored: tuple[int, ...] = (),
+    range_m: list[float] | None = None,
+) -> Boxes:
+    """Picture, class and box of each."""
+    n = len(rows)
+    is_ignored = np.zeros(n, np.bool_)
+    is_ignored[list(ignored)] = True
+    return Boxes(
+        np.array([row[0] for row in rows], np.int64),
+        np.array([row[1] for row in rows], np.int64),
+        np.array([row[2] for row in rows], np.float64).reshape(-1, 4),
+        np.ones(n) if scores is None else np.array(scores),
+        is_ignored,
+        np.full(n, np.nan) if range_m is None else np.array(range_m),
+    )
+
+
+def made_up(seed: int) -> tuple[Boxes, Boxes]:
+    """Labels and detections of 12 pictures and 3 classes; many overlap, some scores are equal."""
+    rng = np.random.default_rng(seed)
+    labels, found, scores = [], [], []
+    for picture in range(12):
+        for _ in range(rng.integers(0, 9)):
+            x, y = rng.uniform(0, 400, 2)
+            w, h = np.exp(rng.uniform(2.5, 5.2, 2))
+            kind = int(rng.integers(0, 3))
+            labels.append((picture, kind, (x, y, x + w, y + h)))
+            for _ in range(rng.integers(0, 4)):
+                off = rng.normal(0.0, 0.15, 4) * (w, h, w, h)
+                x0, y0, x1, y1 = np.array([x, y, x + w, y + h]) + off
+                other = int(rng.integers(0, 3)) if rng.random() < 0.1 else kind
+                found.append((picture, other, (x0, y0, max(x1, x0 + 2), max(y1, y0 + 2))))
+                scores.append(round(float(rng.random()), 1))
+    ignored = tuple(np.flatnonzero(rng.random(len(labels)) < 0.2).tolist())
+    return boxes(*labels, ignored=ignored), boxes(*found, scores=scores)
+
+
+def judged(truth: Boxes, found: Boxes) -> np.ndarray:
+    """The judge's precision: overlap, recall, class, size, most detections."""
+    coco = COCO()
+    coco.dataset = {
+        "images": [{"id": i} for i in range(12)],
+        "categories": [{"id": k, "name": str(k)} for k in range(3)],
+        "annotations": [
+            {
+                "id": i + 1,
+                "image_id": int(truth.picture[i]),
+                "category_id": int(truth.label[i]),
+                "bbox": _xywh(truth.boxes_px[i]),
+                "area": float(truth.areas_px2[i]),
+                "iscrowd": int(truth.is_ignored[i]),
+            }
+            for i in range(len(truth))
+        ],
+    }
+    with contextlib.redirect_stdout(io.StringIO()):
+        coco.createIndex()
+        answers = coco.loadRes(
+            [
+                {
+                    "image_id": int(found.picture[i]),
+                    "category_id": int(found.label[i]),
+                    "bbox": _xywh(found.boxes_px[i]),
+                    "score": float(found.scores[i]),
+                }
+                for i in range(len(found))
+            ]
+        )
+        judge = COCOeval(coco, answers, "bbox")
+        judge.evaluate()
+        judge.accumulate()
+    return np.asarray(judge.eval["precision"])[..., -1]
+
+
+def _xywh(box: np.ndarray) -> list[float]:
+    x0, y0, x1, y1 = box.tolist()
+    return [x0, y0, x1 - x0, y1 - y0]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_average_precision_is_that_of_pycocotools(seed: int) -> None:
+    truth, found = made_up(seed)
+    wanted = judged(truth, found)
+
+    for label in range(3):
+        for i, part in enumerate((ALL, *SIZES)):
+            matched = match(truth, found, label, part)
+            for step in range(len(OVERLAPS)):
+                mine = float(average_precision(matched, step)[0])
+                theirs = wanted[step, :, label, i]
+                if (theirs == -1).all():
+                    assert math.isnan(mine)
+                else:
+                    assert mine == pytest.approx(theirs.mean(), abs=1e-9)
+
+
+UNIT = (0.0, 0.0, 100.0, 100.0)
+AWAY = (200.0, 200.0, 300.0, 300.0)
+
+
+def test_a_hand_can_count_this() -> None:
+    """Two labels, found with 0.9 and 0.3; a false one with 0.6 between them."""
+    truth = boxes((0, 0, UNIT), (1, 0, UNIT))
+    found = boxes((0, 0, UNIT), (0, 0, AWAY), (1, 0, UNIT), scores=[0.9, 0.6, 0.3])
+
+    mean, all_, _ = score_parts(truth, found, ("car",), {"car": 0.5}, np.arange(2))
+
+    # Precision 1 up to recall 0.5 (51 of 101 recalls), and 2/3 up to 1 (50 of them).
+    assert all_.ap50.value == pytest.approx((51 + 50 * 2 / 3) / 101)
+    assert mean.ap50.value == all_.ap50.value
+    assert (all_.labels, all_.right, all_.wrong) == (2, 1, 1)
+    assert (all_.precision.value, all_.recall.value) == (0.5, 0.5)
+
+
+def test_what_is_ignored_is_neither_asked_for_nor_wrong() -> None:
+    truth = boxes((0, 0, UNIT), (0, NOBODY, AWAY), ignored=(1,))
+    inside = (210.0, 210.0, 230.0, 230.0)
+    found = boxes((0, 0, UNIT), (0, 0, inside), (0, 0, AWAY), scores=[0.9, 0.8, 0.7])
+
+    _, all_, *_ = score_parts(truth, found, ("car",), {"car": 0.5}, np.arange(1))
+
+    assert (all_.labels, all_.right, all_.wrong) == (1, 1, 0)
+
+
+def test_one_label_is_found_once() -> None:
+    truth = boxes((0, 0, UNIT))
+    found = boxes((0, 0, UNIT), (0, 0, UNIT), scores=[0.9, 0.8])
+
+    matched = match(truth, found, 0)
+
+    assert matched.is_right[0].tolist() == [True, False]
+    assert matched.is_wrong[0].tolist() == [False, True]
+
+
+def test_by_range_a_label_counts_where_it_is_and_a_false_one_where_it_is_believed() -> None:
+    truth = boxes((0, 0, UNIT), (0, 0, AWAY), range_m=[10.0, 50.0])
+    low = (400.0, 0.0, 440.0, 40.0)
+    found = boxes((0, 0, UNIT), (0, 0, low), scores=[0.9, 0.8], range_m=[30.0, 45.0])
+
+    scores = score_parts(truth, found, ("car",), {"car": 0.5}, np.arange(1))
+    by_part = {one.part: (one.labels, one.right, one.wrong) for one in scores if one.label == "car"}
+
+    assert by_part["0 to 20 m"] == (1, 1, 0)
+    assert by_part["40 to 60 m"] == (1, 0, 1)
+    assert "20 to 40 m" not in by_part
+
+
+def test_intervals_need_blocks_and_the_same_seed_gives_the_same() -> None:
+    assert drawn(np.array([0, 0, 1, 1]), 0) is None
+    first, again = (drawn(np.repeat(np.arange(6), 2), 3) for _ in range(2))
+    assert first is not None
+    np.testing.assert_array_equal(first, again)
+    # Pictures of one block are drawn together.
+    np.testing.assert_array_equal(first[:, 0], first[:, 1])
+
+
+def test_an_interval_holds_the_true_precision_about_as_often_as_it_says() -> None:
+    """Simulated: 60 pictures of 4 detections, each right with probability 0.8."""
+    rng = np.random.default_rng(5)
+    inside = 0
+    for _ in range(100):
+        right = rng.random((60, 4)) < 0.8
+        rows = [
+            (p, 0, (200.0 * i, 0.0, 200.0 * i + 100, 100.0)) for p in range(60) for i in range(4)
+        ]
+        truth = boxes(*(row for row, ok in zip(rows, right.ravel(), strict=True) if ok))
+        found = boxes(*rows, scores=[0.9] * len(rows))
+        weights = drawn(np.arange(60), 0)
+        matched = match(truth, found, 0, overlaps=np.array([0.5]))
+        counts = np.bincount(matched.picture[matched.is_right[0]], minlength=60)
+        assert weights is not None
+        low, high = np.percentile(weights @ counts / 240.0, [2.5, 97.5])
+        inside += bool(low <= 0.8 <= high)
+    assert 86 <= inside <= 100
+
+
+def test_scores_that_are_true_have_no_calibration_error_and_others_do() -> None:
+    rng = np.random.default_rng(0)
+    scores = rng.random(20_000)
+    is_right = rng.random(20_000) < scores
+
+    assert reliability("car", scores, is_right).error < 0.02
+    assert reliability("car", np.full(1000, 0.95), np.zeros(1000, np.bool_)).error == pytest.approx(
+        0.95
+    )
