@@ -134,6 +134,8 @@ _EXPORTS: Final = {
     "FittedCompass": "eval.interface.fits.compass",
     "fit_odometry": "eval.interface.fits.odometry",
     "FittedOdometry": "eval.interface.fits.odometry",
+    "fit_detector": "eval.interface.fits.detector",
+    "FittedDetector": "eval.interface.fits.detector",
     "fit_landmarks": "eval.interface.fits.landmarks",
     "FittedLandmarks": "eval.interface.fits.landmarks",
     "fit_messages": "eval.interface.fits.messages",
@@ -206,6 +208,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.demo import fetch_drive as fetch_drive
     from crosscue.eval.interface.fits.compass import FittedCompass as FittedCompass
     from crosscue.eval.interface.fits.compass import fit_compass as fit_compass
+    from crosscue.eval.interface.fits.detector import FittedDetector as FittedDetector
+    from crosscue.eval.interface.fits.detector import fit_detector as fit_detector
     from crosscue.eval.interface.fits.landmarks import FittedLandmarks as FittedLandmarks
     from crosscue.eval.interface.fits.landmarks import fit_landmarks as fit_landmarks
     from crosscue.eval.interface.fits.messages import FittedMessages as FittedMessages

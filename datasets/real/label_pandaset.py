@@ -67,7 +67,8 @@ def write_labels(sequence: Path, output: Path) -> Path:
     rows: dict[str, Any] = {
         name: table[name].to_numpy(zero_copy_only=False) for name in (*_COLUMNS, "yaw_rad")
     }
-    images, annotations = [], []
+    images: list[dict[str, object]] = []
+    annotations: list[dict[str, object]] = []
     width, height = SIZE_PX
     for frame, t_ns in enumerate(poses.t_ns.tolist()):
         images.append(

@@ -17,10 +17,10 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration
 from crosscue.detectors.rle import area_px
-from crosscue.replay.columns import Floats
 
 from .annotations import Labelled, LabelledPicture, LabelledSet
 from .operating_point import Judged
+from .platt import fit_platt
 from .scores import MIN_AREA_PX
 
 OVERLAP: Final = 0.3
@@ -77,22 +77,8 @@ def _verdicts(
 
 def fitted(rows: Judged) -> Calibration:
     """The calibration of one class."""
-    from scipy.optimize import minimize
-
     right = int(rows.is_right.sum())
     if min(right, len(rows.is_right) - right) < MIN_ROWS:
         return Calibration()
-    kept = np.clip(rows.scores, 1e-6, 1.0 - 1e-6)
-    logit = np.log(kept / (1.0 - kept))
-    # Platt's targets: one more right and one more wrong than were seen.
-    target = np.where(
-        rows.is_right, (right + 1) / (right + 2), 1 / (len(rows.is_right) - right + 2)
-    )
-
-    def cost(at: Floats) -> float:
-        z = np.exp(at[0]) * logit + at[1]
-        return float((np.logaddexp(0.0, z) - target * z).mean())
-
-    best = minimize(cost, np.zeros(2), method="Nelder-Mead").x
-    slope, offset = float(np.clip(np.exp(best[0]), 0.05, 20.0)), float(np.clip(best[1], -20, 20))
-    return Calibration(slope=round(slope, 5), offset=round(offset, 5))
+    found = fit_platt(rows.scores, rows.is_right)
+    return Calibration(slope=found.slope, offset=found.offset)

@@ -39,6 +39,8 @@ OPENS_LOGS: dict[str, str] = {
     "replay": "{log} -o {out} --vehicle {car} --detectors grey --no-cache",
     "estimate": "{run}",
     "score": "{run} --truth {truth}",
+    "score detector": "{run} --labels {coco}",
+    "fit detector": "{run} --labels {coco}",
     "view": "{run} -o {out}.rrd",
     "vehicle init": "{log} -o {out}.toml",
     "vehicle check": "{log} --vehicle {car} -o {out}.html",
@@ -52,8 +54,8 @@ OPENS_LOGS: dict[str, str] = {
     "truth check": "{truth} --log {log} --vehicle {car}",
 }
 """Arguments with which a command reads every chunk of a log."""
-REPORTS_THE_RUN = {"score"}
-"""It reads single pictures, and reports what was dropped as the run does."""
+REPORTS_THE_RUN = {"score", "score detector", "fit detector"}
+"""They read single pictures or none, and report what was dropped as the run does."""
 OPENS_NONE: dict[str, str] = {
     "compare": "tables", "merge": "tables", "fit ranges": "tables", "fit messages": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",

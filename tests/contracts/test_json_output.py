@@ -30,6 +30,8 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "replay": ("LOG --vehicle CAR -o runs/a --no-cache", 3),
     "estimate": ("runs/a", 3),
     "score": ("runs/a --truth TRUTH", 0),
+    "score detector": ("runs/a --labels road/coco.json", 0),
+    "fit detector": ("runs/a --labels road/coco.json", 1),
     "compare": ("runs/a runs/a", 0),
     "merge": ("runs -o merged", 0),
     "truth check": ("TRUTH --log LOG", 0),
@@ -105,6 +107,7 @@ def test_every_result_is_one_strict_document(
     monkeypatch.chdir(tmp_path)
     log = write_drive(tmp_path, Clock(pause_s=(5.0, 9.0)))
     database_of(tmp_path / "marks.sqlite", np.array([[0.0, 1.0], [2.0, 3.0]]))
+    _write_road(tmp_path / "road")
     places = {"LOG": str(log), "CAR": "car.toml", "TRUTH": "truth.json"}
     _run(LINES, places, capsys)
 

@@ -29,6 +29,8 @@ CALLS: Final = {
     "truth schema": ("truth_schema",),
     "run schema": ("run_schema",),
     "score": ("score_runs",),
+    "score detector": ("score_detector",),
+    "fit detector": ("fit_detector",),
     "simulate": (
         "simulate_approaches",
         "draw_contact_sheet",

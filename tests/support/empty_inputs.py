@@ -22,6 +22,8 @@ COMMANDS: dict[str, str] = {
     "fit ranges": "--cue stop_sign --truth {empty}/truth.json",
     "fit landmarks": "--pairs {empty}/pairs.csv",
     "score": "{run} --truth {empty}/truth.json -o {out}",
+    "score detector": "{run} --labels {empty}/coco.json",
+    "fit detector": "{run} --labels {empty}/coco.json -o {out}.toml",
     "train mask-rcnn": "--data {empty}/coco.json --images {empty} -o {out}.safetensors",
     "train road": "--data {empty} -o {out}.safetensors",
     "landmarks add": "{out}.db --images {empty} --coordinates {empty}/places.csv",

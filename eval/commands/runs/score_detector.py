@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score and report."""
+    """Score and report; 3 when the run had dropped something."""
     found = crosscue.score_detector(
         args.run,
         args.labels,
@@ -76,4 +76,4 @@ def run(args: argparse.Namespace) -> int:
         limits=limits_of(args),
     )
     print_result(found, args)
-    return 0
+    return 0 if found.is_whole else 3

@@ -59,6 +59,11 @@ class DetectorScore:
     report: Path
 
     @property
+    def is_whole(self) -> bool:
+        """Nothing was dropped when the run was made."""
+        return self.labelled.is_whole
+
+    @property
     def parts(self) -> pa.Table:
         """A row for each class and part, with 95 % intervals."""
         import pyarrow as pa

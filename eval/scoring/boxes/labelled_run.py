@@ -19,7 +19,7 @@ import numpy as np
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.catalog.class_names import meaning_of
-from crosscue.detectors.cues.frame import Role
+from crosscue.detectors.cues.observed import Role
 from crosscue.eval.fit.log_images import picture_names
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import reopened
@@ -68,6 +68,11 @@ class LabelledRun:
     frames: int
     left_out: Mapping[str, int]
     not_judged: Mapping[str, int]
+
+    @property
+    def is_whole(self) -> bool:
+        """Nothing was dropped when the run was made."""
+        return all(one.is_whole for one in self.run.drive_manifest().account.reading)
 
     def blocks(self, block_s: float) -> Int64s:
         """Shape (P,): pictures taken within so many seconds have the same number."""
@@ -120,7 +125,8 @@ def labelled_run(
     }
     left_out: Counter[str] = Counter(labels.left_out)
     placed, rule = _placed(run, detected, labels, np.array(sorted(frames), np.int64), left_out)
-    classes, of_labels, of_found = _classes(labels, chosen, dict(meanings or {}))
+    reported = chosen.labels if chosen.labels is not None else _labels_met(run, chosen.name)
+    classes, of_labels, of_found = _classes(labels, chosen.name, reported, dict(meanings or {}))
     order = sorted(placed, key=lambda t: frames[t][0])
     sizes = [frames[t][1] for t in order]
     truth = _truth([placed[t] for t in order], sizes, of_labels, left_out)
@@ -235,18 +241,17 @@ def _time_of(picture: LabelPicture) -> int | None:
 
 
 def _classes(
-    labels: BoxLabels, detector: DetectorRow, meanings: dict[str, str]
+    labels: BoxLabels, detector: str, reported: Sequence[str], meanings: dict[str, str]
 ) -> tuple[tuple[str, ...], dict[str, str | None], dict[str, str | None]]:
     """Classes that both know; from a name in the labels, and in the detections, to a class.
 
     Names that are missing there are not judged; None is neither to be found nor wrong.
     """
-    reported = detector.labels or ()
     for name, means in meanings.items():
         if name not in (*labels.classes, *reported):
             raise UsageError(
                 f"--map {name}={means}: no such class; the labels have {_listed(labels.classes)}; "
-                f"{detector.name} reports {_listed(reported)}"
+                f"{detector} reports {_listed(reported)}"
             )
     of_found = {name: meanings.get(name, name) or None for name in reported}
     plain = {_plain(name): name for name in reported}
@@ -261,10 +266,17 @@ def _classes(
     both = {one for one in of_labels.values() if one} & {one for one in of_found.values() if one}
     if not both:
         raise SchemaError(
-            f"{labels.where}: no class that {detector.name} reports; the labels have "
+            f"{labels.where}: no class that {detector} reports; the labels have "
             f"{_listed(labels.classes)}; say what they mean with --map NAME=CLASS"
         )
     return tuple(sorted(both)), of_labels, of_found
+
+
+def _labels_met(run: RunFolder, detector: str) -> tuple[str, ...]:
+    """Of a detector that does not say what it can report: what it did report."""
+    table = run.table("detections", ["detector", "label"])
+    rows = zip(table["detector"].to_pylist(), table["label"].to_pylist(), strict=True)
+    return tuple(sorted({label for name, label in rows if name == detector}))
 
 
 def _plain(name: str) -> str:

@@ -1,0 +1,115 @@
+"""Fit thresholds and calibrations of a detector to labelled boxes, and write them into its card.
+
+For each class the lowest threshold that reaches the precision asked for, by Clopper and Pearson's
+one-sided 95 % bound, corrected for choosing among eight thresholds; and a calibration, so that a
+score is the fraction of such detections that are right. The last half of each run's images is held
+out and shows the result, unless --test names other runs. A class with too few labelled boxes is
+left as it is, and said.
+
+Bounds take detections as independent; those of neighbouring images are not. Fit to several drives.
+
+examples:
+  crosscue fit detector runs/A-01 --labels labels.json -o my.toml
+  crosscue fit detector runs/* --labels labels/*.json --precision 0.98 -o my.toml
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.labels import add_label_arguments, meanings_of
+from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_result
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs with detections")
+    parser.add_argument(
+        "--labels",
+        type=Path,
+        nargs="+",
+        required=True,
+        metavar="LABELS",
+        help="labelled boxes of each run's images, in the same order",
+    )
+    add_label_arguments(parser)
+    parser.add_argument(
+        "--precision",
+        type=float,
+        default=0.95,
+        metavar="P",
+        help="required precision (default: 0.95)",
+    )
+    parser.add_argument(
+        "--calibration",
+        choices=("platt", "isotonic", "none"),
+        default="platt",
+        help="how scores become probabilities (default: platt)",
+    )
+    parser.add_argument(
+        "--hold-out",
+        type=float,
+        default=0.5,
+        metavar="FRACTION",
+        help="last part of each run's images that shows the result (default: 0.5)",
+    )
+    parser.add_argument(
+        "--test",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="RUN",
+        help="other runs that show the result",
+    )
+    parser.add_argument(
+        "--test-labels",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="LABELS",
+        help="labelled boxes of each of these",
+    )
+    parser.add_argument(
+        "--card", type=Path, metavar="CARD.toml", help="the detector's card (default: the run's)"
+    )
+    parser.add_argument("--date", default="", metavar="DATE", help="date of the fit, for the card")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="CARD.toml",
+        help="card to write; may be the same file (default: none)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace another existing card")
+    add_logs_argument(parser)
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit and report; 1 when no class has got a threshold, 3 when runs had dropped something."""
+    found = crosscue.fit_detector(
+        args.runs,
+        args.labels,
+        args.output,
+        precision=args.precision,
+        calibration=args.calibration,
+        test=args.test,
+        test_labels=args.test_labels,
+        hold_out=args.hold_out,
+        card=args.card,
+        detector=args.detector,
+        kind=args.format,
+        class_names=args.class_names,
+        meanings=meanings_of(args.map),
+        overlap=args.overlap,
+        date=args.date,
+        overwrite=args.overwrite,
+        logs=args.logs,
+        limits=limits_of(args),
+    )
+    print_result(found, args)
+    if not found.has_threshold:
+        return 1
+    return 0 if found.is_whole else 3

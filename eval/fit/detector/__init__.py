@@ -1,0 +1,1 @@
+"""Thresholds and calibrations of a detector, from labelled boxes."""

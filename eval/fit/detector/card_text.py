@@ -1,0 +1,125 @@
+"""A model card's text with fitted thresholds and calibrations in it; comments stay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import tomlkit
+from pydantic import ValidationError
+
+from crosscue.detectors.catalog.card import ModelCard
+from crosscue.detectors.catalog.class_names import CUE_LABELS
+from crosscue.detectors.catalog.class_scores import ClassScores
+from crosscue.replay.base import UsageError, VehicleError, one_line
+from crosscue.replay.vehicle.vehicle import tuples
+
+from .class_fit import ClassFit
+
+WRITTEN_BY: Final = "crosscue fit detector"
+
+
+def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, aim: str) -> str:
+    """The card's text with the fit.
+
+    Args:
+        text: Of the card.
+        fits: Of every class; those left as they are change nothing.
+        pictures: Which, how many, by whom labelled.
+        measured: When.
+        aim: What was asked for, in words.
+
+    Raises:
+        VehicleError: The card would not be one.
+    """
+    document = tomlkit.parse(text)
+    scores = document.setdefault("scores", tomlkit.table(is_super_table=True))
+    evidence = [
+        row
+        for row in document.pop("evidence", [])
+        if not str(row.get("note", "")).startswith(WRITTEN_BY)
+    ]
+    for fit in fits:
+        if fit.scores is None:
+            continue
+        for label in fit.members:
+            scores[label] = _section(fit.scores)
+        if fit.held_out is not None:
+            evidence.append(_evidence(fit, pictures, measured, aim))
+    if evidence:
+        rows = tomlkit.aot()
+        for row in evidence:
+            table = tomlkit.table()
+            table.update(row)
+            rows.append(table)
+        document["evidence"] = rows
+    card = _checked(document.unwrap())
+    reported = {card.meaning(i) for i in range(len(card.output.classes))} & {*CUE_LABELS}
+    is_calibrated = bool(reported) and all(
+        label in card.scores and card.scores[label].calibration is not None for label in reported
+    )
+    if is_calibrated != card.is_calibrated:
+        _put_first(document, "is_calibrated", is_calibrated)
+    return tomlkit.dumps(document)
+
+
+def _put_first(document: Any, key: str, value: bool) -> None:
+    """A key of the whole card stands before its first section."""
+    if key in document:
+        document[key] = value
+        return
+    place = list(document).index("weights")
+    document._insert_at(place, tomlkit.key(key), tomlkit.item(value))
+
+
+def _section(scores: ClassScores) -> Any:
+    table = tomlkit.table()
+    if scores.threshold is not None:
+        table["threshold"] = scores.threshold
+    if scores.calibration is not None:
+        inline = tomlkit.inline_table()
+        inline.update(scores.calibration.model_dump(mode="json"))
+        table["calibration"] = inline
+    return table
+
+
+def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str, object]:
+    assert fit.held_out is not None
+    assert fit.scores is not None
+    held = fit.held_out
+    row: dict[str, object] = {
+        "pictures": pictures,
+        "metric": f"precision of {fit.name} above {fit.scores.threshold:g}, held out",
+        "value": round(held.precision, 4) if held.of else 0.0,
+    }
+    if held.of:
+        row |= {"low": round(held.interval.low, 4), "high": round(held.interval.high, 4)}
+    when = f", {measured}" if measured else ""
+    row["note"] = (
+        f"{WRITTEN_BY}{when}: {aim}; fitted to {fit.labels} boxes and {fit.detections} detections, "
+        f"bound {fit.bound:.4f}; held out {held.right} of {held.of} right, recall "
+        f"{held.right} of {held.labels}"
+    )
+    return row
+
+
+def _checked(tree: object) -> ModelCard:
+    try:
+        return ModelCard.model_validate(tuples(tree))
+    except ValidationError as error:
+        raise VehicleError(f"the card with the fit: {one_line(error, 200)}; report it") from None
+
+
+def check_place(card: ModelCard, source: Path, output: Path, *, overwrite: bool) -> None:
+    """Refuse, before any work, a card that cannot be written there or would not find its weights.
+
+    Raises:
+        UsageError: It exists, or its weights are elsewhere.
+    """
+    if output.suffix != ".toml":
+        raise UsageError(f"-o {output}: expected a card's name, which ends in .toml")
+    if output.exists() and not overwrite and not output.samefile(source):
+        raise UsageError(f"{output}: exists; give another name or --overwrite")
+    if not card.files and output.resolve().parent != source.resolve().parent:
+        raise UsageError(f"{output}: a card lies beside its weights, in {source.parent}")

@@ -1,0 +1,334 @@
+"""A detector's thresholds and calibrations, fitted to labelled boxes and written into its card."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from crosscue.datasets.truth.box_labels import read_box_labels
+from crosscue.detectors.catalog.card import read_card
+from crosscue.detectors.catalog.entries import card_path, names
+from crosscue.eval.fit.detector.card_text import check_place, with_fit
+from crosscue.eval.fit.detector.class_fit import (
+    CALIBRATIONS,
+    CalibrationKind,
+    ClassFit,
+    Judged,
+    fit_class,
+)
+from crosscue.eval.interface.runs.detector_scores import names_given
+from crosscue.eval.interface.runs.run import Run
+from crosscue.eval.runs.folder import open_run
+from crosscue.eval.runs.manifest import DetectorRow
+from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
+from crosscue.eval.scoring.boxes.matching import match
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, UsageError, visible, write_text
+
+CONFIDENCE: Final = 0.95
+YEAR_2000_NS: Final = 946_684_800_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedDetector:
+    """Thresholds and calibrations by class; printed as ``crosscue fit detector`` prints them.
+
+    Attributes:
+        detector: As it ran.
+        classes: Of every class that labels and detector have.
+        precision: That was asked for.
+        fitted_to: Pictures.
+        held_out: Other pictures.
+        left_out: What of the labels was left out, by reason.
+        card: The card that was written; None without one.
+        is_whole: Nothing was dropped when the runs were made.
+    """
+
+    detector: DetectorRow
+    classes: tuple[ClassFit, ...]
+    precision: float
+    fitted_to: int
+    held_out: int
+    left_out: Mapping[str, int]
+    card: Path | None
+    is_whole: bool = True
+
+    @property
+    def has_threshold(self) -> bool:
+        """At least one class has got a threshold."""
+        return any(one.scores and one.scores.threshold is not None for one in self.classes)
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue fit detector --json`` prints."""
+        return {
+            "detector": self.detector.name,
+            "precision": self.precision,
+            "confidence": CONFIDENCE,
+            "images_fitted_to": self.fitted_to,
+            "images_held_out": self.held_out,
+            "left_out": dict(self.left_out),
+            "classes": [_class_tree(one) for one in self.classes],
+            "card": None if self.card is None else str(self.card),
+        }
+
+    def __repr__(self) -> str:
+        lines = [
+            f"detector   {visible(self.detector.name)}, fitted to {self.fitted_to:,} images, "
+            f"{self.held_out:,} others held out",
+            *(f"left out   {count:,} {visible(why)}" for why, count in self.left_out.items()),
+        ]
+        for one in self.classes:
+            lines += ["", *_class_lines(one, self.precision)]
+        if self.card is not None:
+            lines += ["", f"written to {visible(str(self.card))}"]
+        return "\n".join(lines)
+
+
+def _class_lines(one: ClassFit, precision: float) -> list[str]:
+    lines = [
+        f"{visible(one.name):10} {one.labels:,} boxes, {one.detections:,} detections, "
+        f"{one.right:,} right"
+    ]
+    if one.scores is not None and one.scores.threshold is not None:
+        lines.append(
+            f"  threshold   {one.scores.threshold:g}: precision at least {one.bound:.3f} with "
+            f"{CONFIDENCE:.0%} confidence (asked: {precision:g})"
+        )
+    if one.scores is not None and one.scores.calibration is not None:
+        lines.append(f"  calibration {_calibration_text(one)}")
+    held = one.held_out
+    if held is not None and held.of:
+        lines.append(
+            f"  held out    precision {held.precision:.3f} ({held.interval.low:.3f} to "
+            f"{held.interval.high:.3f}; {held.right:,} of {held.of:,}), recall {held.recall:.3f} "
+            f"({held.right:,} of {held.labels:,})"
+        )
+        lines.append(
+            f"              calibration error {held.error_before:.3f} before, "
+            f"{held.error_after:.3f} after, {held.detections:,} detections"
+        )
+    return lines + [f"  {note}" for note in one.notes]
+
+
+def _calibration_text(one: ClassFit) -> str:
+    assert one.scores is not None
+    found = one.scores.calibration
+    assert found is not None
+    if found.kind == "platt":
+        return f"platt, slope {found.slope:g}, offset {found.offset:g}"
+    return f"isotonic, {len(found.scores)} points"
+
+
+def _class_tree(one: ClassFit) -> dict[str, Any]:
+    held = one.held_out
+    return {
+        "class": one.name,
+        "labels": list(one.members),
+        "boxes": one.labels,
+        "detections": one.detections,
+        "right": one.right,
+        "scores": None if one.scores is None else one.scores.model_dump(mode="json"),
+        "bound": one.bound,
+        "held_out": None
+        if held is None
+        else asdict(held) | {"precision": held.precision, "recall": held.recall},
+        "notes": list(one.notes),
+    }
+
+
+def fit_detector(
+    runs: Sequence[Run | Path | str] | Run | Path | str,
+    labels: Sequence[Path | str] | Path | str,
+    output: Path | str | None = None,
+    *,
+    precision: float = 0.95,
+    calibration: CalibrationKind = "platt",
+    test: Sequence[Run | Path | str] = (),
+    test_labels: Sequence[Path | str] = (),
+    hold_out: float = 0.5,
+    card: Path | str | None = None,
+    detector: str | None = None,
+    kind: str | None = None,
+    class_names: Sequence[str] | Path | str = (),
+    meanings: Mapping[str, str] | None = None,
+    overlap: float = 0.5,
+    date: str = "",
+    overwrite: bool = False,
+    logs: Path | str | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+) -> FittedDetector:
+    """Fit thresholds and calibrations to labelled boxes.
+
+    For each class the lowest threshold whose precision is high enough by a one-sided bound, and a
+    calibration that makes scores probabilities. Pictures that are held out show the result: those
+    of ``test``, or the last ones of each run.
+
+    Args:
+        runs: With stored detections of one detector, uncalibrated.
+        labels: Of each run, in the same order; see ``score_detector``.
+        output: The card to write; None for none.
+        precision: Required, in (0, 1).
+        calibration: ``platt``, ``isotonic`` or ``none``.
+        test: Other runs that show the result.
+        test_labels: Of each of these.
+        hold_out: Without ``test``, this fraction of each run's pictures, its end, is held out.
+        card: The detector's card, where the run does not say.
+        detector: Its name, where several ran.
+        kind: Format of the labels.
+        class_names: Of YOLO labels in their order, or a file with one a line.
+        meanings: From a class of the labels or of the detector to the class that it counts as.
+        overlap: That makes a detection right.
+        date: Of the fit, for the card; the date of the first picture if left out.
+        overwrite: Replace a card that is there.
+        logs: Where the runs' logs have moved to, if they have.
+        limits: What the logs are read with.
+
+    Raises:
+        UsageError: A value out of range, runs of different detectors, or scores that are
+            calibrated already.
+        AnnotationError: Labels cannot be read.
+        SchemaError: They do not belong to the run.
+        VehicleError: The card cannot be read.
+        OutputError: The card cannot be written.
+    """
+    _check(precision, calibration, hold_out, overlap)
+    given = [runs] if isinstance(runs, Run | Path | str) else list(runs)
+    theirs = [labels] if isinstance(labels, Path | str) else list(labels)
+    if len(theirs) != len(given) or len(test_labels) != len(test):
+        raise UsageError(
+            f"--labels: {len(theirs)} for {len(given)} runs, --test-labels: {len(test_labels)} for "
+            f"{len(test)}; expected one for each, in the same order"
+        )
+
+    if card is not None:
+        # What is wrong with a file is reported before any run is looked at.
+        read_card(Path(card))
+    moved = None if logs is None else Path(logs)
+    places = [run.path if isinstance(run, Run) else Path(run) for run in (*given, *test)]
+    folders = [open_run(place, moved, limits=limits) for place in places]
+    listed = names_given(class_names)
+    read = [read_box_labels(Path(path), kind, listed) for path in (*theirs, *test_labels)]
+    whole = [
+        labelled_run(folder, one, detector, meanings)
+        for folder, one in zip(folders, read, strict=True)
+    ]
+    parts, others = whole[: len(given)], whole[len(given) :]
+    row = _one_detector([*parts, *others])
+    source = _card_of(row, card, is_needed=output is not None)
+    if output is not None and source is not None:
+        check_place(read_card(source), source, Path(output), overwrite=overwrite)
+    first = [_ends_at(part, 0.0 if others else hold_out) for part in parts]
+    rest = [~one for one in first] if not others else [_everything(one) for one in others]
+    fits = tuple(
+        fit_class(
+            name,
+            parts[0].members[name],
+            _judged(parts, first, name, overlap),
+            _judged(others or parts, rest, name, overlap),
+            precision,
+            CONFIDENCE,
+            calibration,
+        )
+        for name in _common(parts, others)
+    )
+    left_out: dict[str, int] = {}
+    for part in (*parts, *others):
+        for why, count in part.left_out.items():
+            left_out[why] = left_out.get(why, 0) + count
+    fitted_to, held = (sum(int(one.sum()) for one in which) for which in (first, rest))
+    written = None
+    if output is not None and source is not None and any(one.scores for one in fits):
+        logs_of = (log.name for part in (*parts, *others) for log in part.run.drive_manifest().logs)
+        names_of = ", ".join(sorted({*logs_of}))
+        when = _date_of(parts)
+        pictures = f"{fitted_to} images fitted to, {held} held out, of {names_of}{when}"
+        aim = f"precision {precision:g} with {CONFIDENCE:.0%} confidence"
+        text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, date, aim)
+        written = Path(output)
+        write_text(written, text)
+    is_whole = all(part.is_whole for part in whole)
+    return FittedDetector(row, fits, precision, fitted_to, held, left_out, written, is_whole)
+
+
+def _check(precision: float, calibration: str, hold_out: float, overlap: float) -> None:
+    if not 0.0 < precision < 1.0:
+        raise UsageError(f"--precision {precision}: expected above 0 and below 1")
+    if calibration not in CALIBRATIONS:
+        raise UsageError(f"--calibration {calibration}: expected one of {', '.join(CALIBRATIONS)}")
+    if not 0.0 < hold_out < 1.0:
+        raise UsageError(f"--hold-out {hold_out}: expected above 0 and below 1")
+    if not 0.0 < overlap <= 1.0:
+        raise UsageError(f"--overlap {overlap}: expected above 0, at most 1")
+
+
+def _one_detector(parts: Sequence[LabelledRun]) -> DetectorRow:
+    row = parts[0].detector
+    for part in parts:
+        if part.detector.identity != row.identity:
+            raise UsageError(
+                f"{part.run.path}: {part.detector.name} is another detector, or has other settings "
+                f"or weights, than that of {parts[0].run.path}; replay both alike"
+            )
+        if part.detector.calibrated:
+            raise UsageError(
+                f"{part.run.path}: scores of {', '.join(part.detector.calibrated)} are calibrated "
+                "already; replay with the card as it was before the fit"
+            )
+    return row
+
+
+def _card_of(row: DetectorRow, card: Path | str | None, *, is_needed: bool) -> Path | None:
+    if card is not None:
+        return Path(card)
+    named = row.settings.get("card")
+    if named is not None:
+        return Path(str(named))
+    if row.kind in names():
+        return card_path(row.kind)
+    if is_needed:
+        raise UsageError(f"-o: {row.name} has no model card; give one with --card, or leave out -o")
+    return None
+
+
+def _common(parts: Sequence[LabelledRun], others: Sequence[LabelledRun]) -> list[str]:
+    found = {name for part in parts for name in part.classes}
+    return sorted(found.intersection(*(part.classes for part in (*parts, *others))))
+
+
+def _ends_at(part: LabelledRun, hold_out: float) -> np.typing.NDArray[np.bool_]:
+    """The first pictures in time, shape (P,)."""
+    n = len(part.names)
+    return np.arange(n) < n - round(hold_out * n)
+
+
+def _everything(part: LabelledRun) -> np.typing.NDArray[np.bool_]:
+    return np.ones(len(part.names), np.bool_)
+
+
+def _judged(
+    parts: Sequence[LabelledRun],
+    which: Sequence[np.typing.NDArray[np.bool_]],
+    name: str,
+    overlap: float,
+) -> Judged:
+    """One class in some pictures of some runs."""
+    scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
+    for part, chosen in zip(parts, which, strict=True):
+        matched = match(*part.part(chosen), part.classes.index(name), overlaps=np.array([overlap]))
+        judged = ~matched.is_out[0]
+        scores.append(matched.scores[judged])
+        right.append(matched.is_right[0][judged])
+        labels += len(matched.labels)
+    return Judged(np.concatenate(scores), np.concatenate(right), labels)
+
+
+def _date_of(parts: Sequence[LabelledRun]) -> str:
+    """Of the first picture, where the log's clock knows it."""
+    first = min(int(part.t_ns[0]) for part in parts)
+    if first < YEAR_2000_NS:
+        return ""
+    return f" ({datetime.fromtimestamp(first // 1_000_000_000, UTC):%Y-%m-%d})"
