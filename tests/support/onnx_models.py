@@ -38,11 +38,20 @@ def open_model(shape: tuple[int | str, ...], metadata: Mapping[str, str]) -> byt
     return _file(helper.make_graph([node], "open", [given], [found]), metadata)
 
 
-def bright_box_model() -> bytes:
+def bright_box_model(*, by_brightness: bool = False) -> bytes:
     """One box (N, 1, 6) around all pixels above 127, with score 1 if there are any, class 0.
 
     Input (N, 3, H, W) of any size: ranges of bright columns and rows by arg max from both ends.
+    ``by_brightness``: the score is the brightest pixel, of 255.
     """
+    scored = [helper.make_node("ReduceMax", ["columns"], ["score"], axes=[1], keepdims=1)]
+    if by_brightness:
+        scored = [
+            helper.make_node("ReduceMax", ["grey"], ["brightest"], axes=[1], keepdims=0),
+            helper.make_node("ReduceMax", ["brightest"], ["most"], axes=[1], keepdims=1),
+            helper.make_node("Constant", [], ["each"], value=_scalar(1.0 / 255.0)),
+            helper.make_node("Mul", ["most", "each"], ["score"]),
+        ]
     nodes = [
         helper.make_node("Constant", [], ["half"], value=_scalar(127.0)),
         helper.make_node("ReduceMax", ["images"], ["grey"], axes=[1], keepdims=0),
@@ -50,7 +59,7 @@ def bright_box_model() -> bytes:
         helper.make_node("Cast", ["bright"], ["light"], to=TensorProto.FLOAT),
         helper.make_node("ReduceMax", ["light"], ["columns"], axes=[1], keepdims=0),
         helper.make_node("ReduceMax", ["light"], ["rows"], axes=[2], keepdims=0),
-        helper.make_node("ReduceMax", ["columns"], ["score"], axes=[1], keepdims=1),
+        *scored,
     ]
     ends = []
     for name in ("columns", "rows"):

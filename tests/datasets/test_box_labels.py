@@ -1,0 +1,148 @@
+"""Labelled boxes in four formats: the same boxes, and one line for what cannot be read."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from crosscue.datasets.truth.box_labels import BoxLabels, read_box_labels
+from crosscue.replay.base import AnnotationError, CrosscueError, EmptyResultError, UsageError
+
+BOX = (10.0, 20.0, 50.0, 60.0)
+SIZE = (100, 80)
+
+
+def coco(folder: Path) -> Path:
+    tree = {
+        "categories": [{"id": 1, "name": "car"}, {"id": 2, "name": "bus"}],
+        "images": [{"id": 0, "file_name": "7.png", "width": 100, "height": 80}],
+        "annotations": [
+            {"id": 1, "image_id": 0, "category_id": 1, "bbox": [10, 20, 40, 40], "range_m": 12.5},
+            {"id": 2, "image_id": 0, "category_id": 2, "bbox": [60, 0, 40, 80], "iscrowd": 1},
+        ],
+    }
+    (folder / "coco.json").write_text(json.dumps(tree))
+    return folder / "coco.json"
+
+
+def yolo(folder: Path) -> Path:
+    (folder / "data.yaml").write_text("names:\n  0: car\n  1: bus\n")
+    (folder / "7.txt").write_text("0 0.3 0.5 0.4 0.5\n")
+    return folder
+
+
+def voc(folder: Path) -> Path:
+    (folder / "7.xml").write_text(
+        "<annotation><filename>7.png</filename><size><width>100</width><height>80</height></size>"
+        "<object><name>car</name><difficult>0</difficult><part><name>wheel</name></part><bndbox>"
+        "<xmin>11</xmin><ymin>21</ymin><xmax>50</xmax><ymax>60</ymax></bndbox></object>"
+        "<object><name>bus</name><difficult>1</difficult><bndbox><xmin>61</xmin><ymin>1</ymin>"
+        "<xmax>100</xmax><ymax>80</ymax></bndbox></object></annotation>"
+    )
+    return folder
+
+
+def kitti(folder: Path) -> Path:
+    (folder / "000007.txt").write_text(
+        "car 0.00 0 -1.5 10 20 50 60 1.5 1.6 3.9 1.0 1.7 12.5 -1.6\n"
+        "DontCare -1 -1 -10 60 0 100 80 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    )
+    return folder
+
+
+FORMATS = {"coco": coco, "yolo": yolo, "voc": voc, "kitti": kitti}
+
+
+def read(path: Path) -> BoxLabels:
+    return read_box_labels(path)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_holds_the_same_box(name: str, tmp_path: Path) -> None:
+    found = read(FORMATS[name](tmp_path))
+
+    (picture,) = found.pictures
+    car, *regions = picture.inside(SIZE, Counter())
+    assert found.format == name
+    assert "car" in found.classes
+    assert (car.label, car.is_ignored) == ("car", False)
+    assert car.box == pytest.approx(BOX)
+    assert [one.is_ignored for one in regions] == ([] if name == "yolo" else [True])
+    assert car.range_m == 12.5 if name in ("coco", "kitti") else math.isnan(car.range_m)
+
+
+def test_what_is_outside_is_cut_or_counted(tmp_path: Path) -> None:
+    (tmp_path / "classes.txt").write_text("car\n")
+    (tmp_path / "7.txt").write_text("0 0.95 0.5 0.4 0.5\n0 1.5 0.5 0.4 0.5\n0 0.5 0.5 0 0.5\n")
+    left_out: Counter[str] = Counter()
+
+    (only,) = read(tmp_path).pictures[0].inside(SIZE, left_out)
+
+    assert only.box == pytest.approx((75.0, 20.0, 100.0, 60.0))
+    assert dict(left_out) == {
+        "boxes cut off at the picture's edge": 1,
+        "boxes outside the picture, or without area": 2,
+    }
+
+
+@pytest.mark.parametrize(
+    ("files", "error", "said"),
+    [
+        ({"7.txt": "0 .5 .5 .1 .1"}, UsageError, "--class-names FILE"),
+        ({"7.txt": "car 0 0 0 1 2"}, UsageError, "--class-names FILE"),
+        (
+            {"7.txt": "1 .5 .5 .1 .1", "classes.txt": "car"},
+            AnnotationError,
+            "7.txt:1: class 1, but",
+        ),
+        (
+            {"7.txt": "0 .5 .5 .1", "classes.txt": "car"},
+            AnnotationError,
+            "7.txt:1: expected a class",
+        ),
+        ({"7.txt": "0 .5 .5 x .1", "classes.txt": "car"}, AnnotationError, "expected numbers"),
+        ({"7.txt": "", "data.yaml": "path: x"}, AnnotationError, "class names under names"),
+        ({"7.txt": "car" + " 1" * 13}, UsageError, "--class-names"),
+        ({"7.txt": "car" + " 1" * 14 + "\nbus 1 2"}, AnnotationError, "7.txt:2: 3 columns"),
+        (
+            {"7.xml": "<!DOCTYPE a [<!ENTITY b 'c'>]><annotation/>"},
+            AnnotationError,
+            "document type",
+        ),
+        ({"7.xml": "<annotation>"}, AnnotationError, "not readable as XML"),
+        ({"7.xml": "<html/>"}, AnnotationError, "no <annotation>"),
+        (
+            {"7.xml": "<annotation><object><name>car</name></object></annotation>"},
+            AnnotationError,
+            "expected bndbox",
+        ),
+        ({"7.jpg": ""}, AnnotationError, "no labels of boxes"),
+        ({}, AnnotationError, "no labels of boxes"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(
+    files: dict[str, str], error: type[CrosscueError], said: str, tmp_path: Path
+) -> None:
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+
+    with pytest.raises(error) as raised:
+        read(tmp_path)
+
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_empty_labels_are_an_answer_and_no_labels_are_none(tmp_path: Path) -> None:
+    (tmp_path / "classes.txt").write_text("car\n")
+    (tmp_path / "7.txt").write_text("")
+    assert read(tmp_path).pictures[0].boxes == ()
+
+    empty = {"categories": [{"id": 1, "name": "car"}], "images": [], "annotations": []}
+    (tmp_path / "coco.json").write_text(json.dumps(empty))
+    with pytest.raises(EmptyResultError, match="not one labelled image"):
+        read(tmp_path / "coco.json")

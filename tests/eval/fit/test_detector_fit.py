@@ -1,0 +1,268 @@
+"""Thresholds with a bound that holds, calibrations, and a card that changes what a cue is."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import crosscue
+from crosscue.detectors.catalog.card import read_card
+from crosscue.detectors.catalog.class_scores import Isotonic, Platt
+from crosscue.detectors.networks.mask_rcnn.detector import SOURCE_SCORES
+from crosscue.detectors.training.platt import fit_isotonic, fit_platt
+from crosscue.eval.fit.detector.threshold import (
+    TRIED,
+    fewest_detections,
+    lower_bound,
+    round_between,
+    threshold_for,
+)
+from crosscue.eval.scoring.boxes.reliability import reliability
+from crosscue.replay.base import SchemaError, UsageError
+from support.onnx_models import bright_box_model
+
+
+def test_the_bound_is_clopper_and_pearson_s() -> None:
+    # Of n of n the bound is the n-th root of the risk (the rule of three: about 1 - 3 / n).
+    assert lower_bound(59, 59, 0.95) == pytest.approx(0.05 ** (1 / 59))
+    assert lower_bound(59, 59, 0.95) > 0.95 > lower_bound(58, 58, 0.95)
+    assert lower_bound(0, 10, 0.95) == 0.0
+    n = fewest_detections(0.95, 0.95)
+    assert lower_bound(n, n, 1 - 0.05 / TRIED) >= 0.95 > lower_bound(n - 1, n - 1, 1 - 0.05 / TRIED)
+
+
+def probability(scores: np.ndarray) -> np.ndarray:
+    """Made up: how often a detection with such a score is right."""
+    return 1.0 / (1.0 + np.exp(-12.0 * (scores - 0.45)))
+
+
+def test_a_chosen_threshold_is_too_imprecise_no_more_often_than_stated() -> None:
+    """Simulated: 400 fits to 600 detections each; the true precision above a score is known."""
+    rng = np.random.default_rng(11)
+    grid = np.linspace(0.2, 1.0, 4001)
+    # Scores are uniform, so the precision above s is the mean of the probability over [s, 1].
+    above = np.cumsum(probability(grid)[::-1])[::-1] / np.arange(len(grid), 0, -1)
+    found, too_low = 0, 0
+    for _ in range(400):
+        scores = rng.uniform(0.2, 1.0, 600)
+        is_right = rng.random(600) < probability(scores)
+        chosen = threshold_for(scores, is_right, 0.95, 0.95)
+        if chosen is not None:
+            found += 1
+            too_low += bool(np.interp(chosen.score, grid, above) < 0.95)
+
+    assert found > 300
+    assert too_low / 400 <= 0.05
+
+
+def test_equal_scores_are_on_one_side_and_too_few_choose_nothing() -> None:
+    scores = np.repeat([0.9, 0.5], 200)
+    is_right = np.arange(400) < 200
+
+    chosen = threshold_for(scores, is_right, 0.95, 0.95)
+
+    assert chosen is not None
+    assert (chosen.of, chosen.right, chosen.score, chosen.next_score) == (200, 200, 0.5, 0.9)
+    few = fewest_detections(0.95, 0.95) - 1
+    assert threshold_for(scores[:few], is_right[:few], 0.95, 0.95) is None
+
+
+def test_a_threshold_is_a_short_number_between_its_neighbours() -> None:
+    assert round_between(0.612, 0.6349) == 0.62
+    low, high = 0.123456, 0.123458
+    assert low <= round_between(low, high) < high
+
+
+@pytest.mark.parametrize("fit", [fit_platt, fit_isotonic])
+def test_a_calibration_makes_scores_probabilities_and_keeps_their_order(fit) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(2)
+    scores = rng.random(4000)
+    is_right = rng.random(4000) < probability(scores)
+    by = fit(scores, is_right)
+
+    fresh = rng.random(4000)
+    right = rng.random(4000) < probability(fresh)
+    after = by.probabilities(fresh)
+
+    assert reliability("", fresh, right).error > 0.1
+    assert reliability("", after, right).error < 0.05
+    order = np.argsort(fresh)
+    assert (np.diff(after[order]) > 0.0).all()
+
+
+def test_platt_without_slope_and_offset_changes_nothing() -> None:
+    scores = np.linspace(0.05, 0.95, 10)
+    np.testing.assert_allclose(
+        Platt(kind="platt", slope=1.0, offset=0.0).probabilities(scores), scores
+    )
+
+
+def test_points_that_fall_are_refused() -> None:
+    with pytest.raises(ValueError, match="rising numbers"):
+        Isotonic(kind="isotonic", scores=(0.2, 0.4), fractions=(0.6, 0.5))
+
+
+def test_the_source_s_thresholds_are_its_network_s_only() -> None:
+    vehicle = crosscue.Vehicle(version=1)
+    assert (vehicle.cues.stop_sign_score, vehicle.cars.score) == (None, None)
+    assert SOURCE_SCORES == {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
+    found = crosscue.Detections(
+        0, (64, 48), np.tile([[1.0, 1.0, 9.0, 9.0]], (2, 1)), np.array([0.92, 0.96]),
+        ("car", "car"), (b"", b""),
+    )  # fmt: skip
+    assert found.with_min_scores(SOURCE_SCORES).are_sure(None).tolist() == [False, True]
+    # Another network's scores mean something else: nothing is said of them, so one half.
+    assert found.are_sure(None).tolist() == [True, True]
+    assert found.with_min_scores(SOURCE_SCORES).are_sure(0.5).tolist() == [True, True]
+
+
+PICTURES = 700
+SIZE = (64, 48)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Simulated: pictures with one bright box each, the brighter the more often a traffic light."""
+    folder = tmp_path_factory.mktemp("lights")
+    (folder / "log").mkdir()
+    (folder / "labels").mkdir()
+    (folder / "labels" / "classes.txt").write_text("Traffic-Light\nvan\n")
+    rng = np.random.default_rng(4)
+    for number in range(PICTURES):
+        score = rng.uniform(0.5, 1.0)
+        pixels = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+        pixels[8:24, 16:32] = round(255 * score)
+        cv2.imwrite(str(folder / "log" / f"frame_{number}.png"), pixels)
+        is_light = rng.random() < 1.0 / (1.0 + np.exp(-25.0 * (score - 0.65)))
+        row = f"0 {24 / 64} {16 / 48} {16 / 64} {16 / 48}\n" if is_light else ""
+        (folder / "labels" / f"frame_{number}.txt").write_text(row)
+    (folder / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
+    weights = bright_box_model(by_brightness=True)
+    (folder / "net.onnx").write_bytes(weights)
+    (folder / "net.toml").write_text(
+        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(weights).hexdigest()}"\n'
+        f"[input]\nwidth_px = {SIZE[0]}\nheight_px = {SIZE[1]}\n"
+        '[output]\nkind = "end-to-end"\nclasses = ["traffic light", "bench"]\nscore = 0.3\n'
+    )
+    detected(folder, "net")
+    return folder
+
+
+def detected(folder: Path, card: str) -> crosscue.Run:
+    """Detections of a card, in the folder of its name."""
+    return crosscue.detect_drive(
+        folder / "log", folder / card.replace("net", "run"), detectors=[f"{folder}/{card}.toml"]
+    )
+
+
+def test_a_fitted_card_makes_cues_as_precise_as_asked(drive: Path) -> None:
+    before = crosscue.score_detector(drive / "run", drive / "labels", has_figures=False)
+    found = crosscue.fit_detector(drive / "run", drive / "labels", drive / "net_fitted.toml")
+    run = detected(drive, "net_fitted")
+    after = crosscue.score_detector(run, drive / "labels", has_figures=False)
+
+    (one,) = found.classes
+    assert one.held_out is not None
+    assert one.bound >= 0.95
+    assert one.held_out.precision >= 0.95
+    assert one.held_out.error_after < one.held_out.error_before
+    assert before.scores[0].right + before.scores[0].wrong == PICTURES
+    precise, imprecise = after.scores[1].precision.value, before.scores[1].precision.value
+    assert imprecise < 0.9 < 0.95 <= precise
+    # The cue counts what is above the card's threshold, in the run's own tables.
+    cues = run["cues"].to_pydict()
+    counts = [
+        n for cue, n in zip(cues["cue"], cues["count"], strict=True) if cue == "traffic_light"
+    ]
+    assert sum(counts) == after.scores[1].right + after.scores[1].wrong
+    card = read_card(drive / "net_fitted.toml")
+    assert card.is_calibrated
+    assert card.evidence[0].value == pytest.approx(one.held_out.precision, abs=1e-4)
+    assert "bound" in card.evidence[0].note
+
+    again = crosscue.fit_detector(drive / "run", drive / "labels", card=drive / "net_fitted.toml")
+    assert again.classes[0].scores == one.scores
+
+
+def test_scores_that_are_calibrated_are_not_fitted_again(drive: Path) -> None:
+    run = drive / "run_fitted"
+    if not run.exists():
+        crosscue.fit_detector(drive / "run", drive / "labels", drive / "net_fitted.toml")
+        detected(drive, "net_fitted")
+    with pytest.raises(UsageError, match="calibrated already"):
+        crosscue.fit_detector(run, drive / "labels")
+
+
+def test_a_class_with_few_labels_is_left_as_it_is_and_said(drive: Path, tmp_path: Path) -> None:
+    for number in range(30):
+        text = (drive / "labels" / f"frame_{number}.txt").read_text()
+        (tmp_path / f"frame_{number}.txt").write_text(text)
+    (tmp_path / "classes.txt").write_text("traffic light\n")
+    output = drive / "net_few.toml"
+
+    found = crosscue.fit_detector(drive / "run", tmp_path, output)
+
+    assert not found.has_threshold
+    assert "20 needed: left as it is" in repr(found)
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "meanings", "error", "said"),
+    [
+        ({"frame_9999.txt": "0 .5 .5 .2 .2"}, {}, SchemaError, "none of its 1 images is in"),
+        ({"frame_1.txt": "1 .5 .5 .2 .2"}, {"cat": "dog"}, UsageError, "--map cat=dog: no such"),
+        (
+            {"frame_1.txt": "7 .5 .5 .2 .2"},
+            {},
+            crosscue.CrosscueError,
+            "class 7, but 2 class names",
+        ),
+        ({"frame_1.txt": "0 .5 .5 nan .2"}, {}, crosscue.CrosscueError, "expected numbers"),
+        ({"frame_1.txt": "0 5 5 .2 .2"}, {}, crosscue.EmptyResultError, "no box of a class"),
+        ({"frame_1.txt": ""}, {}, crosscue.EmptyResultError, "no box of a class"),
+        ({}, {}, crosscue.CrosscueError, "no labels of boxes"),
+    ],
+)
+def test_labels_that_do_not_fit_are_one_line_and_leave_nothing(
+    drive: Path,
+    tmp_path: Path,
+    rows: dict[str, str],
+    meanings: dict[str, str],
+    error: type[Exception],
+    said: str,
+) -> None:
+    for name, row in rows.items():
+        (tmp_path / name).write_text(row + "\n")
+    if rows:
+        (tmp_path / "classes.txt").write_text("traffic light\nvan\n")
+    out = tmp_path / "out"
+
+    with pytest.raises(error, match=said) as raised:
+        crosscue.score_detector(drive / "run", tmp_path, out, meanings=meanings)
+
+    assert "\n" not in str(raised.value)
+    assert not out.exists()
+
+
+def test_what_is_left_out_of_labels_is_counted(drive: Path, tmp_path: Path) -> None:
+    box = (drive / "labels" / "frame_0.txt").read_text() or "0 .375 .333 .25 .333\n"
+    (tmp_path / "classes.txt").write_text("traffic light\nvan\n")
+    (tmp_path / "frame_0.txt").write_text(box + "0 .95 .5 .2 .2\n0 3 3 .1 .1\n1 .5 .5 .2 .2\n")
+    (tmp_path / "frame_9999.txt").write_text(box)
+
+    found = crosscue.score_detector(drive / "run", tmp_path, tmp_path / "out", has_figures=False)
+
+    assert dict(found.labelled.left_out) == {
+        "images that are not in the run": 1,
+        "boxes cut off at the picture's edge": 1,
+        "boxes outside the picture, or without area": 1,
+        "boxes of classes that the detector does not report (van)": 1,
+    }
+    page = found.report.read_text()
+    assert "1 images that are not in the run" in page
+    assert found.parts.num_rows == len(found.scores)
