@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.datasets.truth.box_labels import read_box_labels
+from crosscue.datasets.truth.box_labels import class_names_given, read_box_labels
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.entries import card_path, names
 from crosscue.eval.fit.detector.card_text import check_place, with_fit
@@ -21,7 +21,6 @@ from crosscue.eval.fit.detector.class_fit import (
     Judged,
     fit_class,
 )
-from crosscue.eval.interface.runs.detector_scores import names_given
 from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.runs.manifest import DetectorRow
@@ -210,7 +209,7 @@ def fit_detector(
     moved = None if logs is None else Path(logs)
     places = [run.path if isinstance(run, Run) else Path(run) for run in (*given, *test)]
     folders = [open_run(place, moved, limits=limits) for place in places]
-    listed = names_given(class_names)
+    listed = class_names_given(class_names)
     read = [read_box_labels(Path(path), kind, listed) for path in (*theirs, *test_labels)]
     whole = [
         labelled_run(folder, one, detector, meanings)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.datasets.truth.box_labels import BoxLabels, read_box_labels
+from crosscue.datasets.truth.box_labels import BoxLabels, class_names_given, read_box_labels
 from crosscue.eval.report.detector_page import write_detector_page
 from crosscue.eval.report.worst_boxes import worst_pictures
 from crosscue.eval.runs.folder import open_run
@@ -20,10 +20,8 @@ from crosscue.eval.scoring.boxes.reliability import Reliability, reliability
 from crosscue.eval.scoring.boxes.scores import SEED, Measured, PartScore, score_parts
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
-    MIB,
     Limits,
     UsageError,
-    read_at_most,
     strict_json,
     visible,
     write_text,
@@ -230,7 +228,7 @@ def score_detector(
     if draw < 0:
         raise UsageError(f"--draw {draw}: expected 0 or more")
     folder = open_run(_path_of(run), _maybe(logs), without_images=without_images, limits=limits)
-    read = read_box_labels(Path(labels), kind, names_given(class_names))
+    read = read_box_labels(Path(labels), kind, class_names_given(class_names))
     of = labelled_run(folder, read, detector, meanings)
     scores = score_parts(
         of.truth,
@@ -278,29 +276,6 @@ def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
         judged = ~matched.is_out[0]
         found.append(reliability(name, matched.scores[judged], matched.is_right[0][judged]))
     return tuple(found)
-
-
-def names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
-    """Class names, or those of a file with one a line.
-
-    Raises:
-        UsageError: The file cannot be read, or is empty.
-    """
-    if not isinstance(given, Path | str):
-        return tuple(given)
-    path = Path(given)
-    try:
-        content = read_at_most(path, MIB)
-        if content is None:
-            raise UsageError(f"{path}: over 1 MiB; give class names, one a line")
-        lines = content.decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"{path}: {why}; give class names, one a line") from None
-    names = tuple(line.strip() for line in lines if line.strip())
-    if not names:
-        raise UsageError(f"{path}: no name in it; give class names, one a line")
-    return names
 
 
 def _path_of(run: Run | Path | str) -> Path:
