@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -33,6 +33,9 @@ class Measured:
     value: float
     low: float
     high: float
+
+
+_UNKNOWN: Final = Measured(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +99,9 @@ def score_parts(
             row.scored(name, part, thresholds[name])
             for name, row in zip(classes, rows, strict=True)
         ]
+        if part in RANGES and not np.isfinite(found.range_m).any():
+            # Without a range of its own a false detection belongs nowhere.
+            some = [replace(one, precision=_UNKNOWN) for one in some]
         known = [row for row in rows if row.labels]
         if known and part is ALL:
             scores.append(_mean(known, some))
@@ -207,7 +213,6 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
         rounds = np.stack([getattr(row, f"{name}_rounds") for row in rows]).mean(axis=0)
         return _measured(float(np.mean([getattr(row, name)[0] for row in rows])), rounds)
 
-    unknown = Measured(math.nan, math.nan, math.nan)
     return PartScore(
         "all",
         ALL.name,
@@ -217,8 +222,8 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
         math.nan,
         over("ap"),
         over("ap50"),
-        unknown,
-        unknown,
+        _UNKNOWN,
+        _UNKNOWN,
     )
 
 
