@@ -1,7 +1,7 @@
 """The lowest score above which a detector is precise enough, with a bound that can be relied on.
 
 The bound is Clopper and Pearson's (Biometrika 26, 1934), one-sided. Since the threshold is chosen
-by looking at the same detections, each of ``TRIED`` candidates is held to a share of the allowed
+by looking at the same detections, each of ``TRIED`` candidates is held to a part of the allowed
 risk (Bonferroni), so that with the stated confidence no candidate that passes is less precise than
 asked for. Candidates are fixed by how many detections lie above them, never by which are right.
 

@@ -204,7 +204,7 @@ def fit_detector(
         )
 
     if card is not None:
-        # What is wrong with a file is reported before any run is looked at.
+        # What is wrong with a file is reported before any run is opened.
         read_card(Path(card))
     moved = None if logs is None else Path(logs)
     places = [run.path if isinstance(run, Run) else Path(run) for run in (*given, *test)]

@@ -201,8 +201,8 @@ class _Row:
             threshold,
             _measured(float(self.ap[0]), self.ap_rounds),
             _measured(float(self.ap50[0]), self.ap50_rounds),
-            _share(right, np.concatenate([right, wrong]), self.weights),
-            _share(right, self.matched.labels, self.weights),
+            _fraction_of(right, np.concatenate([right, wrong]), self.weights),
+            _fraction_of(right, self.matched.labels, self.weights),
         )
 
 
@@ -231,7 +231,7 @@ def _measured(value: float, rounds: Floats) -> Measured:
     return Measured(value, *interval_of(rounds))
 
 
-def _share(right: Int64s, of: Int64s, weights: Floats | None) -> Measured:
+def _fraction_of(right: Int64s, of: Int64s, weights: Floats | None) -> Measured:
     """Pictures of what is right, of those of everything."""
     value = len(right) / len(of) if len(of) else math.nan
     if weights is None or not len(of):
