@@ -90,14 +90,16 @@ def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str
     held = fit.held_out
     row: dict[str, object] = {
         "pictures": pictures,
+        "boxes": held.labels,
         "metric": f"precision of {fit.name} above {fit.scores.threshold:g}, held out",
         "value": round(held.precision, 4) if held.of else 0.0,
     }
     if held.of:
         row |= {"low": round(held.interval.low, 4), "high": round(held.interval.high, 4)}
-    when = f", {measured}" if measured else ""
+    if measured:
+        row["measured"] = measured
     row["note"] = (
-        f"{WRITTEN_BY}{when}: {aim}; fitted to {fit.labels} boxes and {fit.detections} detections, "
+        f"{WRITTEN_BY}: {aim}; fitted to {fit.labels} boxes and {fit.detections} detections, "
         f"bound {fit.bound:.4f}; held out {held.right} of {held.of} right, recall "
         f"{held.right} of {held.labels}"
     )
