@@ -99,10 +99,10 @@ def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion,
                 if is_row:
                     values.append(value)
                     clusters.append(number)
-    return {kind: (_share(*right[kind]), _share(*found[kind])) for kind in right}
+    return {kind: (_fraction(*right[kind]), _fraction(*found[kind])) for kind in right}
 
 
-def _share(values: list[bool], clusters: list[int]) -> Proportion:
+def _fraction(values: list[bool], clusters: list[int]) -> Proportion:
     return share(np.array(values, np.bool_), np.array(clusters, np.int64))
 
 

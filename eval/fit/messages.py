@@ -19,6 +19,7 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.travelled import odometer_of
+from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
 from crosscue.eval.scoring.intervals import Interval, mean_by_cluster, wilson
 from crosscue.eval.scoring.truth import CROSSING_NS
 from crosscue.fusion.factor_graph import FactorGraph, graph_of

@@ -180,13 +180,12 @@ def _simulated(
     has cars followed on the road: of the published pairs most are wrong there.
     """
     from crosscue.datasets.scenes.car_file import with_fitted_noise
-    from crosscue.datasets.simulated.drive import DriveSettings
     from crosscue.detectors.registry import EMBEDDED
 
     files = simulate_approach(
         folder / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
     )
-    fitted = with_fitted_noise(files.vehicle.read_text("utf-8"), DriveSettings(seed=seed), WAY_M)
+    fitted = with_fitted_noise(files.vehicle.read_text("utf-8"), seed, WAY_M)
     write_text(files.vehicle, fitted + FOLLOWED)
     return KnownDrive(files.log, files.vehicle, files.truth, "", tuple(EMBEDDED.split(",")))
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from .drives import DriveJudged, as_metrics, score
 from .metric_values import MetricValue, metric_values
 from .pose.score import PoseScore
 
@@ -63,9 +62,14 @@ def direction(path: str) -> Direction | None:
     return None if set(parts) & set(PARTS) else BETTER.get(parts[-1])
 
 
-def parts_of(log: str, judged: DriveJudged, pose: PoseScore | None) -> Iterator[DriveMetric]:
-    """What one drive adds to every judged metric."""
-    tree = as_metrics(score([judged]))
+def parts_of(log: str, tree: Mapping[str, Any], pose: PoseScore | None) -> Iterator[DriveMetric]:
+    """What one drive adds to every judged metric.
+
+    Args:
+        log: Identity of its log.
+        tree: Its own scores as ``as_metrics`` returns them.
+        pose: None where it was not scored.
+    """
     sections = {name: tree[name] or {} for name in ("cues", "approaches", "belief", "range")}
     values = metric_values(sections, parts=False)
     for path, value in values.items():

@@ -316,7 +316,7 @@ def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str
 
 def _parts(one: RunScored) -> Iterator[by_drive.DriveMetric]:
     logs = "+".join(sorted(log.identity.digest for log in one.run.drive_manifest().logs))
-    return by_drive.parts_of(logs, one.judged, one.pose)
+    return by_drive.parts_of(logs, as_metrics(score([one.judged])), one.pose)
 
 
 def _writer(table: pa.Table) -> Any:

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, wilson
+from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
 from crosscue.replay.columns import Floats
 
 Z_95: Final = 1.959964

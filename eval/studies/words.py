@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-from crosscue.eval.scoring.intervals import TOO_FEW
-
-from .intervals import Measured
+from .intervals import TOO_FEW, Measured
 
 
 def km(value: Measured, digits: int = 2) -> str:

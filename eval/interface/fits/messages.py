@@ -9,10 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.datasets.truth.truth import load
-from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs, rates_of, section_of
+from crosscue.eval.fit.messages import (
+    TOO_FEW,
+    Annotated,
+    annotate,
+    graph_of_runs,
+    rates_of,
+    section_of,
+)
 from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.interface.show import listing
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from crosscue.eval.catalog.compare import Comparison
     from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
     from crosscue.eval.report.score_runs import Scored
-    from crosscue.eval.scoring.scene.detection import Definition
 
 VEHICLE: Final = "vehicle.toml"
 
@@ -355,7 +354,7 @@ def score_run(
     truth: Path | str | None = None,
     *,
     threshold: float = 0.9,
-    detection: Definition = "confirmed",
+    detection: Literal["confirmed", "published"] = "confirmed",
     rpe_m: Sequence[float] = (10.0, 100.0),
     any_log: bool = False,
     has_figures: bool = True,

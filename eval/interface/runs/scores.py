@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.interface.runs.run import Run, ScoredRun
@@ -29,7 +29,6 @@ from crosscue.eval.scoring.runs import (
     scores_of,
     write_scores,
 )
-from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.eval.studies.attribution import (
     Attribution,
     Drive,
@@ -154,7 +153,7 @@ def score_runs(
     *,
     gates: Path | str | None = None,
     threshold: float = 0.9,
-    detection: Definition = "confirmed",
+    detection: Literal["confirmed", "published"] = "confirmed",
     rpe_m: Sequence[float] = (10.0, 100.0),
     has_attribution: bool = False,
     has_smoother: bool = False,

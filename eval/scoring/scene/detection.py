@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.truth import DriveTruth
-from crosscue.replay.columns import Int64s
 
 Definition = Literal["confirmed", "published"]
 CONFIRM_FRAMES: Final = 3
@@ -52,7 +51,9 @@ def held(holds: Flags, frames: int) -> Flags:
     return found
 
 
-def is_range_right(tables: RunTables, truth: DriveTruth, number: int | None, t_ns: Int64s) -> Flags:
+def is_range_right(
+    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: NDArray[np.int64]
+) -> Flags:
     """Is the latest range at each time within its 95 % interval of the true one?
 
     Of the ranges to start and end one is enough. Where the truth has none, nothing can be wrong.

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from crosscue.eval.scoring.intervals import TOO_FEW, Mean, Proportion, wilson
+from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
+from crosscue.eval.scoring.intervals import Mean, Proportion, wilson
 from crosscue.eval.scoring.scene.approaches import ApproachResult
 from crosscue.eval.scoring.scene.cues import CueScore
 from crosscue.eval.studies.intersections.scores import StudyScores

@@ -13,7 +13,7 @@ from crosscue.eval.studies.pictures import COLOURS, figure, save
 from crosscue.localization.town.drive import Outcome
 from crosscue.replay.columns import Floats
 
-from .range_study import CompassResult, points
+from .range_study import CALIBRATED_DEG, PREDICTED, PUBLISHED_M, Choice, CompassResult, points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 KM: Final = 1e-3
 FIRST_GOAL_KM: Final = 25.0
 NAME: Final = "range"
+CHOICES: Final = "range_choices"
 
 
 def draw(
@@ -91,3 +92,34 @@ def _survival(axes: Axes, result: CompassResult, columns: dict[str, Floats], col
         )
     if math.isfinite(result.published_m):
         axes.axvline(result.published_m * KM, color=colour, ls=":", lw=1.4)
+
+
+def draw_choices(choices: Sequence[Choice], folder: Path) -> Path:
+    """Write ``range_choices.png`` and ``range_choices.svg``."""
+    made, axes = figure(2, 12.0, 4.6)
+    for panel, compass in zip(axes, (CALIBRATED_DEG, PREDICTED[0]), strict=True):
+        for i, slip in enumerate(dict.fromkeys(one.slip_per_sqrt_m for one in choices)):
+            mine = [one for one in choices if one.slip_per_sqrt_m == slip]
+            found = np.array([one.lost_after_m[compass] for one in mine]) / 1e3
+            panel.errorbar(
+                [one.compass_interval_m for one in mine],
+                found[:, 0],
+                np.nan_to_num(np.abs(found[:, 1:] - found[:, :1]).T),
+                color=COLOURS[i % len(COLOURS)],
+                marker="o",
+                ms=3,
+                lw=1.2,
+                label=f"slip {slip:g} m per root m",
+            )
+        for one in choices:
+            if one.is_studied:
+                panel.axvline(one.compass_interval_m, color="0.6", lw=0.9)
+        panel.axhline(PUBLISHED_M[compass] / 1e3, color="0.2", ls="--", lw=1.0)
+        panel.set_ylim(bottom=0.0)
+        panel.set_xlabel("distance between independent compass readings (m)")
+        panel.set_ylabel("mean distance at loss (km)")
+        role = "calibrated here" if compass == CALIBRATED_DEG else "predicted"
+        panel.set_title(f"compass ±{compass:g}°: {role}; dashed: published", fontsize=9)
+    axes[0].legend(frameon=False, fontsize=8)
+    made.suptitle("Other choices of slip and compass interval, simulated", fontsize=11)
+    return save(made, folder, CHOICES)

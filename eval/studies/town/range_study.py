@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import product
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -29,6 +30,16 @@ if TYPE_CHECKING:
 PUBLISHED_M: Final = {10.0: math.inf, 20.0: 20_800.0, 30.0: 9_300.0, None: 300.0}
 """Mean distance at loss by compass 2-sigma in degrees; infinite: never lost."""
 CALIBRATED_DEG: Final = 30.0
+SLIPS: Final = (0.5, 1.0, 2.0, 3.0)
+"""Times the study's own."""
+INTERVALS: Final = (0.6, 0.8, 0.95, 1.0, 1.25, 1.6)
+"""Times the study's own."""
+PREDICTED: Final = (20.0, None)
+"""Compasses whose published figure was not calibrated to; infinite ones need no curve."""
+FRACTION: Final = 10
+"""Of the study's drives, one in so many for each choice."""
+BLOCK: Final = 1000
+"""Of seeds, which no case of the study uses."""
 CALIBRATION_SEED: Final = 424_242
 CALIBRATION_DRIVES: Final = 2_000
 
@@ -229,3 +240,75 @@ def _crossing(start: float, linear: float, square: float, limit_m: float) -> flo
     if square > 0.0:
         return (math.sqrt(linear**2 + 4.0 * square * short) - linear) / (2.0 * square)
     return short / linear if linear > 0.0 else math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The distance at loss with one slip and one compass interval.
+
+    Attributes:
+        slip_per_sqrt_m: S.d. of a wheel's path after one metre.
+        compass_interval_m: Distance between readings with errors of their own.
+        is_studied: The choice of the study itself.
+        drives: With each compass.
+        lost_after_m: Mean by compass 2-sigma in degrees; None without a compass.
+    """
+
+    slip_per_sqrt_m: float
+    compass_interval_m: float
+    is_studied: bool
+    drives: int
+    lost_after_m: dict[float | None, Measured]
+
+
+def drive_choices(study: RangeStudy, workers: int = 2) -> tuple[Choice, ...]:
+    """Drive every pair of slip and interval; seconds for a full study."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    sensors, count = study.drive.sensors, max(study.drives // FRACTION, 1)
+    with ThreadPoolExecutor(workers) as pool:
+        return tuple(
+            pool.map(
+                lambda pair: _choice(study, pair, count),
+                [
+                    (slip * sensors.slip_per_sqrt_m, max(times * sensors.compass_interval_m, 1.0))
+                    for slip, times in product(SLIPS, INTERVALS)
+                ],
+            )
+        )
+
+
+def _choice(study: RangeStudy, pair: tuple[float, float], count: int) -> Choice:
+    slip, interval_m = pair
+    own = study.drive.sensors
+    sensors = own.model_copy(update={"slip_per_sqrt_m": slip, "compass_interval_m": interval_m})
+    drive = study.drive.model_copy(update={"sensors": sensors})
+    seeds = np.array([key_of(study.seed, BLOCK, i) for i in range(count)], np.uint64)
+    return Choice(
+        slip_per_sqrt_m=slip,
+        compass_interval_m=interval_m,
+        is_studied=(slip, interval_m) == (own.slip_per_sqrt_m, own.compass_interval_m),
+        drives=count,
+        lost_after_m={
+            compass: _lost_after(drive, compass, seeds) for compass in (CALIBRATED_DEG, *PREDICTED)
+        },
+    )
+
+
+def _lost_after(
+    drive: Drive, compass: float | None, seeds: np.typing.NDArray[np.uint64]
+) -> Measured:
+    rows = drive_many(changed(drive, compass_2sigma_deg=compass, goals=UNTIL_LOST), seeds)
+    lost = rows[:, Result._fields.index("outcome")] == Outcome.LOST
+    return mean_of(rows[lost, Result._fields.index("travelled_m")])
+
+
+def choice_tree(choice: Choice) -> dict[str, object]:
+    """As in ``summary.json``; the compass is named in degrees, or ``none``."""
+    return {
+        **asdict(choice),
+        "lost_after_m": {
+            "none" if compass is None else f"{compass:g}": mean
+            for compass, mean in choice.lost_after_m.items()
+        },
+    }

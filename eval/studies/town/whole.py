@@ -14,7 +14,7 @@ from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import Result
 from crosscue.replay.base import RunError, json_tree, strict_json, write_text
 
-from . import choices, landmark_figure, landmark_study, range_figure, range_study
+from . import landmark_figure, landmark_study, range_figure, range_study
 from .settings import LandmarkStudy, RangeStudy
 from .work import DRIVES, assemble, chunks_of, run
 
@@ -74,16 +74,16 @@ def finish_range(study: RangeStudy, folder: Path) -> Made:
     picture = range_figure.draw(
         results, list(range_study.split(table)), study.drive.navigation.lost_above_m, folder
     )
-    others = choices.drive_choices(study)
+    others = range_study.drive_choices(study)
     return _finish(
         study,
         folder,
         "Range without landmarks",
         [asdict(r) for r in results],
-        (*range_tables(results), choices.table(others)),
+        (*range_tables(results), choices_table(others)),
         (OURS, *RANGE_NOTES),
-        [picture, choices.draw(others, folder)],
-        choices=[choices.as_dict(one) for one in others],
+        [picture, range_figure.draw_choices(others, folder)],
+        choices=[range_study.choice_tree(one) for one in others],
     )
 
 
@@ -157,6 +157,35 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
                 )
                 for r in results
             ),
+        ),
+    )
+
+
+def choices_table(choices: Sequence[range_study.Choice]) -> Table:
+    """Every choice beside the published figures."""
+    published = [
+        f"{range_study.PUBLISHED_M[c] / 1e3:.1f} published"
+        for c in (range_study.CALIBRATED_DEG, *range_study.PREDICTED)
+    ]
+    return Table(
+        f"Mean distance at loss with other choices, km ({choices[0].drives} drives each)",
+        (
+            "slip, m per root m",
+            "compass interval, m",
+            f"30 degrees, {published[0]}",
+            f"20 degrees, {published[1]}",
+            f"none, {published[2]}",
+        ),
+        tuple(
+            (
+                f"{one.slip_per_sqrt_m:g}",
+                f"{one.compass_interval_m:.3f}" + (" (studied)" if one.is_studied else ""),
+                *(
+                    km(one.lost_after_m[c])
+                    for c in (range_study.CALIBRATED_DEG, *range_study.PREDICTED)
+                ),
+            )
+            for one in choices
         ),
     )
 

@@ -24,7 +24,7 @@ def test_simulated_drives_are_as_wrong_as_their_noise_says(tmp_path: Path) -> No
         settings = DriveSettings(seed=seed, blocks=1, block_m=70.0)
         files = write_drive(tmp_path / str(seed), settings)
         text = files.vehicle.read_text("utf-8")
-        files.vehicle.write_text(with_fitted_noise(text, settings, files.metres))
+        files.vehicle.write_text(with_fitted_noise(text, seed, files.metres))
         with open_log(files.log) as log:
             run = create(tmp_path / f"run {seed}", overwrite=False)
             found = replay_drive([log], load(files.vehicle), run, EVERYTHING).run

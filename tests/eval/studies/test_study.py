@@ -26,12 +26,12 @@ from crosscue.eval.studies.intervals import (
 )
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.town import work
-from crosscue.eval.studies.town.choices import drive_choices
 from crosscue.eval.studies.town.field_study import drive_field, finish_field
 from crosscue.eval.studies.town.landmark_study import comparisons_of
 from crosscue.eval.studies.town.range_study import (
     CALIBRATION_SEED,
     calibrate,
+    drive_choices,
     implied_m,
     summarise,
 )
