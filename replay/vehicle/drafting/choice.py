@@ -28,7 +28,7 @@ from .observed import Bus, Observed
 from .series import Grid, Series
 
 USUAL_RADIUS_M: Final = 0.32
-"""Of a car's wheel, to tell whether it moves where nothing shows the true one."""
+"""Of a car's wheel, to decide whether it moves where nothing shows the true one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
