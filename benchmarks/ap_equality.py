@@ -38,8 +38,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from crosscue.detectors.base import Choice, Detections, Frame, View
-from crosscue.detectors.catalog.entries import card_path, entry, place_of
+from crosscue.detectors.catalog.entries import entry, place_of
 from crosscue.detectors.catalog.fetch import fetch
+from crosscue.detectors.catalog.places import card_path
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.registry import make
 

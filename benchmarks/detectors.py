@@ -18,8 +18,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of
+from crosscue.datasets.scenes.drive import jpeg
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, View
 from crosscue.detectors.cues.frame import CuePass

@@ -24,8 +24,9 @@ from statistics import median
 
 import numpy as np
 
-from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run

@@ -35,7 +35,7 @@ from crosscue.eval.batch.jobs import Job, in_turn, run_many
 from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.batch.processes import Processes
 from crosscue.eval.runs.folder import RunFolder, clear, create, locked, open_run, write_manifest
-from crosscue.eval.runs.tables.table_sink import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 

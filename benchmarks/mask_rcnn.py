@@ -33,8 +33,8 @@ import torch
 from torch import Tensor, nn
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
-from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration, Checkpoint, Facts

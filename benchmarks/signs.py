@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.signs.detector import POINTS_DRAWN, SignSettings, build, orb_points

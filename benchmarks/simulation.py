@@ -18,9 +18,10 @@ from tempfile import TemporaryDirectory
 
 import cv2
 
-from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of, write_scene
+from crosscue.datasets.scenes.drive import jpeg, write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 
 
 def cpu_s(work: Callable[[], object]) -> float:

@@ -38,14 +38,14 @@ _EXPORTS: Final = {
     "Signals": "eval.interface.logs.log",
     "DriveSummary": "eval.interface.logs.summary",
     "Run": "eval.interface.runs.run",
-    "ScoredRun": "eval.interface.runs.run",
+    "ScoredRun": "eval.interface.runs.score",
     "open_run": "eval.interface.runs.run",
-    "replay_drive": "eval.interface.runs.run",
-    "detect_drive": "eval.interface.runs.run",
-    "estimate_run": "eval.interface.runs.run",
-    "score_run": "eval.interface.runs.run",
-    "compare_runs": "eval.interface.runs.run",
-    "save_recording": "eval.interface.runs.run",
+    "replay_drive": "eval.interface.runs.make",
+    "detect_drive": "eval.interface.runs.make",
+    "estimate_run": "eval.interface.runs.make",
+    "score_run": "eval.interface.runs.score",
+    "compare_runs": "eval.interface.runs.compare",
+    "save_recording": "eval.interface.runs.recording",
     "load_vehicle": "eval.interface.runs.run",
     "demo": "eval.interface.demo",
     "Demo": "eval.interface.demo",
@@ -175,7 +175,7 @@ _EXPORTS: Final = {
     "MeasuredMaskRcnn": "eval.interface.training.mask_rcnn",
     "run_intersection_study": "eval.interface.studies.intersections",
     "IntersectionResult": "eval.interface.studies.intersections",
-    "IntersectionStudy": "eval.studies.intersections.study",
+    "IntersectionStudy": "eval.studies.intersections.settings",
 }
 """From a public name to its module."""
 
@@ -254,19 +254,19 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.batch import ReplayedDrives as ReplayedDrives
     from crosscue.eval.interface.runs.batch import find_drives as find_drives
     from crosscue.eval.interface.runs.batch import replay_drives as replay_drives
+    from crosscue.eval.interface.runs.compare import compare_runs as compare_runs
     from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
     from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
+    from crosscue.eval.interface.runs.make import detect_drive as detect_drive
+    from crosscue.eval.interface.runs.make import estimate_run as estimate_run
+    from crosscue.eval.interface.runs.make import replay_drive as replay_drive
+    from crosscue.eval.interface.runs.recording import save_recording as save_recording
     from crosscue.eval.interface.runs.run import Run as Run
-    from crosscue.eval.interface.runs.run import ScoredRun as ScoredRun
-    from crosscue.eval.interface.runs.run import compare_runs as compare_runs
-    from crosscue.eval.interface.runs.run import detect_drive as detect_drive
-    from crosscue.eval.interface.runs.run import estimate_run as estimate_run
     from crosscue.eval.interface.runs.run import load_vehicle as load_vehicle
     from crosscue.eval.interface.runs.run import open_run as open_run
-    from crosscue.eval.interface.runs.run import replay_drive as replay_drive
     from crosscue.eval.interface.runs.run import run_schema as run_schema
-    from crosscue.eval.interface.runs.run import save_recording as save_recording
-    from crosscue.eval.interface.runs.run import score_run as score_run
+    from crosscue.eval.interface.runs.score import ScoredRun as ScoredRun
+    from crosscue.eval.interface.runs.score import score_run as score_run
     from crosscue.eval.interface.runs.scores import ScoredRuns as ScoredRuns
     from crosscue.eval.interface.runs.scores import score_runs as score_runs
     from crosscue.eval.interface.runs.tables import MergedRuns as MergedRuns
@@ -313,7 +313,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft
     from crosscue.eval.interface.vehicles import check_vehicle as check_vehicle
     from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
-    from crosscue.eval.studies.intersections.study import IntersectionStudy as IntersectionStudy
+    from crosscue.eval.studies.intersections.settings import IntersectionStudy as IntersectionStudy
     from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy

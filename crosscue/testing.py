@@ -36,7 +36,7 @@ from crosscue.replay.logs.opening import open_log
 if TYPE_CHECKING:
     from crosscue.detectors.base import Detector, Found, Frame
     from crosscue.replay.base import Block
-    from crosscue.replay.vehicle.cue_spec import CueSpec
+    from crosscue.replay.vehicle.vehicle import CueSpec
 
 __all__ = ["check_cue", "check_dataset", "check_detector", "check_reader"]
 

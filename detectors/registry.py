@@ -19,7 +19,7 @@ from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.plugins import GROUPS
 
 from .base import Choice, Detector
-from .catalog import entries as catalog
+from .catalog import places as catalog
 
 GROUP: Final = GROUPS["detector"]
 

@@ -37,7 +37,7 @@ from .belief import (
     source_speaker,
 )
 from .calibrated import CalibratedMessageModel, voices_of
-from .evidence import FrameEvidence, RangePosterior, SignRange
+from .evidence import FrameEvidence, PastCues, RangePosterior, SignRange
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
 from .persistence import Confirmed, Persistence, PersistentSpeaker
@@ -87,10 +87,6 @@ class Step:
     probabilities: Mapping[str, float] = field(default_factory=dict)
     established: bool = False
     not_believed: Mapping[str, str] = field(default_factory=dict)
-
-
-PastCues = Callable[[RangeBelief | None, Reference | None], Mapping[str, int]]
-"""Cues that need to know where the intersection is: from the best range to counts."""
 
 
 def no_past_cues(best: RangeBelief | None, reference: Reference | None) -> Mapping[str, int]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from .intersection_range import Reference
+from .intersection_range import RangeBelief, Reference
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,3 +69,7 @@ class FrameEvidence:
     turned_rad: float | None = None
     assumed_m: float = 0.0
     posteriors: tuple[RangePosterior, ...] = ()
+
+
+PastCues = Callable[[RangeBelief | None, Reference | None], Mapping[str, int]]
+"""Cues that need to know where the intersection is: from the best range to counts."""

@@ -73,8 +73,10 @@ from .ledger import (
     Detail,
     Ledger,
     TopicAccount,
+    warn_of,
 )
 from .limits import DEFAULT_LIMITS, MIB, Limits
+from .losses import LossWarning, losses_heard, warn_again, with_losses
 from .safe_text import visible
 from .versions import installed, versions
 
@@ -116,6 +118,7 @@ __all__ = [
     "LogError",
     "LogFormatError",
     "LogTooLargeError",
+    "LossWarning",
     "Messages",
     "MissingTopicError",
     "OutputError",
@@ -135,6 +138,7 @@ __all__ = [
     "file_sha256",
     "installed",
     "json_tree",
+    "losses_heard",
     "one_line",
     "read_at_most",
     "report_missing",
@@ -143,6 +147,9 @@ __all__ = [
     "toml_tree",
     "versions",
     "visible",
+    "warn_again",
+    "warn_of",
+    "with_losses",
     "write_bytes",
     "write_text",
     "write_whole",

@@ -14,12 +14,14 @@ the log is then not whole, and the summary says "at least".
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol, TypeVar
 
 from .errors import AccountError
+from .losses import LossWarning
 
 DETAILS_KEPT: Final = 1000
 """Single skips and losses kept with time and text; counts are exact beyond it."""
@@ -282,3 +284,11 @@ class Ledger:
     def _keep(self, detail: Detail) -> None:
         if len(self.details) < DETAILS_KEPT:
             self.details.append(detail)
+
+
+def warn_of(ledger: Ledger) -> None:
+    """Warn of all that was dropped from a log."""
+    for drop in ledger.drops():
+        detail = f" ({drop.detail})" if drop.detail else ""
+        text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"
+        warnings.warn(text, LossWarning, stacklevel=3)

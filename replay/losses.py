@@ -9,11 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
-
-if TYPE_CHECKING:
-    from crosscue.replay.base import Ledger
-
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -21,14 +17,6 @@ R = TypeVar("R")
 
 class LossWarning(UserWarning):
     """Something of a log was dropped, in one line."""
-
-
-def warn_of(ledger: Ledger) -> None:
-    """Warn of all that was dropped from a log."""
-    for drop in ledger.drops():
-        detail = f" ({drop.detail})" if drop.detail else ""
-        text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"
-        warnings.warn(text, LossWarning, stacklevel=3)
 
 
 def with_losses(work: Callable[[T], R], one: T) -> tuple[R, tuple[str, ...]]:

@@ -17,8 +17,8 @@ from typing import Annotated, Final, Literal
 from pydantic import Field, ValidationError
 
 from crosscue.detectors.catalog.card import Hash
-from crosscue.detectors.catalog.entries import user_cache
 from crosscue.detectors.catalog.fetch import DATA
+from crosscue.detectors.catalog.places import user_cache
 from crosscue.detectors.settings import Settings
 from crosscue.replay.base import (
     MIB,

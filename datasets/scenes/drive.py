@@ -15,7 +15,8 @@ import numpy as np
 
 from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.datasets.scenes.rendering.render import DEFAULTS, Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.simulated.drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
 from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
@@ -28,7 +29,6 @@ from crosscue.replay.base import (
     Ledger,
     Messages,
     Topic,
-    UsageError,
     json_tree,
     read_at_most,
     sha256_of,
@@ -41,11 +41,11 @@ from crosscue.replay.files.made_of import SIMULATED, made_of, refuse_another
 from crosscue.replay.write.convert import LogWriter
 
 from .car_file import vehicle_text
-from .conditions import Conditions, conditions_of
+from .conditions import Conditions
 from .cues import CueRuns, present
-from .layout import Layout, layout_named
+from .layout import Layout
 from .mobileye import Device
-from .world import World, build
+from .world import World
 
 MADE_OF: Final = SIMULATED
 """Says which drive a folder holds."""
@@ -53,7 +53,6 @@ CAR_BUS: Final = "/can/car"
 MOBILEYE_BUS: Final = "/can/mobileye"
 IMAGES: Final = "/camera/image/compressed"
 CALIBRATION: Final = "/camera/camera_info"
-CAMERA: Final = Camera()
 SOURCE: Final = "simulated by crosscue, exact"
 TOPICS: Final = (
     Topic(CAR_BUS, "crosscue/CanFrames", "columns"),
@@ -63,44 +62,6 @@ TOPICS: Final = (
     Topic("/imu", "sensor_msgs/msg/Imu", "columns"),
     Topic("/compass", "sensor_msgs/msg/MagneticField", "columns"),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class SceneSettings:
-    """One run to simulate.
-
-    Attributes:
-        layout: ``A`` to ``H``, or ``L`` and a seed.
-        run: From 1; ten are laid down, more come from the seed.
-        seed: Everything random about the run comes from it; plan and buildings do not.
-        rate_hz: Pictures a second.
-        camera: Size, lens, mounting.
-        picture: How pictures are made.
-    """
-
-    layout: str = "A"
-    run: int = 1
-    seed: int = 0
-    rate_hz: int = 10
-    camera: Camera = CAMERA
-    picture: PictureSettings = DEFAULTS
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be.
-
-        Raises:
-            ValueError: Naming what was wanted.
-        """
-        layout_named(self.layout)
-        if self.run < 1 or self.seed < 0:
-            raise ValueError(f"run {self.run}, seed {self.seed}: expected 1 or more, 0 or more")
-        if self.rate_hz not in (10, 20, 25, 50):
-            raise ValueError(f"rate_hz: expected 10, 20, 25 or 50, got {self.rate_hz}")
-
-    @property
-    def name(self) -> str:
-        """As its folder is called."""
-        return f"{self.layout}-{self.run:02d}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,24 +81,6 @@ class SceneFiles:
     truth: Path
     pictures: int
     seconds: float
-
-
-def camera_of_width(width_px: int) -> Camera:
-    """The camera of simulated drives with pictures of another size; they are 9/16 high.
-
-    Raises:
-        UsageError: Not a size that it has.
-    """
-    if not 64 <= width_px <= 3840 or width_px % 16:
-        raise UsageError(f"--width {width_px}: expected a multiple of 16 from 64 to 3840")
-    return Camera(width_px=width_px, height_px=width_px * 9 // 16)
-
-
-def world_of(settings: SceneSettings) -> tuple[Layout, Conditions, World]:
-    """The world that a run happens in."""
-    layout = layout_named(settings.layout)
-    conditions = conditions_of(layout, settings.run, settings.seed)
-    return layout, conditions, build(layout, conditions)
 
 
 def pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:

@@ -26,6 +26,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from crosscue.detectors.decoders.table import AnyBoxOutput
+from crosscue.detectors.networks.weights import Weights
 from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
 from crosscue.replay.vehicle.validation_errors import explain
@@ -198,20 +199,6 @@ class ModelCard(Settings):
         """The label that a detection of a class gets."""
         name = self.output.classes[number]
         return self.labels.get(name, name)
-
-
-class Weights(Settings):
-    """Weights as read and verified.
-
-    Attributes:
-        name: Of the file, for errors.
-        content: Its bytes.
-        second: Bytes of an OpenVINO ``.bin``, else empty.
-    """
-
-    name: str
-    content: bytes
-    second: bytes = b""
 
 
 def read_card(path: Path) -> ModelCard:

@@ -16,10 +16,11 @@ from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.backends import Network, load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.picture_input import prepared
+from crosscue.detectors.networks.weights import Weights
 from crosscue.replay.base import UsageError, one_line, read_at_most
 
 from .architectures import WEIGHTS_SUFFIXES
-from .card import MAX_BYTES, Input, Weights
+from .card import MAX_BYTES, Input
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
 DEFAULT_SIDE_PX: Final = 640

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.vehicle.cue_spec import CueSpec
-from crosscue.replay.vehicle.vehicle import Cars, Vehicle
+from crosscue.replay.vehicle.vehicle import Cars, CueSpec, Vehicle
 
 from .observed import NONE, Judged, Sides, nose_of, of_side
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from crosscue.detectors.base import Detections
-from crosscue.replay.vehicle.cue_spec import CueSpec
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import CueSpec, Vehicle
 
 
 def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:

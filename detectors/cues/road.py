@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.replay.vehicle.cue_spec import CueSpec
-from crosscue.replay.vehicle.vehicle import Polygon, Regions, Vehicle
+from crosscue.replay.vehicle.vehicle import CueSpec, Polygon, Regions, Vehicle
 
 from .observed import RoadShares
 

@@ -7,8 +7,7 @@ from functools import lru_cache
 from importlib import import_module
 from typing import Any, TypeAlias, cast
 
-from crosscue.replay.vehicle.cue_spec import CueSpec, Input
-from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import CUES, CueSpec, Input
 
 Rule: TypeAlias = Callable[[Any, Any, CueSpec], int | None]
 """From an input, the settings and the cue's row to a count; None where it cannot be evaluated."""

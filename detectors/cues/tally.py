@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from crosscue.detectors.base import Detections
-from crosscue.replay.vehicle.cue_spec import CueSpec, Input
-from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import CUES, CueSpec, Input, Vehicle
 
 from .candidates import (
     BELOW_SCORE,

@@ -17,12 +17,12 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.catalog.card import Weights
 from crosscue.replay.base import VehicleError, installed, one_line
 
 from .free_size import Size, free_size, resized
 from .onnx_input import input_shape
 from .openvino import import_openvino
+from .weights import Weights
 
 Array = NDArray[np.generic]
 _EXTERNAL: Final = b"\x0a\x08location"

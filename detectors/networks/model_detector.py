@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detector, Found, Frame, RoadMask, View
-from crosscue.detectors.catalog.card import (
-    ModelCard,
-    SegmentationOutput,
-    Weights,
-    read_card,
-    read_weights,
-)
+from crosscue.detectors.catalog.card import ModelCard, SegmentationOutput, read_card, read_weights
 from crosscue.detectors.catalog.entries import weights_folder
 from crosscue.detectors.decoders.base import Array, named
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
@@ -30,6 +24,7 @@ from crosscue.replay.errors import VehicleError, one_line
 from .backends import Network, load_network
 from .box_model import BoxModel
 from .picture_input import Placement, prepared
+from .weights import Weights
 
 VERSION: Final = 2
 """Counts up when the same pixels, card and settings would give other numbers."""

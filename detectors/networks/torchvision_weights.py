@@ -18,10 +18,12 @@ import torch
 from torch import Tensor, nn
 
 from crosscue.detectors.catalog.architectures import ARCHITECTURES, ArchitectureName
-from crosscue.detectors.catalog.card import MAX_BYTES, ModelCard, Weights
+from crosscue.detectors.catalog.card import MAX_BYTES, ModelCard
 from crosscue.detectors.decoders.base import Array
 from crosscue.detectors.devices import chosen_device, threads_of
 from crosscue.replay.errors import VehicleError, one_line
+
+from .weights import Weights
 
 _COUNTER: Final = "num_batches_tracked"
 """Of training: missing where normalisation is frozen, and without a meaning for detection."""

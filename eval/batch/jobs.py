@@ -24,13 +24,14 @@ from crosscue.replay.base import (
     RunError,
     UsageError,
     json_tree,
+    losses_heard,
     one_line,
     strict_json,
+    warn_again,
     write_text,
 )
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
-from crosscue.replay.losses import losses_heard, warn_again
 
 JOURNAL: Final = ".drives"
 FORMAT_VERSION: Final = 2

@@ -15,24 +15,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.eval.runs.account import summed
 from crosscue.eval.runs.folder import (
     MANIFEST,
-    RunFolder,
-    clear,
-    locked,
-    open_run,
-    staged,
-    write_manifest,
-)
-from crosscue.eval.runs.manifest import (
     DriveManifest,
     EstimateManifest,
     MergedDrive,
     MergedLog,
     MergedManifest,
+    RunFolder,
+    clear,
+    locked,
+    open_run,
+    staged,
+    summed,
+    write_manifest,
 )
-from crosscue.eval.runs.tables.table_sink import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,

@@ -18,8 +18,8 @@ import numpy as np
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.by_drive import DriveMetric, direction
+from crosscue.eval.scoring.files import BY_DRIVE, FOLDER, METRICS
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
-from crosscue.eval.scoring.runs import BY_DRIVE, FOLDER, METRICS
 from crosscue.replay.base import (
     MIB,
     UnreadableRunError,

@@ -10,11 +10,21 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
-from crosscue.eval.runs.account import Account, account, account_lines, details_of, reading_of
-from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
-from crosscue.eval.runs.manifest import DecodeManifest
+from crosscue.eval.runs.folder import (
+    Account,
+    DecodeManifest,
+    RunFolder,
+    account,
+    account_lines,
+    clear,
+    details_of,
+    locked,
+    reading_of,
+    staged,
+    write_manifest,
+)
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.replay.base import (
     Block,
     CanFrames,

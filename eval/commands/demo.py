@@ -18,11 +18,11 @@ from pathlib import Path
 
 import crosscue
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.progress import (
+from crosscue.eval.commands.shared.terminal import (
     Done,
     DriveLine,
     is_shown,
+    print_json,
     progress_line,
 )
 from crosscue.replay.base import UsageError, visible

@@ -13,7 +13,7 @@ import argparse
 from dataclasses import asdict
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_json
+from crosscue.eval.commands.shared.terminal import print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

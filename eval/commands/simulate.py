@@ -18,8 +18,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.progress import Done, progress_line
+from crosscue.eval.commands.shared.terminal import Done, print_json, progress_line
 from crosscue.replay.errors import UsageError
 
 PUBLISHED_RUNS = 10

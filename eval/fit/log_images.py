@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,15 +18,12 @@ from crosscue.replay.base import (
     Int64s,
     Ledger,
     Limits,
-    Log,
     LogError,
     VehicleError,
+    warn_of,
 )
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.losses import warn_of
-from crosscue.replay.readers.images.files import SUFFIXES
-from crosscue.replay.readers.time_file import find_time_file, read_time_file
-from crosscue.replay.readers.timed_files import list_files, pair
+from crosscue.replay.readers.images.names import picture_names
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.stamp_watch import StampWatch
@@ -106,17 +102,3 @@ def log_span(path: Path, limits: Limits = DEFAULT_LIMITS) -> LogSpan:
     for watch in watches.values():
         watch.finish()
     return LogSpan(first, last + 1, any(watch.set_backs for watch in watches.values()))
-
-
-def picture_names(log: Log) -> Mapping[str, int]:
-    """From file name to time, for a folder of pictures."""
-    if log.format != "images":
-        return {}
-    time_file = find_time_file(log.path)
-    assert time_file is not None
-    files = pair(list_files(log.path, SUFFIXES), read_time_file(time_file, DEFAULT_LIMITS))
-    return {
-        path.name: t_ns
-        for path, t_ns in zip(files.paths, files.t_ns.tolist(), strict=True)
-        if t_ns >= 0
-    }

@@ -6,8 +6,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from crosscue.replay.base import Ledger, Log, Selection
-from crosscue.replay.losses import warn_of
+from crosscue.replay.base import Ledger, Log, Selection, warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Samples, Signal

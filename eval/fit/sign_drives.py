@@ -18,9 +18,9 @@ from crosscue.replay.base import (
     Log,
     LogError,
     read_at_most,
+    warn_of,
 )
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.losses import warn_of
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle, load

@@ -37,8 +37,7 @@ from crosscue.replay.base import (
     visible,
     write_text,
 )
-from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
 
 from .log_images import LogSpan, log_pictures, log_span
 

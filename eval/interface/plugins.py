@@ -8,8 +8,7 @@ from crosscue.detectors.registry import BUILTIN
 from crosscue.eval.interface.show import Listing
 from crosscue.replay.formats import FORMATS, DataSet, Format
 from crosscue.replay.plugins import GROUPS, Kind, Plugin, described, load, offered
-from crosscue.replay.vehicle.cue_spec import CueSpec
-from crosscue.replay.vehicle.cue_table import BUILTIN_CUES
+from crosscue.replay.vehicle.vehicle import BUILTIN_CUES, CueSpec
 
 
 class Plugins(Listing[Plugin]):

@@ -11,7 +11,8 @@ from crosscue.eval.interface.show import Listing
 from crosscue.replay.base import OutputError, UsageError
 
 if TYPE_CHECKING:
-    from crosscue.datasets.scenes.drive import SceneFiles, SceneSettings
+    from crosscue.datasets.scenes.drive import SceneFiles
+    from crosscue.datasets.scenes.settings import SceneSettings
     from crosscue.datasets.simulated.log_files import DriveFiles
     from crosscue.replay.base import Bytes
 
@@ -172,7 +173,7 @@ def _scenes(
     Raises:
         UsageError: A value out of range, or a layout named twice.
     """
-    from crosscue.datasets.scenes.drive import SceneSettings, camera_of_width
+    from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 
     if len(set(layouts)) != len(layouts):
         raise UsageError("simulate: a layout is named twice; name each once")

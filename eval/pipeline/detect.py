@@ -33,17 +33,24 @@ from crosscue.detectors.registry import knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
-from crosscue.eval.runs.account import account, detecting_of, reading_of
-from crosscue.eval.runs.folder import RunFolder, clear, locked, staged, write_manifest
-from crosscue.eval.runs.input import input_of
-from crosscue.eval.runs.logs import is_simulated, log_names, log_rows
-from crosscue.eval.runs.manifest import (
+from crosscue.eval.pipeline.progress import OnFrames, no_progress
+from crosscue.eval.runs.folder import (
     DetectCounts,
     DetectManifest,
     DetectorRow,
     DetectTimings,
+    RunFolder,
+    account,
+    clear,
+    detecting_of,
+    locked,
     part_of,
+    reading_of,
+    staged,
+    write_manifest,
 )
+from crosscue.eval.runs.input import input_of
+from crosscue.eval.runs.logs import is_simulated, log_names, log_rows
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Block, Int64s, Ledger, Log, Selection, VehicleError, versions
@@ -60,14 +67,6 @@ from .empty_result import empty_result, nothing_left
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-OnFrames = Callable[[int, int | None], None]
-"""Reported how many frames are done, and of how many where that is known."""
-
-
-def no_progress(_done: int, _of: int | None) -> None:
-    """Nobody looks."""
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, Choice]:

@@ -13,25 +13,12 @@ from dataclasses import asdict
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from crosscue.eval.pipeline.outcome import (
-    DetectOutcome,
-    OnTime,
-    Outcome,
-    SceneOutcome,
-    report_time,
-    unwatched_time,
-)
+from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
+from crosscue.eval.pipeline.scene.outcome import SceneOutcome
 from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, gives_reasons, schemas
-from crosscue.eval.runs.account import (
+from crosscue.eval.runs.folder import (
+    MANIFEST,
     UNATTRIBUTED,
-    account,
-    joined_accounts,
-    reading_of,
-)
-from crosscue.eval.runs.candidates import candidate_rows
-from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest
-from crosscue.eval.runs.logs import log_names, log_rows, relative
-from crosscue.eval.runs.manifest import (
     ApproachRow,
     DetectManifest,
     EstimateCounts,
@@ -40,15 +27,22 @@ from crosscue.eval.runs.manifest import (
     LandmarksUsed,
     LogRow,
     PoseSummary,
+    RunFolder,
     SceneSummary,
+    account,
+    candidate_rows,
+    joined_accounts,
     part_of,
+    reading_of,
+    write_manifest,
 )
+from crosscue.eval.runs.logs import log_names, log_rows, relative
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink, StoredMobileye
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.eval.runs.tables.table_sink import TableSink
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
@@ -70,6 +64,7 @@ from .drive_time import drive_timeline, refuse_other_segments, selections_of, ti
 from .empty_result import empty_result, silent_roles
 from .landmarks import looking
 from .pose import PoseStage, estimating_of, turn_signal_of
+from .progress import OnTime, report_time, unwatched_time
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -117,8 +112,8 @@ def estimate_into(
     stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle), timeline=timeline)
     if reading.camera is not None and landmarks is not None:
         at = reading.camera[0]
-        stage.landmarks = looking(landmarks, vehicle, reading.ledgers[at])
-        reading.extractors[at].on_pictures = stage.landmarks.see
+        looks = looking(landmarks, vehicle, reading.ledgers[at])
+        stage.landmarks, reading.extractors[at].on_pictures = looks, looks.see
     if detected is None:
         begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)

@@ -14,8 +14,9 @@ from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.features import CameraGeometry, Features, Matcher, make_matcher
 from crosscue.localization.landmarks.images import grey_of, picture_of
-from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings, Sighting
-from crosscue.localization.pose_track import ACCEPTED, NoLooks
+from crosscue.localization.landmarks.sighting import Sighting
+from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
+from crosscue.localization.pose_track import ACCEPTED
 from crosscue.replay.base import Block, Images, Int64s, Ledger, LogError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -61,28 +62,6 @@ def open_for(path: Path, matcher: Matcher) -> LandmarkDatabase:
             "landmarks.matcher in the vehicle file, or give another database"
         )
     return database
-
-
-class NoLandmarks(NoLooks):
-    """A replay without a landmark database."""
-
-    def take_sightings(self) -> list[Sighting]:
-        """None."""
-        return []
-
-    def take_names(self, t_ns: Int64s) -> list[str | None]:
-        """None at any time."""
-        return [None] * len(t_ns)
-
-    def cross_gap(self) -> None:
-        """Nothing is remembered."""
-
-    def let_go(self, before_ns: int) -> None:
-        """Nothing is held."""
-
-    def counts(self) -> dict[str, int]:
-        """Nothing to count."""
-        return {}
 
 
 @dataclass(frozen=True, slots=True, order=True)

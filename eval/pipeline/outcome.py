@@ -2,34 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
-from crosscue.detectors.cues.candidates import Candidates
 from crosscue.detectors.runner import Counts
-from crosscue.eval.runs.account import Account, account_lines, details_of
-from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
-from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.pipeline.scene.outcome import ApproachSummary, SceneOutcome
+from crosscue.eval.runs.folder import (
+    Account,
+    RunFolder,
+    account_lines,
+    candidate_lines,
+    candidate_rows,
+    details_of,
+    not_looked_lines,
+)
 from crosscue.replay.base import Ledger, visible
 from crosscue.replay.safe_text import terminal_width, wrapped
-from crosscue.replay.time.segments import ONE_SEGMENT, Segment, Timeline
-
-OnTime = Callable[[float, float], None]
-"""Called with the seconds of a drive that are done, and those there are."""
-
-
-def unwatched_time(_done_s: float, _of_s: float) -> None:
-    """Nobody wants to know."""
-
-
-def report_time(on_time: OnTime, timeline: Timeline, t_ns: int) -> None:
-    """Call ``on_time`` for a drive that has been worked through up to ``t_ns``."""
-    first, last = timeline.segments[0], timeline.segments[-1]
-    if last.end_ns > first.start_ns:
-        # The last window ends after the last wheel speed.
-        on_time(
-            (min(t_ns, last.end_ns) - first.start_ns) * 1e-9, (last.end_ns - first.start_ns) * 1e-9
-        )
+from crosscue.replay.time.segments import ONE_SEGMENT, Segment
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -79,56 +67,6 @@ class DetectOutcome:
 
     def __repr__(self) -> str:
         return _detect_text(self)
-
-
-@dataclass(slots=True)
-class ApproachSummary:
-    """One approach as the run itself saw it; no truth is asked.
-
-    Attributes:
-        number: From 1 in the order of the drive.
-        start_ns: First step.
-        end_ns: Last step.
-        detected_ns: When the intersection was first held present with a range known.
-        detected_m: The range then.
-        reference: What that range goes to.
-        probabilities: At the last step.
-        not_seen: Features that no cue has said anything about: a probability that is the prior.
-    """
-
-    number: int
-    start_ns: int
-    end_ns: int
-    detected_ns: int | None = None
-    detected_m: float | None = None
-    reference: str | None = None
-    probabilities: Mapping[str, float] = field(default_factory=dict)
-    not_seen: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class SceneOutcome:
-    """What the scene part did.
-
-    Attributes:
-        frames: Looked at.
-        positive: Frames in which each cue was positive.
-        approaches: In order.
-        counts: What became of the evidence, as ``Approaches`` counts it.
-        without_odometry: Frames before which the odometry has a hole.
-        candidates: By cue, what became of everything that could have been it.
-        ranged: By cue, what became of its detections on the way to a range.
-        not_looked_for: Cues without any row, and why.
-    """
-
-    frames: int
-    positive: Mapping[str, int]
-    approaches: tuple[ApproachSummary, ...]
-    counts: Mapping[str, int]
-    without_odometry: int
-    candidates: Mapping[str, Candidates] = field(default_factory=dict)
-    ranged: Mapping[str, Candidates] = field(default_factory=dict)
-    not_looked_for: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
-from crosscue.eval.runs.account import Line, line
-from crosscue.eval.runs.manifest import OWN_FRAME
+from crosscue.eval.runs.folder import OWN_FRAME, Line, line
 from crosscue.eval.runs.tables.measurements import (
     gap_rows,
     heading_rows,
@@ -20,22 +19,23 @@ from crosscue.eval.runs.tables.measurements import (
 )
 from crosscue.localization import compass, odometry, pose_track
 from crosscue.localization.gap import GapSettings, cross_gap
+from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
     Headings,
+    Looks,
+    NoLooks,
     PoseColumns,
     TrackCounts,
     TrackSettings,
     TrackState,
 )
-from crosscue.replay.columns import Floats
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.windows import Window
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-from .landmarks import LandmarkStage, NoLandmarks
 
 REJECTED_SHARE: Final = 0.1
 """An honest filter refuses one reading in a thousand; above this something is wrong."""
@@ -78,6 +78,52 @@ def gap_settings(vehicle: Vehicle) -> GapSettings:
     return GapSettings(**fields)
 
 
+class LandmarkLooks(Looks, Protocol):
+    """What looks for landmarks beside the pose track; ``landmarks.LandmarkStage`` does."""
+
+    def take_sightings(self) -> list[Sighting]:
+        """The sightings since the last call."""
+        ...
+
+    def take_names(self, t_ns: Int64s) -> list[str | None]:
+        """The landmark weighed in at each row's time, or None."""
+        ...
+
+    def cross_gap(self) -> None:
+        """Forget what was in view before a gap in time."""
+        ...
+
+    def let_go(self, before_ns: int) -> None:
+        """Drop what no odometry will reach any more."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """What became of every frame, for the manifest."""
+        ...
+
+
+class NoLandmarks(NoLooks):
+    """A replay without a landmark database."""
+
+    def take_sightings(self) -> list[Sighting]:
+        """None."""
+        return []
+
+    def take_names(self, t_ns: Int64s) -> list[str | None]:
+        """None at any time."""
+        return [None] * len(t_ns)
+
+    def cross_gap(self) -> None:
+        """Nothing is remembered."""
+
+    def let_go(self, before_ns: int) -> None:
+        """Nothing is held."""
+
+    def counts(self) -> dict[str, int]:
+        """Nothing to count."""
+        return {}
+
+
 @dataclass(slots=True)
 class PoseStage:
     """Carries belief and pending rows from window to window, and the belief across gaps.
@@ -97,7 +143,7 @@ class PoseStage:
 
     vehicle: Vehicle
     turn: Signal | None
-    landmarks: LandmarkStage | NoLandmarks = field(default_factory=NoLandmarks)
+    landmarks: LandmarkLooks = field(default_factory=NoLandmarks)
     notices: list[str] = field(default_factory=list)
     odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
     track_counts: TrackCounts = field(default_factory=TrackCounts)

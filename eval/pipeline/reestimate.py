@@ -6,15 +6,24 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from crosscue.eval.pipeline.outcome import OnTime, Outcome, unwatched_time
-from crosscue.eval.runs.folder import MANIFEST, RunFolder, locked, staged, write_input
+from crosscue.eval.pipeline.outcome import Outcome
+from crosscue.eval.runs.folder import (
+    MANIFEST,
+    DriveManifest,
+    EstimateManifest,
+    LogRow,
+    RunFolder,
+    locked,
+    staged,
+    write_input,
+)
 from crosscue.eval.runs.input import settings_changed
 from crosscue.eval.runs.logs import reopened
-from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest, LogRow
 from crosscue.replay.base import Log, RunError, UsageError, sha256_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .estimate import begin_again, estimate_into
+from .progress import OnTime, unwatched_time
 
 
 def estimate_run(

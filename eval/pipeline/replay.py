@@ -9,21 +9,21 @@ from typing import Final
 
 from crosscue.detectors.base import Choice
 from crosscue.detectors.registry import make
-from crosscue.eval.pipeline.outcome import DetectOutcome, OnTime, Outcome, unwatched_time
-from crosscue.eval.runs.folder import RunFolder, clear, locked, staged
+from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
+from crosscue.eval.runs.folder import DetectManifest, RunFolder, clear, locked, part_of, staged
 from crosscue.eval.runs.input import input_of, refuse_another
 from crosscue.eval.runs.logs import log_rows
-from crosscue.eval.runs.manifest import DetectManifest, part_of
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Log, RunError, Selection, Topic
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import OnFrames, detect_into, no_progress
+from .detect import detect_into
 from .drive_time import drive_timeline
 from .empty_result import nothing_left
 from .estimate import estimate_into
+from .progress import OnFrames, OnTime, no_progress, unwatched_time
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
 """What the second stage reads of the first."""

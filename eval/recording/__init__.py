@@ -7,14 +7,14 @@ stored. ``save`` is all there is to call.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DriveManifest
-from crosscue.eval.runs.stored_images import StoredCamera, camera_of
+from crosscue.eval.runs.folder import DriveManifest, RunFolder
+from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.base import Floats, write_whole
@@ -101,7 +101,7 @@ def _log_all(
         series.log_cues(recording, time, scene)
         _log_marks(recording, time, run, manifest)
     if stored is not None:
-        left_out = camera.log_pictures(recording, stored, time)
+        left_out = camera.log_pictures(recording, partial(read_pictures, stored), time)
         if left_out:
             more.append(f"{stored.topic.name}: {left_out} pictures that cannot be decoded")
     recording.log("notes", notes(run, more), static=True)

@@ -18,8 +18,7 @@ from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, place_of
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DriveManifest
+from crosscue.eval.runs.folder import DriveManifest, RunFolder
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow

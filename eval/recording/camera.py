@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +10,6 @@ import rerun as rr
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded
-from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
 from crosscue.replay.base import Block, Images, LogError
 
 from .drive_time import DriveTime
@@ -21,14 +21,18 @@ BATCH_BYTES: Final = 4 << 20
 QUALITY: Final = 90
 
 
-def log_pictures(recording: rr.RecordingStream, camera: StoredCamera, time: DriveTime) -> int:
+def log_pictures(
+    recording: rr.RecordingStream,
+    read_pictures: Callable[[Callable[[Block], None]], None],
+    time: DriveTime,
+) -> int:
     """Send all pictures; returns how many could not be decoded, which are left out.
 
     Raises:
         LogError: The log cannot be opened.
     """
     sink = _Sink(recording, time)
-    read_pictures(camera, sink.add)
+    read_pictures(sink.add)
     return sink.left_out
 
 

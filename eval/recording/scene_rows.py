@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.replay.columns import Int64s
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class SceneRows:
     belief: pa.Table | None
 
 
-def scene_rows(run: RunFolder) -> SceneRows:
+def scene_rows(run: TableFolder) -> SceneRows:
     """Read them.
 
     Raises:
@@ -59,7 +59,7 @@ def longest_m(scene: SceneRows) -> float:
     return 10.0 * float(np.ceil(0.1 * np.nanmax(highest)))
 
 
-def _table(run: RunFolder, name: str) -> pa.Table | None:
+def _table(run: TableFolder, name: str) -> pa.Table | None:
     if not run.file(f"{name}.parquet").exists():
         return None
     table = run.table(name).sort_by("t_ns")

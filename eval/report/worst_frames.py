@@ -19,8 +19,7 @@ from crosscue.eval.runs.stored_images import camera_of, picture_at
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.eval.scoring.scene.cues import CueFrames
 from crosscue.replay.errors import CrosscueError
-from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import CUES, Vehicle
 
 from .scene_figures import WorstFrame, is_wrong
 

@@ -1,7 +1,7 @@
 """The run folder: where stages meet on disk.
 
-Files get their final name only when whole. One lock file names the process at work. Tables are
-Parquet with page checksums, verified when read.
+Files get their final name only when whole. One lock file names the process at work. The records of
+the manifest, the account and what became of candidates are imported from here as well.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,
@@ -25,21 +26,109 @@ from crosscue.replay.base import (
     strict_json,
     write_text,
 )
-from crosscue.replay.files.parquet import opened
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
 
+from .account import (
+    UNATTRIBUTED,
+    Account,
+    Line,
+    ScoredAccount,
+    SummedAccount,
+    account,
+    account_lines,
+    check,
+    details_of,
+    detecting_of,
+    joined_accounts,
+    line,
+    reading_of,
+    summed,
+)
+from .candidates import CandidateRow, candidate_lines, candidate_rows, not_looked_lines
 from .manifest import (
     FORMAT_VERSION,
+    OWN_FRAME,
+    ApproachRow,
     DecodeManifest,
+    DetectCounts,
+    DetectManifest,
+    DetectorRow,
+    DetectTimings,
     DriveManifest,
+    EstimateCounts,
+    EstimateManifest,
+    EstimateTimings,
+    LandmarksUsed,
+    LogRow,
     Manifest,
+    MergedDrive,
+    MergedLog,
     MergedManifest,
     OtherVersionError,
+    PoseSummary,
+    SceneSummary,
+    TimeSegments,
+    json_schema,
     parse_manifest,
+    part_of,
 )
 
-if TYPE_CHECKING:
-    import pyarrow as pa
+__all__ = [
+    "INPUT",
+    "LOCK",
+    "MANIFEST",
+    "MAX_MANIFEST_BYTES",
+    "OWN_FRAME",
+    "STAGED",
+    "UNATTRIBUTED",
+    "Account",
+    "ApproachRow",
+    "CandidateRow",
+    "DecodeManifest",
+    "DetectCounts",
+    "DetectManifest",
+    "DetectTimings",
+    "DetectorRow",
+    "DriveManifest",
+    "EstimateCounts",
+    "EstimateManifest",
+    "EstimateTimings",
+    "LandmarksUsed",
+    "Line",
+    "LogRow",
+    "Manifest",
+    "MergedDrive",
+    "MergedLog",
+    "MergedManifest",
+    "PoseSummary",
+    "RunFolder",
+    "SceneSummary",
+    "ScoredAccount",
+    "SummedAccount",
+    "TableFolder",
+    "TimeSegments",
+    "account",
+    "account_lines",
+    "candidate_lines",
+    "candidate_rows",
+    "check",
+    "clear",
+    "create",
+    "details_of",
+    "detecting_of",
+    "joined_accounts",
+    "json_schema",
+    "line",
+    "locked",
+    "not_looked_lines",
+    "open_run",
+    "part_of",
+    "reading_of",
+    "staged",
+    "summed",
+    "write_input",
+    "write_manifest",
+]
 
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
@@ -51,26 +140,20 @@ STAGED: Final = ".new"
 
 
 @dataclass(frozen=True, slots=True)
-class RunFolder:
+class RunFolder(TableFolder):
     """A run's folder; make one with ``create`` or ``open_run``.
 
     Attributes:
-        path: Where it is.
         logs: A folder that its logs have moved to, or None where they are as the manifest says.
         without_images: Is it to be shown without the pictures in its logs?
         limits: What its logs are read with.
         home: Where it will lie, if it is still being made elsewhere; see ``staged``.
     """
 
-    path: Path
     logs: Path | None = None
     without_images: bool = False
     limits: Limits = DEFAULT_LIMITS
     home: Path | None = None
-
-    def file(self, name: str) -> Path:
-        """Path of one of its files."""
-        return self.path / name
 
     def manifest(self) -> Manifest:
         """The manifest as read.
@@ -110,71 +193,6 @@ class RunFolder:
         if isinstance(found, DecodeManifest):
             raise RunError(f"{self.path}: holds tables of crosscue decode; give a run of replay")
         return found
-
-    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
-        """Rows of ``NAME.parquet``, its page checksums verified.
-
-        Raises:
-            RunError: Not there or damaged.
-        """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        path = self.file(f"{name}.parquet")
-        try:
-            with opened(path) as file:
-                return pq.read_table(file, columns=columns, page_checksum_verification=True)
-        except FileNotFoundError:
-            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
-        except (OSError, pa.ArrowException) as error:
-            raise UnreadableRunError(
-                f"{path}: damaged ({error}); run crosscue replay again"
-            ) from None
-
-    def schema(self, name: str) -> pa.Schema:
-        """Columns of ``NAME.parquet``.
-
-        Raises:
-            RunError: Not there or damaged.
-        """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        path = self.file(f"{name}.parquet")
-        try:
-            with opened(path) as file:
-                return pq.read_schema(file).remove_metadata()
-        except FileNotFoundError:
-            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
-        except (OSError, pa.ArrowException) as error:
-            raise UnreadableRunError(
-                f"{path}: damaged ({error}); run crosscue replay again"
-            ) from None
-
-    def batches(
-        self, name: str, columns: list[str] | None = None, rows: int = 16_384
-    ) -> Iterator[pa.RecordBatch]:
-        """Rows of ``NAME.parquet`` a batch at a time, its page checksums verified.
-
-        Raises:
-            RunError: Not there or damaged.
-        """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        path = self.file(f"{name}.parquet")
-        try:
-            with (
-                opened(path) as handle,
-                pq.ParquetFile(handle, page_checksum_verification=True) as file,
-            ):
-                yield from file.iter_batches(rows, columns=columns)
-        except FileNotFoundError:
-            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
-        except (OSError, pa.ArrowException) as error:
-            raise UnreadableRunError(
-                f"{path}: damaged ({error}); run crosscue replay again"
-            ) from None
 
 
 def create(path: Path, *, overwrite: bool) -> RunFolder:

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.detectors.base import Choice
-from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
-from crosscue.eval.runs.manifest import part_of
+from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder, part_of
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Log,

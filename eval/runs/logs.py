@@ -13,8 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import LogRow
+from crosscue.eval.runs.folder import LogRow, RunFolder
 from crosscue.replay.base import CrosscueError, Log, UnreadableRunError, sha256_of
 from crosscue.replay.files.identity import identity_of, identity_of_log
 from crosscue.replay.files.made_of import SIMULATED

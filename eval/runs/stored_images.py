@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.images import Encoded, encoded
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.eval.runs.folder import DetectManifest, RunFolder
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Block,
@@ -22,10 +21,10 @@ from crosscue.replay.base import (
     Selection,
     Topic,
     UnreadableRunError,
+    warn_of,
 )
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.losses import warn_of
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog

@@ -20,8 +20,8 @@ from crosscue.replay.base import (
     LogFormatError,
     Selection,
     Topic,
+    warn_of,
 )
-from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.extractor import Extractor, pictures_of
 from crosscue.replay.signals.kinds import Plan, Samples, Signal

@@ -32,6 +32,7 @@ from crosscue.replay.columns import Floats
 
 from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
 from .features import Features, Match, Matcher
+from .sighting import Sighting
 
 FALLEN_SHARE: Final = 0.8
 """A score below this fraction of its peak has passed it."""
@@ -104,28 +105,6 @@ class LandmarkCounts:
     def as_dict(self) -> dict[str, int]:
         """Plain numbers by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
-
-
-class Sighting(NamedTuple):
-    """A landmark that reached the filter.
-
-    Attributes:
-        t_ns: When it was weighed in.
-        name: The landmark's.
-        xy_m: Shape (2,): the camera's position as measured, carried to ``t_ns``.
-        cov_m2: Shape (2, 2).
-        score: At its best.
-        nis: Normalised innovation squared, chi-square with two degrees of freedom.
-        outcome: ``ACCEPTED`` or ``REJECTED`` by the gate.
-    """
-
-    t_ns: int
-    name: str
-    xy_m: Floats
-    cov_m2: Floats
-    score: float
-    nis: float
-    outcome: int
 
 
 class Best(NamedTuple):

@@ -186,7 +186,7 @@ def _raise(error: OSError) -> None:
 
 
 def _beside(place: Path) -> list[Path]:
-    from crosscue.replay.readers.time_file import find_time_file
+    from .time_file_names import find_time_file
 
     if place.is_dir():
         with suppress(LogError):
@@ -202,7 +202,7 @@ def _beside(place: Path) -> list[Path]:
 
 def _names_beside(name: str, is_there: Callable[[str], bool]) -> list[str]:
     """What lies beside a file and belongs to it: journals, and the time file of a video."""
-    from crosscue.replay.readers.time_file import times_of_video
+    from .time_file_names import times_of_video
 
     times = times_of_video(name) if PurePosixPath(name).suffix.lower() in _videos() else ()
     time_file = next(filter(is_there, times), None)

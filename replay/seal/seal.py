@@ -106,7 +106,7 @@ def files_of(log: Path) -> dict[str, Path]:
     """
     if log.is_dir():
         return {path.relative_to(log).as_posix(): path for path in sorted(_walked(log))}
-    from crosscue.replay.readers.time_file import time_file_of_video
+    from crosscue.replay.files.time_file_names import time_file_of_video
 
     beside = [log.with_name(log.name + suffix) for suffix in ("-wal", "-journal")]
     times = time_file_of_video(log) if _is_video(log) else None

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from crosscue.replay.base import Block, Floats, Int64s, Ledger, Table, VehicleError
-from crosscue.replay.vehicle.vehicle import AngleSignal, Vehicle
+from crosscue.replay.vehicle.vehicle import AngleSignal
 
 from .kinds import Samples, Signal
-
-if TYPE_CHECKING:
-    from crosscue.replay.can.database import CanDatabase
 
 SPEED_UNITS: Final[Mapping[str, float]] = {
     "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kph": 1 / 3.6, "kmh": 1 / 3.6, "kmph": 1 / 3.6,
@@ -29,55 +24,6 @@ ANGLE_UNITS: Final[Mapping[str, float]] = {
     "radians": 1.0, "radians/second": 1.0, "rad/sec": 1.0, "degrees/second": np.pi / 180,
     "unit_degreofarc": np.pi / 180, "unit_degreofarcpersecon": np.pi / 180,
 }  # fmt: skip
-
-
-@lru_cache(maxsize=8)
-def database_of(files: tuple[str, ...]) -> CanDatabase:
-    """Read once for the probe of the clocks and the run."""
-    from crosscue.replay.can.database import CanDatabase
-
-    return CanDatabase.load([Path(name) for name in files])
-
-
-def check_signals(
-    database: CanDatabase, vehicle: Vehicle, signals: Collection[Signal]
-) -> frozenset[tuple[str, str]]:
-    """The (message, signal) pairs that the vehicle file names, each known to the database.
-
-    Args:
-        database: Of all buses.
-        vehicle: The vehicle file.
-        signals: Those that one bus gives; pairs of others are left out.
-
-    Raises:
-        VehicleError: A name that the database does not hold; with the nearest one.
-    """
-    import difflib
-
-    known = {f"{m.topic_name}.{s.name}" for m in database.messages for s in m.signals}
-    pairs: set[tuple[str, str]] = set()
-    for of, key, name in _named_signals(vehicle):
-        if name not in known:
-            close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-            hint = f"did you mean {close[0]}?" if close else "look it up in the DBC file"
-            raise VehicleError(f"{key} = {name!r}: no such signal in {vehicle.can.dbc}; {hint}")
-        if of in signals:
-            message, _, signal = name.partition(".")
-            pairs.add((message, signal))
-    return frozenset(pairs)
-
-
-def _named_signals(vehicle: Vehicle) -> Iterator[tuple[Signal, str, str]]:
-    can = vehicle.can
-    if can.wheel_speeds is not None:
-        for wheel in ("front_left", "front_right", "rear_left", "rear_right"):
-            name = getattr(can.wheel_speeds, wheel)
-            if name is not None:
-                yield Signal.WHEEL_SPEEDS, f"can.wheel_speeds.{wheel}", name
-    if can.yaw_rate is not None:
-        yield Signal.YAW_RATE, "can.yaw_rate.signal", can.yaw_rate.signal
-    if can.steering is not None:
-        yield Signal.STEERING, "can.steering.signal", can.steering.signal
 
 
 @dataclass(frozen=True, slots=True, eq=False)

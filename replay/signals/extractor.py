@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, cast
 
 import numpy as np
 
@@ -15,25 +16,36 @@ from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .converters import (
-    FROM_TABLE,
-    SPEED_UNITS,
-    angle_samples,
-    check_signals,
-    column_of,
-    database_of,
-    wheel_samples,
-)
+from .converters import FROM_TABLE
 from .kinds import MOBILEYE_SIGNALS, Plan, Samples, Signal, Source
 
 if TYPE_CHECKING:
-    from crosscue.replay.can.decode import BusDecoder
     from crosscue.replay.decode.packets import PacketDecoder
-    from crosscue.replay.mobileye.samples import MobileyeStream
 
 
 PROBE_NS: Final = 10_000_000_000
 """Log time examined before a clock is chosen for each topic."""
+
+
+READERS: Final = {
+    Role.CAN: "crosscue.replay.signals.can_signals:CanSignals",
+    Role.MOBILEYE: "crosscue.replay.mobileye.samples:MobileyeStream",
+}
+"""What reads a bus or a device: ``module:class``, imported for a drive that has one."""
+
+CanReader: TypeAlias = Callable[[Block], Iterator[Samples]]
+
+
+class MobileyeReader(Protocol):
+    """Reads one device, a block at a time."""
+
+    def __call__(self, block: Block, /) -> Iterator[Samples]:
+        """The samples of a block."""
+        ...
+
+    def flush(self) -> Iterator[Samples]:
+        """What was held back until it was known to be whole; once, at the log's end."""
+        ...
 
 
 def _no_pictures(block: Block) -> None:
@@ -65,8 +77,8 @@ class Extractor:
     on_pictures: Callable[[Block], None] = _no_pictures
     shift_at: Callable[[Int64s], Int64s] | None = None
     _decoders: dict[str, Decoder | None] = field(default_factory=dict)
-    _buses: dict[str, BusDecoder] = field(default_factory=dict)
-    _mobileye: MobileyeStream | None = None
+    _buses: dict[str, CanReader] = field(default_factory=dict)
+    _mobileye: MobileyeReader | None = None
     _packets: dict[str, PacketDecoder] = field(default_factory=dict)
 
     def __call__(self, block: Block) -> Iterator[Samples]:
@@ -96,7 +108,7 @@ class Extractor:
             yield from self._mobileye_stream(source)(block)
         if role_of(source.topic) is Role.CAN:
             if not {*source.signals} <= {*MOBILEYE_SIGNALS}:
-                yield from self._from_can(block, source)
+                yield from self._can_signals(source)(block)
             return
         if isinstance(block.rows, Images):
             self._show(block, block.rows)
@@ -145,16 +157,14 @@ class Extractor:
             if source.log == self.log and not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
         ]
 
-    def _mobileye_stream(self, source: Source) -> MobileyeStream:
+    def _mobileye_stream(self, source: Source) -> MobileyeReader:
         if self._mobileye is None:
-            from crosscue.replay.mobileye.samples import MobileyeStream
-
             types = {
                 one.topic.name: one.topic.type_name
                 for one in self._mobileye_sources()
                 if role_of(one.topic) is Role.MOBILEYE
             }
-            self._mobileye = MobileyeStream(
+            self._mobileye = _reader(Role.MOBILEYE)(
                 source.topic.name,
                 self.ledger,
                 self.vehicle.mobileye,
@@ -163,43 +173,16 @@ class Extractor:
             )
         return self._mobileye
 
-    def _from_can(self, block: Block, source: Source) -> Iterator[Samples]:
-        decoder = self._bus_decoder(source)
-        tables = {part.topic.rsplit("/", 1)[1]: part for part in decoder(block)}
-        can = self.vehicle.can
-        if can.wheel_speeds is not None and Signal.WHEEL_SPEEDS in source.signals:
-            wheels = can.wheel_speeds
-            names = (wheels.front_left, wheels.front_right, wheels.rear_left, wheels.rear_right)
-            scales = dict(SPEED_UNITS)
-            if wheels.wheel_radius_m is not None:
-                scales["rad/s"] = wheels.wheel_radius_m
-            columns = [
-                column_of(tables, name, wheels.unit, scales, "can.wheel_speeds") for name in names
-            ]
-            yield from wheel_samples(columns)
-        for section, signal, key in (
-            (can.yaw_rate, Signal.YAW_RATE, "can.yaw_rate"),
-            (can.steering, Signal.STEERING, "can.steering"),
-        ):
-            if section is not None and signal in source.signals:
-                yield from angle_samples(tables, section, signal, key)
-
-    def _bus_decoder(self, source: Source) -> BusDecoder:
+    def _can_signals(self, source: Source) -> CanReader:
         bus = source.topic.name
         if bus not in self._buses:
-            from crosscue.replay.can.decode import BusDecoder
-            from crosscue.replay.mobileye.can.admit import all_ids
-            from crosscue.replay.mobileye.samples import settings_of
-
-            database = database_of(self.vehicle.can.dbc)
-            for sentence in database.notices:
-                self.ledger.notice(sentence)
-            wanted = check_signals(database, self.vehicle, source.signals)
-            is_shared = not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
-            settings = settings_of(self.vehicle.mobileye, is_shared_bus=is_shared)
-            elsewhere = all_ids(settings) if is_shared else ()
-            self._buses[bus] = BusDecoder(database, bus, self.ledger, wanted, elsewhere=elsewhere)
+            self._buses[bus] = _reader(Role.CAN)(bus, self.ledger, self.vehicle, source.signals)
         return self._buses[bus]
+
+
+def _reader(role: Role) -> Callable[..., Any]:
+    module, _, name = READERS[role].partition(":")
+    return cast("Callable[..., Any]", getattr(import_module(module), name))
 
 
 def probe_clocks(

@@ -3,6 +3,8 @@
 TOML, versioned, checked with pydantic. Unknown keys, wrong units and missing roles are refused with
 the line in the file and a suggestion. Units stand last in every name (SI); frames are ISO 8855 /
 REP-103: x forward, y left, heading counter-clockwise. Every default is written to the manifest.
+
+The table of cues, which the file is checked against, is handed on with it.
 """
 
 from __future__ import annotations
@@ -15,8 +17,14 @@ from pydantic_core import PydanticCustomError
 
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
 
-from .cue_spec import CueSpec
-from .cue_table import CUES, SAME_SIGN
+from .cue_spec import CueSpec as CueSpec
+from .cue_spec import Input as Input
+from .cue_spec import Scoring as Scoring
+from .cue_table import BUILTIN_CUES as BUILTIN_CUES
+from .cue_table import CUES as CUES
+from .cue_table import SAME_SIGN
+from .cue_table import STOP_SIGN as STOP_SIGN
+from .cue_table import TRAFFIC_LIGHT as TRAFFIC_LIGHT
 from .fusion import Fusion, Name, RangeFilter
 from .mobileye_cues import Past
 from .pose import DEGREE, Gnss, Odometry, Start

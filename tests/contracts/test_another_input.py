@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.datasets.scenes.drive import MADE_OF, SceneSettings
+from crosscue.datasets.scenes.drive import MADE_OF
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
 from crosscue.replay.base import OutputError, strict_json
 from crosscue.replay.files.made_of import made_of

@@ -20,7 +20,8 @@ from crosscue.eval.recording.series import of_cue
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import summary
 from crosscue.eval.report.worst_frames import worst_frames
-from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.files import FOLDER
+from crosscue.eval.scoring.runs import judge_run, metrics_of, scores_of
 from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.cue_table import CUES, groups

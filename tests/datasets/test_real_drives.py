@@ -9,8 +9,8 @@ import pytest
 
 from crosscue.datasets.real.recordings import FOLDER
 from crosscue.datasets.truth.truth import load as load_truth
-from crosscue.detectors.catalog import entries
 from crosscue.detectors.catalog import fetch as weights
+from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.data import shared
@@ -52,7 +52,7 @@ def test_a_minute_and_its_one_picture_are_one_drive(
     """The commands of the documentation, up to the traffic light in the picture."""
     (segment,) = shared("comma2k19", "Example_1").glob("*/40")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv(entries.VARIABLE, str(tmp_path / "models"))
+    monkeypatch.setenv(places.VARIABLE, str(tmp_path / "models"))
     monkeypatch.setenv(weights.DATA, str(shared("weights").parent))
     weights.fetch("yolox-nano")
     front = tmp_path / "front"

@@ -11,7 +11,7 @@ import pytest
 from torchvision.models import get_model_weights
 
 from crosscue.detectors.base import Choice
-from crosscue.detectors.catalog import entries, fetch
+from crosscue.detectors.catalog import entries, fetch, places
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
 from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, meaning_of
 from crosscue.detectors.registry import make
@@ -27,7 +27,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "cache"
-    monkeypatch.setenv(entries.VARIABLE, str(folder))
+    monkeypatch.setenv(places.VARIABLE, str(folder))
     monkeypatch.delenv(fetch.DATA, raising=False)
     monkeypatch.delenv(fetch.MIRROR, raising=False)
     return folder
@@ -54,7 +54,7 @@ def card(server: Served, cache: Path, monkeypatch: pytest.MonkeyPatch) -> ModelC
     return changed
 
 
-@pytest.mark.parametrize("name", entries.names())
+@pytest.mark.parametrize("name", places.names())
 def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> None:
     card = entries.entry(name)
 
@@ -66,7 +66,7 @@ def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> Non
     assert len(set(card.output.classes)) == len(card.output.classes)
 
 
-@pytest.mark.parametrize("name", [name for name in entries.names() if "rcnn" in name])
+@pytest.mark.parametrize("name", [name for name in places.names() if "rcnn" in name])
 def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> None:
     """URL, beginning of the hash, network and classes, as the installed package has them."""
     card = entries.entry(name)
@@ -90,7 +90,7 @@ def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> No
     assert stated.get("mask AP, %") == published.get("mask_map")
 
 
-@pytest.mark.parametrize("name", entries.names())
+@pytest.mark.parametrize("name", places.names())
 def test_every_entry_at_hand_runs(name: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the very file of its hash, from the data folder."""
     monkeypatch.setenv(fetch.DATA, str(shared("weights").parent))
@@ -115,7 +115,7 @@ def test_a_model_that_is_not_fetched_is_one_line_with_the_command(cache: Path) -
 
 def test_a_name_with_a_typo_gets_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean yolox-nano"):
-        entries.card_path("yolo-nano")
+        places.card_path("yolo-nano")
 
 
 def test_it_comes_from_the_server_once(card: ModelCard, server: Served) -> None:
@@ -215,7 +215,7 @@ def test_the_data_folder_is_looked_through(
 def test_list_and_show_print_every_model(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["model", "list"]) == 0
     listed = capsys.readouterr().out
-    for name in entries.names():
+    for name in places.names():
         assert name in listed
         assert run(["model", "show", name]) == 0
         assert entries.entry(name).sha256 in capsys.readouterr().out

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crosscue.fusion.approaches import Approaches, PastCues, Step, no_past_cues
-from crosscue.fusion.evidence import FrameEvidence
+from crosscue.fusion.approaches import Approaches, Step, no_past_cues
+from crosscue.fusion.evidence import FrameEvidence, PastCues
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter

@@ -16,7 +16,7 @@ from crosscue.eval.batch.jobs import Job
 from crosscue.eval.runs.account import LogAccount, account
 from crosscue.eval.runs.folder import clear, create, locked, write_manifest
 from crosscue.eval.runs.manifest import EstimateTimings
-from crosscue.eval.runs.tables.table_sink import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.replay.base import LogFormatError
 from crosscue.replay.losses import LossWarning
 

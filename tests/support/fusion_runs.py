@@ -11,7 +11,7 @@ from crosscue.datasets.truth.truth import Approach, Features, Truth, save
 from crosscue.eval.pipeline.scene.stage import schemas
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.runs.tables import measurements
-from crosscue.eval.runs.tables.table_sink import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.fusion.approaches import Approaches, Step
 from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of

@@ -11,7 +11,7 @@ import pytest
 from crosscue.datasets.adapters.pandaset import read_poses
 from crosscue.datasets.real import recordings
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
-from crosscue.detectors.catalog import entries
+from crosscue.detectors.catalog import entries, places
 from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
 from support.onnx_models import bright_box_model
@@ -69,7 +69,7 @@ def stand_in(place: Path, server: Served, monkeypatch: pytest.MonkeyPatch) -> St
     )
     monkeypatch.setattr(recordings, "FOLDER", place / "own")
     monkeypatch.setenv(recordings.VARIABLE, str(place / "drives"))
-    monkeypatch.setenv(entries.VARIABLE, str(place / "models"))
+    monkeypatch.setenv(places.VARIABLE, str(place / "models"))
     for name in (recordings.MIRROR, weights.DATA, weights.MIRROR):
         monkeypatch.delenv(name, raising=False)
     card = _card(network, server)

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.overlay import write_label
 
 BEFORE_M: Final = 25.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crosscue.datasets.scenes.drive import SceneSettings, world_of
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.replay.columns import Bytes
 
 

@@ -13,8 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.datasets.scenes.drive import SceneSettings, jpeg, world_of
+from crosscue.datasets.scenes.drive import jpeg
 from crosscue.datasets.scenes.rendering.render import Renderer
+from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.scenes.world import World
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.replay.base import Floats, write_bytes

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import (
+from crosscue.eval.commands.shared.terminal import (
     add_part_arguments,
     add_vehicle_output,
     metres,

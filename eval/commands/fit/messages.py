@@ -15,8 +15,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_result
-from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.eval.commands.shared.terminal import print_result, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import (
+from crosscue.eval.commands.shared.terminal import (
     add_log_arguments,
     add_vehicle_output,
     print_result,

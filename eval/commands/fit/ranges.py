@@ -18,7 +18,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.detectors.ranging.height_to_range import FAMILIES
-from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.commands.shared.terminal import print_result
 from crosscue.eval.interface.fits.ranges import PUBLISHED_SD_M
 
 

@@ -17,8 +17,13 @@ from pathlib import Path
 
 import crosscue
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
-from crosscue.eval.commands.shared.progress import Done, with_progress
+from crosscue.eval.commands.shared.terminal import (
+    Done,
+    add_limit_arguments,
+    limits_of,
+    print_result,
+    with_progress,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_part_arguments, metres, print_result
+from crosscue.eval.commands.shared.terminal import add_part_arguments, metres, print_result
 from crosscue.replay.base import UsageError
 
 

@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,8 +23,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_part_arguments, print_json
-from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.eval.commands.shared.terminal import add_part_arguments, print_json, progress_line
 from crosscue.replay.safe_text import terminal_width, wrapped
 
 SHOWN = 20

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_log_arguments, print_result
-from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.eval.commands.shared.terminal import add_log_arguments, print_result, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

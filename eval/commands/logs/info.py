@@ -16,12 +16,13 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import (
+from crosscue.eval.commands.shared.terminal import (
+    Done,
     add_part_arguments,
     limits_of,
     print_json,
+    with_progress,
 )
-from crosscue.eval.commands.shared.progress import Done, with_progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,8 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.progress import Done, ProgressLine, progress_line
+from crosscue.eval.commands.shared.terminal import Done, ProgressLine, print_json, progress_line
 from crosscue.replay.errors import UsageError
 
 

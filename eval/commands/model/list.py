@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,8 +15,12 @@ from pathlib import Path
 import crosscue
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_log_arguments, print_result
-from crosscue.eval.commands.shared.progress import DriveLine, is_shown
+from crosscue.eval.commands.shared.terminal import (
+    DriveLine,
+    add_log_arguments,
+    is_shown,
+    print_result,
+)
 from crosscue.replay.errors import UsageError
 
 

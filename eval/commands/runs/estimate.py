@@ -12,8 +12,13 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_logs_argument, limits_of, print_result
-from crosscue.eval.commands.shared.progress import DriveLine, is_shown
+from crosscue.eval.commands.shared.terminal import (
+    DriveLine,
+    add_logs_argument,
+    is_shown,
+    limits_of,
+    print_result,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

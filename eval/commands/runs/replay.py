@@ -21,8 +21,14 @@ from pathlib import Path
 import crosscue
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
 from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.options import add_part_arguments, limits_of, print_result
-from crosscue.eval.commands.shared.progress import DriveLine, DrivesLine, is_shown
+from crosscue.eval.commands.shared.terminal import (
+    DriveLine,
+    DrivesLine,
+    add_part_arguments,
+    is_shown,
+    limits_of,
+    print_result,
+)
 from crosscue.replay.errors import UsageError
 
 

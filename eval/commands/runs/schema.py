@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_schema_output, print_schema
+from crosscue.eval.commands.shared.terminal import add_schema_output, print_schema
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

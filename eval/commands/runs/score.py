@@ -24,8 +24,13 @@ import sys
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_logs_arguments, limits_of, metres, print_json
-from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.eval.commands.shared.terminal import (
+    add_logs_arguments,
+    limits_of,
+    metres,
+    print_json,
+    progress_line,
+)
 from crosscue.replay.base import CrosscueError, one_line, visible
 
 

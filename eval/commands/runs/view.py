@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import (
+from crosscue.eval.commands.shared.terminal import (
     add_logs_arguments,
     limits_of,
     print_json,

@@ -13,7 +13,7 @@ from crosscue.eval.interface.logs.log import open as open_drive
 from crosscue.replay.logs.log_part import part_in_words
 from crosscue.replay.logs.opening import unless_damaged
 
-from .options import limits_of
+from .terminal import limits_of
 
 
 @contextmanager

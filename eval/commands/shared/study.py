@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import crosscue
 from crosscue.replay.base import UsageError
 
-from .options import print_json
+from .terminal import print_json
 
 if TYPE_CHECKING:
     from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy

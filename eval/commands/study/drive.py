@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_result
+from crosscue.eval.commands.shared.terminal import print_result
 
 STRATEGIES = ("straight to goal", "landmark to landmark", "hybrid")
 

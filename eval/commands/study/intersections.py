@@ -15,8 +15,7 @@ from pathlib import Path
 import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED
-from crosscue.eval.commands.shared.options import print_result
-from crosscue.eval.commands.shared.progress import DrivesLine, is_shown
+from crosscue.eval.commands.shared.terminal import DrivesLine, is_shown, print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,8 +16,6 @@ from __future__ import annotations
 import argparse
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_json
-from crosscue.eval.commands.shared.progress import progress_line
 from crosscue.eval.commands.shared.study import (
     add_cluster_arguments,
     add_study_arguments,
@@ -25,6 +23,7 @@ from crosscue.eval.commands.shared.study import (
     study_of,
     workers_of,
 )
+from crosscue.eval.commands.shared.terminal import print_json, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -21,8 +21,7 @@ from functools import partial
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_result
-from crosscue.eval.commands.shared.progress import progress_line
+from crosscue.eval.commands.shared.terminal import print_result, progress_line
 from crosscue.replay.errors import UsageError
 
 

@@ -18,8 +18,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import print_result
-from crosscue.eval.commands.shared.progress import Done, progress_line
+from crosscue.eval.commands.shared.terminal import Done, print_result, progress_line
 from crosscue.replay.errors import UsageError
 
 

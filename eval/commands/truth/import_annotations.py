@@ -18,7 +18,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
+from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_result
 from crosscue.replay.errors import UsageError
 
 

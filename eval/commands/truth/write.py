@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
+from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_result
+from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

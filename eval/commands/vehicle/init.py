@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 import crosscue
-from crosscue.eval.commands.shared.options import add_limit_arguments, limits_of, print_json
+from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_json
 
 MOUNTING: Final = {
     "x-m": "how far the camera sits ahead of the rear axle",

@@ -25,6 +25,7 @@ from crosscue.replay.base import (
     Images,
     Ledger,
     Limits,
+    LossWarning,
     MissingTopicError,
     SchemaError,
     Selection,
@@ -32,6 +33,7 @@ from crosscue.replay.base import (
     Topic,
     TopicAccount,
     UsageError,
+    warn_of,
 )
 from crosscue.replay.base import Log as OneLog
 from crosscue.replay.decode import Decoder, decoder_for
@@ -41,7 +43,6 @@ from crosscue.replay.logs.log_part import part_of
 from crosscue.replay.logs.opening import open_log as open_one
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.logs.topic_part import columns_of
-from crosscue.replay.losses import LossWarning, warn_of
 from crosscue.replay.remote.logs import name_of
 
 if TYPE_CHECKING:

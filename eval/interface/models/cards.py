@@ -11,7 +11,7 @@ from pathlib import Path
 from crosscue.detectors.base import Detections, Detector, Frame, View
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.draft import Draft, draft
-from crosscue.detectors.catalog.entries import card_named
+from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
 from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.images import decode, read_file

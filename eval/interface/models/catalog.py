@@ -8,8 +8,9 @@ from pathlib import Path
 
 from crosscue.detectors.catalog.card import Evidence, ModelCard, read_card
 from crosscue.detectors.catalog.class_names import CUE_LABELS
-from crosscue.detectors.catalog.entries import card_named, entry, names, place_of
+from crosscue.detectors.catalog.entries import entry, place_of
 from crosscue.detectors.catalog.fetch import Fetched, fetch
+from crosscue.detectors.catalog.places import card_named, names
 from crosscue.eval.interface.show import Listing
 
 

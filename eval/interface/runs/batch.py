@@ -18,7 +18,6 @@ from crosscue.eval.batch.jobs import (
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.interface.logs.log import open as open_drive
-from crosscue.eval.interface.runs.run import replay_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.input import files_named_in
@@ -27,6 +26,8 @@ from crosscue.replay.logs.log_part import part_in_words
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+
+from .make import replay_drive
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

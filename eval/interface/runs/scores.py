@@ -8,27 +8,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 from crosscue.eval.catalog.find_runs import runs_of
-from crosscue.eval.interface.runs.run import Run, ScoredRun
+from crosscue.eval.interface.runs.run import Run
+from crosscue.eval.interface.runs.score import Failed, ScoredRun, ScoreWork, score_each
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.page import REPORT, write_report
-from crosscue.eval.report.score_runs import Failed, ScoreWork
-from crosscue.eval.report.score_runs import score_runs as score_each
 from crosscue.eval.report.summary import gate_lines, pose_summary, reported_line, summary
 from crosscue.eval.report.worst_frames import worst_frames
-from crosscue.eval.runs.account import account_lines
-from crosscue.eval.runs.folder import locked
+from crosscue.eval.runs.folder import account_lines, locked
 from crosscue.eval.scoring.drives import Scores, ScoreSettings
+from crosscue.eval.scoring.files import FOLDER, write_scores
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import smoother_text
-from crosscue.eval.scoring.runs import (
-    FOLDER,
-    RunScored,
-    account_of_scores,
-    metrics_of,
-    scores_of,
-    write_scores,
-)
+from crosscue.eval.scoring.runs import RunScored, account_of_scores, metrics_of, scores_of
 from crosscue.eval.studies.attribution import (
     Attribution,
     Drive,

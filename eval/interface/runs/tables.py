@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crosscue.eval.interface.logs.log import Log, opened
-from crosscue.eval.interface.runs.run import vehicle_of
 from crosscue.eval.runs.folder import create
 from crosscue.replay.base import RunError, visible
+
+from .make import vehicle_of
 
 if TYPE_CHECKING:
     from crosscue.eval.catalog.decoded_logs import Decoded

@@ -10,8 +10,9 @@ from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import Done, Progress, exit_status_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.intersections.report import StudyFiles, summary, write_study
-from crosscue.eval.studies.intersections.scores import StudyScores
-from crosscue.eval.studies.intersections.study import IntersectionStudy, run_drives, score_study
+from crosscue.eval.studies.intersections.settings import IntersectionStudy
+from crosscue.eval.studies.intersections.study import run_drives, score_study
+from crosscue.eval.studies.intersections.tables import StudyScores
 from crosscue.replay.base import RunError, json_tree, visible
 
 

@@ -163,12 +163,16 @@ def run_field_study(
         RunError: The folder holds another study's results.
     """
     from crosscue.eval.studies.town.field_study import NOTES, drive_field, finish_field
+    from crosscue.eval.studies.town.replayed import through_log
     from crosscue.eval.studies.town.work import default_workers
 
     if not study.range_runs + study.landmark_runs:
         raise UsageError("study field: no runs; give --range-runs or --landmark-runs")
     folder, runs = Path(output), []
-    for done, one in drive_field(study, folder, workers or default_workers(), overwrite=overwrite):
+    driven = drive_field(
+        study, folder, workers or default_workers(), through_log, overwrite=overwrite
+    )
+    for done, one in driven:
         runs.append(one)
         on_percent(100.0 * done, 100.0)
     return FieldResult(folder, tuple(runs), finish_field(study, runs, folder), tuple(NOTES))

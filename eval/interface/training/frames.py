@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from crosscue.datasets.scenes.drive import SOURCE, SceneSettings, camera_of_width
+from crosscue.datasets.scenes.drive import SOURCE
 from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.export.training_frames import frames, joined
+from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.eval.interface.training.inputs import check_place, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from crosscue.datasets.scenes.drive import SceneSettings
 from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rendered
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.interface.training.inputs import check_place, layouts_of, learnt_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.made_of import made_of

@@ -30,12 +30,12 @@ from crosscue.detectors.ranging.object_tracks import (
     Track,
     difference_var_m2,
 )
-from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, Usable, source_of, usable
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.cue_table import TRAFFIC_LIGHT
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import TRAFFIC_LIGHT, Vehicle
+
+from .usable import MEASURED, Usable, source_of, usable
 
 CLEARLY: Final = 2.0
 """Standard deviations of the difference of two ranges."""

@@ -18,27 +18,23 @@ from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Place, Seen
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import Motion
-from crosscue.eval.pipeline.outcome import (
-    ApproachSummary,
-    OnTime,
-    SceneOutcome,
-    report_time,
-    unwatched_time,
-)
+from crosscue.eval.pipeline.progress import OnTime, report_time, unwatched_time
 from crosscue.eval.pipeline.scene.looked_for import not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
-from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
+from crosscue.eval.runs.folder import DetectManifest, RunFolder
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
-from crosscue.fusion.approaches import Approaches, PastCues, RangeRow, Step
+from crosscue.fusion.approaches import Approaches, RangeRow, Step
 from crosscue.fusion.belief import begin, probabilities
-from crosscue.fusion.evidence import FrameEvidence
+from crosscue.fusion.evidence import FrameEvidence, PastCues
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .outcome import ApproachSummary, SceneOutcome
+from .usable import MEASURED
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.time.segments import LogClock, Timeline
 
-from .table_sink import TableSink
+from .parquet import TableFolder, TableSink
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,7 +36,7 @@ class LabelledSink(TableSink):
     """A table of a run; each row's segment and original stamp are added by its ``t_ns``."""
 
     def __init__(
-        self, run: RunFolder, name: str, schema: pa.Schema, timeline: Timeline, clock: LogClock
+        self, run: TableFolder, name: str, schema: pa.Schema, timeline: Timeline, clock: LogClock
     ) -> None:
         """Begin ``NAME.parquet``; ``clock`` is that of the log whose rows these are."""
         super().__init__(run, name, labelled(schema))

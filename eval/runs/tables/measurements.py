@@ -9,25 +9,21 @@ weighed in).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.ekf import PoseBelief
-from crosscue.localization.fixes import Fixes
 from crosscue.localization.gap import Crossed
-from crosscue.localization.landmarks.update import Sighting
-from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
-from crosscue.localization.pose_track import ACCEPTED, HeadingColumns, Headings
-from crosscue.replay.base import Floats, RunError
+from crosscue.localization.landmarks.sighting import Sighting
+from crosscue.localization.odometry import Increments
+from crosscue.localization.pose_track import ACCEPTED, HeadingColumns
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 TABLE: Final = "measurements"
-_NUMBERS: Final = (
+NUMBERS: Final = (
     "distance_m",
     "turn_rad",
     "distance_var_m2",
@@ -44,23 +40,6 @@ _NUMBERS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """All measurements of a run.
-
-    Attributes:
-        start: The first belief.
-        increments: Odometry.
-        headings: Those that counted.
-        fixes: Positions of the camera by landmarks.
-    """
-
-    start: PoseBelief
-    increments: Increments
-    headings: Headings
-    fixes: Fixes
-
-
 def schema() -> pa.Schema:
     """Columns of ``measurements.parquet``."""
     import pyarrow as pa
@@ -70,7 +49,7 @@ def schema() -> pa.Schema:
             ("kind", pa.dictionary(pa.int8(), pa.string())),
             ("start_ns", pa.int64()),
             ("t_ns", pa.int64()),
-            *((name, pa.float64()) for name in _NUMBERS),
+            *((name, pa.float64()) for name in NUMBERS),
             ("landmark", pa.string()),
         ]
     )
@@ -99,7 +78,7 @@ def start_rows(belief: PoseBelief) -> dict[str, object]:
 
 def odometry_rows(made: Increments) -> dict[str, object]:
     """Increments as rows."""
-    names = _NUMBERS[:6]
+    names = NUMBERS[:6]
     columns: dict[str, object] = {name: getattr(made, name) for name in names}
     return _rows("odometry", made.stop_ns, columns | {"start_ns": made.start_ns})
 
@@ -149,66 +128,9 @@ def landmark_rows(sightings: list[Sighting]) -> dict[str, object]:
 def _rows(kind: str, t_ns: object, columns: Mapping[str, object]) -> dict[str, object]:
     times = np.asarray(t_ns, np.int64)
     nothing = [None] * len(times)
-    names = ("start_ns", *_NUMBERS, "landmark")
+    names = ("start_ns", *NUMBERS, "landmark")
     return {
         "kind": [kind] * len(times),
         "t_ns": times,
         **{name: columns.get(name, nothing) for name in names},
     }
-
-
-def read_measured(run: RunFolder) -> Measured:
-    """The measurements of a finished run.
-
-    Raises:
-        RunError: The table is missing (a run of an older crosscue), damaged, or empty.
-    """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    table = run.table(TABLE)
-
-    def of(*kinds: str) -> dict[str, Floats]:
-        part = table.filter(pc.is_in(table["kind"].cast("string"), pa.array(kinds)))
-        names = ("start_ns", "t_ns", *_NUMBERS)
-        return {name: part[name].to_numpy() for name in names}
-
-    start, heading, landmark = map(of, ("start", "heading", "landmark"))
-    odometry, gaps = of("odometry", "gap"), of("gap")
-    is_gap = np.isin(odometry["t_ns"], gaps["t_ns"]) & np.isin(
-        odometry["start_ns"], gaps["start_ns"]
-    )
-    if len(start["t_ns"]) != 1 or not len(odometry["t_ns"]):
-        raise RunError(f"{run.path}: no odometry in it, so there is nothing to smooth")
-    cov = np.zeros((4, 4))
-    cov[:2, :2] = _matrices(start)[0]
-    cov[2, 2], cov[3, 3] = start["heading_var_rad2"][0], start["speed_var_m2ps2"][0]
-    mean = np.array([start[name][0] for name in ("x_m", "y_m", "heading_rad", "speed_mps")])
-    return Measured(
-        PoseBelief(int(start["t_ns"][0]), mean, cov),
-        Increments(
-            start_ns=odometry["start_ns"].astype(np.int64),
-            stop_ns=odometry["t_ns"].astype(np.int64),
-            distance_m=odometry["distance_m"],
-            turn_rad=odometry["turn_rad"],
-            distance_var_m2=odometry["distance_var_m2"],
-            turn_var_rad2=odometry["turn_var_rad2"],
-            speed_mps=odometry["speed_mps"],
-            speed_var_m2ps2=odometry["speed_var_m2ps2"],
-            turn_source=np.where(is_gap, BY_NOTHING, BY_YAW_RATE).astype(np.uint8),
-            is_gap=is_gap,
-        ),
-        Headings(
-            heading["t_ns"].astype(np.int64), heading["heading_rad"], heading["heading_var_rad2"]
-        ),
-        Fixes(
-            landmark["t_ns"].astype(np.int64),
-            np.column_stack([landmark["x_m"], landmark["y_m"]]),
-            _matrices(landmark),
-        ),
-    )
-
-
-def _matrices(columns: Mapping[str, Floats]) -> Floats:
-    xx, xy, yy = (columns[name] for name in ("xx_m2", "xy_m2", "yy_m2"))
-    return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 
 from crosscue.detectors.cues.far_side import MobileyeState, end_of, past_counts, state_at
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.fusion.approaches import PastCues
+from crosscue.fusion.evidence import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.replay.signals.kinds import (
     LANE_COLUMNS,
@@ -29,6 +28,7 @@ from crosscue.replay.time.segments import BEGINNING, LogClock, Timeline
 from crosscue.replay.vehicle.mobileye_cues import Past
 
 from .labelled import LabelledSink
+from .parquet import TableFolder
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -49,7 +49,7 @@ def schema(signal: Signal) -> pa.Schema:
 class MobileyeSink:
     """Writes both tables, a window at a time; a context manager."""
 
-    def __init__(self, run: RunFolder, timeline: Timeline, clock: LogClock) -> None:
+    def __init__(self, run: TableFolder, timeline: Timeline, clock: LogClock) -> None:
         self._stack: Final = ExitStack()
         self._sinks: Final = {
             signal: LabelledSink(run, name, schema(signal), timeline, clock)
@@ -81,7 +81,7 @@ class MobileyeSink:
 class StoredMobileye:
     """Both tables read forwards in time; memory holds a batch of each."""
 
-    def __init__(self, run: RunFolder, past: Past) -> None:
+    def __init__(self, run: TableFolder, past: Past) -> None:
         self._past: Final = past
         self._since_ns = BEGINNING
         self._readers: Final = {signal: _Reader(signal, _parts(run, signal)) for signal in TABLES}
@@ -141,7 +141,7 @@ def _joined(before: Samples, fresh: Samples, from_ns: int) -> Samples:
     )
 
 
-def _parts(run: RunFolder, signal: Signal) -> Iterator[Samples]:
+def _parts(run: TableFolder, signal: Signal) -> Iterator[Samples]:
     name, columns = TABLES[signal]
     if not run.file(f"{name}.parquet").exists():
         return

@@ -8,12 +8,11 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.runs.account import UNATTRIBUTED, LogAccount, TopicLine
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.base import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 
 from .labelled import labelled
-from .table_sink import TableSink
+from .parquet import TableFolder, TableSink
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -42,7 +41,7 @@ def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
 
 
 def write_skipped(
-    run: RunFolder,
+    run: TableFolder,
     ledgers: Sequence[Ledger],
     reading: Sequence[LogAccount],
     kept: pa.Table | None = None,

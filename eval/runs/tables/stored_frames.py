@@ -11,9 +11,10 @@ import numpy as np
 
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.observed import RoadShares, Role, Seen, all_labels
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.replay.columns import Floats
+
+from .parquet import TableFolder
 
 NO_BOXES: Final = np.empty((0, 4))
 
@@ -83,7 +84,7 @@ MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
 
 def stored_frames(
-    run: RunFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
+    run: TableFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
 ) -> Iterator[StoredFrame]:
     """All frames of a run in the order they were examined; memory holds one batch of rows.
 

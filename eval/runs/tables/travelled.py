@@ -14,10 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 
-from . import measurements
+from .parquet import TableFolder
 
 COLUMNS: Final = ("start_ns", "t_ns", "distance_m", "turn_rad", "distance_var_m2")
 
@@ -113,7 +112,7 @@ class Odometer:
         return self._rows[self._next]
 
 
-def odometer_of(run: RunFolder) -> Odometer:
+def odometer_of(run: TableFolder) -> Odometer:
     """The odometry of a run.
 
     Raises:
@@ -122,12 +121,12 @@ def odometer_of(run: RunFolder) -> Odometer:
     return Odometer(_parts(run))
 
 
-def _parts(run: RunFolder) -> Iterator[_Part]:
+def _parts(run: TableFolder) -> Iterator[_Part]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
     kinds = pa.array(["odometry", "gap"])
-    for batch in run.batches(measurements.TABLE, ["kind", *COLUMNS]):
+    for batch in run.batches("measurements", ["kind", *COLUMNS]):
         kind = batch["kind"].cast("string")
         is_way = pc.is_in(kind, kinds)
         part = batch.filter(is_way)

@@ -20,11 +20,11 @@ from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.catalog.class_names import meaning_of
 from crosscue.detectors.cues.observed import Role
-from crosscue.eval.fit.log_images import picture_names
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import reopened
 from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
 from crosscue.replay.base import EmptyResultError, Int64s, SchemaError, UsageError
+from crosscue.replay.readers.images.names import picture_names
 
 from .matching import NOBODY, Boxes
 

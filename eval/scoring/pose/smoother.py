@@ -12,12 +12,12 @@ import numpy as np
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import refuse_set_back
-from crosscue.eval.runs.tables.measurements import read_measured
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
 from crosscue.replay.base import Floats, Int64s, SchemaError, strict_json, write_text
 
 from .errors import NeesSummary, nees, pair, summarise_nees
+from .measured import read_measured
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
 
 MIN_STEP_NS: Final = 1_000_000_000

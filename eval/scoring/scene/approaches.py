@@ -275,7 +275,7 @@ def _result(
     ranged = _has_range(tables, number, steps.t_ns)
     is_right = np.ones(len(steps.t_ns), np.bool_)
     if rule.checks_range:
-        is_right = is_range_right(tables, truth, number, steps.t_ns)
+        is_right = _is_range_right(tables, truth, number, steps.t_ns)
     published = likely & ranged
     detected = held(published & is_right, rule.frames)
     # Where a sign or light stands, it is what must be found; elsewhere nothing could speak of it.
@@ -315,6 +315,17 @@ def _result(
             name: float(values[-1]) for name, values in steps.features.items() if len(values)
         },
     )
+
+
+def _is_range_right(
+    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: Int64s
+) -> NDArray[np.bool_]:
+    """As ``is_range_right``; where the truth has no ranges, nothing can be wrong."""
+    rows = tables.ranges
+    if rows is None or number is None or truth.ranges is None:
+        return np.ones(len(t_ns), np.bool_)
+    true_m = truth.ranges.at(rows.t_ns, truth.approach_at(rows.t_ns))
+    return is_range_right(rows, true_m, number, t_ns)
 
 
 def _overlap_s(steps: BeliefRows) -> float:

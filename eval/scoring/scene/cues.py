@@ -35,8 +35,7 @@ from crosscue.eval.scoring.pooling import (
 )
 from crosscue.eval.scoring.truth import DriveTruth, cue_at, has_feature
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.vehicle.cue_spec import Scoring
-from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import CUES, Scoring
 
 Reading = Scoring
 

@@ -14,8 +14,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.columns import RunTables
-from crosscue.eval.scoring.truth import DriveTruth
+from crosscue.eval.scoring.columns import RangeRows
+from crosscue.replay.columns import Floats, Int64s
 
 Definition = Literal["confirmed", "published"]
 CONFIRM_FRAMES: Final = 3
@@ -52,18 +52,21 @@ def held(holds: Flags, frames: int) -> Flags:
 
 
 def is_range_right(
-    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: NDArray[np.int64]
+    rows: RangeRows, true_m: tuple[Floats, Floats], number: int, t_ns: Int64s
 ) -> Flags:
     """Is the latest range at each time within its 95 % interval of the true one?
 
-    Of the ranges to start and end one is enough. Where the truth has none, nothing can be wrong.
+    Of the ranges to start and end one is enough.
+
+    Args:
+        rows: The run's.
+        true_m: To start and end, at the times of ``rows``; NaN where unknown.
+        number: The run's approach.
+        t_ns: Shape (N,).
     """
-    rows, right = tables.ranges, np.zeros(len(t_ns), np.bool_)
-    if rows is None or number is None or truth.ranges is None:
-        return np.ones(len(t_ns), np.bool_)
+    right = np.zeros(len(t_ns), np.bool_)
     is_known = right.copy()
-    start_m, end_m = truth.ranges.at(rows.t_ns, truth.approach_at(rows.t_ns))
-    for reference, true_m in (("start", start_m), ("end", end_m)):
+    for reference, true in zip(("start", "end"), true_m, strict=True):
         mine = np.flatnonzero(
             (rows.approach == number) & (rows.reference == reference) & np.isfinite(rows.range_m)
         )
@@ -71,7 +74,7 @@ def is_range_right(
         latest = np.searchsorted(rows.t_ns[mine], t_ns, side="right") - 1
         exists = latest >= 0
         at = mine[latest[exists]]
-        error_m = np.abs(rows.range_m[at] - true_m[at])
+        error_m = np.abs(rows.range_m[at] - true[at])
         is_known[exists] |= np.isfinite(error_m)
         right[exists] |= error_m <= SDS_95 * np.sqrt(rows.var_m2[at])
     return right | ~is_known

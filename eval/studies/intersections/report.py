@@ -13,16 +13,24 @@ from crosscue.eval.batch.jobs import Done
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
-from crosscue.eval.scoring.runs import metrics_of, write_scores
+from crosscue.eval.scoring.files import write_scores
+from crosscue.eval.scoring.intervals import TOO_FEW
+from crosscue.eval.scoring.runs import metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
-from crosscue.eval.studies.intersections.scores import StudyScores
 from crosscue.replay.base import strict_json, versions, write_text
 
 from .causes import Finding, by_cause, condition_costs, findings
 from .contact_sheet import write_sheet
 from .figures import draw_beliefs, draw_distances, draw_reliability
-from .study import IntersectionStudy
-from .tables import TOO_FEW, attribution_rows, cue_rows, intersection_rows, mean_text, quoted_rows
+from .settings import IntersectionStudy
+from .tables import (
+    StudyScores,
+    attribution_rows,
+    cue_rows,
+    intersection_rows,
+    mean_text,
+    quoted_rows,
+)
 
 PAGE: Final = "study.html"
 TEMPLATE: Final = "intersections.html.j2"

@@ -4,15 +4,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
-from crosscue.eval.scoring.intervals import Mean, Proportion, wilson
+from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.intervals import TOO_FEW, Mean, Proportion, wilson
+from crosscue.eval.scoring.runs import RunScored
 from crosscue.eval.scoring.scene.approaches import ApproachResult
+from crosscue.eval.scoring.scene.belief import BeliefDifference
 from crosscue.eval.scoring.scene.cues import CueScore
-from crosscue.eval.studies.intersections.scores import StudyScores
+from crosscue.eval.studies.attribution import Attribution
 from crosscue.replay.vehicle.cue_table import groups
+
+
+@dataclass(frozen=True, slots=True)
+class StudyScores:
+    """The scored study.
+
+    Attributes:
+        scored: Every drive beside its truth.
+        scores: All together.
+        worth: What each of the nine cues was worth; empty where that was not asked.
+        calibrated: All again, each intersection with messages learned at the others; None where
+            there are too few.
+        difference: Calibrated less source, by feature.
+    """
+
+    scored: tuple[RunScored, ...]
+    scores: Scores
+    worth: dict[str, Attribution]
+    calibrated: Scores | None
+    difference: dict[str, BeliefDifference]
+
 
 PUBLISHED_RUNS: Final[Mapping[str, tuple[float, float]]] = {
     "E-01": (38.6, 19.8), "F-05": (41.2, 29.4), "A-07": (75.2, 30.1), "B-10": (47.7, 17.6),

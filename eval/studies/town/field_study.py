@@ -11,22 +11,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder, locked
+from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.eval.studies.intervals import fraction_of, mean_of
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.pictures import figure, save
 from crosscue.eval.studies.words import percent
+from crosscue.localization.town.drive import Traced
 from crosscue.localization.town.random_stream import key_of
+from crosscue.localization.town.settings import Drive
 from crosscue.replay.base import RunError, json_tree, strict_json, write_text
 from crosscue.replay.processes import in_processes
 
 from .range_study import implied_m
-from .replayed import through_log
 from .settings import FieldStudy
 
 SUMMARY: Final = "summary.json"
@@ -86,6 +89,38 @@ class FieldRun:
     is_whole: bool
 
 
+class Replayed(Protocol):
+    """One drive and what became of it; see ``replayed.Replayed``."""
+
+    @property
+    def traced(self) -> Traced:
+        """As simulated."""
+        ...
+
+    @property
+    def score(self) -> PoseScore:
+        """The replay against truth."""
+        ...
+
+    @property
+    def is_whole(self) -> bool:
+        """The replay lost nothing of the log."""
+        ...
+
+    @property
+    def landmark_counts(self) -> dict[str, int]:
+        """What became of camera frames."""
+        ...
+
+
+class ThroughLog(Protocol):
+    """Drives, writes the log, replays and scores it."""
+
+    def __call__(self, folder: Path, settings: Drive, seed: int, *, overwrite: bool) -> Replayed:
+        """One drive, in its folder."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class _Job:
     study: FieldStudy
@@ -96,11 +131,23 @@ class _Job:
 
 
 def drive_field(
-    study: FieldStudy, folder: Path, workers: int, *, overwrite: bool = False
+    study: FieldStudy,
+    folder: Path,
+    workers: int,
+    through_log: ThroughLog,
+    *,
+    overwrite: bool = False,
 ) -> Iterator[tuple[float, FieldRun]]:
     """Drive, record, replay and score every run; fraction done and run, in order.
 
     A run that is there already, of the same study, is not driven again.
+
+    Args:
+        study: What to drive.
+        folder: Where to.
+        workers: Processes.
+        through_log: Drives once and replays that; ``replayed.through_log``.
+        overwrite: Replace another study's results.
 
     Raises:
         RunError: The folder holds another study.
@@ -113,7 +160,7 @@ def drive_field(
         for i in range(runs)
     ]
     with locked(RunFolder(folder)):
-        for done, run in enumerate(in_processes(_run, jobs, workers), 1):
+        for done, run in enumerate(in_processes(partial(_run, through_log), jobs, workers), 1):
             yield done / len(jobs), run
 
 
@@ -136,7 +183,7 @@ def _claim(study: FieldStudy, folder: Path, *, overwrite: bool) -> None:
     write_text(path, strict_json(wanted) + "\n")
 
 
-def _run(job: _Job) -> FieldRun:
+def _run(through_log: ThroughLog, job: _Job) -> FieldRun:
     folder = job.folder / job.name
     kept = folder / "field_run.json"
     if kept.exists():

@@ -28,7 +28,7 @@ from crosscue.localization.town.drive import Outcome
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.columns import Floats
 
-from .range_study import split
+from .cases import split
 from .settings import LandmarkStudy
 
 if TYPE_CHECKING:

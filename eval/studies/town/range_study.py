@@ -8,7 +8,6 @@ first goal, or was lost before.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Final
@@ -22,6 +21,7 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
 from crosscue.replay.columns import Floats
 
+from .cases import split
 from .settings import UNTIL_LOST, RangeStudy, changed
 
 if TYPE_CHECKING:
@@ -113,16 +113,6 @@ def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
         _of_case(case.settings, rows)
         for case, rows in zip(study.cases(), split(table), strict=True)
     ]
-
-
-def split(table: pa.Table) -> Iterator[dict[str, Floats]]:
-    """The columns of each case in turn, by name."""
-    names = list(Result._fields)
-    cases = table["case"].to_numpy()
-    columns = {name: table[name].to_numpy() for name in names}
-    for case in range(int(cases[-1]) + 1):
-        part = slice(*np.searchsorted(cases, [case, case + 1]).tolist())
-        yield {name: columns[name][part] for name in names}
 
 
 def points(rows: dict[str, Floats]) -> tuple[Floats, Floats]:

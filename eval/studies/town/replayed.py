@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import replay_drive
-from crosscue.eval.report.score_runs import score_pose
+from crosscue.eval.report.pose_figures import draw_all
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.pose.score import PoseScore
+from crosscue.eval.scoring.files import FOLDER, METRICS
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import EVERYTHING
+from crosscue.replay.base import EVERYTHING, strict_json, write_text
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
@@ -60,3 +61,18 @@ def through_log(folder: Path, settings: Drive, seed: int, *, overwrite: bool = F
         outcome = replay_drive([log], vehicle, run, EVERYTHING, landmarks=landmarks)
     scored = score_pose(run, files.truth)
     return Replayed(traced, files, run, scored, outcome.exit_status == 0, outcome.landmark_counts)
+
+
+def score_pose(run: RunFolder, truth_path: Path) -> PoseScore:
+    """Score a run's pose alone; metrics, tracks and figures go into its ``score`` folder.
+
+    Raises:
+        RunError: The run's tables are missing or damaged.
+        SchemaError: The truth does not fit the run.
+    """
+    truth, _ = load_truth(truth_path)
+    result, poses = measure(run, truth_path)
+    content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
+    write_text(run.file(FOLDER) / METRICS, strict_json(content) + "\n")
+    draw_all(poses, run.file(FOLDER))
+    return result

@@ -15,6 +15,7 @@ from crosscue.localization.town.drive import Result
 from crosscue.replay.base import RunError, json_tree, strict_json, write_text
 
 from . import landmark_figure, landmark_study, range_figure, range_study
+from .cases import split
 from .settings import LandmarkStudy, RangeStudy
 from .work import DRIVES, assemble, chunks_of, run
 
@@ -72,7 +73,7 @@ def finish_range(study: RangeStudy, folder: Path) -> Made:
     table = RunFolder(folder).table(DRIVES)
     results = range_study.summarise(study, table)
     picture = range_figure.draw(
-        results, list(range_study.split(table)), study.drive.navigation.lost_above_m, folder
+        results, list(split(table)), study.drive.navigation.lost_above_m, folder
     )
     others = range_study.drive_choices(study)
     return _finish(
@@ -91,7 +92,7 @@ def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
     """Summary, pictures and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     result = landmark_study.summarise(study, table)
-    pictures = landmark_figure.draw(study, result, list(range_study.split(table)), folder)
+    pictures = landmark_figure.draw(study, result, list(split(table)), folder)
     tables = landmark_study.tables(study, result)
     return _finish(
         study,

@@ -22,7 +22,7 @@ import numpy as np
 
 from crosscue.eval.batch.ray_cluster import joined
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.table_sink import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.localization.compiled import fingerprint
 from crosscue.localization.town import parameters
 from crosscue.localization.town import settings as drive_settings

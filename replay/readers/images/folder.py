@@ -20,7 +20,8 @@ from crosscue.replay.base import (
     Selection,
     Topic,
 )
-from crosscue.replay.readers.time_file import find_time_file, read_time_file
+from crosscue.replay.files.time_file_names import find_time_file
+from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
 from crosscue.replay.seal.touched import Touched
 

@@ -38,12 +38,8 @@ from crosscue.replay.base import (
     Selection,
     Topic,
 )
-from crosscue.replay.readers.time_file import (
-    SECOND_NS,
-    TimeFile,
-    read_time_file,
-    time_file_of_video,
-)
+from crosscue.replay.files.time_file_names import time_file_of_video
+from crosscue.replay.readers.time_file import SECOND_NS, TimeFile, read_time_file
 from crosscue.replay.readers.timed_files import is_inside
 
 from .files import image_block

@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, CanFrames, Floats, Int64s, Ledger, Log, Selection, Table
+from crosscue.replay.base import (
+    Block,
+    CanFrames,
+    Floats,
+    Int64s,
+    Ledger,
+    Log,
+    Selection,
+    Table,
+    warn_of,
+)
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.losses import warn_of
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.vehicle.roles import Role, role_of
 

@@ -16,11 +16,11 @@ from crosscue.datasets.scenes.drive import (
     IMAGES,
     MOBILEYE_BUS,
     SceneFiles,
-    SceneSettings,
     write_scene,
 )
 from crosscue.datasets.scenes.mobileye import SETTINGS, Faults
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.datasets.truth.truth import load
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.detectors import rle

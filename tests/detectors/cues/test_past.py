@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.datasets.truth.truth import load as load_truth
 from crosscue.detectors.cues.far_side import (
     MobileyeState,

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.replay.base import RunError

@@ -12,13 +12,13 @@ from typing import Final
 
 import pytest
 
-from crosscue.eval.commands.shared import progress
-from crosscue.eval.commands.shared.progress import Done, DriveLine, ProgressLine
+from crosscue.eval.commands.shared import terminal as progress
+from crosscue.eval.commands.shared.terminal import Done, DriveLine, ProgressLine
 from support.gap_drive import Clock, write_drive
 
 FRAMES: Final = 300
 COMMAND: Final = (
-    "import sys; from crosscue.eval.commands.shared import progress; progress.EVERY_S = 0.0; "
+    "import sys; from crosscue.eval.commands.shared import terminal; terminal.EVERY_S = 0.0; "
     "from crosscue.eval.cli import main; main(sys.argv[1:])"
 )
 

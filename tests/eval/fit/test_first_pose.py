@@ -14,8 +14,8 @@ from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.fit.first_pose import with_start
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
-from crosscue.eval.report.score_runs import score_pose
 from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING, Block, Table, Topic, UsageError, VehicleError
 from crosscue.replay.vehicle.pose import Gnss, Start
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -12,8 +12,8 @@ import pytest
 import crosscue
 from crosscue.datasets.real import annotate_pandaset, recordings
 from crosscue.datasets.truth.truth import load as load_truth
-from crosscue.detectors.catalog import entries
 from crosscue.detectors.catalog import fetch as weights
+from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
 from crosscue.eval.interface import demo as real_demo
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
@@ -67,7 +67,7 @@ def test_from_a_folder_or_the_data_folder_nothing_is_asked(
 ) -> None:
     assert run(["demo", "--real", "--data", str(made_up.folder), "-q"]) == 0
     shutil.rmtree(recordings.place_of(made_up.known).parent)
-    shutil.rmtree(entries.cache_folder())
+    shutil.rmtree(places.cache_folder())
     monkeypatch.setenv(weights.DATA, str(made_up.folder))
 
     drive = crosscue.fetch_drive()
@@ -100,7 +100,7 @@ def test_another_file_than_the_published_one_is_not_kept(made_up: StandIn, name:
     with pytest.raises(crosscue.CrosscueError, match="another SHA-256"):
         crosscue.fetch_drive()
 
-    below = (recordings.place_of(made_up.known), entries.cache_folder())
+    below = (recordings.place_of(made_up.known), places.cache_folder())
     names = [path.name for folder in below for path in folder.rglob("*")]
     assert Path(name).name not in names
 
@@ -205,7 +205,7 @@ def test_the_real_drive_is_replayed_and_scored(
     source = shared("sequences", "pandaset_002").parents[1]
     shared("weights", "yolox_nano")
     monkeypatch.setenv(recordings.VARIABLE, str(tmp_path / "drives"))
-    monkeypatch.setenv(entries.VARIABLE, str(tmp_path / "models"))
+    monkeypatch.setenv(places.VARIABLE, str(tmp_path / "models"))
 
     made = crosscue.demo(tmp_path / "demo", real=True, source=source)
 

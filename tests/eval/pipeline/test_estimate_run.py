@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from crosscue.datasets.scenes.drive import SceneSettings, write_scene
+from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import RunFolder, open_run
 from support.oracle import Oracle

@@ -21,7 +21,7 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
 from crosscue.eval.pipeline.landmarks import LandmarkStage, looking
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.measurements import read_measured
+from crosscue.eval.scoring.pose.measured import read_measured
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.images import grey_of

@@ -11,8 +11,9 @@ from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import create
 from crosscue.replay.base import EVERYTHING, Block, EmptyResultError, RunError, VehicleError
+from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.time import Time
-from crosscue.replay.vehicle.vehicle import Start, Vehicle, parse
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.data import shared
 from support.manifests import estimate_manifest
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block

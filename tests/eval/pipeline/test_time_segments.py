@@ -18,8 +18,9 @@ from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.pose_track import start_belief
 from crosscue.replay.base import EVERYTHING, Block, Int64s
 from crosscue.replay.time.stamp_watch import StampWatch
+from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.time import Time
-from crosscue.replay.vehicle.vehicle import Start, Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
 SECOND = 1_000_000_000

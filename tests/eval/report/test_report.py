@@ -28,7 +28,8 @@ from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.candidates import CandidateRow
 from crosscue.eval.runs.folder import RunFolder, write_manifest
 from crosscue.eval.runs.manifest import SceneSummary
-from crosscue.eval.scoring.runs import FOLDER, RunScored, judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.files import FOLDER
+from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, scores_of
 from support.manifests import estimate_manifest
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder

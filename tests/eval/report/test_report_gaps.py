@@ -11,8 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 from rerun.chunk import RrdReader
 
+from crosscue.eval.interface.runs.score import ScoreWork
 from crosscue.eval.recording import save
-from crosscue.eval.report.score_runs import ScoreWork
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import Gap, broken_at, gaps_of
 from crosscue.eval.scoring.drives import ScoreSettings

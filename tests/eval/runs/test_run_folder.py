@@ -12,7 +12,7 @@ import pytest
 
 from crosscue.eval.runs import folder
 from crosscue.eval.runs.folder import create, locked, open_run
-from crosscue.eval.runs.tables.table_sink import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.replay.base import OutputError, RunError, write_text, write_whole
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])

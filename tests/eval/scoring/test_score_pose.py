@@ -16,12 +16,13 @@ from crosscue.eval import cli
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save as save_recording
 from crosscue.eval.report.page import write_report
-from crosscue.eval.report.score_runs import score_pose
 from crosscue.eval.report.summary import pose_summary
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
-from crosscue.eval.scoring.runs import FOLDER, judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.runs import judge_run, metrics_of, scores_of
+from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import (
     EVERYTHING,
     Block,
@@ -33,7 +34,8 @@ from crosscue.replay.base import (
     Topic,
 )
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.vehicle.vehicle import Camera, Start, Vehicle
+from crosscue.replay.vehicle.pose import Start
+from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 from crosscue.replay.write.convert import LogWriter
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 

@@ -8,9 +8,9 @@ from crosscue.datasets.scenes.car_file import with_fitted_noise
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.pipeline.replay import replay_drive
-from crosscue.eval.report.score_runs import score_pose
 from crosscue.eval.runs.folder import create
 from crosscue.eval.scoring.consistency import mean_band
+from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load

@@ -425,9 +425,9 @@ def test_a_simulated_drive_goes_through_its_log(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_field_runs_are_kept_and_not_driven_twice(tmp_path: Path) -> None:
     study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
-    first = [run for _, run in drive_field(study, tmp_path, 1)]
+    first = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
     logs = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/drive.mcap")}
-    again = [run for _, run in drive_field(study, tmp_path, 1)]
+    again = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
     finish_field(study, again, tmp_path)
 
     assert first == again
@@ -435,7 +435,7 @@ def test_field_runs_are_kept_and_not_driven_twice(tmp_path: Path) -> None:
     assert [run.has_landmarks for run in first] == [False, True]
     assert all(run.is_whole and run.minutes == pytest.approx(2.0, abs=0.01) for run in first)
     with pytest.raises(RunError, match="other settings"):
-        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1))
+        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1, through_log))
 
 
 def test_a_logistic_curve_finds_the_one_it_was_drawn_from() -> None:

@@ -11,12 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogFormatError, LogTooLargeError
-from crosscue.replay.readers.time_file import (
-    TimeFile,
-    find_time_file,
-    read_time_file,
-    time_file_of_video,
-)
+from crosscue.replay.files.time_file_names import find_time_file, time_file_of_video
+from crosscue.replay.readers.time_file import TimeFile, read_time_file
 
 quick = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -25,8 +25,8 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
-from crosscue.replay.encode import Encoders, Outgoing
-from crosscue.replay.encode.outgoing import TIME_MISFIT
+from crosscue.replay.encode.outgoing import TIME_MISFIT, Outgoing
+from crosscue.replay.write.convert import Encoders
 from support.ros_messages import (
     block_of,
     messages_of,

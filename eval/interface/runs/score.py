@@ -1,0 +1,228 @@
+"""One run scored, or many side by side; one that fails does not stop the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from crosscue.eval.report.page import write_report
+from crosscue.eval.report.summary import headline, pose_summary, summary
+from crosscue.eval.report.worst_frames import worst_frames
+from crosscue.eval.runs.folder import locked, open_run
+from crosscue.eval.scoring.drives import ScoreSettings
+from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
+from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.pose.score import load_truth
+from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
+from crosscue.eval.scoring.runs import RunScored, find_truth, judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.scene.detection import Definition
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError
+from crosscue.replay.processes import in_processes
+
+from .run import Run, run_given
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A run that was scored, its files written.
+
+    Attributes:
+        one: Laid beside its truth.
+        metrics: What its ``metrics.json`` holds.
+        report: Its page.
+        smoothed: The batch smoother beside the filter, if asked for.
+    """
+
+    one: RunScored
+    metrics: dict[str, Any]
+    report: Path
+    smoothed: SmootherScore | None
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A run that could not be scored.
+
+    Attributes:
+        path: Its folder.
+        error: What would have ended the command for this run alone.
+    """
+
+    path: Path
+    error: CrosscueError
+
+
+@dataclass(frozen=True, slots=True)
+class ScoreWork:
+    """What is done for one run, here or in another process.
+
+    Attributes:
+        truth: The truth of all runs, or None for the one beside each run's log.
+        settings: Of the scores.
+        rpe_m: Distances of the relative pose error.
+        has_smoother: Run the batch smoother as well?
+        any_log: Take truth that names the hash of another file?
+        logs: Where the runs' logs have moved to, if they have.
+        limits: What the runs' logs are read with.
+        has_figures: Draw figures into the report?
+        without_images: Report without pictures of the worst frames, whose logs may be gone?
+    """
+
+    truth: Path | None
+    settings: ScoreSettings
+    rpe_m: tuple[float, ...]
+    has_smoother: bool = False
+    any_log: bool = False
+    logs: Path | None = None
+    limits: Limits = DEFAULT_LIMITS
+    has_figures: bool = True
+    without_images: bool = False
+
+    def __call__(self, path: Path) -> Scored:
+        """Score one run and write its files.
+
+        Raises:
+            CrosscueError: It cannot be scored.
+        """
+        folder = open_run(path, self.logs, without_images=self.without_images, limits=self.limits)
+        truth_path = find_truth(folder, self.truth)
+        with locked(folder):
+            one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
+            scores = scores_of([one], self.settings)
+            metrics = metrics_of([one], scores)
+            smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
+            if smoothed is not None:
+                metrics["smoother"] = asdict(smoothed)
+            # First what may lack pictures: then nothing is written.
+            worst = worst_frames([one])
+            report = write_report(
+                folder.file(FOLDER), [one], scores, metrics, worst, has_figures=self.has_figures
+            )
+            write_scores(folder.file(FOLDER), [one], metrics)
+        return Scored(one, metrics, report, smoothed)
+
+    def attempt(self, path: Path) -> Scored | Failed:
+        """Score one run; an error of ours becomes a result."""
+        try:
+            return self(path)
+        except CrosscueError as error:
+            return Failed(path, error)
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ScoredRun:
+    """A run beside its truth; printed as ``crosscue score`` prints it.
+
+    Attributes:
+        scored: What was measured.
+        metrics: Every metric by name, as in ``metrics.json``.
+        report: The page that shows them.
+    """
+
+    scored: Scored
+    metrics: Mapping[str, Any]
+    report: Path
+
+    @property
+    def headline(self) -> str:
+        """Its folder and most important numbers in one line."""
+        return headline(str(self.scored.one.run.path), metric_values(self.metrics))
+
+    @property
+    def cues(self) -> pa.Table:
+        """Precision and recall of each cue with 95 % intervals, judged as its row says."""
+        import pyarrow as pa
+
+        rows = []
+        for name, cue in scores_of([self.scored.one]).cues.items():
+            row: dict[str, object] = {"cue": name}
+            for what, share in (("precision", cue.precision), ("recall", cue.recall)):
+                row |= {
+                    what: None if share is None else share.value,
+                    f"{what}_low": None if share is None else share.low,
+                    f"{what}_high": None if share is None else share.high,
+                    f"{what}_of": 0 if share is None else share.of,
+                }
+            rows.append(row)
+        return pa.Table.from_pylist(rows)
+
+    @property
+    def curves(self) -> pa.Table:
+        """Probability of each feature against true distance, a row for each step."""
+        return curve_table([self.scored.one.judged])
+
+    @property
+    def true_track(self) -> pa.Table:
+        """The truth's positions over time, in the columns t_ns, x_m, y_m, z_m.
+
+        Raises:
+            SchemaError: The truth has none.
+        """
+        import pyarrow as pa
+
+        _, track = load_truth(self.scored.one.truth_path)
+        columns = {f"{axis}_m": track.xyz_m[:, i] for i, axis in enumerate("xyz")}
+        return pa.table({"t_ns": track.t_ns, **columns})
+
+    def __repr__(self) -> str:
+        one = self.scored.one
+        lines = [summary(scores_of([one]), one.why_no_pose)]
+        if one.pose is not None:
+            lines += ["", pose_summary(one.pose)]
+        return "\n".join(lines)
+
+
+def score_run(
+    run: Run | Path | str,
+    truth: Path | str | None = None,
+    *,
+    threshold: float = 0.9,
+    detection: Definition = "confirmed",
+    rpe_m: Sequence[float] = (10.0, 100.0),
+    any_log: bool = False,
+    has_figures: bool = True,
+) -> ScoredRun:
+    """Score a run against its truth; metrics, figures and report go into ``RUN/score``.
+
+    Args:
+        run: A finished run.
+        truth: Its truth; None for the ``truth.json`` beside its log.
+        threshold: A feature is detected above this probability.
+        detection: ``confirmed`` by three frames and a right range, or as ``published``: the first
+            frame counts, with any range.
+        rpe_m: Distances of the relative pose error.
+        any_log: Take a truth that names the hash of another file: the same drive, converted.
+        has_figures: Draw figures, for which matplotlib is imported.
+
+    Raises:
+        SchemaError: The truth does not fit the run.
+        UsageError: No truth is given and none lies beside the log.
+    """
+    of = run_given(run)
+    try:
+        settings = ScoreSettings(threshold=threshold, detection=detection)
+    except ValueError as error:
+        raise UsageError(f"score: {error}") from None
+    work = ScoreWork(
+        None if truth is None else Path(truth),
+        settings,
+        tuple(rpe_m),
+        any_log=any_log,
+        logs=of.folder.logs,
+        limits=of.folder.limits,
+        has_figures=has_figures,
+    )
+    scored = work(of.path)
+    return ScoredRun(scored, scored.metrics, scored.report)
+
+
+def score_each(
+    paths: Sequence[Path], work: ScoreWork, workers: int = 1
+) -> Iterator[Scored | Failed]:
+    """Score runs, in order; with several workers in as many processes."""
+    return in_processes(work.attempt, paths, workers)

@@ -1,0 +1,183 @@
+"""Tables of a folder: Parquet with page checksums, written in batches, verified when read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Self
+
+from crosscue.replay.base import UnreadableRunError, cannot_write
+from crosscue.replay.files.parquet import opened
+from crosscue.replay.files.partial_file import PartialFile
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+GROUP_ROWS: Final = 8192
+"""Rows of a table held back before they are written."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableFolder:
+    """A folder of tables.
+
+    Attributes:
+        path: Where it is.
+    """
+
+    path: Path
+
+    def file(self, name: str) -> Path:
+        """Path of one of its files."""
+        return self.path / name
+
+    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
+        """Rows of ``NAME.parquet``, its page checksums verified.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with opened(path) as file:
+                return pq.read_table(file, columns=columns, page_checksum_verification=True)
+        except FileNotFoundError:
+            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise UnreadableRunError(
+                f"{path}: damaged ({error}); run crosscue replay again"
+            ) from None
+
+    def schema(self, name: str) -> pa.Schema:
+        """Columns of ``NAME.parquet``.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with opened(path) as file:
+                return pq.read_schema(file).remove_metadata()
+        except FileNotFoundError:
+            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise UnreadableRunError(
+                f"{path}: damaged ({error}); run crosscue replay again"
+            ) from None
+
+    def batches(
+        self, name: str, columns: list[str] | None = None, rows: int = 16_384
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows of ``NAME.parquet`` a batch at a time, its page checksums verified.
+
+        Raises:
+            RunError: Not there or damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        path = self.file(f"{name}.parquet")
+        try:
+            with (
+                opened(path) as handle,
+                pq.ParquetFile(handle, page_checksum_verification=True) as file,
+            ):
+                yield from file.iter_batches(rows, columns=columns)
+        except FileNotFoundError:
+            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
+        except (OSError, pa.ArrowException) as error:
+            raise UnreadableRunError(
+                f"{path}: damaged ({error}); run crosscue replay again"
+            ) from None
+
+
+class TableSink:
+    """A Parquet file written a batch at a time and named when whole; a context manager.
+
+    Small batches are held back until they make a row group worth its header.
+    """
+
+    def __init__(self, run: TableFolder, name: str, schema: pa.Schema) -> None:
+        """Begin ``NAME.parquet``."""
+        import pyarrow.parquet as pq
+
+        self._path: Final = run.file(f"{name}.parquet")
+        self._schema: Final = schema
+        self._held: list[pa.Table] = []
+        self._rows = 0
+        try:
+            self._partial: Final = PartialFile(self._path)
+            self._file: Final = self._partial.open()
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+        try:
+            self._writer: Final = pq.ParquetWriter(
+                self._file, schema, compression="zstd", write_page_checksum=True
+            )
+        except OSError as error:
+            self._give_up()
+            raise cannot_write(self._path, error) from None
+
+    def write(self, columns: Mapping[str, object]) -> None:
+        """Append rows given as columns.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        import pyarrow as pa
+
+        table = pa.table(dict(columns), schema=self._schema)
+        self._held.append(table)
+        self._rows += table.num_rows
+        if self._rows < GROUP_ROWS:
+            return
+        try:
+            self._flush()
+        except OSError as error:
+            raise cannot_write(self._path, error) from None
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+
+        held, self._held, self._rows = self._held, [], 0
+        if held:
+            self._writer.write_table(pa.concat_tables(held).combine_chunks())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            # The disk may be full: what matters is that nothing half stays and the cause is kept.
+            with suppress(OSError, ValueError):
+                self._writer.close()
+            self._give_up()
+            return
+        try:
+            self._flush()
+            self._writer.close()
+            self._file.close()
+            self._partial.keep()
+        except OSError as error:
+            self._give_up()
+            raise cannot_write(self._path, error) from None
+
+    def _give_up(self) -> None:
+        """Leave nothing half."""
+        with suppress(OSError):
+            self._file.close()
+        self._partial.drop()

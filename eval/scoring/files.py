@@ -1,0 +1,119 @@
+"""Files of a score: metrics as JSON, curves, frames and drives as tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from crosscue.replay.base import strict_json, write_text, write_whole
+
+from .by_drive import DriveMetric, parts_of, table_of
+from .drives import DriveJudged, as_metrics, score
+from .runs import RunScored
+from .truth import FEATURES
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FOLDER: Final = "score"
+"""In a run, or in a study."""
+METRICS: Final = "metrics.json"
+CURVES: Final = "curves"
+CUE_FRAMES: Final = "cue_frames"
+BY_DRIVE: Final = "by_drive"
+
+
+def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> None:
+    """Write ``metrics.json``, and ``curves``, ``cue_frames`` and ``by_drive`` as Parquet.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    write_text(folder / METRICS, strict_json(metrics) + "\n")
+    judged = [one.judged for one in scored]
+    parts = chain.from_iterable(map(_parts, scored))
+    tables = {CURVES: curve_table(judged), CUE_FRAMES: cue_frame_table(judged)}
+    for name, table in (tables | {BY_DRIVE: table_of(parts)}).items():
+        write_whole(folder / f"{name}.parquet", _writer(table))
+
+
+def _parts(one: RunScored) -> Iterator[DriveMetric]:
+    logs = "+".join(sorted(log.identity.digest for log in one.run.drive_manifest().logs))
+    return parts_of(logs, as_metrics(score([one.judged])), one.pose)
+
+
+def _writer(table: pa.Table) -> Any:
+    import pyarrow.parquet as pq
+
+    def write(path: Path) -> None:
+        pq.write_table(table, path, compression="zstd", write_page_checksum=True)
+
+    return write
+
+
+def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
+    """Probabilities against true distance, a row for each step of each matched approach.
+
+    Columns: drive, approach (id in the truth), intersection, t_ns, distance_m, then features.
+    """
+    import pyarrow as pa
+
+    curves = [
+        curve for one in judged if one.approaches is not None for curve in one.approaches.curves
+    ]
+    own = sorted({name for curve in curves for name in curve.features} - set(FEATURES))
+    missing = {len(c.t_ns): np.full(len(c.t_ns), math.nan) for c in curves}
+    columns: dict[str, Any] = {
+        "drive": _repeated([(c.drive, len(c.t_ns)) for c in curves]),
+        "approach": pa.array([c.approach for c in curves for _ in c.t_ns], pa.int64()),
+        "intersection": _repeated([(c.intersection, len(c.t_ns)) for c in curves]),
+        "t_ns": _joined([c.t_ns for c in curves], np.int64),
+        "distance_m": _joined([c.distance_m for c in curves], np.float64),
+    }
+    for name in (*FEATURES, *own):
+        parts = [c.features.get(name, missing[len(c.t_ns)]) for c in curves]
+        columns[name] = _joined(parts, np.float64)
+    return pa.table(columns)
+
+
+def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:
+    """Every frame in which a cue was looked for, with what is true of it.
+
+    Columns: drive, t_ns, cue, count, approach, distance_m, object, feature (1 so, 0 not so,
+    null unknown), true_count (null unknown), visible.
+    """
+    import pyarrow as pa
+
+    rows = [cue for one in judged for cue in one.cues if len(cue.t_ns)]
+    columns: dict[str, Any] = {
+        "drive": _repeated([(c.drive, len(c.t_ns)) for c in rows]),
+        "t_ns": _joined([c.t_ns for c in rows], np.int64),
+        "cue": _repeated([(c.cue, len(c.t_ns)) for c in rows]),
+        "count": _joined([c.count for c in rows], np.int64),
+    }
+    for name, parts in (
+        ("approach", [c.approach for c in rows]),
+        ("object", [c.is_object for c in rows]),
+        ("feature", [c.is_feature for c in rows]),
+        ("true_count", [c.true_count for c in rows]),
+    ):
+        values = _joined(parts, np.int64)
+        columns[name] = pa.array(values, mask=values < 0)
+    columns["distance_m"] = _joined([c.distance_m for c in rows], np.float64)
+    columns["visible"] = _joined([c.visible for c in rows], np.float64)
+    return pa.table(columns)
+
+
+def _repeated(names: Sequence[tuple[str, int]]) -> pa.Array:
+    import pyarrow as pa
+
+    return pa.array([name for name, times in names for _ in range(times)], pa.string())
+
+
+def _joined(parts: Sequence[Any], kind: type) -> Any:
+    return np.concatenate([np.empty(0, kind), *parts]).astype(kind)

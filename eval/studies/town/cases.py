@@ -1,0 +1,22 @@
+"""The table of a study's drives, case by case."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def split(table: pa.Table) -> Iterator[dict[str, Floats]]:
+    """The columns of each case in turn, by name."""
+    cases = table["case"].to_numpy()
+    columns = {name: table[name].to_numpy() for name in table.column_names if name != "case"}
+    for case in range(int(cases[-1]) + 1):
+        part = slice(*np.searchsorted(cases, [case, case + 1]).tolist())
+        yield {name: column[part] for name, column in columns.items()}

@@ -1,0 +1,114 @@
+"""A car's own signals from the frames of one bus, as the vehicle file names them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+from crosscue.replay.base import Block, Ledger, VehicleError
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.decode import BusDecoder
+from crosscue.replay.mobileye.can.admit import all_ids
+from crosscue.replay.mobileye.samples import settings_of
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .converters import SPEED_UNITS, angle_samples, column_of, wheel_samples
+from .kinds import MOBILEYE_SIGNALS, Samples, Signal
+
+
+class CanSignals:
+    """Reads wheel speeds, yaw rate and steering of one bus, a block at a time."""
+
+    def __init__(
+        self, bus: str, ledger: Ledger, vehicle: Vehicle, signals: Collection[Signal]
+    ) -> None:
+        """Prepare.
+
+        Args:
+            bus: Its topic.
+            ledger: Reported of what could not be used.
+            vehicle: Names the signals.
+            signals: What this bus gives, a Mobileye's among them where it is on the same bus.
+
+        Raises:
+            VehicleError: A name that the database does not hold.
+        """
+        self._can: Final = vehicle.can
+        self._signals: Final = frozenset(signals)
+        database = database_of(vehicle.can.dbc)
+        for sentence in database.notices:
+            ledger.notice(sentence)
+        wanted = check_signals(database, vehicle, signals)
+        is_shared = not self._signals.isdisjoint(MOBILEYE_SIGNALS)
+        settings = settings_of(vehicle.mobileye, is_shared_bus=is_shared)
+        elsewhere = all_ids(settings) if is_shared else ()
+        self._decode: Final = BusDecoder(database, bus, ledger, wanted, elsewhere=elsewhere)
+
+    def __call__(self, block: Block) -> Iterator[Samples]:
+        """The samples of a block of frames."""
+        tables = {part.topic.rsplit("/", 1)[1]: part for part in self._decode(block)}
+        can = self._can
+        if can.wheel_speeds is not None and Signal.WHEEL_SPEEDS in self._signals:
+            wheels = can.wheel_speeds
+            names = (wheels.front_left, wheels.front_right, wheels.rear_left, wheels.rear_right)
+            scales = dict(SPEED_UNITS)
+            if wheels.wheel_radius_m is not None:
+                scales["rad/s"] = wheels.wheel_radius_m
+            columns = [
+                column_of(tables, name, wheels.unit, scales, "can.wheel_speeds") for name in names
+            ]
+            yield from wheel_samples(columns)
+        for section, signal, key in (
+            (can.yaw_rate, Signal.YAW_RATE, "can.yaw_rate"),
+            (can.steering, Signal.STEERING, "can.steering"),
+        ):
+            if section is not None and signal in self._signals:
+                yield from angle_samples(tables, section, signal, key)
+
+
+@lru_cache(maxsize=8)
+def database_of(files: tuple[str, ...]) -> CanDatabase:
+    """Read once for the probe of the clocks and the run."""
+    return CanDatabase.load([Path(name) for name in files])
+
+
+def check_signals(
+    database: CanDatabase, vehicle: Vehicle, signals: Collection[Signal]
+) -> frozenset[tuple[str, str]]:
+    """The (message, signal) pairs that the vehicle file names, each known to the database.
+
+    Args:
+        database: Of all buses.
+        vehicle: The vehicle file.
+        signals: Those that one bus gives; pairs of others are left out.
+
+    Raises:
+        VehicleError: A name that the database does not hold; with the nearest one.
+    """
+    known = {f"{m.topic_name}.{s.name}" for m in database.messages for s in m.signals}
+    pairs: set[tuple[str, str]] = set()
+    for of, key, name in _named_signals(vehicle):
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = f"did you mean {close[0]}?" if close else "look it up in the DBC file"
+            raise VehicleError(f"{key} = {name!r}: no such signal in {vehicle.can.dbc}; {hint}")
+        if of in signals:
+            message, _, signal = name.partition(".")
+            pairs.add((message, signal))
+    return frozenset(pairs)
+
+
+def _named_signals(vehicle: Vehicle) -> Iterator[tuple[Signal, str, str]]:
+    can = vehicle.can
+    if can.wheel_speeds is not None:
+        for wheel in ("front_left", "front_right", "rear_left", "rear_right"):
+            name = getattr(can.wheel_speeds, wheel)
+            if name is not None:
+                yield Signal.WHEEL_SPEEDS, f"can.wheel_speeds.{wheel}", name
+    if can.yaw_rate is not None:
+        yield Signal.YAW_RATE, "can.yaw_rate.signal", can.yaw_rate.signal
+    if can.steering is not None:
+        yield Signal.STEERING, "can.steering.signal", can.steering.signal
