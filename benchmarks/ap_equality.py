@@ -153,7 +153,6 @@ class Bare:
             output.type.tensor_type.ClearField("shape")
         del model.graph.value_info[:]
         onnxruntime: Any = import_module("onnxruntime")
-        onnxruntime: Any = import_module("onnxruntime")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.log_severity_level = 4

@@ -59,8 +59,8 @@ _EXPORTS: Final = {
     "run_study": "eval.interface.studies.town",
     "RangeStudy": "eval.studies.town.settings",
     "LandmarkStudy": "eval.studies.town.settings",
-    "SignFit": "eval.fit.sign_threshold",
-    "fit_signs": "eval.fit.sign_threshold",
+    "SignFit": "eval.fit.signs.threshold",
+    "fit_signs": "eval.fit.signs.threshold",
     "Detector": "detectors.base",
     "BoxDetector": "detectors.box_detector",
     "Detections": "detectors.base",
@@ -196,8 +196,8 @@ if TYPE_CHECKING:
     from crosscue.eval.batch.drive_list import DriveList as DriveList
     from crosscue.eval.catalog.compare import Comparison as Comparison
     from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
-    from crosscue.eval.fit.sign_threshold import SignFit as SignFit
-    from crosscue.eval.fit.sign_threshold import fit_signs as fit_signs
+    from crosscue.eval.fit.signs.threshold import SignFit as SignFit
+    from crosscue.eval.fit.signs.threshold import fit_signs as fit_signs
     from crosscue.eval.fit.truth_check import ImportedTruth as ImportedTruth
     from crosscue.eval.fit.truth_check import TruthFit as TruthFit
     from crosscue.eval.fit.truth_check import check_truth as check_truth

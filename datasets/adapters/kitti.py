@@ -44,7 +44,8 @@ from crosscue.replay.base import (
     Table,
     Topic,
 )
-from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
+from crosscue.replay.decode.coding import IMAGE_SUFFIXES
+from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
 from crosscue.replay.seal.touched import Touched, open_noted
@@ -260,7 +261,7 @@ def _open_raw(path: Path, limits: Limits) -> Drive:
     unreadable: list[Unreadable] = []
     touched = Touched()
     for folder in sorted(path.glob("image_[0-9][0-9]")):
-        files = _timed(folder, SUFFIXES, folder.name, unreadable, limits, touched)
+        files = _timed(folder, IMAGE_SUFFIXES, folder.name, unreadable, limits, touched)
         if files is not None:
             topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
             cameras.append(PictureFiles(topic, files, touched))
@@ -321,7 +322,7 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
     name = singles[0].stem
     cameras, touched = [], Touched()
     for folder in sorted(path.glob(f"image_[0-9][0-9]/{name}")):
-        paths = list_files(folder, SUFFIXES)
+        paths = list_files(folder, IMAGE_SUFFIXES)
         if paths:
             topic = Topic(folder.parent.name, "crosscue/Images", "columns")
             t_ns = np.array([_frame_ns(path.stem) for path in paths], dtype=np.int64)

@@ -41,7 +41,8 @@ from crosscue.replay.base import (
     Topic,
     read_at_most,
 )
-from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
+from crosscue.replay.decode.coding import IMAGE_SUFFIXES
+from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched
@@ -183,7 +184,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     touched.add(times_file, 0, times_file.stat().st_size)
     cameras = []
     for folder in sorted(path.glob("image_[0-9]")):
-        paths = list_files(folder, SUFFIXES)
+        paths = list_files(folder, IMAGE_SUFFIXES)
         if paths:
             files = _timed(paths, times.t_ns)
             topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)

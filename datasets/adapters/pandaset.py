@@ -39,7 +39,8 @@ from crosscue.replay.base import (
     json_tree,
     read_at_most,
 )
-from crosscue.replay.readers.images.files import SUFFIXES, PictureFiles
+from crosscue.replay.decode.coding import IMAGE_SUFFIXES
+from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched
 
@@ -185,7 +186,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     for file in (one for pattern in READ_ON_OPENING for one in path.glob(pattern)):
         touched.add(file, 0, file.stat().st_size)
     for folder in sorted((path / "camera").iterdir()):
-        paths = list_files(folder, SUFFIXES) if folder.is_dir() else []
+        paths = list_files(folder, IMAGE_SUFFIXES) if folder.is_dir() else []
         if not paths:
             continue
         try:

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cues.tracked.judge import cars_past, judge
+from crosscue.detectors.cues.tracked.motion import CarMotion
+from crosscue.detectors.cues.tracked.tracks import CarTracks
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .car_judge import cars_past, judge
-from .car_motion import CarMotion
-from .car_tracks import CarTracks
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
 from .observed import FrameCues, Place, Seen

@@ -9,7 +9,7 @@ import tomlkit
 
 from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
-from crosscue.localization.compass_fit import CompassFit, fit_compass
+from crosscue.localization.fit.compass import CompassFit, fit_compass
 from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan

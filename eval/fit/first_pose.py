@@ -12,7 +12,7 @@ import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic, geodetic_to_ecef
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
-from crosscue.localization.known_drive import KnownDrive
+from crosscue.localization.fit.known_drive import KnownDrive
 from crosscue.localization.odometry import integrate
 from crosscue.localization.start_pose import START_S, start_pose
 from crosscue.replay.base import Log, MissingTopicError, Selection, UsageError, VehicleError

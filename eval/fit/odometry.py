@@ -14,10 +14,10 @@ import tomlkit
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import circular_mean, wrap_all
-from crosscue.localization.compass_fit import persistence
-from crosscue.localization.known_drive import KnownDrive, whitened
+from crosscue.localization.fit.compass import persistence
+from crosscue.localization.fit.known_drive import KnownDrive, whitened
+from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit, fit_odometry
 from crosscue.localization.odometry import OdometrySettings
-from crosscue.localization.odometry_fit import FIX_DELAY, OdometryFit, fit_odometry
 from crosscue.replay.base import EmptyResultError, Floats, Log, Selection, VehicleError
 from crosscue.replay.remote.logs import name_of
 from crosscue.replay.signals.kinds import Samples, Signal

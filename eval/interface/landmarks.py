@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.eval.fit.landmark_database import (
+from crosscue.eval.fit.landmarks.database import (
     AddCounts,
     Frame,
     add_from_images,

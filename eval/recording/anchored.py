@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.car_judge import along, crossing, is_past, parked
-from crosscue.detectors.cues.car_motion import CarMotion
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
+from crosscue.detectors.cues.tracked.judge import along, crossing, is_past, parked
+from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, place_of
 from crosscue.eval.runs.folder import DriveManifest, RunFolder
 from crosscue.eval.runs.tables.stored_frames import StoredFrame

@@ -9,6 +9,8 @@ from crosscue.replay.columns import ImageCoding
 MAGIC_BYTES: Final = 12
 """As many first bytes as ``coding_of`` examines."""
 
+IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
+"""Of files that are read as images."""
 JPEG: Final = b"\xff\xd8"
 _LABELS: Final[tuple[tuple[str, ImageCoding], ...]] = (
     ("jpeg", "jpeg"),

@@ -272,7 +272,10 @@ def test_completion_scripts_are_printed(shell: str, capsys: pytest.CaptureFixtur
     [
         ("crosscue re", {"replay"}),
         ("crosscue ", {name.split()[0] for name in cli.COMMANDS}),
-        ("crosscue fit ", {"compass", "odometry", "signs", "ranges", "messages", "landmarks"}),
+        (
+            "crosscue fit ",
+            {"compass", "detector", "landmarks", "messages", "odometry", "ranges", "signs"},
+        ),
         ("crosscue truth c", {"check"}),
         ("crosscue truth check t.json --lo", {"--log"}),
         ("crosscue replay drive.mcap --wor", {"--workers"}),

@@ -241,7 +241,7 @@ def test_labels_mean_what_the_user_says(
     for own, said in (
         ("cat=stop_sign", "no such label"),
         ("dog=sing", "no such cue"),
-        ("dog", "expected LABEL=CUE"),
+        ("dog", "expected LABEL=NAME"),
     ):
         assert _import(source, log, tmp_path / "u.json", "--map", own) == 2
         assert said in _refused(capsys)

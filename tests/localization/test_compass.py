@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from crosscue.localization.angles import circular_mean, interpolate_angle, wrap_all
 from crosscue.localization.compass import CompassSettings, Matrix, course_at, heading, level_field
-from crosscue.localization.compass_fit import (
+from crosscue.localization.fit.compass import (
     HARD_IRON,
     MOUNTING,
     SOFT_IRON,

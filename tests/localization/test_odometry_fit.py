@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from crosscue.localization.fit.known_drive import KnownDrive
+from crosscue.localization.fit.odometry import OdometryFit, fit_odometry
 from crosscue.localization.fixes import Fixes
-from crosscue.localization.known_drive import KnownDrive
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, integrate
-from crosscue.localization.odometry_fit import OdometryFit, fit_odometry
 from crosscue.localization.start_pose import start_pose
 from crosscue.replay.base import Floats, VehicleError
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels

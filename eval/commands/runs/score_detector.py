@@ -18,10 +18,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from crosscue.eval.commands.shared.terminal import add_logs_arguments, limits_of, print_result
-
 import crosscue
 from crosscue.eval.commands.shared.labels import add_label_arguments, meanings_of
+from crosscue.eval.commands.shared.terminal import add_logs_arguments, limits_of, print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -27,8 +27,8 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "--map",
         nargs="+",
         default=[],
-        metavar="NAME=CLASS",
-        help="class that a name of the labels or the detector counts as; NAME= judges it nowhere",
+        metavar="LABEL=NAME",
+        help="class that a label counts as, of the file or the detector; LABEL= for none",
     )
     parser.add_argument(
         "--detector", metavar="NAME", help="name of the detector, where several ran"
@@ -46,12 +46,12 @@ def meanings_of(texts: Sequence[str]) -> dict[str, str]:
     """What ``--map`` says.
 
     Raises:
-        UsageError: Not ``NAME=CLASS``.
+        UsageError: Not ``LABEL=NAME``.
     """
     found = {}
     for text in texts:
         name, equals, means = text.rpartition("=")
         if not equals or not name:
-            raise UsageError(f"--map {text}: expected NAME=CLASS")
+            raise UsageError(f"--map {text}: expected LABEL=NAME")
         found[name] = means
     return found

@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--map",
         nargs="+",
         default=[],
-        metavar="LABEL=CUE",
-        help="cue of a label; LABEL= for no cue",
+        metavar="LABEL=NAME",
+        help="cue that a label counts as; LABEL= for none",
     )
     parser.add_argument(
         "--add",
@@ -78,5 +78,5 @@ def run(args: argparse.Namespace) -> int:
 def _meaning(text: str) -> tuple[str, str]:
     label, equals, cue = text.rpartition("=")
     if not equals or not label:
-        raise UsageError(f"--map {text}: expected LABEL=CUE")
+        raise UsageError(f"--map {text}: expected LABEL=NAME")
     return label, cue

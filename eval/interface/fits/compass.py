@@ -13,7 +13,7 @@ from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 if TYPE_CHECKING:
-    from crosscue.localization.compass_fit import CompassFit
+    from crosscue.localization.fit.compass import CompassFit
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

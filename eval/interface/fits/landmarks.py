@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.eval.fit.landmark_database import read_poses
-from crosscue.eval.fit.landmark_pairs import pairs_of_drive, pairs_of_table, with_min_score
+from crosscue.eval.fit.landmarks.database import read_poses
+from crosscue.eval.fit.landmarks.pairs import pairs_of_drive, pairs_of_table, with_min_score
 from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
 from crosscue.eval.interface.landmarks import frames_of
 from crosscue.eval.interface.logs.log import Log, opened

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.detectors.ranging.height_to_range import FAMILIES, Bin, RangeFit, fit_range, residuals
-from crosscue.eval.fit.range_pairs import (
+from crosscue.eval.fit.ranges.pairs import (
     RangePairs,
     pairs_of_run,
     pairs_of_table,
@@ -166,7 +166,7 @@ def fit_ranges(
         tested = residuals(*others, found.best.curve, bin_m)
         found = FittedRanges(cue, found.fits, tested)
     if picture is not None:
-        from crosscue.eval.fit.range_figure import draw
+        from crosscue.eval.fit.ranges.figure import draw
 
         draw(picture, cue, pairs, list(found.fits), found.tested)
     return found

@@ -267,7 +267,7 @@ def _classes(
     if not both:
         raise SchemaError(
             f"{labels.where}: no class that {detector} reports; the labels have "
-            f"{_listed(labels.classes)}; say what they mean with --map NAME=CLASS"
+            f"{_listed(labels.classes)}; say what they mean with --map LABEL=NAME"
         )
     return tuple(sorted(both)), of_labels, of_found
 

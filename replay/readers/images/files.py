@@ -29,7 +29,6 @@ from crosscue.replay.seal.touched import Touched, open_noted
 
 from .damage import CHECKED, damage_of
 
-SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
 _DETAILS_TOLD: Final = 20
 
 

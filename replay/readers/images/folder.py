@@ -20,12 +20,13 @@ from crosscue.replay.base import (
     Selection,
     Topic,
 )
+from crosscue.replay.decode.coding import IMAGE_SUFFIXES
 from crosscue.replay.files.time_file_names import find_time_file
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import list_files, pair
 from crosscue.replay.seal.touched import Touched
 
-from .files import SUFFIXES, PictureFiles
+from .files import PictureFiles
 
 
 class ImageFolder(Closing):
@@ -67,7 +68,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     Raises:
         LogFormatError: No picture, no time file, or a time file that cannot be understood.
     """
-    paths = list_files(path, SUFFIXES)
+    paths = list_files(path, IMAGE_SUFFIXES)
     if not paths:
         raise LogFormatError(f"{path}: no picture in it; expected .png, .jpg or .webp files")
     time_file = find_time_file(path)

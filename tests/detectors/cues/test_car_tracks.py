@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.car_judge import cars_past, crossing, judge, parked
-from crosscue.detectors.cues.car_motion import CAR_HEIGHT_M, CarMotion
-from crosscue.detectors.cues.car_tracks import CarTracks, are_hidden
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Place, Seen, Sides, Ways
+from crosscue.detectors.cues.tracked.judge import cars_past, crossing, judge, parked
+from crosscue.detectors.cues.tracked.motion import CAR_HEIGHT_M, CarMotion
+from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
 

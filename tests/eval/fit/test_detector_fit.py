@@ -110,10 +110,10 @@ def test_the_source_s_thresholds_are_its_network_s_only() -> None:
     vehicle = crosscue.Vehicle(version=1)
     assert (vehicle.cues.stop_sign_score, vehicle.cars.score) == (None, None)
     assert SOURCE_SCORES == {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
+    boxes = np.tile([[1.0, 1.0, 9.0, 9.0]], (2, 1))
     found = crosscue.Detections(
-        0, (64, 48), np.tile([[1.0, 1.0, 9.0, 9.0]], (2, 1)), np.array([0.92, 0.96]),
-        ("car", "car"), (b"", b""),
-    )  # fmt: skip
+        0, (64, 48), boxes, np.array([0.92, 0.96]), ("car", "car"), (b"", b"")
+    )
     assert found.with_min_scores(SOURCE_SCORES).are_sure(None).tolist() == [False, True]
     # Another network's scores mean something else: nothing is said of them, so one half.
     assert found.are_sure(None).tolist() == [True, True]

@@ -16,7 +16,7 @@ from crosscue.eval.fit.gnss_truth import write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.studies.town.replayed import score_pose
-from crosscue.replay.base import EVERYTHING, Block, Table, Topic, UsageError, VehicleError
+from crosscue.replay.base import EVERYTHING, Block, Floats, Table, Topic, UsageError, VehicleError
 from crosscue.replay.vehicle.pose import Gnss, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
@@ -28,7 +28,7 @@ SPEED_MPS = 8.0
 GNSS = Topic("/gnss", "sensor_msgs/msg/NavSatFix", "columns")
 
 
-def along(t_s: np.ndarray[tuple[int], np.dtype[np.float64]], speed_mps: float) -> Table:
+def along(t_s: Floats, speed_mps: float) -> Table:
     """Positions of a straight drive, as a receiver reports them."""
     east, north = np.cos(HEADING_RAD) * t_s * speed_mps, np.sin(HEADING_RAD) * t_s * speed_mps
     turn = ecef_to_enu_matrix(math.radians(PLACE[0]), math.radians(PLACE[1]))
@@ -51,7 +51,7 @@ def driven(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog:
         blocks.append(gyro_block(t, [0.0] * 10))
         blocks.append(wheel_block(t, [speed_mps] * 10))
         at = np.array([second * SECOND], np.int64)
-        blocks.append(Block("/gnss", at, along(at * 1e-9, speed_mps)))
+        blocks.append(Block("/gnss", at, along(np.asarray(at * 1e-9, np.float64), speed_mps)))
     return MemoryLog((WHEELS, GYRO, GNSS), blocks, path=Path(__file__))
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from crosscue.detectors.cues.car_motion import CarMotion
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
+from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.eval.recording.anchored import way_px
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 

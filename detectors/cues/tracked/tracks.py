@@ -16,12 +16,17 @@ import numpy as np
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.observed import nose_of
+from crosscue.detectors.cues.tracked.motion import (
+    CAR_HEIGHT_M,
+    CarMotion,
+    Observation,
+    motion_of,
+    place_of_end,
+)
 from crosscue.detectors.ranging.object_tracks import Motion, iou
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Cars
-
-from .car_motion import CAR_HEIGHT_M, CarMotion, Observation, motion_of, place_of_end
-from .observed import nose_of
 
 BOX_PX: Final = 1.0
 """Standard deviation of a box's edge ..."""

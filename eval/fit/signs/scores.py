@@ -12,10 +12,9 @@ import numpy as np
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.training.operating_point import Judged, judge, together
+from crosscue.eval.fit.signs.drives import drive_pictures
+from crosscue.eval.fit.signs.labels import Labelled, read_labels
 from crosscue.replay.base import DEFAULT_LIMITS, Floats, Limits, LogError, UsageError
-
-from .sign_drives import drive_pictures
-from .sign_labels import Labelled, read_labels
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.localization.fixes import Fixes
+from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
+from crosscue.localization.pose_filter import State, at_point, predict, update_position
+from crosscue.localization.start_pose import start_pose
 from crosscue.replay.columns import Floats, Int64s
-
-from .fixes import Fixes
-from .odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
-from .pose_filter import State, at_point, predict, update_position
-from .start_pose import start_pose
 
 STEP_S: Final = 0.2
 """Odometry is followed in arcs no longer than this."""

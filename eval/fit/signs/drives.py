@@ -8,6 +8,8 @@ from typing import Final
 
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
+from crosscue.eval.fit.signs.labels import Boxes, Labelled, coco_boxes
+from crosscue.eval.fit.truth_check import OBJECTS
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EVERYTHING,
@@ -24,9 +26,6 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle, load
-
-from .sign_labels import Boxes, Labelled, coco_boxes
-from .truth_check import OBJECTS
 
 MAX_BYTES: Final = 512 * MIB
 

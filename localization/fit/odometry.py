@@ -22,13 +22,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from crosscue.localization.angles import wrap
+from crosscue.localization.fit.compass import NotObservable, persistence
+from crosscue.localization.fit.known_drive import GATE_NIS, KnownDrive, Steps, whitened
+from crosscue.localization.odometry import OdometrySettings
+from crosscue.localization.pose_filter import State
 from crosscue.replay.base import Floats, VehicleError
-
-from .angles import wrap
-from .compass_fit import NotObservable, persistence
-from .known_drive import GATE_NIS, KnownDrive, Steps, whitened
-from .odometry import OdometrySettings
-from .pose_filter import State
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult

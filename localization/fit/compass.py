@@ -21,10 +21,9 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.localization.angles import circular_mean, wrap_all
+from crosscue.localization.compass import IDENTITY, CompassSettings, Vector, heading, level_field
 from crosscue.replay.base import Floats, Int64s, VehicleError
-
-from .angles import circular_mean, wrap_all
-from .compass import IDENTITY, CompassSettings, Vector, heading, level_field
 
 Complexes: TypeAlias = NDArray[np.complex128]
 

@@ -21,10 +21,9 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from crosscue.detectors.cues.observed import Judged, Place, Sides, Ways
+from crosscue.detectors.cues.tracked.motion import HEIGHT_FRACTION, CarMotion
 from crosscue.replay.vehicle.vehicle import Camera, Cars
-
-from .car_motion import HEIGHT_FRACTION, CarMotion
-from .observed import Judged, Place, Sides, Ways
 
 MAX_BEARING: Final = 0.6
 """Further off the axis a car along the street is as long as one across it."""

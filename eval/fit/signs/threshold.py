@@ -13,10 +13,9 @@ import numpy as np
 from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
+from crosscue.eval.fit.signs.scores import Rules, judged_pictures
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
 from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Limits, UsageError
-
-from .sign_scores import Rules, judged_pictures
 
 Progress = Callable[[Iterable[Judged], Callable[[], tuple[int, int]]], Iterable[Judged]]
 """Passes parts on while it shows how far the work is; the second argument returns parts done, and

@@ -1,0 +1,1 @@
+"""Cues of cars that are followed over frames."""

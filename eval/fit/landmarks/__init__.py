@@ -1,0 +1,1 @@
+"""Landmark databases and how well images match."""

@@ -1,0 +1,1 @@
+"""Height-to-range curves: pairs and their figure."""

@@ -1,0 +1,1 @@
+"""Threshold of the sign detector: drives, labels, scores."""

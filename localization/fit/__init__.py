@@ -1,0 +1,1 @@
+"""Compass and odometry fitted to known positions."""
