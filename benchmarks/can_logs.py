@@ -28,7 +28,7 @@ FORD = "can/ford_fusion_2017/acc_on_speed_changing_from_30km_to_80km_per_hour.ca
 
 
 def ours(path: Path) -> int:
-    """Frames that our reader gives."""
+    """Frames that our reader yields."""
     ledger = Ledger(str(path))
     with open_log(path) as log:
         count = sum(len(block) for block in log.read(ledger))
@@ -38,7 +38,7 @@ def ours(path: Path) -> int:
 
 
 def theirs(path: Path) -> int:
-    """Frames that python-can gives."""
+    """Frames that python-can yields."""
     with can.LogReader(path) as reader:
         return sum(1 for _ in reader)
 

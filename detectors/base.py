@@ -1,4 +1,4 @@
-"""What every detector takes and gives."""
+"""What every detector takes and returns."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Detections:
         scores: Shape (N,), float64, in [0, 1]; comparable only within one detector.
         labels: N class names.
         masks: N masks as compressed runs over the picture (``crosscue.detectors.rle``), empty
-            where the detector gives only a box.
+            where the detector returns only a box.
         lenses: N names of the lit lens (``crosscue.detectors.ranging.lens``), empty for what is no
             traffic light; no entries at all where nobody looked.
         min_scores: Shape (N,): the score that each has to exceed to be a cue, as its detector says;

@@ -3,7 +3,7 @@
 A name is one of ``BUILTIN``, a model of the catalog (``crosscue model list``), one that an
 installed package offers under the entry point group ``crosscue.detectors``, a ``module:factory``,
 or the file name of a model card (``.toml``). A factory takes settings by name, as the vehicle file
-spells them, and gives a ``Detector``.
+spells them, and returns a ``Detector``.
 """
 
 from __future__ import annotations

@@ -398,7 +398,7 @@ def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Refere
 
 
 def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
-    """What gives each approach its speaker.
+    """Makes the speaker of each approach.
 
     Raises:
         ValueError: ``calibrated`` without what was learned; no vehicle file can say that.

@@ -51,7 +51,7 @@ class FrameEvidence:
         travelled_var_m2: Its variance.
         signs: Each detection that reports a range.
         counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
-        objects: From cue to identities of the counted things, where a tracker gives them.
+        objects: From cue to identities of the counted things, where a tracker assigns them.
         is_new_picture: Not the same picture as the frame before.
         turned_rad: Change of heading since the evidence before, counter-clockwise, where known.
         assumed_m: How much of the way was assumed across a gap in time: on it nobody looked, so no

@@ -15,7 +15,7 @@ class Situation:
         is_established: Presence was established by earlier frames.
         is_near: The intersection is known to be near, or passed.
         may_dissent: It is, and the car has moved since dissent was last sent.
-        objects: From cue to identities of the counted things, where a tracker gives them.
+        objects: From cue to identities of the counted things, where a tracker assigns them.
         is_new_picture: Not the same picture as before.
         moved_m: Way gone since the frame before, forwards or back.
         passed_s: Time since then.

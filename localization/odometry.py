@@ -4,7 +4,7 @@ Dead reckoning for the centre of the rear axle. Change of heading comes from the
 there is: a yaw rate, else the steering angle, else the difference between left and right wheels.
 All noise is stated so that it does not depend on the sampling rate: errors that grow with the
 root of distance or time, besides the wheel sensors' rounding. A wheel scale, track width or gyro
-bias that is wrong all drive long is none of these: fit it first.
+bias that is wrong all drive long is not noise: fit it first.
 
 Long drives go in windows. Cut every column at one common time and pass that time as ``until_ns``:
 rows whose interval cannot be closed yet wait in ``Pending``, and the increments are the same, bit

@@ -179,7 +179,7 @@ EVERYTHING: Final = Selection()
 
 
 class Readable(Protocol):
-    """What gives blocks: a log, or one that is read on another time."""
+    """A source of blocks: a log, or one that is read on another time."""
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """As ``Log.read``."""

@@ -1,6 +1,6 @@
 """What a recording holds, in columns: one object per chunk of a topic, never one per message.
 
-A reader gives ``Block``s. The rows of a block are one of
+A reader yields ``Block``s. The rows of a block are one of
 
 * ``Messages``   opaque messages, as ranges of one buffer (ROS, protobuf, JSON, encoded video);
 * ``CanFrames``  raw CAN frames (CAN logs; ``can_msgs/Frame`` after decoding);
@@ -46,7 +46,7 @@ class Topic:
         type_name: Message type (``sensor_msgs/msg/Imu``, ``foxglove.CompressedImage``), or one of
             our own: ``crosscue/CanFrames``, ``crosscue/Table``, ``crosscue/Images``.
         encoding: How messages are coded: ``cdr``, ``ros1``, ``protobuf``, ``json``; ``columns``
-            when the reader gives ``CanFrames``, ``Table`` or ``Images`` itself; else as stored.
+            when the reader yields ``CanFrames``, ``Table`` or ``Images`` itself; else as stored.
         schema: The message definition, as stored.
         schema_encoding: ``ros2msg``, ``ros1msg``, ``ros2idl``, ``protobuf``, ``jsonschema``
             or empty.

@@ -140,7 +140,7 @@ class Drive(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Cameras, then what the box gives."""
+        """Cameras, then the signals of the GNSS and inertial box."""
         cameras = tuple(camera.topic for camera in self._cameras)
         if self._oxts is None:
             return cameras

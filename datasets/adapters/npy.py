@@ -34,7 +34,7 @@ class Column:
 
 
 def read_column(path: Path) -> Column:
-    """Map an array file; a cut one gives its whole rows.
+    """Map an array file; of a cut one, its whole rows.
 
     Raises:
         LogFormatError: Not an .npy file, or one of Python objects.

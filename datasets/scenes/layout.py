@@ -111,7 +111,7 @@ TABLE_6: Final = {
 
 
 def any_layout(seed: int) -> Layout:
-    """An intersection that is none of Table 6, for training and for breadth."""
+    """An intersection that is not in Table 6, for training and for breadth."""
     rng = np.random.default_rng([seed, 0x1A])
     arms = str(rng.choice(["all", "t", "no_left", "no_right"], p=[0.5, 0.26, 0.12, 0.12]))
     control = str(rng.choice(["stop_sign", "traffic_light", "none"], p=[0.5, 0.35, 0.15]))

@@ -115,7 +115,7 @@ def read_tum(path: Path, limits: Limits = DEFAULT_LIMITS) -> Trajectory:
 
 
 def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a trajectory that ``read_tum`` gives back number for number.
+    """Write a trajectory that ``read_tum`` reads back number for number.
 
     Raises:
         OutputError: It cannot be written.

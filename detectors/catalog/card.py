@@ -63,7 +63,7 @@ class Input(Settings):
     dtype: Literal["float32", "uint8"] = "float32"
     is_resizable: bool = False
     """A network without fully connected layers runs at other sizes than its file declares, and
-    then gives as many candidates more."""
+    then returns as many candidates more."""
     max_batch: Annotated[int, Field(gt=0, le=64)] = 1
     """Pictures given to the network at once, where its batch axis is free."""
 

@@ -28,7 +28,7 @@ DEFAULT_SIDE_PX: Final = 640
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
 """Of one input that a file declares: the largest picture that a card may name."""
 SENSIBLE_FRACTION: Final = 0.99
-"""Of boxes that a network gives for noise, where their layout is read rightly."""
+"""Of boxes that a network finds in noise, where their layout is read rightly."""
 _REFUSED: Final = {
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",

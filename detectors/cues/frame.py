@@ -27,7 +27,7 @@ from .tally import CueTally
 
 @dataclass(slots=True)
 class CuePass:
-    """Gives each frame's cues; keeps the cars of earlier frames.
+    """Computes each frame's cues; keeps the cars of earlier frames.
 
     Attributes:
         vehicle: Regions and thresholds.

@@ -1,4 +1,4 @@
-"""What every decoder takes and gives."""
+"""What every decoder takes and returns."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Candidates:
         boxes_px: Shape (N, 4), float64: x0, y0, x1, y1 in pixels of the network's input.
         scores: Shape (N,), float64.
         classes: Shape (N,), int64: index into the card's ``classes``.
-        masks: Gives their masks; None where the network has none.
+        masks: Computes their masks; None where the network has none.
     """
 
     boxes_px: Floats
@@ -128,7 +128,7 @@ def kind_of(decoder: type[BoxOutput]) -> str:
 
 
 def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:
-    """One output by the card's name for it, the only one where the card gives none.
+    """One output by the card's name for it, the only one where the card names none.
 
     Raises:
         ValueError: No such output, or several and no name.

@@ -103,7 +103,7 @@ class DetectionOutput(BoxOutput):
         return Guess(
             {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0},
             len(model.class_names) or None,
-            ("rows of 7, as the operation DetectionOutput gives",),
+            ("rows of 7, as the operation DetectionOutput returns",),
             ("class 0 is the background, the classes start at 1",),
             {"colour": "bgr", "fit": "stretch"},
         )

@@ -1,6 +1,6 @@
 """The input shape that an ONNX file declares, read from its bytes alone.
 
-OpenCV runs a network on sizes that it was not made for, and gives numbers that mean nothing. Field
+OpenCV runs a network on sizes that it was not made for, and returns meaningless numbers. Field
 numbers are those of ONNX's public ``onnx.proto``; everything else in the file is stepped over.
 """
 

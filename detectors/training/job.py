@@ -104,7 +104,7 @@ def run_job(
     overwrite: bool,
     tell: Callable[[Point], None],
 ) -> Facts:
-    """Train, validate, calibrate, write; gives what the checkpoint says of itself.
+    """Train, validate, calibrate, write; returns what the checkpoint says of itself.
 
     Raises:
         OutputError: Something lies where the results go, or they cannot be written.

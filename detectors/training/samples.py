@@ -110,7 +110,7 @@ class Sampler:
         kinds: list[int] = []
         for i, picture in enumerate(labelled.pictures):
             own = [(one.label, one.box_px) for one in picture.objects if not one.is_crowd]
-            # What is none of the classes but was worth annotating is what they are mistaken for.
+            # What belongs to no class but was worth annotating is what they are mistaken for.
             for kind, box in own + [(len(labelled.classes), box) for box in picture.decoys_px]:
                 if _is_big_enough(box, picture, plan):
                     places.append((i, box))

@@ -38,7 +38,7 @@ FORMAT_VERSION: Final = 2
 
 
 class Result(Protocol):
-    """What the work on a drive gives back: something that can be pickled."""
+    """What the work on a drive returns: something that can be pickled."""
 
     @property
     def exit_status(self) -> int:

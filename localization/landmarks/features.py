@@ -119,11 +119,11 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
         made = build(camera)
     except TypeError as error:
         raise UsageError(
-            f"matcher {name!r}: {error}; a factory takes a CameraGeometry and gives a Matcher"
+            f"matcher {name!r}: {error}; a factory takes a CameraGeometry and returns a Matcher"
         ) from error
     lacks = [part for part in ("kind", "describe", "match") if not hasattr(made, part)]
     if lacks:
         raise UsageError(
-            f"matcher {name!r}: what the factory gives has no {lacks[0]}; expected a Matcher"
+            f"matcher {name!r}: what the factory returns has no {lacks[0]}; expected a Matcher"
         )
     return made

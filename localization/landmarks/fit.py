@@ -2,7 +2,7 @@
 
 Pairs of pictures, labelled as one place or two, are scored. Half of the query pictures choose the
 threshold: the lowest at which no more than the wanted fraction of two-place pairs match. The other
-half, never examined until then, gives the rates. Intervals: false matches by Clopper and Pearson
+half, never examined until then, yields the rates. Intervals: false matches by Clopper and Pearson
 (Biometrika 26, 1934), which holds even where none was seen; found places by Wilson (JASA 22, 1927).
 """
 

@@ -215,7 +215,7 @@ class LandmarkSearch:
         Args:
             belief: At the frame's time.
             travelled_m: Distance driven so far.
-            describe: Gives the frame's features, or None if it does not decode; asked only where
+            describe: Returns the frame's features, or None if it does not decode; asked only where
                 there is something to compare with.
 
         Returns:

@@ -506,7 +506,7 @@ def _pass_landmark(
     log: Log,
     steps: int,
 ) -> tuple[State, Tally, Stream]:
-    """Perhaps recognise it: then it gives the vehicle's position."""
+    """Perhaps recognise it, which measures the vehicle's position."""
     number, noise = uniform(noise)
     node = landmarks.nodes[landmark]
     if number >= p.detection_rate:

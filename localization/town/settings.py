@@ -1,6 +1,6 @@
 """Settings of a simulated drive: city, car, sensors, navigation; SI units, degrees where named.
 
-The source gives the sizes of cities, the compass's uncertainty and the limits of 50 and 100 m.
+The source states the sizes of cities, the compass's uncertainty and the limits of 50 and 100 m.
 Everything else is ours; ``sensors.compass_interval_m`` is the one number calibrated to a published
 result (9.3 km at 30 degrees).
 """

@@ -1,1 +1,1 @@
-"""CAN payloads to signal columns, by the bit layouts that a DBC file gives."""
+"""CAN payloads to signal columns, by the bit layouts of a DBC file."""

@@ -27,7 +27,7 @@ def encode(message: CanMessage, columns: Mapping[str, Column]) -> NDArray[np.uin
         message: Its layout.
         columns: From signal name to N physical values; all signals that no multiplexer rules out in
             every row. Values in rows where the multiplexers rule a signal out are ignored.
-            Companion columns ``SIGNAL_is_present``, as decoding gives them, are ignored too.
+            Companion columns ``SIGNAL_is_present``, as decoding writes them, are ignored too.
 
     Returns:
         Shape (N, message.length), uint8; bits of no signal are zero.

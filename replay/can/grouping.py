@@ -111,14 +111,14 @@ class Grouped:
 
 
 class Engine(Protocol):
-    """Groups frames and gives the columns of each group."""
+    """Groups frames and decodes the columns of each group."""
 
     def group(self, frames: CanFrames) -> Grouped:
         """Look up, check and sort frames."""
         ...
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
-        """Columns of one message of the frames grouped last, as ``Extractor`` gives them."""
+        """Columns of one message of the frames grouped last, as of ``Extractor``."""
         ...
 
 

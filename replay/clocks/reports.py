@@ -2,7 +2,7 @@
 
 A recording may give up to three times for a row: the *log time* (when the recorder stored it), the
 *publish time* (when the sender sent it) and the *header stamp* (the sensor's own). ``ClockWatch``
-is fed blocks as they are read, in bounded memory, and gives a ``ClockReport`` for every topic.
+is fed blocks as they are read, in bounded memory, and makes a ``ClockReport`` for every topic.
 
 The rule, in ``choose`` and nowhere else. The header stamp is used when it agrees with the log
 clock, else the publish time when it does, else the log time. A clock agrees when

@@ -1,6 +1,6 @@
 """Messages to columns: one decoder per way of coding, one table from message type to columns.
 
-``decoder_for(topic)`` gives a function from a block of ``Messages`` to a block of ``CanFrames``,
+``decoder_for(topic)`` returns a function from a block of ``Messages`` to a block of ``CanFrames``,
 ``Table`` or ``Images`` with ``header_ns``; what cannot be decoded is skipped in the ledger.
 """
 

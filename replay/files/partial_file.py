@@ -3,7 +3,7 @@
 Every writer of crosscue fills a file with a temporary name in the final folder and renames it when
 it is whole. While a process works on one it holds a lock (``flock``) on the file itself, which the
 kernel drops when the process dies, however that happens. Whoever writes next in that folder takes
-away what nobody holds. A process number would not do: the system gives it to another program.
+away what nobody holds. A process number would not do: the system reuses it for another program.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ the one whose name has ``time`` or ``stamp`` is the time, and a unit there (``ti
 ``time_us``, ``time_ms``, ``time [s]``) counts. A time is
 
 * seconds with a decimal point or exponent (``12.35``, ``1.2e-1``);
-* an integer, which counts nanoseconds unless the column's name gives another unit;
+* an integer, which counts nanoseconds unless the column's name states another unit;
 * a date-time (``2011-09-26 13:02:25.964389445``, ``...T13:02:25Z``, ``...+02:00``), UTC where it
   names no zone.
 
@@ -113,7 +113,7 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
             one = None
         if one is None or (may_be_cut and _is_shorter(one, times)):
             notices = (
-                f"{path.name}: line {number}, the last one, is cut: {line[:80]!r}; it gives no "
+                f"{path.name}: line {number}, the last one, is cut: {line[:80]!r}; it has no "
                 "time (end the line if it is whole)",
             )
             continue

@@ -1,6 +1,6 @@
 """Numbered files in a folder and a time for each.
 
-Files and times are paired by name where the time file gives names; else one by one where there are
+Files and times are paired by name where the time file has names; else one by one where there are
 as many of each; else by the numbers in the file names where these span as many; else in order from
 the first, which is reported. Nothing is paired in silence when the counts differ.
 """
@@ -32,7 +32,7 @@ class TimedFiles:
         paths: N files in natural order.
         t_ns: Shape (N,), int64; -1 for a file without time.
         missing_ns: Shape (M,), int64: times whose file is not there.
-        declared: How many times the time file gives, or None where it gives a rate.
+        declared: How many times the time file has, or None where it states a rate.
         notices: What is odd about the pairing, a sentence each.
     """
 

@@ -423,7 +423,7 @@ def open_remote(
         return whole("its format is read from a local file")
     ranged = _ranged(url, system, address, store or default_store())
     if ranged is None:
-        return whole("its store gives no ranges")
+        return whole("its store serves no ranges")
     module, _, function = RANGED[suffix].partition(":")
     open_ranged = cast(
         "Callable[[Path, RangedFile, Limits], _Partial | None]",
@@ -482,7 +482,7 @@ class RemoteFiles:
         return not self._objects or (entry / "log").exists()
 
     def ranged(self, name: str) -> RangedFile | None:
-        """One of the files by ranges; None where the store gives none.
+        """One of the files by ranges; None where the store serves none.
 
         Raises:
             LogError: As ``fetch``.

@@ -227,7 +227,7 @@ class RangedFile:
         return bytes(found)
 
     def _tried(self, ask: Callable[[], T], what: str) -> T:
-        """What ``ask`` gives, tried again a few times; each store's library has its own errors."""
+        """What ``ask`` returns, after a few retries; each store's library has its own errors."""
         for wait_s in (*WAITS_S, None):
             try:
                 return ask()

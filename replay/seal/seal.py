@@ -418,7 +418,7 @@ class Check:
         return self._name if name == THE_LOG else name
 
     def named(self, path: Path) -> str | None:
-        """The name in the seal of one of the log's files, or None if it is none of them."""
+        """The name in the seal of one of the log's files, or None if it is not one of them."""
         return self._names.get(path)
 
     def everything(self) -> Iterator[int]:

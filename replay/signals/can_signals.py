@@ -31,7 +31,7 @@ class CanSignals:
             bus: Its topic.
             ledger: Reported of what could not be used.
             vehicle: Names the signals.
-            signals: What this bus gives, a Mobileye's among them where it is on the same bus.
+            signals: What this bus carries, a Mobileye's among them where it is on the same bus.
 
         Raises:
             VehicleError: A name that the database does not hold.
@@ -83,7 +83,7 @@ def check_signals(
     Args:
         database: Of all buses.
         vehicle: The vehicle file.
-        signals: Those that one bus gives; pairs of others are left out.
+        signals: Those that one bus carries; pairs of others are left out.
 
     Raises:
         VehicleError: A name that the database does not hold; with the nearest one.

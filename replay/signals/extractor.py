@@ -213,7 +213,7 @@ def probe_clocks(
 def wheels_only(
     planned: Plan, vehicle: Vehicle, number: int, clocks: Mapping[str, Clock]
 ) -> Extractor:
-    """What gives the wheel speeds of one log's blocks and decodes nothing else."""
+    """Extracts the wheel speeds of one log's blocks and decodes nothing else."""
     can = vehicle.can.model_copy(update={"yaw_rate": None, "steering": None})
     source = planned.source_of(Signal.WHEEL_SPEEDS)
     only = () if source is None else (replace(source, signals=(Signal.WHEEL_SPEEDS,)),)

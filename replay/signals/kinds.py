@@ -50,7 +50,7 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One topic of one log and the signals it gives."""
+    """One topic of one log and the signals it carries."""
 
     log: int
     topic: Topic
@@ -63,7 +63,7 @@ class Plan:
 
     Attributes:
         sources: In the order of logs and topics.
-        missing: From a signal that nothing gives to the reason, in plain words.
+        missing: From a signal that no topic carries to the reason, in plain words.
     """
 
     sources: tuple[Source, ...]
@@ -74,7 +74,7 @@ class Plan:
         return frozenset(source.topic.name for source in self.sources if source.log == log)
 
     def source_of(self, signal: Signal) -> Source | None:
-        """Who gives ``signal``."""
+        """Which topic carries ``signal``."""
         return next((source for source in self.sources if signal in source.signals), None)
 
 

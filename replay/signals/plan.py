@@ -1,4 +1,4 @@
-"""Decides once, from topics and vehicle file, which topic gives which signal, or why none does."""
+"""Decides, from topics and vehicle file, which topic carries which signal, or why none does."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class Window:
 
 
 class Extracting(Protocol):
-    """What gives the samples of a log's blocks, as ``replay.signals.extractor.Extractor`` does."""
+    """Extracts the samples of a log's blocks, as ``replay.signals.extractor.Extractor`` does."""
 
     @property
     def ledger(self) -> Ledger:

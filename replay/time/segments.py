@@ -7,7 +7,7 @@ that runs forward. After a set-back it is the log's clock plus a shift that puts
 ``log_t_ns`` beside it is the stamp as recorded. A clock that jumps forward cannot be told from a
 pause: its stamps stay, and the time between them is a gap.
 
-``TimedLog`` gives a log's blocks in drive time, so that nobody downstream sees a clock run back.
+``TimedLog`` yields a log's blocks in drive time, so that nobody downstream sees a clock run back.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class CueSpec:
         observed_by: Input that yields it; without that input the cue is not evaluated.
         rule: ``module:function`` that counts it, called with the input, the settings, this row.
         precision: Published precision, the default message strength.
-        precision_is_lower_bound: The source gives "at least".
+        precision_is_lower_bound: The source says "at least".
         supports: Features whose presence it implies.
         excludes: Features whose absence it implies.
         scored_as: The source's definition: is the object there, or does the feature exist?

@@ -65,7 +65,7 @@ class WheelSpeeds(Section):
     rear_left: Signal
     rear_right: Signal
     unit: Literal["km/h", "m/s", "mph", "rad/s"] | None = None
-    """Overrides the unit that the DBC file gives, or gives it where the file is silent."""
+    """Overrides the unit of the DBC file, or states it where the file is silent."""
     wheel_radius_m: Positive | None = None
     """Rolling radius, for signals in rad/s."""
 

@@ -114,7 +114,7 @@ class McapWriter:
         schema_encoding: str = "ros2msg",
         converted_from: str = "",
     ) -> int:
-        """Number of the channel for CDR messages of a topic; the same call gives the same one.
+        """Number of the channel for CDR messages of a topic; the same call returns the same one.
 
         Args:
             topic: Name.

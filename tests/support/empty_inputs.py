@@ -31,7 +31,7 @@ COMMANDS: dict[str, str] = {
     "vehicle check": "{strange} --vehicle {bare} -o {out}.html",
     "merge": "{empty} -o {out}",
 }
-"""Commands that such input gives nothing, and their arguments."""
+"""Commands that find nothing in such input, and their arguments."""
 
 
 def empty_inputs(folder: Path) -> dict[str, Path]:

@@ -206,7 +206,7 @@ def _write_truth(folder: Path, true_ns: Int64s) -> None:
 
 
 class GreyNumber:
-    """Reads the frame's number and gives the sign that is seen from there."""
+    """Reads the frame's number and returns the sign that is seen from there."""
 
     @property
     def view(self) -> View:

@@ -14,7 +14,7 @@ OPSET = 17
 
 
 def constant_model(shape: tuple[int, ...], outputs: Mapping[str, Array]) -> bytes:
-    """A network that gives the same outputs for every input of a shape."""
+    """A network that returns the same outputs for every input of a shape."""
     nodes = [
         helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
         for name, values in outputs.items()

@@ -16,7 +16,7 @@ from crosscue.detectors.base import Detections, Found, Frame, View, nothing_foun
 
 
 class Oracle:
-    """Gives every labelled object with a score of 0.99."""
+    """Returns every labelled object with a score of 0.99."""
 
     def __init__(self, objects: str) -> None:
         tree = json.loads(Path(objects).read_text())

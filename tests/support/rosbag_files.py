@@ -118,7 +118,7 @@ def write_folder(
 
 
 def read_rows(path: Path, selection: Selection = EVERYTHING) -> Reading:
-    """Everything our reader gives of ``path``."""
+    """Everything our reader yields of ``path``."""
     ledger = Ledger(str(path))
     rows: list[Row] = []
     with open_log(path) as log:

@@ -44,7 +44,7 @@ def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:
 
 
 def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
-    """Render and write ``count`` pictures of one run into ``folder``; gives their annotations.
+    """Render and write ``count`` pictures of one run into ``folder``; returns their annotations.
 
     Raises:
         OutputError: A picture cannot be written.

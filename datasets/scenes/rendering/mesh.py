@@ -24,7 +24,7 @@ class Mesh:
         uv: Shape (T, 3, 2), in widths and heights of the texture, v downwards.
         texture: Shape (T,), number in the atlas, -1 for none.
         albedo: Shape (T, 3): colour 0 to 1, or factor on the texture.
-        glow: Shape (T,): 1 where the surface gives its own light.
+        glow: Shape (T,): 1 where the surface emits light.
         instance: Shape (T,): number of the object, ``NOBODY`` for scenery.
     """
 

@@ -73,7 +73,7 @@ def build_network(plan: Plan) -> Any:
 
 
 def set_limits(network: Any, proposals: int, score: float, objectness: float = 0.0) -> None:
-    """Which places the network examines more closely, and the least score of what it gives.
+    """Which places the network examines more closely, and the minimum score of what it returns.
 
     Boxes below the score never reach the mask head, so this is also where the masks' time is saved.
 

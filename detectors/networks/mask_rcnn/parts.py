@@ -1,6 +1,6 @@
 """Mask R-CNN in parts: the heavy ones behind whichever back end runs them, the rest in torchvision.
 
-A back end gives levels and scores of the whole picture, the box head and the mask head. Proposals,
+A back end computes levels and scores of the picture, the box head and the mask head. Proposals,
 pooling and suppression are the same for all: torchvision's own functions, and on a processor ours
 that give the same boxes.
 """
@@ -92,10 +92,10 @@ def _pooler(
 
 
 def _proposals(rpn: Any, body: Body, sizes: list[tuple[int, int]]) -> list[Tensor]:
-    """The likeliest boxes of each picture, as ``RegionProposalNetwork.forward`` gives them.
+    """The likeliest boxes of each picture, as ``RegionProposalNetwork.forward`` returns them.
 
     That decodes every anchor and then takes the likeliest of each level; here the likeliest are
-    taken first, which gives the same boxes.
+    taken first, which leads to the same boxes.
     """
     pictures = len(sizes)
     boxes, scores = [], []

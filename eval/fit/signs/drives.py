@@ -60,7 +60,7 @@ def _boxes(path: Path) -> dict[int, Boxes]:
     found: dict[int, Boxes] = {}
     for image, boxes in coco_boxes(text, path):
         if not isinstance(image.get("t_ns"), int):
-            raise AnnotationError(f"{path}: images without t_ns; crosscue truth import gives them")
+            raise AnnotationError(f"{path}: images without t_ns; crosscue truth import adds them")
         found[image["t_ns"]] = boxes
     return found
 

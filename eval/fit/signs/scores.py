@@ -73,7 +73,7 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
     width, height = size
     found = detector([Frame(0, one.name, pixels, size)])[0]
     if not isinstance(found, Detections):
-        raise UsageError("the detector gives no boxes; choose one for signs")
+        raise UsageError("the detector returns no boxes; choose one for signs")
     parts = []
     for label in rules.labels:
         truth: Floats = np.array(one.boxes.get(label, []), np.float64).reshape(-1, 4)

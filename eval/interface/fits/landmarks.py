@@ -88,7 +88,7 @@ def fit_landmarks(
 ) -> FittedLandmarks:
     """Choose the match threshold for a wanted false-match rate, from labelled pictures.
 
-    Half of the query pictures choose it, the other half gives the rates. Pairs come from a table,
+    Half of the query pictures choose it, the rates are of the other half. Pairs come from a table,
     or from a drive with known poses against a database that another drive made.
 
     Args:

@@ -194,7 +194,7 @@ def replay_drives(
     One that fails does not stop the others. The tables of all runs are merged.
 
     Args:
-        drives: As ``find_drives`` gives them; or logs, each of them a drive, and folders of drives.
+        drives: What ``find_drives`` returns; or logs, each of them a drive, and folders of drives.
         output: Folder that gets one run folder per drive, and ``merged``.
         vehicle: The vehicle file of all drives; None for the ``vehicle.toml`` beside each.
         detectors: As in ``replay_drive``.

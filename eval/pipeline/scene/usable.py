@@ -39,7 +39,7 @@ def why_not(
     are_sure: NDArray[np.bool_],
     source: Source | None,
 ) -> str | None:
-    """Why a detection gives no range; None where it gives one, or belongs to a track that does."""
+    """Why a detection has no range; None where it has one, or belongs to a track that has."""
     if not are_sure[i]:
         return BELOW_SCORE
     if heights_px[i] <= 0.0:

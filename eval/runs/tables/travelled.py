@@ -70,7 +70,7 @@ class Odometer:
     def until(self, t_ns: int) -> Way:
         """The way since the last call; the first call's begins with the odometry itself.
 
-        A time before the last call's moves nothing and gives nothing.
+        A time before the last call's moves nothing and returns nothing.
         """
         if self.at_ns is not None and t_ns <= self.at_ns:
             return Way(0.0, 0.0, 0.0, 0)

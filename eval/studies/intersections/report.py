@@ -188,7 +188,7 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
 
 
 def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
-    """A difference as ``asdict`` gives it, with its interval."""
+    """A difference as of ``asdict``, with its interval."""
     value, low, high = mean["value"], mean["low"], mean["high"]
     if math.isnan(value):
         return "-"

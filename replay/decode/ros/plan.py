@@ -3,7 +3,7 @@
 Nested messages are flattened, so that a plan is a short list of three kinds of step: a *run* of
 fields whose sizes are fixed, a string, and a sequence. Inside a run the place of every field
 depends only on where the run begins modulo 8 (CDR aligns each value to its own size), so a table
-of eight rows gives all places at once.
+of eight rows yields all places at once.
 """
 
 from __future__ import annotations

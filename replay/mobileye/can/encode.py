@@ -62,7 +62,7 @@ def encode_tables(
     sent as missing, or as the layout's default.
 
     Args:
-        tables: Blocks as ``MobileyeDecoder`` gives them; the part of the topic after the last ``/``
+        tables: Blocks of a ``MobileyeDecoder``; the part of the topic after the last ``/``
             says which table.
         settings: The revision (``auto``: classic, except where a status row says) and family
             (``auto``: extended) to send, and the mounting.

@@ -443,7 +443,7 @@ class Walk:
         return Chunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
 
     def _repaired(self, index: ChunkIndex, head: ChunkHead, bound: int) -> Chunk:
-        """A chunk read by the head that the summary gives it."""
+        """A chunk read by its entry in the summary."""
         at = self._at
         messages, index_fault = self._message_indexes(min(at + index.length, bound), index)
         self._has_bare &= self._before is not None

@@ -94,7 +94,7 @@ def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
 
 
 def fetched(database: Database, query: str, values: Sequence[int] = ()) -> list[Any]:
-    """All rows of a query that gives few."""
+    """All rows of a query that has few."""
     return database.connection.execute(query, values).fetchall()
 
 

@@ -36,7 +36,7 @@ Uint64s: TypeAlias = NDArray[np.uint64]
 
 
 class Giver:
-    """Gives the messages of one recording as blocks.
+    """Yields the messages of one recording as blocks.
 
     Attributes:
         met: Messages met, by channel number.

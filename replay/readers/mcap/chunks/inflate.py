@@ -68,7 +68,7 @@ def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
         declared = zstandard.frame_content_size(body.data)
         if declared > size:
             raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
-        # One byte of room more than is due, so that a frame which gives more is found out.
+        # One byte of room more than is due, so that a frame which holds more is noticed.
         done = 0
         with _decompressor().stream_reader(body.data, read_across_frames=True) as stream:
             while done <= size:
@@ -105,7 +105,7 @@ def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
         if declared not in (*UNKNOWN_SIZES, size):
             raise BrokenRecordError(f"its lz4 frame declares {declared} bytes, the chunk {size}")
         while not is_done:
-            # In small steps: the library gives new memory each time, which is slow when large.
+            # In small steps: the library allocates new memory each time, which is slow when large.
             step, taken, is_done = lz4.frame.decompress_chunk(
                 context, view[used:], max_length=min(size - done, LZ4_STEP) or 1
             )
