@@ -59,6 +59,7 @@ from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
+from crosscue.replay.vehicle.intrinsics import check_center, doubts
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .clocks import clock_rows
@@ -338,6 +339,10 @@ class _Tables:
         self._size = result.size_px
         self._frame += 1
         if self._frame == 0:
+            check_center(self.vehicle.camera, result.size_px)
+            self.notices += [
+                f"warning: {one}" for one in doubts(self.vehicle.camera, result.size_px)
+            ]
             self._meanings = meanings(self.vehicle)
             self._min_scores = [min_scores_of(one.detector) for one in self.detectors]
             self._labels = all_labels(

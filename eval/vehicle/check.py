@@ -40,14 +40,12 @@ from crosscue.replay.vehicle.drafting.agreement import (
 )
 from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
 from crosscue.replay.vehicle.drafting.series import Grid, Series, Track
+from crosscue.replay.vehicle.intrinsics import doubts
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 WHEELS: Final = ("front left", "front right", "rear left", "rear right")
 INTRINSICS_OFF: Final = 0.02
 """Focal lengths that differ by more are those of different pictures."""
-CENTER_OFF: Final = 0.15
-"""Of the picture's size: no lens points further from its middle, unless the picture is cropped."""
-VIEW_DEG: Final = (15.0, 150.0)
 WHEEL_OFF: Final = 0.1
 UNCONFIRMED: Final = "too few bends here for course or wheels to confirm its sign"
 
@@ -353,21 +351,7 @@ def _of_camera(shown: Shown | None, log: Log, camera: Camera) -> Iterator[str]:
         yield "camera: not one picture in the seconds examined"
         return
     wide, high = shown.pixels.shape[1], shown.pixels.shape[0]
-    if camera.focal_px is not None:
-        view_deg = 2.0 * math.degrees(math.atan(0.5 * wide / camera.focal_px))
-        if not VIEW_DEG[0] <= view_deg <= VIEW_DEG[1]:
-            yield (
-                f"camera.focal_px = {camera.focal_px:g}: a picture {wide} pixels wide would show "
-                f"{view_deg:.0f} deg; the intrinsics are those of another size"
-            )
-    if camera.center_px is not None:
-        off = [abs(c - s / 2) / s for c, s in zip(camera.center_px, (wide, high), strict=True)]
-        if max(off) > CENTER_OFF:
-            yield (
-                f"camera.center_px = ({camera.center_px[0]:g}, {camera.center_px[1]:g}): far from "
-                f"the middle of a picture of {wide} x {high}; the intrinsics are those of another "
-                "size"
-            )
+    yield from doubts(camera, (wide, high))
     published = log.intrinsics(shown.topic) if isinstance(log, KnowsItsCameras) else None
     if published is not None and camera.focal_px is not None:
         focal = published[0]

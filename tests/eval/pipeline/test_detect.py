@@ -169,6 +169,25 @@ def test_a_camera_that_changes_size_is_followed_and_reported(tmp_path: Path) -> 
     assert "(64, 48) became (128, 96)" in open_run(out).drive_manifest().notices[0]
 
 
+def test_intrinsics_of_another_size_are_refused_and_doubtful_ones_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
+    command = ["detect", str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache", "-q"]
+    command += ["--detectors", BRIGHT]
+
+    vehicle.write_text("version = 1\n[camera]\nfocal_px = 60.0\ncenter_px = [640.0, 24.0]\n")
+    assert run(command) == 2
+    said = capsys.readouterr().err
+    assert "camera.center_px = (640, 24): outside the images of 64 x 48 pixels" in said
+    assert not (out / "manifest.json").exists()
+
+    vehicle.write_text("version = 1\n[camera]\nfocal_px = 600.0\ncenter_px = [32.0, 24.0]\n")
+    assert run([*command, "--overwrite"]) == 0
+    (notice,) = open_run(out).drive_manifest().notices
+    assert "camera.focal_px = 600: a picture 64 pixels wide would show 6 deg" in notice
+
+
 @pytest.mark.parametrize(
     ("detector", "said"),
     [
