@@ -81,7 +81,7 @@ def find_scene(path: Path) -> Scene:
     scenes = {
         str(row["name"]): Scene(str(row["name"]), token, root, folder)
         for folder in folders
-        for token, row in whole_table(folder / "scene.json").items()
+        for token, row in whole_table(folder / "scene.json", "name").items()
     }
     if not path.is_dir():
         if path.stem not in scenes:
@@ -133,8 +133,8 @@ def read_tables(scene: Scene) -> SceneTables:
         LogFormatError: A table is missing, or one that all rows lean on is damaged.
     """
     folder = scene.tables
-    sensors = whole_table(folder / "sensor.json")
-    calibrated = whole_table(folder / "calibrated_sensor.json")
+    sensors = whole_table(folder / "sensor.json", "channel", "modality")
+    calibrated = whole_table(folder / "calibrated_sensor.json", "sensor_token")
     channels = {
         token: str(sensor["channel"])
         for token, row in calibrated.items()

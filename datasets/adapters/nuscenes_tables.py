@@ -84,14 +84,23 @@ def _after_row(text: str, start: int) -> int:
     return min(ends) if ends else len(text)
 
 
-def whole_table(path: Path, key: str = "token") -> dict[str, Row]:
-    """All rows of a small table by a key.
+def whole_table(path: Path, *needs: str) -> dict[str, Row]:
+    """All rows of a small table by their token.
+
+    Args:
+        path: The table.
+        needs: Texts that every row must have, besides its token.
 
     Raises:
-        LogFormatError: It is not there, or a row of it is damaged: others lean on it.
+        LogFormatError: It is not there, or a row, on which others lean, is damaged or lacks a text.
     """
     rows = RowsOf(checked(path))
-    found = {str(row[key]): row for row in rows if key in row}
+    found: dict[str, Row] = {}
+    for row in rows:
+        lacks = [key for key in ("token", *needs) if not isinstance(row.get(key), str)]
+        if lacks:
+            raise LogFormatError(f"{path}: row {len(found)}: no {lacks[0]}; copy it again")
+        found[row["token"]] = row
     if rows.damaged or rows.is_cut or not found:
         what = rows.first_damage or ("cut" if rows.is_cut else "no rows")
         raise LogFormatError(f"{path}: {what}; copy it again")

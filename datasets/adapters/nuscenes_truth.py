@@ -82,8 +82,12 @@ def write(path: Path, folder: Path) -> Path:
 def _objects(tables: SceneTables) -> tuple[Objects, int]:
     """Boxes of the front camera's key frames, and how many rows were damaged."""
     folder = tables.scene.tables
-    attributes = {t: str(row["name"]) for t, row in whole_table(folder / "attribute.json").items()}
-    categories = {t: str(row["name"]) for t, row in whole_table(folder / "category.json").items()}
+    attributes = {
+        t: str(row["name"]) for t, row in whole_table(folder / "attribute.json", "name").items()
+    }
+    categories = {
+        t: str(row["name"]) for t, row in whole_table(folder / "category.json", "name").items()
+    }
     table = RowsOf(checked(folder / "sample_annotation.json"))
     of_sample: dict[str, list[Row]] = {}
     for row in table:

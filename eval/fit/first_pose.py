@@ -127,7 +127,8 @@ def _laid(
     end_ns = begin_ns + round(READ_S * 1e9)
     if selection.end_ns is not None:
         end_ns = min(end_ns, selection.end_ns)
-    part = replace(selection, start_ns=begin_ns, end_ns=end_ns)
+    # The first stored row need not be the earliest, so nothing is cut off before it.
+    part = replace(selection, end_ns=end_ns)
     found = read_signals(logs, planned, vehicle, part, wanted, warns=False)
     samples = found.get(Signal.POSITION)
     if truth is not None:
