@@ -189,8 +189,7 @@ def fit_detector(
     Raises:
         UsageError: A value out of range, runs of different detectors, or scores that are
             calibrated already.
-        SchemaError: Labels cannot be read.
-        SchemaError: They do not belong to the run.
+        SchemaError: Labels cannot be read, or do not belong to the run.
         VehicleError: The card cannot be read.
         OutputError: The card cannot be written.
     """

@@ -216,8 +216,7 @@ def score_detector(
 
     Raises:
         UsageError: A value out of range, no such detector, or a class that nobody has.
-        SchemaError: The labels cannot be read.
-        SchemaError: They do not belong to the run.
+        SchemaError: The labels cannot be read, or do not belong to the run.
         EmptyResultError: No labelled box of a class that the detector reports.
         RunError: No run, damaged, or its log is gone.
     """
