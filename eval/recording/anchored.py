@@ -114,12 +114,20 @@ class Anchored:
 
 
 def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> Floats:
-    """Where the middle of a car would move in the picture within a second, did the camera stand."""
+    """Where the middle of a car would move within a second, did the camera stand; in the image."""
     center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
     now_px = np.array(car.center_px) - center
     then_m = max(car.distance_m + ARROW_S * car.ahead_mps, NEAREST_M)
     sideways_px = np.array([(camera.focal_px or 0.0) * ARROW_S * car.right_mps / then_m, 0.0])
-    return np.asarray(now_px * (car.distance_m / then_m - 1.0) + sideways_px, np.float64)
+    way = np.asarray(now_px * (car.distance_m / then_m - 1.0) + sideways_px, np.float64)
+    return way * _part_inside(np.asarray(car.center_px), way, size_px)
+
+
+def _part_inside(tail_px: Floats, way_px: Floats, size_px: tuple[int, int]) -> float:
+    """How much of an arrow fits the image: the viewer makes room for the whole of it."""
+    room_px = np.where(way_px > 0.0, np.subtract(size_px, tail_px), tail_px)
+    moves = np.abs(way_px) > 0.0
+    return max(float(np.min(room_px[moves] / np.abs(way_px[moves]), initial=1.0)), 0.0)
 
 
 def _ranges_of(run: RunFolder) -> dict[int, list[RangeRow]]:

@@ -34,7 +34,12 @@ def test_a_crossing_car_goes_sideways_as_far_as_a_pinhole_sees_it() -> None:
 
 
 def test_a_car_that_would_pass_the_camera_has_a_finite_way() -> None:
-    assert np.isfinite(way_px(car(0.0, -60.0), CAMERA, SIZE)).all()
+    near = car(0.0, -60.0)
+    way = way_px(near, CAMERA, SIZE)
+    tip = np.array(near.center_px) + way
+    assert way.any()
+    assert (tip >= 0.0).all()
+    assert (tip <= SIZE).all()
 
 
 def test_regions_lie_below_the_horizon_and_mirror_each_other() -> None:
