@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from crosscue.datasets.truth.box_labels import class_names_given
 from crosscue.detectors.base import Detections, Detector, Frame, View
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.draft import Draft, draft
@@ -18,11 +19,9 @@ from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.overlay import picture_of
 from crosscue.replay.base import (
-    MIB,
     Bytes,
     LogError,
     UsageError,
-    read_at_most,
     write_bytes,
     write_text,
 )
@@ -140,7 +139,9 @@ def draft_card(
     else:
         model = read_interface(path)
         guess = _guess(path, closed(path, model, size), kind)
-    written = draft(path, model, guess, _names(class_names), size)
+    written = draft(
+        path, model, guess, () if class_names is None else class_names_given(class_names), size
+    )
     if picture is None:
         _try(place, written)
         return CardDraft(place, written)
@@ -205,26 +206,6 @@ def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
 
 def _shape(shape: tuple[int | str | None, ...]) -> str:
     return "x".join("?" if side is None else str(side) for side in shape)
-
-
-def _names(given: Sequence[str] | Path | str | None) -> Sequence[str]:
-    if given is None:
-        return ()
-    if not isinstance(given, Path | str):
-        return given
-    path = Path(given)
-    try:
-        content = read_at_most(path, MIB)
-        if content is None:
-            raise UsageError(f"{path}: over 1 MiB; give class names, one a line")
-        lines = content.decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"{path}: {why}; give class names, one a line") from None
-    names = tuple(line.strip() for line in lines if line.strip())
-    if not names:
-        raise UsageError(f"{path}: no name in it; give class names, one a line")
-    return names
 
 
 def _size(text: str) -> tuple[int, int]:
