@@ -122,8 +122,8 @@ SIMULATED: Final[dict[str, Simulated]] = {
 class CueRuns:
     """Joins equal presences of consecutive pictures into spans of time."""
 
-    def __init__(self, period_ns: int, approach: int) -> None:
-        """Begin an approach whose pictures come every ``period_ns``."""
+    def __init__(self, period_ns: int, approach: int | None) -> None:
+        """Begin an approach, or a road without one, whose pictures come every ``period_ns``."""
         self._period_ns = period_ns
         self._approach = approach
         self._open: dict[str, tuple[int, int, Presence]] = {}

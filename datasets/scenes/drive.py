@@ -151,7 +151,8 @@ class _Record:
         self.layout, self.conditions = layout, conditions
         self.world, self.settings = world, settings
         self.objects = Objects()
-        self._cues = CueRuns(1_000_000_000 // settings.rate_hz, approach=0)
+        approach = 0 if layout.is_intersection else None
+        self._cues = CueRuns(1_000_000_000 // settings.rate_hz, approach)
         self._ranges: list[str] = []
         rng = np.random.default_rng([layout.seed, 8])
         self._heading_rad = float(rng.uniform(-np.pi, np.pi))
@@ -208,6 +209,8 @@ class _Record:
         self.objects.add(t_ns, picture, self.conditions.tags(self.layout), to_start)
         if t_ns < self._enter_ns:
             self._cues.add(t_ns, present(self.layout, picture))
+            if not self.layout.is_intersection:
+                return
             to_end = to_start + self.layout.end_m
             self._ranges.append(f"{t_ns},0,{to_start:.4f},{to_end:.4f}")
 
@@ -229,9 +232,9 @@ class _Record:
         track = planar(motion.t_ns[tenth], motion.x_m[tenth], motion.y_m[tenth], turned)
         write_tum(folder / "pose.tum", track, SOURCE)
         self.objects.save(folder / "objects.json", SOURCE)
-        write_text(
-            folder / "ranges.csv", "\n".join(["t_ns,approach,start_m,end_m", *self._ranges, ""])
-        )
+        if layout.is_intersection:
+            lines = ["t_ns,approach,start_m,end_m", *self._ranges, ""]
+            write_text(folder / "ranges.csv", "\n".join(lines))
         start_ns, step = int(motion.t_ns[0]), 1_000_000_000 // self.settings.rate_hz
         approach = Approach(
             id=0,
@@ -256,10 +259,10 @@ class _Record:
                 end_ns=int(motion.t_ns[-1]) + step,
                 pose="pose.tum",
                 source=SOURCE,
-                approaches=(approach,),
+                approaches=(approach,) if layout.is_intersection else (),
                 cues=self._cues.finished(),
                 objects="objects.json",
-                ranges="ranges.csv",
+                ranges="ranges.csv" if layout.is_intersection else None,
             ),
             folder,
         )

@@ -1,5 +1,8 @@
 """Intersections as plans: the eight of Table 6, and any number of others from seeds.
 
+Layouts ``M`` are mixed: twelve kinds in turn, four of which are no intersection at all, so that
+every feature of an intersection has positives and negatives in any twelve that follow one another.
+
 Local frame: x ahead along the approach road, y to the left, zero on the approach road's middle line
 where the intersection starts (stop line, and stop sign if there is one). The crossroad's near kerb
 is ``NEAR_KERB_M`` beyond; the intersection ends, and traffic lights hang, at ``end_m``.
@@ -7,12 +10,17 @@ is ``NEAR_KERB_M`` beyond; the intersection ends, and traffic lights hang, at ``
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 
 Control = Literal["stop_sign", "traffic_light", "none"]
+Kind = Literal[
+    "crossing", "light", "open", "t_both", "t_left", "t_right",
+    "one_way", "one_way_t", "straight", "bend", "driveways", "lot",
+]  # fmt: skip
 Side = Literal["left", "right"]
 
 NEAR_KERB_M: Final = 4.5
@@ -25,7 +33,7 @@ class Layout:
     """What does not change from run to run.
 
     Attributes:
-        name: Letter of Table 6, or ``L`` and the layout's seed.
+        name: Letter of Table 6, or ``L`` or ``M`` and the layout's seed.
         seed: Everything random about buildings and plants comes from it.
         control: What the approach road's driver must heed.
         has_left: There is road to the left; likewise ``has_right`` and ``has_ahead``.
@@ -59,6 +67,27 @@ class Layout:
     vegetation: bool = False
     is_town: bool = False
     has_lot: bool = True
+
+    @property
+    def is_intersection(self) -> bool:
+        """Does more than one road lead on? Otherwise the road runs straight on or bends."""
+        return self.has_left + self.has_right + self.has_ahead > 1
+
+    @property
+    def features(self) -> dict[str, bool]:
+        """What is true of it, as far as that can be said.
+
+        Where no intersection is, one can turn nowhere; a road that runs on is no direction of
+        travel to choose, so straight is left out, and so is the side to which a road bends.
+        """
+        if self.is_intersection:
+            ways = {"left": self.goes_left, "right": self.goes_right, "straight": self.goes_ahead}
+            return {"intersection": True, **ways}
+        sides = {"left": self.has_left, "right": self.has_right}
+        return {
+            "intersection": False,
+            **{name: False for name, bends in sides.items() if not bends},
+        }
 
     @property
     def has_parking_lane(self) -> bool:
@@ -145,14 +174,77 @@ def any_layout(seed: int) -> Layout:
     )
 
 
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+WITHOUT: Final[Mapping[Kind, tuple[str, ...]]] = {
+    "t_both": ("ahead",), "t_left": ("right",), "t_right": ("left",), "one_way_t": ("ahead",),
+    "straight": ("left", "right"), "driveways": ("left", "right"), "lot": ("left", "right"),
+}  # fmt: skip
+"""Roads that a kind does not have; a bend has one of the sides alone."""
+
+
+CONTROLS: Final[Mapping[Kind, tuple[Control, ...]]] = {
+    "crossing": ("stop_sign",), "light": ("traffic_light",), "open": ("none",),
+    "t_both": ("stop_sign", "stop_sign", "none"), "t_left": ("stop_sign", "stop_sign", "none"),
+    "t_right": ("stop_sign", "stop_sign", "none"), "one_way": ("stop_sign", "traffic_light"),
+    "one_way_t": ("stop_sign",), "straight": ("none",), "bend": ("none",), "driveways": ("none",),
+    "lot": ("none",),
+}  # fmt: skip
+"""What a kind's control is drawn from."""
+
+
+def mixed_kind(seed: int) -> Kind:
+    """The kind of layout ``M`` and a seed."""
+    return KINDS[seed % len(KINDS)]
+
+
+def mixed_layout(seed: int) -> Layout:
+    """An intersection of one of the kinds in turn, or a road without one."""
+    rng = np.random.default_rng([seed, 0x4D])
+    kind, side = mixed_kind(seed), _side(rng)
+    missing = WITHOUT.get(kind, ())
+    if kind == "bend":
+        missing = ("ahead", "right" if side == "left" else "left")
+    controls = CONTROLS[kind]
+    control = controls[int(rng.integers(len(controls)))]
+    closed = kind in ("crossing", "light") and bool(rng.random() < 0.25)
+    parked = int(rng.choice([0, 0, 2, 4, 6])) if len(missing) < 2 else 0
+    return Layout(
+        name=f"M{seed}",
+        seed=5000 + seed,
+        control=control,
+        has_left="left" not in missing,
+        has_right="right" not in missing,
+        has_ahead="ahead" not in missing,
+        one_way=side if kind.startswith("one_way") else None,
+        do_not_enter=closed or (kind == "one_way_t" and bool(rng.random() < 0.5)),
+        ahead_is_closed=closed,
+        half_width_m=float(rng.uniform(4.2, 6.4)),
+        cross_width_m=float(rng.uniform(11.0 if parked else 8.0, 13.0)),
+        cross_traffic=float(rng.choice([1.0, 5.0, 12.0, 26.0])),
+        parked_cross=parked,
+        parked_past=int(rng.choice([0, 0, 2, 5])),
+        vegetation=bool(rng.random() < 0.15),
+        # Houses have driveways, shops do not.
+        is_town=kind not in ("driveways", "lot") and bool(rng.random() < 0.5),
+        has_lot=kind == "lot" or (kind != "straight" and bool(rng.random() < 0.3)),
+    )
+
+
+def _side(rng: np.random.Generator) -> Side:
+    return "left" if rng.random() < 0.5 else "right"
+
+
 def layout_named(name: str) -> Layout:
-    """``A`` to ``H``, or ``L`` and a seed.
+    """``A`` to ``H``, or ``L`` or ``M`` and a seed.
 
     Raises:
         ValueError: No such layout.
     """
     if name in TABLE_6:
         return TABLE_6[name]
-    if name[:1] == "L" and name[1:].isdecimal() and len(name) < 11:
-        return any_layout(int(name[1:]))
-    raise ValueError(f"{name!r} is not a layout; there are: A to H, and L0, L1, ... from seeds")
+    makers = {"L": any_layout, "M": mixed_layout}
+    if name[:1] in makers and name[1:].isdecimal() and len(name) < 11:
+        return makers[name[:1]](int(name[1:]))
+    raise ValueError(
+        f"{name!r} is not a layout; there are: A to H, and L0, L1, ..., M0, M1, ... from seeds"
+    )

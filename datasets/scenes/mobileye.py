@@ -182,7 +182,8 @@ class Device:
         chance = 0.75 if layout.has_ahead and to_end < sight - 8.0 else 0.01
         if self._rng.random() < 0.08:
             self._sees_past = bool(self._rng.random() < chance)
-        if self._sees_past and layout.has_ahead:
+        is_endless = layout.has_ahead and not layout.is_intersection
+        if (self._sees_past and layout.has_ahead) or is_endless:
             return float(sight + self._rng.normal(0, 1.0))
         return float(min(to_start, sight) + self._rng.normal(0, 0.4))
 

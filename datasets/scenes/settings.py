@@ -21,7 +21,7 @@ class SceneSettings:
     """One run to simulate.
 
     Attributes:
-        layout: ``A`` to ``H``, or ``L`` and a seed.
+        layout: ``A`` to ``H``, or ``L`` or ``M`` and a seed.
         run: From 1; ten are laid down, more come from the seed.
         seed: Everything random about the run comes from it; plan and buildings do not.
         rate_hz: Pictures a second.

@@ -27,7 +27,7 @@ PUBLISHED_RUNS = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument(
-        "layouts", nargs="*", metavar="LAYOUT", help="layouts: A to H, or L0, L1 and so on"
+        "layouts", nargs="*", metavar="LAYOUT", help="layouts: A to H, or L0, L1, ... and M0, M1, ..."
     )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder per drive"
@@ -118,7 +118,7 @@ def _sheet(layouts: Sequence[str], runs: Sequence[int], args: argparse.Namespace
 def _wanted(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
     """Layouts, and runs of each."""
     if args.all == bool(args.layouts):
-        raise UsageError("simulate: give layouts (A to H, L0, L1, ...), or --all")
+        raise UsageError("simulate: give layouts (A to H, L0, L1, ..., M0, M1, ...), or --all")
     if (args.output is None) == (args.sheet is None):
         raise UsageError("simulate: give -o DIR for drives, or --sheet JPEG for pictures of them")
     if args.run is not None and (args.runs is not None or args.all):

@@ -230,6 +230,9 @@ def _wear(canvas: _Canvas, layout: Layout, rng: Generator, is_road: NDArray[np.b
 
 def _lines(canvas: _Canvas, layout: Layout) -> None:
     w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
+    if layout.has_ahead and not layout.is_intersection:
+        _lines_along(canvas, layout)
+        return
     for y in (-0.17, 0.17):
         canvas.line((X_M[0], -0.6), (y - 0.055, y + 0.055), YELLOW)
         if layout.has_ahead and not layout.ahead_is_closed:
@@ -245,6 +248,16 @@ def _lines(canvas: _Canvas, layout: Layout) -> None:
         if layout.has_ahead:
             _crosswalk(canvas, (far + 1.2, far + 3.6), w)
     _cross_lines(canvas, layout, near, far)
+
+
+def _lines_along(canvas: _Canvas, layout: Layout) -> None:
+    """Of a road that nothing crosses."""
+    for y in (-0.17, 0.17):
+        canvas.line(X_M, (y - 0.055, y + 0.055), YELLOW)
+    if layout.has_parking_lane:
+        side = layout.half_width_m - PARKING_LANE_M
+        for y in (-side, side):
+            canvas.line(X_M, (y - 0.05, y + 0.05), WHITE)
 
 
 def _crosswalk(canvas: _Canvas, x: tuple[float, float], half_m: float) -> None:
