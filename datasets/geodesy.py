@@ -11,9 +11,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
-
-from crosscue.replay.columns import Floats
+from numpy.typing import ArrayLike, NDArray
 
 SEMI_MAJOR_M: Final = 6_378_137.0
 FLATTENING: Final = 1.0 / 298.257_223_563
@@ -25,7 +23,9 @@ _BOWRING_STEPS: Final = 3
 """One step is good to a micrometre near the ground; three hold to the orbit of a satellite."""
 
 
-def geodetic_to_ecef(lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike) -> Floats:
+def geodetic_to_ecef(
+    lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike
+) -> NDArray[np.float64]:
     """Earth-fixed positions of places on or above the ellipsoid.
 
     Args:
@@ -52,7 +52,9 @@ def geodetic_to_ecef(lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike) -
     )
 
 
-def ecef_to_geodetic(xyz_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
+def ecef_to_geodetic(
+    xyz_m: ArrayLike,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Latitude and longitude in degrees and height in metres of earth-fixed positions.
 
     Args:
@@ -85,7 +87,7 @@ def ecef_to_geodetic(xyz_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
     return np.degrees(np.arctan2(sin_lat, cos_lat)), np.degrees(np.arctan2(y, x)), alt_m
 
 
-def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> Floats:
+def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> NDArray[np.float64]:
     """The rotation ``enu_R_ecef`` at one place: ``enu_m = matrix @ (xyz_m - origin_m)``.
 
     Args:
@@ -108,7 +110,7 @@ def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> Floats:
 
 def geodetic_to_enu(
     lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike, origin: tuple[float, float, float]
-) -> Floats:
+) -> NDArray[np.float64]:
     """Local east, north, up of places near ``origin``.
 
     Args:
@@ -122,11 +124,13 @@ def geodetic_to_enu(
     """
     enu_from_ecef = ecef_to_enu_matrix(np.radians(origin[0]), np.radians(origin[1]))
     away_m = geodetic_to_ecef(lat_deg, lon_deg, alt_m) - geodetic_to_ecef(*origin)
-    rotated: Floats = away_m @ enu_from_ecef.T
+    rotated: NDArray[np.float64] = away_m @ enu_from_ecef.T
     return rotated
 
 
-def _unit(opposite: Floats, adjacent: Floats) -> tuple[Floats, Floats]:
+def _unit(
+    opposite: NDArray[np.float64], adjacent: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sine and cosine of the angle with these legs."""
     length = np.hypot(opposite, adjacent)
     return opposite / length, adjacent / length

@@ -9,8 +9,6 @@ from typing import Any, Final, Protocol, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Floats
-
 MIN_SCORE: Final = 0.5
 """A detection is a cue above this score, where neither vehicle file nor detector says more."""
 
@@ -42,7 +40,7 @@ class Frame:
 
     t_ns: int
     camera: str
-    pixels: Bytes
+    pixels: NDArray[np.uint8]
     size_px: tuple[int, int]
 
     def __post_init__(self) -> None:
@@ -78,12 +76,12 @@ class Detections:
 
     t_ns: int
     size_px: tuple[int, int]
-    boxes_px: Floats
-    scores: Floats
+    boxes_px: NDArray[np.float64]
+    scores: NDArray[np.float64]
     labels: tuple[str, ...]
     masks: tuple[bytes, ...]
     lenses: tuple[str, ...] = ()
-    min_scores: Floats | None = None
+    min_scores: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up, and numbers that are none.
@@ -109,7 +107,7 @@ class Detections:
         return len(self.labels)
 
     @property
-    def heights_px(self) -> Floats:
+    def heights_px(self) -> NDArray[np.float64]:
         """Height of each box, shape (N,)."""
         return np.asarray(self.boxes_px[:, 3] - self.boxes_px[:, 1])
 

@@ -16,8 +16,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 _BASE: Final = 48
 _MORE: Final = 0x20
 _SIGN: Final = 0x10
@@ -54,7 +52,7 @@ def encode(mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[i
     return _to_text(lengths[:-1] if len(edges) and lengths[-1] == 0 else lengths)
 
 
-def runs(text: bytes) -> Int64s:
+def runs(text: bytes) -> NDArray[np.int64]:
     """Lengths of the runs of background and object in turn.
 
     Raises:
@@ -66,7 +64,7 @@ def runs(text: bytes) -> Int64s:
         raise ValueError(f"not a compressed mask: {text[:20]!r}")
     is_last = codes < _MORE
     last = np.flatnonzero(is_last)
-    values: Int64s = ((codes[last] ^ _SIGN).astype(np.int64)) - _SIGN
+    values: NDArray[np.int64] = ((codes[last] ^ _SIGN).astype(np.int64)) - _SIGN
     if len(last) < len(codes):
         _prepend(values, codes, np.flatnonzero(~is_last).tolist(), text)
     values[1::2] = values[1::2].cumsum()
@@ -76,7 +74,9 @@ def runs(text: bytes) -> Int64s:
     return values
 
 
-def _prepend(values: Int64s, codes: NDArray[np.uint8], places: list[int], text: bytes) -> None:
+def _prepend(
+    values: NDArray[np.int64], codes: NDArray[np.uint8], places: list[int], text: bytes
+) -> None:
     """Put the lower groups of five bits, at ``places``, under those that end each value.
 
     Runs are mostly shorter than 16 pixels apart, so there are few: a loop beats ten calls.
@@ -100,7 +100,7 @@ def area_px(text: bytes) -> int:
     return int(runs(text)[1::2].sum())
 
 
-def column_heights_px(text: bytes, size_px: tuple[int, int]) -> Floats:
+def column_heights_px(text: bytes, size_px: tuple[int, int]) -> NDArray[np.float64]:
     """Object pixels in each column of the picture, shape (width,).
 
     Raises:
@@ -138,7 +138,7 @@ def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     return flat.reshape(width, height).T
 
 
-def _checked(text: bytes, size_px: tuple[int, int]) -> Int64s:
+def _checked(text: bytes, size_px: tuple[int, int]) -> NDArray[np.int64]:
     lengths = runs(text)
     _check_pixels(int(lengths.sum()), size_px)
     return lengths
@@ -149,7 +149,7 @@ def _check_pixels(reported: int, size_px: tuple[int, int]) -> None:
         raise ValueError(f"mask of {reported} pixels: expected {size_px[0]} x {size_px[1]}")
 
 
-def _to_text(lengths: Int64s) -> bytes:
+def _to_text(lengths: NDArray[np.int64]) -> bytes:
     values = lengths.copy()
     values[3:] -= lengths[1:-2]
     groups = (values[:, None] >> (5 * np.arange(_LONGEST))) & 0x1F

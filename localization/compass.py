@@ -14,8 +14,7 @@ from dataclasses import dataclass, fields
 from typing import Final, TypeAlias
 
 import numpy as np
-
-from crosscue.replay.columns import Floats, Int64s
+from numpy.typing import NDArray
 
 from .angles import interpolate_angle, wrap_all
 
@@ -67,11 +66,11 @@ class CompassSettings:
 
 
 def heading(
-    field_t: Floats,
+    field_t: NDArray[np.float64],
     settings: CompassSettings,
-    roll_rad: Floats | None = None,
-    pitch_rad: Floats | None = None,
-) -> Floats:
+    roll_rad: NDArray[np.float64] | None = None,
+    pitch_rad: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """Headings of the car, counter-clockwise from east.
 
     Args:
@@ -94,11 +93,11 @@ def heading(
 
 
 def level_field(
-    field_t: Floats,
+    field_t: NDArray[np.float64],
     settings: CompassSettings,
-    roll_rad: Floats | None = None,
-    pitch_rad: Floats | None = None,
-) -> Floats:
+    roll_rad: NDArray[np.float64] | None = None,
+    pitch_rad: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
     """Corrected readings in level axes forward, left, up, before the mounting yaw.
 
     Arguments and errors as for ``heading``; shape (N, 3).
@@ -110,7 +109,7 @@ def level_field(
         if angle is not None and angle.shape != (n,):
             raise ValueError(f"{name}: expected ({n},), got {angle.shape}")
     to_car = np.array(settings.mounting_rotation) @ np.array(settings.soft_iron)
-    body: Floats = (field_t - np.array(settings.hard_iron_t)) @ to_car.T
+    body: NDArray[np.float64] = (field_t - np.array(settings.hard_iron_t)) @ to_car.T
     if roll_rad is None and pitch_rad is None:
         return body
     zero = np.zeros(n)
@@ -129,13 +128,13 @@ def level_field(
 
 
 def course_at(
-    at_ns: Int64s,
-    course_t_ns: Int64s,
-    course_rad: Floats,
-    speed_mps: Floats,
+    at_ns: NDArray[np.int64],
+    course_t_ns: NDArray[np.int64],
+    course_rad: NDArray[np.float64],
+    speed_mps: NDArray[np.float64],
     min_speed_mps: float = 3.0,
     max_gap_s: float = 1.5,
-) -> Floats:
+) -> NDArray[np.float64]:
     """The course over ground at other times, NaN where the car was too slow to have one.
 
     Args:

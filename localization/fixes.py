@@ -8,8 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fixes:
@@ -21,9 +19,9 @@ class Fixes:
         cov_m2: Shape (N, 2, 2).
     """
 
-    t_ns: Int64s
-    xy_m: Floats
-    cov_m2: Floats
+    t_ns: NDArray[np.int64]
+    xy_m: NDArray[np.float64]
+    cov_m2: NDArray[np.float64]
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up.

@@ -16,8 +16,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
-
 from .angles import wrap
 
 Ints = NDArray[np.int64]
@@ -50,7 +48,11 @@ def option_cost(heading_rad: float, bearing_rad: float, penalty_rad: float) -> f
     return abs(wrap(heading_rad - bearing_rad)) + penalty_rad
 
 
-def choose(headings_rad: Floats, bearings_rad: Floats, penalties_rad: Floats) -> int:
+def choose(
+    headings_rad: NDArray[np.float64],
+    bearings_rad: NDArray[np.float64],
+    penalties_rad: NDArray[np.float64],
+) -> int:
     """The option of least cost (eq. 4); of equal ones the first.
 
     Args:
@@ -103,12 +105,12 @@ class Memory(NamedTuple):
     """
 
     sizes: Ints
-    x_m: Floats
-    y_m: Floats
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
     first: Ints
     following: Ints
-    headings_rad: Floats
-    times: Floats
+    headings_rad: NDArray[np.float64]
+    times: NDArray[np.float64]
 
 
 def empty_memory() -> Memory:
@@ -201,7 +203,7 @@ def _with_room_for_options(memory: Memory) -> Memory:
     )
 
 
-def _doubled(numbers: Floats) -> Floats:
+def _doubled(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
     larger = np.empty(2 * len(numbers))
     larger[: len(numbers)] = numbers
     return larger
@@ -218,7 +220,7 @@ def landmark_ahead(
     y_m: float,
     goal_x_m: float,
     goal_y_m: float,
-    landmarks_m: Floats,
+    landmarks_m: NDArray[np.float64],
     is_visited: NDArray[np.bool_],
 ) -> int:
     """The nearest landmark that brings the car closer to its goal, or ``NONE``.

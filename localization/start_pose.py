@@ -6,8 +6,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-
-from crosscue.replay.columns import Floats, Int64s
+from numpy.typing import NDArray
 
 from .angles import wrap
 from .fixes import Fixes
@@ -23,12 +22,12 @@ INDEPENDENT_S: Final = 1.0
 class Path(NamedTuple):
     """Dead reckoning from pose (0, 0, 0), shape (N,) each."""
 
-    x_m: Floats
-    y_m: Floats
-    heading_rad: Floats
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    heading_rad: NDArray[np.float64]
 
 
-def path_of(increments: Increments, at_ns: Int64s, begin_ns: int) -> Path:
+def path_of(increments: Increments, at_ns: NDArray[np.int64], begin_ns: int) -> Path:
     """Dead reckoning from the pose at ``begin_ns`` to given times; linear inside increments."""
     heading = np.append(0.0, np.cumsum(increments.turn_rad))
     half = 0.5 * increments.turn_rad

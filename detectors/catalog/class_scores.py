@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Annotated, Final, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from crosscue.detectors.settings import Proportion, Settings
-from crosscue.replay.columns import Floats
 
 ORDER: Final = 1e-6
 """So much of the network's score is kept by ``Isotonic``, so that no two scores become equal."""
@@ -28,7 +28,7 @@ class Platt(Settings):
     slope: Annotated[float, Field(gt=0.0, le=100.0)]
     offset: Annotated[float, Field(ge=-100.0, le=100.0)]
 
-    def probabilities(self, scores: Floats) -> Floats:
+    def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """The fraction of detections with such a score that are right, shape (N,)."""
         kept = np.clip(scores, 1e-9, 1.0 - 1e-9)
         logit = self.slope * np.log(kept / (1.0 - kept)) + self.offset
@@ -50,7 +50,7 @@ class Isotonic(Settings):
             raise ValueError("scores and fractions: expected rising numbers")
         return self
 
-    def probabilities(self, scores: Floats) -> Floats:
+    def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """As ``Platt``."""
         found = np.interp(scores, self.scores, self.fractions)
         return np.asarray((1.0 - ORDER) * found + ORDER * scores, np.float64)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.vehicle import Cars, CueSpec, Vehicle
 
 from .observed import NONE, Judged, Sides, nose_of, of_side
@@ -36,9 +35,9 @@ class CarShapes:
 
     t_ns: int
     size_px: tuple[int, int]
-    center_px: Floats
-    area_px: Floats
-    nose: Int64s
+    center_px: NDArray[np.float64]
+    area_px: NDArray[np.float64]
+    nose: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.area_px)
@@ -56,9 +55,9 @@ class Pairs:
         judged: What they do, where that is known from more than these two frames.
     """
 
-    step_px: Floats
-    center_px: Floats
-    nose: Int64s
+    step_px: NDArray[np.float64]
+    center_px: NDArray[np.float64]
+    nose: NDArray[np.int64]
     width_px: int
     judged: Judged | None = None
 
@@ -138,7 +137,7 @@ def no_pairs(width_px: int) -> Pairs:
     return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width_px)
 
 
-def _nearest(cost: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _nearest(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Row and column of the cheapest finite entries, each row and column at most once."""
     rows, columns = np.nonzero(np.isfinite(cost))
     order = np.argsort(cost[rows, columns], kind="stable")

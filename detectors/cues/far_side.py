@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples
 from crosscue.replay.vehicle.cue_spec import CueSpec
@@ -35,8 +35,8 @@ class MobileyeState:
         lanes: Shape (M, 8), ``LANE_COLUMNS``; likewise.
     """
 
-    obstacles: Floats | None
-    lanes: Floats | None
+    obstacles: NDArray[np.float64] | None
+    lanes: NDArray[np.float64] | None
 
 
 def state_at(
@@ -68,7 +68,7 @@ def _between(samples: Samples | None, oldest_ns: int, newest_ns: int) -> Samples
     return Samples(samples.signal, samples.t_ns[low:high], samples.values[low:high])
 
 
-def _last_burst(samples: Samples | None, past: Past) -> Floats | None:
+def _last_burst(samples: Samples | None, past: Past) -> NDArray[np.float64] | None:
     if samples is None:
         return None
     values = samples.values
@@ -76,16 +76,16 @@ def _last_burst(samples: Samples | None, past: Past) -> Floats | None:
     if values[-1, _OBSTACLE["burst"]] < 0:
         # Messages without a status message: those of one image come together.
         last = samples.t_ns > samples.t_ns[-1] - round(past.settles_s * 1e9)
-    found: Floats = values[last & np.isfinite(values[:, _OBSTACLE["x_m"]])]
+    found: NDArray[np.float64] = values[last & np.isfinite(values[:, _OBSTACLE["x_m"]])]
     return found
 
 
-def _last_lanes(samples: Samples | None) -> Floats | None:
+def _last_lanes(samples: Samples | None) -> NDArray[np.float64] | None:
     if samples is None:
         return None
     sides = samples.values[:, _LANE["side"]]
     rows = [int(np.flatnonzero(sides == side)[-1]) for side in np.unique(sides)]
-    found: Floats = samples.values[rows]
+    found: NDArray[np.float64] = samples.values[rows]
     return found
 
 
@@ -136,7 +136,7 @@ def count_vehicles_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:
 
 
 def lanes_past(
-    lanes: Floats, end_m: float, past: Past
+    lanes: NDArray[np.float64], end_m: float, past: Past
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which of M lines reach past the end, shape (M,): usable ones that run on ahead."""
     reach = end_m + past.lane_reach_m
@@ -153,7 +153,7 @@ def lanes_past(
 
 
 def vehicles_past(
-    obstacles: Floats, end_m: float, past: Past
+    obstacles: NDArray[np.float64], end_m: float, past: Past
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Which of N obstacles are vehicles past the end and on the road straight ahead, shape (N,)."""
     is_past: np.ndarray[tuple[int], np.dtype[np.bool_]] = (

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crosscue.detectors.base import Detections, Found, RoadMask
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.cue_spec import CueSpec
 
 
@@ -88,7 +90,7 @@ class Judged(NamedTuple):
     past: Ways | None = None
 
 
-def nose_of(heights_px: Floats) -> int:
+def nose_of(heights_px: NDArray[np.float64]) -> int:
     """-1 where the mask's left end is lower than its right, 1 where the right is, 0 where equal.
 
     An end is the outer quarter of the mask's length: single columns are too noisy.

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.replay.base import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 
 from .observed import NOT_SEEN, Place, RoadShares
@@ -75,7 +74,7 @@ def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float],
 
 def outlines(
     camera: Camera, regions: Regions, place: Place | None, size_px: tuple[int, int]
-) -> tuple[Floats | None, ...]:
+) -> tuple[NDArray[np.float64] | None, ...]:
     """Corners of the left, straight and right region in the picture, shape (4, 2) each.
 
     None for one at or behind the camera, or where no range is known.
@@ -88,12 +87,14 @@ def outlines(
     )
 
 
-def _corners(one: Rectangle) -> Floats:
+def _corners(one: Rectangle) -> NDArray[np.float64]:
     first, last, rightmost, leftmost = one
     return np.array([(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)])
 
 
-def project(points_m: Floats, camera: Camera, size_px: tuple[int, int]) -> Floats:
+def project(
+    points_m: NDArray[np.float64], camera: Camera, size_px: tuple[int, int]
+) -> NDArray[np.float64]:
     """Points on level ground in the picture.
 
     Args:
@@ -140,16 +141,16 @@ def _fraction(
     return float(np.count_nonzero(is_road & inside) / count)
 
 
-def _inside(polygon: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _inside(polygon: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """The pixels whose centres lie in a convex polygon, shape (h, w)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
-    signs: list[Floats] = []
+    signs: list[NDArray[np.float64]] = []
     for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         signs.append((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0))
     inside: NDArray[np.bool_] = (np.min(signs, axis=0) >= 0.0) | (np.max(signs, axis=0) <= 0.0)
     return inside
 
 
-def _area(polygon: Floats) -> float:
+def _area(polygon: NDArray[np.float64]) -> float:
     x, y = polygon.T
     return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))

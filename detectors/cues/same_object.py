@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.object_tracks import iou
-from crosscue.replay.base import Int64s
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_IOU: Final = 0.5
@@ -34,7 +34,7 @@ def meanings(vehicle: Vehicle) -> dict[str, str]:
 
 def same_objects(
     found: Sequence[Detections], meaning: Mapping[str, str], is_calibrated: Sequence[bool]
-) -> tuple[Int64s, ...]:
+) -> tuple[NDArray[np.int64], ...]:
     """Which detections are another detector's object again.
 
     Args:

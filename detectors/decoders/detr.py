@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
-
-from crosscue.replay.columns import Floats
 
 from .base import (
     BoxOutput,
@@ -52,7 +51,7 @@ class DetrOutput(BoxOutput):
         best, classes = best_class(scores)
         return Candidates(from_centers(boxes) * np.tile(size_px, 2), best, classes)
 
-    def _scores(self, logits: Floats) -> Floats:
+    def _scores(self, logits: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.activation == "none":
             return logits
         if self.activation == "sigmoid":

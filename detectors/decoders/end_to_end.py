@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
-
-from crosscue.replay.columns import Floats
 
 from .base import (
     BoxOutput,
@@ -41,7 +41,7 @@ class EndToEndOutput(BoxOutput):
         table = rows_of(named(outputs, self.name), 6 + len(prototypes), "boxes and mask weights")
         return self._of(table, PrototypeMasks(table[:, 6:], prototypes))
 
-    def _of(self, table: Floats, masks: PrototypeMasks | None) -> Candidates:
+    def _of(self, table: NDArray[np.float64], masks: PrototypeMasks | None) -> Candidates:
         return Candidates(
             table[:, :4], table[:, 4], class_numbers(table[:, 5], len(self.classes)), masks
         )

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
-
-from crosscue.replay.columns import Floats
 
 from .base import (
     BoxOutput,
@@ -99,7 +98,7 @@ class PicodetOutput(BoxOutput):
         )
 
 
-def _expected(logits: Floats) -> Floats:
+def _expected(logits: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of each distribution over its bins: shape (N, 4, bins) to (N, 4)."""
     weights = np.exp(logits - logits.max(axis=2, keepdims=True))
     bins = np.arange(logits.shape[2], dtype=np.float64)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
-
-from crosscue.replay.columns import Floats, Int64s
 
 from .base import (
     Array,
@@ -96,6 +95,6 @@ class _WholeMasks:
 
     masks: Array
 
-    def __call__(self, kept: Int64s, /) -> Floats:
+    def __call__(self, kept: NDArray[np.int64], /) -> NDArray[np.float64]:
         """Shape (len(kept), H, W)."""
         return np.asarray(self.masks[kept, 0], np.float64)

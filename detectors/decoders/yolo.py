@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
-
-from crosscue.replay.columns import Floats, Int64s
 
 from .base import (
     Array,
@@ -148,10 +147,10 @@ class YoloV8SegOutput(BoxOutput):
 class PrototypeMasks:
     """Masks as weighted sums of prototypes: weights (N, K), prototypes (K, h, w)."""
 
-    weights: Floats
-    prototypes: Floats
+    weights: NDArray[np.float64]
+    prototypes: NDArray[np.float64]
 
-    def __call__(self, kept: Int64s, /) -> Floats:
+    def __call__(self, kept: NDArray[np.int64], /) -> NDArray[np.float64]:
         """Shape (len(kept), h, w)."""
         return sigmoid(np.tensordot(self.weights[kept], self.prototypes, axes=1))
 
@@ -165,7 +164,7 @@ def prototype_output(model: Interface) -> tuple[str, int] | None:
     return None
 
 
-def prototypes_of(output: Array) -> Floats:
+def prototypes_of(output: Array) -> NDArray[np.float64]:
     """Prototype masks (1, K, h, w) without their batch axis.
 
     Raises:
@@ -176,7 +175,7 @@ def prototypes_of(output: Array) -> Floats:
     return np.asarray(output[0], np.float64)
 
 
-def _columns(output: Array, rows: int) -> Floats:
+def _columns(output: Array, rows: int) -> NDArray[np.float64]:
     if output.ndim != 3 or output.shape[:2] != (1, rows):
         raise ValueError(f"expected (1, {rows}, N) for these classes, got {output.shape}")
     return np.asarray(output[0].T, np.float64)

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.card import Tiles
 from crosscue.detectors.decoders.base import Size
-from crosscue.replay.columns import Floats
 
 Corner = tuple[int, int]
 EDGE_PX = 2.0
@@ -32,7 +31,9 @@ def _starts(first: int, last: int, length: int, overlap: float, side: int) -> li
     return [first + round(i * (span - length) / (count - 1)) for i in range(count)]
 
 
-def is_whole(boxes_px: Floats, corner: Corner, tile: Size, picture: Size) -> NDArray[np.bool_]:
+def is_whole(
+    boxes_px: NDArray[np.float64], corner: Corner, tile: Size, picture: Size
+) -> NDArray[np.bool_]:
     """Which boxes (N, 4), in the picture's pixels, are not cut off by an inner edge of a tile."""
     low = np.array(corner, np.float64)
     high = np.minimum(low + tile, picture)

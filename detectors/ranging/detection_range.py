@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .height_to_range import range_of
@@ -23,7 +23,11 @@ BORDER_PX: Final = 2.0
 
 
 def detection_range(
-    vehicle: Vehicle, label: str, box_px: Floats, height_px: float, size_px: tuple[int, int]
+    vehicle: Vehicle,
+    label: str,
+    box_px: NDArray[np.float64],
+    height_px: float,
+    size_px: tuple[int, int],
 ) -> OneRange | None:
     """From the rear axle; None where there is no curve and no default.
 
@@ -55,7 +59,11 @@ def _has_defaults(vehicle: Vehicle) -> bool:
 
 
 def _by_size(
-    vehicle: Vehicle, label: str, box_px: Floats, height_px: float, size_px: tuple[int, int]
+    vehicle: Vehicle,
+    label: str,
+    box_px: NDArray[np.float64],
+    height_px: float,
+    size_px: tuple[int, int],
 ) -> OneRange | None:
     """Depth from the camera."""
     cues, camera = vehicle.cues, vehicle.camera
@@ -75,7 +83,7 @@ def _by_size(
     return vehicle_range(y1, height_px, over_ground, VEHICLES[label])
 
 
-def _is_cut(box_px: Floats, size_px: tuple[int, int]) -> bool:
+def _is_cut(box_px: NDArray[np.float64], size_px: tuple[int, int]) -> bool:
     x0, y0, x1, y1 = box_px.tolist()
     right, bottom = size_px[0] - BORDER_PX, size_px[1] - BORDER_PX
     return bool(min(x0, y0) < BORDER_PX or x1 > right or y1 > bottom)

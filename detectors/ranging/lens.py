@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Frame
-from crosscue.replay.columns import Bytes, Floats
 
 VERSION: Final = 1
 """Of the rule; results kept by an older one are not used."""
@@ -45,7 +44,7 @@ MARGIN: Final = 0.06
 """Of the box's width, left out on either side: what is behind the housing."""
 
 
-def lens_of(pixels: Bytes, box_px: Floats) -> Lens:
+def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
     """The lit lens in one box; ``dark`` where none is lit, ``unknown`` where too small to say.
 
     Args:

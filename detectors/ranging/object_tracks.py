@@ -16,8 +16,7 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 from .lens import HUES
 from .range_from_motion import MotionRange, range_from_motion
@@ -119,7 +118,7 @@ class Track:
     """
 
     number: int
-    box_px: Floats
+    box_px: NDArray[np.float64]
     height_px: float
     estimate: MotionRange
     alone: MotionRange
@@ -209,7 +208,7 @@ class Track:
         if motion.way_m is None or abs(self._turned_rad) > STRAIGHT_RAD:
             self._forget()
 
-    def observe(self, box_px: Floats, height_px: float, cue: str, lens: Lens) -> None:
+    def observe(self, box_px: NDArray[np.float64], height_px: float, cue: str, lens: Lens) -> None:
         """Take the box of the newest frame."""
         width_px = float(box_px[2] - box_px[0])
         if width_px > 0.0:
@@ -269,8 +268,8 @@ class ObjectTracks:
     def __call__(
         self,
         motion: Motion,
-        boxes_px: Floats,
-        heights_px: Floats,
+        boxes_px: NDArray[np.float64],
+        heights_px: NDArray[np.float64],
         lenses: Sequence[str] = (),
     ) -> Sequence[Track]:
         """Take the next frame's boxes.
@@ -300,7 +299,9 @@ class ObjectTracks:
         self._share_sizes()
         return self.tracks
 
-    def _assign(self, boxes_px: Floats, heights_px: Floats, lenses: Sequence[str]) -> list[int]:
+    def _assign(
+        self, boxes_px: NDArray[np.float64], heights_px: NDArray[np.float64], lenses: Sequence[str]
+    ) -> list[int]:
         """Nearest pairs first; the boxes that were taken."""
         pairs = [
             (away, i, j)
@@ -337,7 +338,7 @@ class ObjectTracks:
             if others and one.is_seen:
                 one.weigh(shared_size(one.size, others), self._lens)
 
-    def _begin(self, box_px: Floats, height_px: float, lens: str) -> None:
+    def _begin(self, box_px: NDArray[np.float64], height_px: float, lens: str) -> None:
         self.counts["objects followed"] += 1
         size = size_of(self._cue)
         first = range_from_motion(np.zeros(1), np.array([height_px]), self._lens.focal_px, size)
@@ -392,7 +393,7 @@ def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizeP
     return SizePrior(math.exp(size.log_mean + mean + 0.5 * var), math.sqrt(math.expm1(var)))
 
 
-def iou(one: Floats, other: Floats) -> float:
+def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Intersection over union of two boxes."""
     low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
     inside = float(np.prod(np.maximum(high - low, 0.0)))
@@ -400,7 +401,7 @@ def iou(one: Floats, other: Floats) -> float:
     return inside / (both - inside) if both > inside else 0.0
 
 
-def _away(track: Track, box_px: Floats, height_px: float) -> float:
+def _away(track: Track, box_px: NDArray[np.float64], height_px: float) -> float:
     """Distance from the predicted box in heights; infinite if it is another's for its height."""
     if abs(math.log(height_px / track.height_px)) > math.log(GROWTH):
         return math.inf

@@ -15,8 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Floats
-
 POINTS: Final = 600
 MIN_POINTS: Final = 60
 MIN_FLOW_PX: Final = 2.0
@@ -44,7 +42,10 @@ class Travel(NamedTuple):
 
 
 def travel_between(
-    before: Bytes, after: Bytes, focal_px: float, center_px: tuple[float, float]
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    focal_px: float,
+    center_px: tuple[float, float],
 ) -> Travel | None:
     """The direction of travel, in the axes half-way between both pictures.
 
@@ -82,22 +83,28 @@ def travel_between(
     return _travel(*_refined(turn, first, rays_before, rays_after, focal_px), agree)
 
 
-def _rays(points: NDArray[np.float32], focal_px: float, center_px: tuple[float, float]) -> Floats:
+def _rays(
+    points: NDArray[np.float32], focal_px: float, center_px: tuple[float, float]
+) -> NDArray[np.float64]:
     """Directions of points in a picture, shape (N, 3), the last being 1."""
     flat = (points.astype(np.float64) - np.array(center_px)) / focal_px
     return np.column_stack([flat, np.ones(len(flat))])
 
 
 def _refined(
-    turn: Floats, shift: Floats, before: Floats, after: Floats, focal_px: float
-) -> tuple[Floats, Floats]:
+    turn: NDArray[np.float64],
+    shift: NDArray[np.float64],
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    focal_px: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Turn and shift of the least distances from epipolar lines (Sampson's), robustly.
 
     Five points, which random sampling makes do with, leave the shift off by degrees.
     """
     from scipy.optimize import least_squares
 
-    def off_line_px(parameters: Floats) -> Floats:
+    def off_line_px(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
         rotation = np.asarray(cv2.Rodrigues(parameters[:3])[0], np.float64)
         x, y, z = parameters[3:] / np.linalg.norm(parameters[3:])
         essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
@@ -112,7 +119,7 @@ def _refined(
 
 
 def _followed(
-    before: Bytes, after: Bytes, found: NDArray[np.float32]
+    before: NDArray[np.uint8], after: NDArray[np.uint8], found: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points in both pictures, those that come back to where they were."""
     size = (21, 21)
@@ -123,7 +130,7 @@ def _followed(
     return found.reshape(-1, 2)[good], np.asarray(there, np.float32).reshape(-1, 2)[good]
 
 
-def _travel(turn: Floats, shift: Floats, points: int) -> Travel:
+def _travel(turn: NDArray[np.float64], shift: NDArray[np.float64], points: int) -> Travel:
     """Points of the first camera's axes, turned and shifted, are in the second's."""
     half = np.asarray(cv2.Rodrigues(0.5 * turn)[0], np.float64)
     # In the second camera's axes the camera came from +shift; half the turn takes that half-way.

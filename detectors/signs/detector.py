@@ -17,7 +17,6 @@ from pydantic import Field
 
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
-from crosscue.replay.columns import Bytes, Floats, Int64s
 
 from .matching import Counts, Words, nearest, window_counts
 from .templates import AMERICAN, LABELS, Drawing, Kind, drawings
@@ -81,11 +80,11 @@ class Points:
         words: Shape (N, 4), uint64: descriptors.
     """
 
-    at_px: Floats
+    at_px: NDArray[np.float64]
     words: Words
 
 
-def orb_points(grey: Bytes, most: int, fast: int = 10) -> Points:
+def orb_points(grey: NDArray[np.uint8], most: int, fast: int = 10) -> Points:
     """Points with upright descriptors; patches small enough for signs of fifty pixels.
 
     Signs stand upright. Descriptors turned with the picture would take a left arrow for a right one
@@ -116,8 +115,8 @@ class _Gallery:
 
     drawn: tuple[Drawing, ...]
     points: Points
-    first: Int64s
-    to_middle_px: Floats
+    first: NDArray[np.int64]
+    to_middle_px: NDArray[np.float64]
 
 
 def _gallery(settings: SignSettings) -> _Gallery:
@@ -177,7 +176,7 @@ class SignDetector:
         top = int(height * self.settings.crop_top)
         bottom = height - int(height * self.settings.crop_bottom)
         grey = frame.pixels[top:bottom]
-        candidates: list[tuple[float, Kind, Floats]] = []
+        candidates: list[tuple[float, Kind, NDArray[np.float64]]] = []
         for level in range(self.settings.levels if grey.size else 0):
             scale = self.settings.enlarge / self.settings.factor**level
             candidates += self._level(grey, scale)
@@ -191,7 +190,9 @@ class SignDetector:
         scores = np.array([score for score, _, _ in kept])
         return Detections(frame.t_ns, frame.size_px, boxes, scores, labels, (b"",) * len(labels))
 
-    def _level(self, grey: Bytes, scale: float) -> list[tuple[float, Kind, Floats]]:
+    def _level(
+        self, grey: NDArray[np.uint8], scale: float
+    ) -> list[tuple[float, Kind, NDArray[np.float64]]]:
         import cv2
 
         size = (round(grey.shape[1] * scale), round(grey.shape[0] * scale))
@@ -207,7 +208,7 @@ class SignDetector:
             self.settings.ratio,
             self.settings.max_bits,
         )
-        found: list[tuple[float, Kind, Floats]] = []
+        found: list[tuple[float, Kind, NDArray[np.float64]]] = []
         for k, drawing in enumerate(self.gallery.drawn):
             which = np.flatnonzero(matched[k] >= 0)
             at = matched[k, which]
@@ -221,13 +222,13 @@ class SignDetector:
 
     def _windows(
         self,
-        votes: Floats,
-        at: Int64s,
+        votes: NDArray[np.float64],
+        at: NDArray[np.int64],
         shape: tuple[int, ...],
         drawing: Drawing,
         points_drawn: int,
         scale: float,
-    ) -> list[tuple[float, Kind, Floats]]:
+    ) -> list[tuple[float, Kind, NDArray[np.float64]]]:
         reach = max(round(self.settings.reach * drawing.size_px[1] / _CELL_PX), 1)
         rows, columns = shape[0] // _CELL_PX + 1, shape[1] // _CELL_PX + 1
         cells = np.floor(votes / _CELL_PX).astype(np.int64)
@@ -254,8 +255,8 @@ def _is_peak(counts: Counts, reach: int) -> NDArray[np.bool_]:
 
 
 def _apart(
-    candidates: list[tuple[float, Kind, Floats]], overlap: float
-) -> list[tuple[float, Kind, Floats]]:
+    candidates: list[tuple[float, Kind, NDArray[np.float64]]], overlap: float
+) -> list[tuple[float, Kind, NDArray[np.float64]]]:
     """The best windows, without those that lie over a better one, of whatever kind.
 
     A sign is found on neighbouring levels and by drawings of several sizes, a chance likeness

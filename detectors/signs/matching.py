@@ -13,8 +13,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
-
 Words = NDArray[np.uint64]
 Counts = NDArray[np.int32]
 _BITS_AT: Final = np.uint64(32)
@@ -60,7 +58,9 @@ def _least(keys: Words) -> np.uint64:
 
 
 @njit(cache=True, nogil=True)
-def nearest(points: Words, drawn: Words, first: Int64s, ratio: float, most: int) -> Int64s:
+def nearest(
+    points: Words, drawn: Words, first: NDArray[np.int64], ratio: float, most: int
+) -> NDArray[np.int64]:
     """For each drawing and point the drawing's descriptor that passes the ratio test, else -1.
 
     Args:
@@ -91,7 +91,9 @@ def nearest(points: Words, drawn: Words, first: Int64s, ratio: float, most: int)
 
 
 @njit(cache=True, nogil=True)
-def window_counts(at_cell: Int64s, drawn: Int64s, rows: int, columns: int, reach: int) -> Counts:
+def window_counts(
+    at_cell: NDArray[np.int64], drawn: NDArray[np.int64], rows: int, columns: int, reach: int
+) -> Counts:
     """How many different points of one drawing vote for the window around each cell of a grid.
 
     A texture that repeats one point of the drawing a hundred times still counts once.

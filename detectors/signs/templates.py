@@ -13,8 +13,7 @@ from importlib.resources import files
 from typing import Final, Literal
 
 import numpy as np
-
-from crosscue.replay.columns import Bytes
+from numpy.typing import NDArray
 
 Kind = Literal["one way left", "one way right", "do not enter", "no entry"]
 KINDS: Final[tuple[Kind, ...]] = ("one way left", "one way right", "do not enter", "no entry")
@@ -39,7 +38,7 @@ class Drawing:
     """
 
     kind: Kind
-    grey: Bytes
+    grey: NDArray[np.uint8]
     size_px: tuple[int, int]
 
 
@@ -79,7 +78,7 @@ def file_name(kind: Kind, height_px: int) -> str:
     return f"{kind.replace(' ', '_')}_{height_px}.png"
 
 
-def _stored(kind: Kind, height_px: int) -> Bytes:
+def _stored(kind: Kind, height_px: int) -> NDArray[np.uint8]:
     import cv2
 
     path = files("crosscue.detectors.signs").joinpath("drawings", file_name(kind, height_px))

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.boxes import overlaps
-from crosscue.replay.columns import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +20,7 @@ class Judged:
         signs: True signs.
     """
 
-    scores: Floats
+    scores: NDArray[np.float64]
     is_right: NDArray[np.bool_]
     signs: int
 
@@ -52,9 +51,9 @@ class Rates:
 
 
 def judge(
-    boxes_px: Floats,
-    scores: Floats,
-    truth_px: Floats,
+    boxes_px: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    truth_px: NDArray[np.float64],
     min_overlap: float,
     min_height_px: float = 0.0,
 ) -> Judged:

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.class_scores import Isotonic, Platt
-from crosscue.replay.columns import Floats
 
 
-def fit_platt(scores: Floats, is_right: NDArray[np.bool_]) -> Platt:
+def fit_platt(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Platt:
     """Logistic regression on the score's logit (Platt 1999).
 
     Args:
@@ -24,7 +23,7 @@ def fit_platt(scores: Floats, is_right: NDArray[np.bool_]) -> Platt:
     # Platt's targets: one more right and one more wrong than were seen.
     target = np.where(is_right, (right + 1) / (right + 2), 1 / (len(is_right) - right + 2))
 
-    def cost(at: Floats) -> float:
+    def cost(at: NDArray[np.float64]) -> float:
         z = np.exp(at[0]) * logit + at[1]
         return float((np.logaddexp(0.0, z) - target * z).mean())
 
@@ -33,7 +32,7 @@ def fit_platt(scores: Floats, is_right: NDArray[np.bool_]) -> Platt:
     return Platt(kind="platt", slope=round(slope, 5), offset=round(offset, 5))
 
 
-def fit_isotonic(scores: Floats, is_right: NDArray[np.bool_]) -> Isotonic:
+def fit_isotonic(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Isotonic:
     """The rising steps nearest to what was seen, joined at their middles.
 
     Args:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.scoring.by_drive import Direction, DriveMetric, Kind, direction
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
-from crosscue.replay.base import Floats
 
 FALSE_ALARMS: Final = 0.05
 """Comparisons of equal runs in which any verdict falls, at most."""
@@ -70,10 +70,10 @@ class PairedMetric:
 class _Sums(NamedTuple):
     """Shapes (G,), by drive: total and rows in the first run, then in the second."""
 
-    total: Floats
-    rows: Floats
-    other_total: Floats
-    other_rows: Floats
+    total: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    other_total: NDArray[np.float64]
+    other_rows: NDArray[np.float64]
 
 
 def compare_drives(
@@ -121,7 +121,7 @@ def _sums(
     return _Sums(*columns)
 
 
-def _swaps(drives: int) -> Floats:
+def _swaps(drives: int) -> NDArray[np.float64]:
     """Shape (S, G): 1 where a drive's results are swapped; the first row swaps none."""
     if drives <= EXACT_DRIVES:
         return np.array(
@@ -132,7 +132,7 @@ def _swaps(drives: int) -> Floats:
     return drawn
 
 
-def _swapped(kind: Kind, sums: _Sums, swaps: Floats) -> Floats:
+def _swapped(kind: Kind, sums: _Sums, swaps: NDArray[np.float64]) -> NDArray[np.float64]:
     """After minus before for every way of swapping, shape (S,)."""
     total = swaps @ (sums.other_total - sums.total)
     rows = swaps @ (sums.other_rows - sums.rows)
@@ -141,7 +141,9 @@ def _swapped(kind: Kind, sums: _Sums, swaps: Floats) -> Floats:
     return np.nan_to_num(after - before)
 
 
-def _value(kind: Kind, total: Floats, rows: Floats) -> Floats:
+def _value(
+    kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]
+) -> NDArray[np.float64]:
     if kind == "sum":
         return total
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -149,7 +151,7 @@ def _value(kind: Kind, total: Floats, rows: Floats) -> Floats:
     return np.sqrt(np.maximum(mean, 0.0)) if kind == "rms" else mean
 
 
-def _critical(largest: Floats) -> float:
+def _critical(largest: NDArray[np.float64]) -> float:
     """What the largest difference must reach; infinite where no difference could be rare enough."""
     ordered = np.sort(largest)[::-1]
     rank = math.floor(FALSE_ALARMS * len(ordered) + ROUNDING)
@@ -163,7 +165,7 @@ def _judged(
     kind: Kind,
     sums: _Sums,
     unit: float,
-    largest: Floats,
+    largest: NDArray[np.float64],
     critical: float,
     allowed_of: Callable[[str, float], float],
 ) -> PairedMetric:

@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -51,7 +51,7 @@ def log_ahead(
         _log_truth(recording, time, truth)
 
 
-def above(x_m: Floats, y_m: Floats) -> Floats:
+def above(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """From the car's frame to the view's, where x goes right and y down; shape (N, 2)."""
     return np.stack([-y_m, -x_m], axis=-1)
 
@@ -146,13 +146,13 @@ def _log_mobileye(
     recording.log("ahead/mobileye_lanes", rr.LineStrips2D.from_fields(radii=[0.15]), static=True)
 
 
-def _vehicles(obstacles: Floats | None) -> Iterator[tuple[Floats, str]]:
+def _vehicles(obstacles: NDArray[np.float64] | None) -> Iterator[tuple[NDArray[np.float64], str]]:
     for row in [] if obstacles is None else obstacles:
         kind = KINDS.get(int(row[_OBSTACLE["type"]]), "object")
         yield np.array([-row[_OBSTACLE["y_m"]], -row[_OBSTACLE["x_m"]]]), kind
 
 
-def _lanes(lanes: Floats | None) -> Iterator[Floats]:
+def _lanes(lanes: NDArray[np.float64] | None) -> Iterator[NDArray[np.float64]]:
     for row in [] if lanes is None else lanes:
         end_m = row[_LANE["x_end_m"]]
         if np.isfinite(row[_CUBIC]).all() and np.isfinite(end_m):

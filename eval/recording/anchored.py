@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.frame import CuePass
@@ -23,7 +24,6 @@ from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera
 
 from .columns import Colour
@@ -88,7 +88,7 @@ class Anchored:
             for car in self._cues.followed():
                 self._car(car, frame.size_px, place)
 
-    def _region(self, side: str, corners: Floats, share: float) -> None:
+    def _region(self, side: str, corners: NDArray[np.float64], share: float) -> None:
         is_road = share > self.manifest.settings.cues.road_fraction
         said = "not seen" if np.isnan(share) else f"{100.0 * share:.0f} %"
         colour = REGION_WITH_ROAD if is_road else REGION
@@ -109,11 +109,13 @@ class Anchored:
                 car, way_px(car, camera, size_px), colour, f"{way} {abs(car.ahead_mps):.0f} m/s"
             )
 
-    def _arrow(self, car: CarMotion, way_px: Floats, colour: Colour, label: str) -> None:
+    def _arrow(
+        self, car: CarMotion, way_px: NDArray[np.float64], colour: Colour, label: str
+    ) -> None:
         self.marks.cars.add(np.concatenate([car.center_px, way_px]), colour, label)
 
 
-def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> Floats:
+def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> NDArray[np.float64]:
     """Where the middle of a car would move within a second, did the camera stand; in the image."""
     center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
     now_px = np.array(car.center_px) - center
@@ -123,7 +125,9 @@ def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> Floats:
     return way * _part_inside(np.asarray(car.center_px), way, size_px)
 
 
-def _part_inside(tail_px: Floats, way_px: Floats, size_px: tuple[int, int]) -> float:
+def _part_inside(
+    tail_px: NDArray[np.float64], way_px: NDArray[np.float64], size_px: tuple[int, int]
+) -> float:
     """How much of an arrow fits the image: the viewer makes room for the whole of it."""
     room_px = np.where(way_px > 0.0, np.subtract(size_px, tail_px), tail_px)
     moves = np.abs(way_px) > 0.0

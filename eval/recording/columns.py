@@ -10,8 +10,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
-
 from .drive_time import DriveTime
 
 Colour: TypeAlias = tuple[int, int, int]
@@ -28,8 +26,10 @@ class Shapes:
     """
 
     entity: str
-    to_columns: Callable[[list[Floats], list[Colour], list[str]], rr.ComponentColumnList]
-    geometry: list[Floats] = field(default_factory=list)
+    to_columns: Callable[
+        [list[NDArray[np.float64]], list[Colour], list[str]], rr.ComponentColumnList
+    ]
+    geometry: list[NDArray[np.float64]] = field(default_factory=list)
     colours: list[Colour] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Shapes:
         self.times.append(t_ns)
         self.counts.append(0)
 
-    def add(self, geometry: Floats, colour: Colour, label: str = "") -> None:
+    def add(self, geometry: NDArray[np.float64], colour: Colour, label: str = "") -> None:
         """One thing of the frame begun last."""
         self.geometry.append(geometry)
         self.colours.append(colour)
@@ -60,7 +60,7 @@ class Shapes:
 
 
 def boxes(
-    geometry: list[Floats], colours: list[Colour], labels: list[str]
+    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
     """Geometry: x0, y0, x1, y1."""
     corners = np.asarray(geometry, np.float32).reshape(-1, 4)
@@ -73,7 +73,7 @@ def boxes(
 
 
 def strips(
-    geometry: list[Floats], colours: list[Colour], _labels: list[str]
+    geometry: list[NDArray[np.float64]], colours: list[Colour], _labels: list[str]
 ) -> rr.ComponentColumnList:
     """Geometry: shape (N, 2)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
@@ -81,7 +81,7 @@ def strips(
 
 
 def labelled_strips(
-    geometry: list[Floats], colours: list[Colour], labels: list[str]
+    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
     """The same with a label each."""
     lines = [np.asarray(line, np.float32) for line in geometry]
@@ -89,7 +89,7 @@ def labelled_strips(
 
 
 def strips_above(
-    geometry: list[Floats], colours: list[Colour], _labels: list[str]
+    geometry: list[NDArray[np.float64]], colours: list[Colour], _labels: list[str]
 ) -> rr.ComponentColumnList:
     """In space; geometry: shape (N, 3)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
@@ -97,7 +97,7 @@ def strips_above(
 
 
 def arrows(
-    geometry: list[Floats], colours: list[Colour], labels: list[str]
+    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
     """Geometry: x, y of the tail, then of the way to the tip."""
     both = np.asarray(geometry, np.float32).reshape(-1, 4)
@@ -107,7 +107,7 @@ def arrows(
 
 
 def points(
-    geometry: list[Floats], colours: list[Colour], labels: list[str]
+    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
     """Geometry: x, y."""
     places = np.asarray(geometry, np.float32).reshape(-1, 2)

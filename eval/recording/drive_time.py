@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
-
-from crosscue.replay.columns import Int64s
+from numpy.typing import NDArray
 
 TIMELINE: Final = "drive"
 """Not ``log_time``: under that name the viewer keeps the wall clock of the logging itself."""
@@ -26,7 +25,7 @@ class DriveTime:
 
     is_date: bool
 
-    def column(self, t_ns: Int64s | Sequence[int]) -> list[rr.TimeColumn]:
+    def column(self, t_ns: NDArray[np.int64] | Sequence[int]) -> list[rr.TimeColumn]:
         """The index of ``send_columns`` for rows at these times."""
         times = np.asarray(t_ns, np.int64)
         if self.is_date:

@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 import rerun.blueprint as rrb
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 from .drive_time import TIMELINE
 from .series import BELIEF, CUES, POSE, RANGE
@@ -32,7 +31,7 @@ class Shown:
     """
 
     camera: str | None
-    pose: Mapping[str, Floats] | None
+    pose: Mapping[str, NDArray[np.float64]] | None
     has_truth: bool
     has_scene: bool
     longest_m: float = FAR_M
@@ -123,7 +122,7 @@ def _whole() -> rrb.TimeRange:
     return rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
 
 
-def _plan(shown: Shown, pose: Mapping[str, Floats]) -> rrb.View:
+def _plan(shown: Shown, pose: Mapping[str, NDArray[np.float64]]) -> rrb.View:
     return rrb.Spatial3DView(
         origin="plan",
         name="Map, truth in green" if shown.has_truth else "Map",
@@ -132,7 +131,7 @@ def _plan(shown: Shown, pose: Mapping[str, Floats]) -> rrb.View:
     )
 
 
-def _from_above(pose: Mapping[str, Floats]) -> rrb.EyeControls3D:
+def _from_above(pose: Mapping[str, NDArray[np.float64]]) -> rrb.EyeControls3D:
     """North up, the whole track in sight."""
     x, y = pose["x_m"], pose["y_m"]
     middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2)

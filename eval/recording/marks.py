@@ -27,7 +27,6 @@ from crosscue.detectors.cues.cars import (
 from crosscue.detectors.cues.observed import RoadShares
 from crosscue.detectors.cues.road import road_fractions
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .columns import Colour, Shapes, arrows, boxes, labelled_strips, strips
@@ -155,17 +154,21 @@ class Marks:
                 ahead = np.array([0.04 * pairs.width_px * float(one.nose[0]), 0.0])
                 self._arrow(one.center_px[0], ahead, PARKED, "parked")
 
-    def _arrow(self, tail: Floats, way: Floats, colour: Colour, label: str) -> None:
+    def _arrow(
+        self, tail: NDArray[np.float64], way: NDArray[np.float64], colour: Colour, label: str
+    ) -> None:
         self.cars.add(np.concatenate([tail, way]), colour, label)
 
 
-def _report_text(found: Detections) -> Iterator[tuple[Floats, str, int]]:
+def _report_text(found: Detections) -> Iterator[tuple[NDArray[np.float64], str, int]]:
     """Box, text and row of each detection."""
     for row, (label, score) in enumerate(zip(found.labels, found.scores.tolist(), strict=True)):
         yield found.boxes_px[row], f"{label} {score:.2f}", row
 
 
-def outline(mask: bytes, size_px: tuple[int, int], box_px: Floats) -> list[Floats]:
+def outline(
+    mask: bytes, size_px: tuple[int, int], box_px: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
     """Closed strips of shape (N, 2) around a mask, to a pixel; none for an empty mask."""
     if not mask:
         return []
@@ -174,7 +177,7 @@ def outline(mask: bytes, size_px: tuple[int, int], box_px: Floats) -> list[Float
     return _borders(rle.decode(mask, size_px)[y0:y1, x0:x1], (x0, y0))
 
 
-def road_lines(road: RoadMask) -> list[Floats]:
+def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
     """Outline of the road and a line along every few rows of it, in the picture's pixels."""
     width, height = road.mask_size_px
     scale = np.array(road.size_px, np.float64) / (width, height)
@@ -187,7 +190,7 @@ def road_lines(road: RoadMask) -> list[Floats]:
     return [line * scale for line in (*_borders(is_road, (0, 0)), *hatch)]
 
 
-def _borders(mask: NDArray[np.bool_], corner_px: tuple[int, int]) -> list[Floats]:
+def _borders(mask: NDArray[np.bool_], corner_px: tuple[int, int]) -> list[NDArray[np.float64]]:
     """Closed strips around the parts of a mask whose top-left pixel is ``corner_px``."""
     import cv2
 

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.replay.columns import Floats, Int64s
 
 from .colours import ELLIPSE, END, ESTIMATE, LANDMARK, START, TRUTH
 from .columns import Shapes, strips_above
@@ -26,7 +26,9 @@ LANDMARK_POINTS: Final = 6.0
 TRUE_CAR_POINTS: Final = 5.0
 
 
-def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats]) -> None:
+def log_pose(
+    recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, NDArray[np.float64]]
+) -> None:
     """Path, car and ellipse."""
     recording.log("plan", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     t_ns = pose["t_ns"].astype(np.int64)
@@ -58,7 +60,9 @@ def log_pose(recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, 
 
 
 def log_landmarks(
-    recording: rr.RecordingStream, pose: Mapping[str, Floats], names: Sequence[str | None]
+    recording: rr.RecordingStream,
+    pose: Mapping[str, NDArray[np.float64]],
+    names: Sequence[str | None],
 ) -> None:
     """Where landmarks were used, by name."""
     rows = [i for i, name in enumerate(names) if name is not None]
@@ -91,7 +95,10 @@ def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack)
 
 
 def log_intersection(
-    recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats], scene: SceneRows
+    recording: rr.RecordingStream,
+    time: DriveTime,
+    pose: Mapping[str, NDArray[np.float64]],
+    scene: SceneRows,
 ) -> None:
     """A bar across the road where the intersection starts and ends: ahead of the estimated car."""
     if scene.ranges is None:
@@ -116,25 +123,31 @@ def log_intersection(
     recording.log("plan/intersection", rr.LineStrips3D.from_fields(radii=[0.5]), static=True)
 
 
-def _pieces(flat: Floats, segment: Floats, thin: slice) -> list[Floats]:
+def _pieces(
+    flat: NDArray[np.float64], segment: NDArray[np.float64], thin: slice
+) -> list[NDArray[np.float64]]:
     """The path in pieces that no gap of the drive interrupts."""
     breaks = np.flatnonzero(np.diff(segment[thin])) + 1
     return [np.asarray(part) for part in np.split(flat[thin], breaks)]
 
 
-def _every(t_ns: Int64s, rate_hz: float) -> Int64s:
+def _every(t_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
     """Indices of about ``rate_hz`` rows a second, the last one included."""
     slots = (t_ns - t_ns[0]) // round(1e9 / rate_hz)
     first = np.flatnonzero(np.diff(slots, prepend=-1))
     return np.union1d(first, [len(t_ns) - 1]).astype(np.int64)
 
 
-def _position_cov(pose: Mapping[str, Floats], rows: Int64s) -> Floats:
+def _position_cov(
+    pose: Mapping[str, NDArray[np.float64]], rows: NDArray[np.int64]
+) -> NDArray[np.float64]:
     xx, xy, yy = (pose[f"cov_{name}"][rows] for name in ("xx_m2", "xy_m2", "yy_m2"))
     return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
 
 
-def _rings(centre: Floats, cov: Floats, points: int = 33) -> Floats:
+def _rings(
+    centre: NDArray[np.float64], cov: NDArray[np.float64], points: int = 33
+) -> NDArray[np.float64]:
     """2-sigma ellipses, shape (N, points, 3)."""
     angle = np.linspace(0.0, 2.0 * np.pi, points)
     circle = np.stack([np.cos(angle), np.sin(angle)])

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.parquet import TableFolder
-from crosscue.replay.columns import Int64s
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,8 +26,8 @@ class SceneRows:
         belief: As in ``belief.parquet``.
     """
 
-    frames_ns: Int64s
-    gaps_ns: Int64s
+    frames_ns: NDArray[np.int64]
+    gaps_ns: NDArray[np.int64]
     cues: pa.Table | None
     ranges: pa.Table | None
     belief: pa.Table | None

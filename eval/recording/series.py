@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import LABELS
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -38,7 +37,7 @@ NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LABELS)
 
 
 def log_pose_series(
-    recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, Floats]
+    recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, NDArray[np.float64]]
 ) -> None:
     """One plot for each of ``POSE``."""
     series = {
@@ -144,8 +143,11 @@ def of_cue(cue: str) -> Colour:
 
 
 def _changes(
-    t_ns: Int64s, is_found: NDArray[np.bool_], frames_ns: Int64s, gaps_ns: Int64s
-) -> tuple[Int64s, Int64s]:
+    t_ns: NDArray[np.int64],
+    is_found: NDArray[np.bool_],
+    frames_ns: NDArray[np.int64],
+    gaps_ns: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Times at which a cue comes or goes, and 1 or 0 from then on.
 
     Where it was not looked for, and in gaps of the drive, it counts as 0.
@@ -176,8 +178,8 @@ def _send(
     recording: rr.RecordingStream,
     time: DriveTime,
     entity: list[str],
-    t_ns: Int64s | Floats,
-    values: Floats,
+    t_ns: NDArray[np.int64] | NDArray[np.float64],
+    values: NDArray[np.float64],
     *pieces: NDArray[Any],
 ) -> None:
     """Send a series, broken wherever one of ``pieces`` changes, shape (N,) each."""

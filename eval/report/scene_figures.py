@@ -17,7 +17,6 @@ from crosscue.eval.scoring.scene.approaches import THRESHOLD, ApproachResult, Cu
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueFrames
 from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore
-from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .svg_plot import Drawing, Panel
@@ -163,7 +162,7 @@ def _placed(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Curve, Sequence[Cu
     return replace(curve, distance_m=to_last_s), timed, "time"
 
 
-def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Int64s, Floats]:
+def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Times of an approach, sorted, and the distance still to go, shape (N,) each.
 
     Frames before the belief's first step belong to it.
@@ -176,12 +175,12 @@ def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Int64s, Floats]:
     return t_ns[known], distance_m[first][known]
 
 
-def _between_rows(gaps: Sequence[Gap], t_ns: Int64s) -> list[tuple[Gap, int]]:
+def _between_rows(gaps: Sequence[Gap], t_ns: NDArray[np.int64]) -> list[tuple[Gap, int]]:
     """Gaps that lie between two rows, each with the row after it."""
     return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
 
 
-def _shade(drawing: Drawing, panel: Panel, ends: Floats, text: str) -> None:
+def _shade(drawing: Drawing, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
     """A gap between two values of x, with its length beside it."""
     left, right = sorted(panel.x(value) for value in ends.tolist())
     drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
@@ -343,8 +342,8 @@ def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None
     known = {_middle(name): one for name, one in score.by_distance.items()}
     places = sorted(known)
     x = np.array(places, np.float64)
-    bias: Floats = np.array([known[p].bias_m for p in places])
-    rmse: Floats = np.array([known[p].rmse_m for p in places])
+    bias: NDArray[np.float64] = np.array([known[p].bias_m for p in places])
+    rmse: NDArray[np.float64] = np.array([known[p].rmse_m for p in places])
     drawing.band(panel, x, -rmse, rmse, f"band {style}")
     drawing.curve(panel, x, bias, f"line {style}")
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from markupsafe import Markup, escape
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +121,9 @@ class Drawing:
         self.text(panel.left + panel.width / 2, panel.bottom + 28, x_label, "label")
         self.text(panel.left - 5, panel.top - 8, y_label, "label", "start")
 
-    def curve(self, panel: Panel, x: Floats, y: Floats, style: str) -> None:
+    def curve(
+        self, panel: Panel, x: NDArray[np.float64], y: NDArray[np.float64], style: str
+    ) -> None:
         """A line through finite points, broken where one is missing; drawn no finer than seen."""
         for part in _finite_parts(np.asarray(x, np.float64), np.asarray(y, np.float64)):
             places = [(_n(panel.x(a)), _n(panel.y(b))) for a, b in part]
@@ -134,7 +135,14 @@ class Drawing:
             path = " ".join(f"{a},{b}" for a, b in kept)
             self._parts.append(f'<polyline points="{path}" class="{style}"/>')
 
-    def band(self, panel: Panel, x: Floats, low: Floats, high: Floats, style: str) -> None:
+    def band(
+        self,
+        panel: Panel,
+        x: NDArray[np.float64],
+        low: NDArray[np.float64],
+        high: NDArray[np.float64],
+        style: str,
+    ) -> None:
         """The area between two lines."""
         there = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
         if there.sum() < 2:
@@ -176,7 +184,9 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
     return [round(i * step, 10) for i in range(first, last + 1)]
 
 
-def _finite_parts(x: Floats, y: Floats) -> list[list[tuple[float, float]]]:
+def _finite_parts(
+    x: NDArray[np.float64], y: NDArray[np.float64]
+) -> list[list[tuple[float, float]]]:
     parts: list[list[tuple[float, float]]] = [[]]
     for a, b in zip(x.tolist(), y.tolist(), strict=True):
         if math.isfinite(a) and math.isfinite(b):

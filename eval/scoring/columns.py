@@ -9,8 +9,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 NONE: Final = -1
 """Stands for a null approach."""
 
@@ -26,21 +24,21 @@ class CueRows:
         count: Shape (N,), never negative.
     """
 
-    t_ns: Int64s
-    approach: Int64s
+    t_ns: NDArray[np.int64]
+    approach: NDArray[np.int64]
     cue: NDArray[np.str_]
-    count: Int64s
+    count: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeRows:
     """N rows of the range filter; ``reference`` is ``start`` or ``end``."""
 
-    t_ns: Int64s
-    approach: Int64s
+    t_ns: NDArray[np.int64]
+    approach: NDArray[np.int64]
     reference: NDArray[np.str_]
-    range_m: Floats
-    var_m2: Floats
+    range_m: NDArray[np.float64]
+    var_m2: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,9 +52,9 @@ class BeliefRows:
         established: Shape (N,): presence of the intersection is established.
     """
 
-    t_ns: Int64s
-    approach: Int64s
-    features: Mapping[str, Floats]
+    t_ns: NDArray[np.int64]
+    approach: NDArray[np.int64]
+    features: Mapping[str, NDArray[np.float64]]
     established: NDArray[np.bool_]
 
 
@@ -73,7 +71,7 @@ class RunTables:
             of ranges by reference (``start``, ``end``).
     """
 
-    frames_ns: Int64s | None
+    frames_ns: NDArray[np.int64] | None
     cues: CueRows | None
     ranges: RangeRows | None
     belief: BeliefRows | None

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-
-from crosscue.replay.columns import Floats, Int64s
+from numpy.typing import NDArray
 
 CONFIDENCE: Final = 0.95
 MIN_CLUSTERS: Final = 4
@@ -105,7 +104,7 @@ def _wilson(share: float, of: float, z: float) -> Interval:
     return Interval(0.0 if share == 0.0 else middle - half, 1.0 if share == 1.0 else middle + half)
 
 
-def share(is_right: np.typing.NDArray[np.bool_], clusters: Int64s) -> Proportion:
+def share(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) -> Proportion:
     """The fraction of true rows with both intervals.
 
     Args:
@@ -127,7 +126,7 @@ def share(is_right: np.typing.NDArray[np.bool_], clusters: Int64s) -> Proportion
     )
 
 
-def mean(values: Floats, clusters: Int64s) -> Mean:
+def mean(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Mean:
     """The mean of finite values, with an interval over whole clusters."""
     kept = np.isfinite(values)
     values, clusters = values[kept], clusters[kept]
@@ -136,7 +135,9 @@ def mean(values: Floats, clusters: Int64s) -> Mean:
     return Mean(value, ends.low, ends.high, len(values), len(np.unique(clusters)))
 
 
-def mean_by_cluster(values: Floats, clusters: Int64s, confidence: float = CONFIDENCE) -> Interval:
+def mean_by_cluster(
+    values: NDArray[np.float64], clusters: NDArray[np.int64], confidence: float = CONFIDENCE
+) -> Interval:
     """Interval of the mean over rows that counts whole clusters as independent.
 
     Args:
@@ -152,7 +153,9 @@ def mean_by_cluster(values: Floats, clusters: Int64s, confidence: float = CONFID
 
 
 def share_by_cluster(
-    is_right: np.typing.NDArray[np.bool_], clusters: Int64s, confidence: float = CONFIDENCE
+    is_right: np.typing.NDArray[np.bool_],
+    clusters: NDArray[np.int64],
+    confidence: float = CONFIDENCE,
 ) -> Interval:
     """Interval of the fraction of true rows that counts whole clusters as independent.
 
@@ -184,7 +187,7 @@ class _Spread(NamedTuple):
         return float(stdtrit(max(self.equal_clusters - 1.0, 1.0), 0.5 + 0.5 * confidence))
 
 
-def _spread(values: Floats, clusters: Int64s) -> _Spread | None:
+def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> _Spread | None:
     """Mean over rows and its standard deviation by the jackknife; None for too few clusters."""
     names, which = np.unique(clusters, return_inverse=True)
     n = len(names)

@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 """Borders of bins of true range."""
 
 
-def cluster_numbers(drives: Sequence[str], approaches: Sequence[Int64s]) -> Int64s:
+def cluster_numbers(
+    drives: Sequence[str], approaches: Sequence[NDArray[np.int64]]
+) -> NDArray[np.int64]:
     """One number for each approach of each drive, row by row over all drives.
 
     Args:
@@ -66,7 +66,9 @@ def first_reasons(
     return rows, counts
 
 
-def distance_bins(distance_m: Floats, borders_m: Sequence[float]) -> dict[str, NDArray[np.bool_]]:
+def distance_bins(
+    distance_m: NDArray[np.float64], borders_m: Sequence[float]
+) -> dict[str, NDArray[np.bool_]]:
     """Which rows lie in which half-open bin; every row lies in exactly one."""
     found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
     for low, high in pairwise(borders_m):

@@ -12,10 +12,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import project, rectangles
-from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 AHEAD_M: Final = (5, 10, 15, 20, 30, 50, 80)
@@ -35,7 +35,7 @@ def horizon_px(camera: Camera, size_px: tuple[int, int]) -> float | None:
     return center - camera.focal_px * math.tan(camera.pitch_rad)
 
 
-def draw_ground(pixels: Bytes, vehicle: Vehicle) -> Bytes:
+def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8]:
     """A copy with the horizon, a grid in metres on the road, and the regions.
 
     Args:
@@ -64,7 +64,7 @@ def draw_ground(pixels: Bytes, vehicle: Vehicle) -> Bytes:
     return canvas
 
 
-def _grid(camera: Camera) -> Iterator[tuple[Floats, str]]:
+def _grid(camera: Camera) -> Iterator[tuple[NDArray[np.float64], str]]:
     """Lines across the road with their labels, from the left; then those along it."""
     for ahead in AHEAD_M:
         if ahead - camera.x_m > NEAREST_M:
@@ -75,7 +75,9 @@ def _grid(camera: Camera) -> Iterator[tuple[Floats, str]]:
         yield np.array([[near, aside], [max(AHEAD_M), aside]], np.float64), ""
 
 
-def _regions(vehicle: Vehicle, size_px: tuple[int, int]) -> Iterator[tuple[str, Floats]]:
+def _regions(
+    vehicle: Vehicle, size_px: tuple[int, int]
+) -> Iterator[tuple[str, NDArray[np.float64]]]:
     regions, camera = vehicle.regions, vehicle.camera
     names = ("left", "straight", "right")
     if regions.kind == "picture":
@@ -91,7 +93,12 @@ def _regions(vehicle: Vehicle, size_px: tuple[int, int]) -> Iterator[tuple[str, 
             yield name, project(np.array(corners), camera, size_px)
 
 
-def _line(canvas: Bytes, points: Floats, colour: tuple[int, int, int], scale: float) -> None:
+def _line(
+    canvas: NDArray[np.uint8],
+    points: NDArray[np.float64],
+    colour: tuple[int, int, int],
+    scale: float,
+) -> None:
     high, wide = canvas.shape[:2]
     # A polygon may reach far beyond the picture; OpenCV wants numbers that fit.
     clipped = np.clip(points, -4.0 * max(high, wide), 4.0 * max(high, wide))
@@ -102,7 +109,11 @@ def _line(canvas: Bytes, points: Floats, colour: tuple[int, int, int], scale: fl
 
 
 def _write(
-    canvas: Bytes, text: str, at: tuple[float, float], colour: tuple[int, int, int], scale: float
+    canvas: NDArray[np.uint8],
+    text: str,
+    at: tuple[float, float],
+    colour: tuple[int, int, int],
+    scale: float,
 ) -> None:
     high, wide = canvas.shape[:2]
     font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.6 * scale

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.fusion.factor_graph import CueNode
-from crosscue.replay.columns import Floats, Int64s
 
 NOT_LOOKED: Final = -1
 """Count of a cue that nothing looked for."""
@@ -32,15 +31,15 @@ class AnnotatedApproach:
         place: Which intersection; drives up to the same one are no new evidence about others.
     """
 
-    way_m: Floats
-    time_s: Floats
+    way_m: NDArray[np.float64]
+    time_s: NDArray[np.float64]
     is_near: Bools
     is_established: Bools
-    counts: Mapping[str, Int64s]
+    counts: Mapping[str, NDArray[np.int64]]
     features: Mapping[str, bool]
     place: str
 
-    def looks(self, cue: CueNode) -> Int64s:
+    def looks(self, cue: CueNode) -> NDArray[np.int64]:
         """Frames in which the cue was looked for and would speak."""
         count = self.counts.get(cue.name)
         if count is None:

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.fusion.factor_graph import USUAL_FADE, CueNode, FactorGraph
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach, Bools
-from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.fusion import Fade
 
 MIN_POSITIVES: Final = 20
@@ -46,9 +46,9 @@ class Binned(NamedTuple):
         correlation: Mean.
     """
 
-    pairs: Floats
-    distance: Floats
-    correlation: Floats
+    pairs: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    correlation: NDArray[np.float64]
 
 
 def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode) -> FadeFit:
@@ -82,7 +82,7 @@ def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: C
 
 def _residuals(
     approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode
-) -> list[tuple[Int64s, Floats]]:
+) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Looks of each approach, and positive (1) or not (0) less the rate among looks alike."""
     ends = [edge.feature for edge in graph.edges if edge.cue == cue.name]
     rows = [approach.looks(cue) for approach in approaches]
@@ -105,7 +105,7 @@ def _residuals(
     return list(zip(rows, residuals, strict=True))
 
 
-def _binned(distance: Floats, correlation: Floats) -> Binned:
+def _binned(distance: NDArray[np.float64], correlation: NDArray[np.float64]) -> Binned:
     """Equally many pairs in each bin, but equal distances never parted."""
     edges = np.unique(np.quantile(distance, np.linspace(0.0, 1.0, BINS + 1)))
     which = np.searchsorted(edges, distance, side="right")
@@ -118,7 +118,7 @@ def _binned(distance: Floats, correlation: Floats) -> Binned:
     )
 
 
-def _integral(binned: Binned, scales: Floats, length: float) -> tuple[float, float]:
+def _integral(binned: Binned, scales: NDArray[np.float64], length: float) -> tuple[float, float]:
     """Integral of the best curve over ``length``, and its misfit less what no curve can repair."""
     best, least = float(scales[0]), float("inf")
     for scale in scales.tolist():
@@ -132,7 +132,7 @@ def _integral(binned: Binned, scales: Floats, length: float) -> tuple[float, flo
     return max(best, float(scales[0])), least
 
 
-def _line(shape: Floats, binned: Binned) -> tuple[float, float]:
+def _line(shape: NDArray[np.float64], binned: Binned) -> tuple[float, float]:
     """Least squares of ``always + fading * shape``, both from 0 to 1."""
     weight = binned.pairs / binned.pairs.sum()
     middle, level = float(weight @ shape), float(weight @ binned.correlation)

@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.fusion.calibrated import CalibratedMessageModel, voices_of
 from crosscue.fusion.factor_graph import CueNode, FactorGraph, log_odds
 from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
 from crosscue.fusion.fit.fade_fit import FadeFit, fit_fade
 from crosscue.fusion.situation import Situation
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 MIN_PLACES: Final = 3
@@ -158,7 +158,7 @@ def _exponents(
     out: dict[str, float] = {}
     for column, feature in enumerate(graph.features):
         sides: dict[bool, set[str]] = {True: set(), False: set()}
-        losses: dict[str, list[Floats]] = {}
+        losses: dict[str, list[NDArray[np.float64]]] = {}
         for approach, odds in zip(approaches, sums, strict=True):
             is_there = approach.features.get(feature.name)
             if is_there is not None and len(odds):
@@ -173,7 +173,9 @@ def _exponents(
     return out
 
 
-def log_odds_of(approach: AnnotatedApproach, graph: FactorGraph, learned: Calibrated) -> Floats:
+def log_odds_of(
+    approach: AnnotatedApproach, graph: FactorGraph, learned: Calibrated
+) -> NDArray[np.float64]:
     """Sums of messages after each frame, without the prior, shape (N, features)."""
     speaker = CalibratedMessageModel(len(graph.features), voices_of(graph, learned))
     messages = [speaker(situation) for situation in _situations(approach)]

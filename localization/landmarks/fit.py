@@ -16,8 +16,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 Z_95: Final = 1.959963984540054
 
 
@@ -31,9 +29,9 @@ class ScoredPairs:
         query: Shape (N,), int64: number of the query picture; pairs of one go to one half.
     """
 
-    score: Floats
+    score: NDArray[np.float64]
     is_same: NDArray[np.bool_]
-    query: Int64s
+    query: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         """Refuse columns that do not line up.
@@ -127,7 +125,9 @@ def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> Land
     )
 
 
-def _threshold(score: Floats, is_false: NDArray[np.bool_], wanted_rate: float) -> float:
+def _threshold(
+    score: NDArray[np.float64], is_false: NDArray[np.bool_], wanted_rate: float
+) -> float:
     """Half-way between the highest score that must not match and the next one seen."""
     worst_first = np.sort(score[is_false])[::-1]
     allowed = math.floor(wanted_rate * len(worst_first) + 1e-9)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from crosscue.replay.columns import Floats
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Sighting(NamedTuple):
@@ -22,8 +23,8 @@ class Sighting(NamedTuple):
 
     t_ns: int
     name: str
-    xy_m: Floats
-    cov_m2: Floats
+    xy_m: NDArray[np.float64]
+    cov_m2: NDArray[np.float64]
     score: float
     nis: float
     outcome: int

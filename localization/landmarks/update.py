@@ -23,12 +23,12 @@ from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap
 from crosscue.localization.ekf import PoseBelief, Updated
 from crosscue.localization.pose_filter import HEADING, SPEED
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
-from crosscue.replay.columns import Floats
 
 from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
 from .features import Features, Match, Matcher
@@ -114,7 +114,9 @@ class Best(NamedTuple):
     match: Match
 
 
-def camera_position(belief: PoseBelief, lever_m: tuple[float, float]) -> tuple[Floats, Floats]:
+def camera_position(
+    belief: PoseBelief, lever_m: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The camera's estimated position, shape (2,), and its covariance, shape (2, 2)."""
     expected, observe = _observed(belief, lever_m)
     cov = observe @ belief.cov @ observe.T
@@ -123,8 +125,8 @@ def camera_position(belief: PoseBelief, lever_m: tuple[float, float]) -> tuple[F
 
 def update_camera_position(
     belief: PoseBelief,
-    xy_m: Floats,
-    cov_m2: Floats,
+    xy_m: NDArray[np.float64],
+    cov_m2: NDArray[np.float64],
     lever_m: tuple[float, float] = (0.0, 0.0),
     gate_nis: float | None = None,
 ) -> Updated:
@@ -153,7 +155,9 @@ def update_camera_position(
     return Updated(PoseBelief(belief.t_ns, mean, 0.5 * (cov + cov.T)), True, innovation, nis)
 
 
-def _observed(belief: PoseBelief, lever_m: tuple[float, float]) -> tuple[Floats, Floats]:
+def _observed(
+    belief: PoseBelief, lever_m: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The camera's expected position and its Jacobian by the state."""
     c, s = math.cos(belief.mean[HEADING]), math.sin(belief.mean[HEADING])
     ahead, left = lever_m
@@ -242,7 +246,10 @@ class LandmarkSearch:
         return taken
 
     def _best(
-        self, camera_m: Floats, cov_m2: Floats, describe: Callable[[], Features | None]
+        self,
+        camera_m: NDArray[np.float64],
+        cov_m2: NDArray[np.float64],
+        describe: Callable[[], Features | None],
     ) -> Best | None:
         settings = self.settings
         candidates = self.database.near(camera_m, cov_m2, settings.sigmas, settings.max_candidates)
@@ -301,7 +308,7 @@ class LandmarkSearch:
         self._counted_m[place.name] = travelled_m
         return done.belief
 
-    def _moved(self, belief: PoseBelief, travelled_m: float, peak: _Peak) -> Floats:
+    def _moved(self, belief: PoseBelief, travelled_m: float, peak: _Peak) -> NDArray[np.float64]:
         """How far the camera has moved since the peak.
 
         From way and heading, not from the two estimated positions: what the filter corrected

@@ -42,7 +42,6 @@ from crosscue.localization.pose_filter import (
     update,
     update_position,
 )
-from crosscue.replay.columns import Floats
 
 from . import settings as settings_of
 from .parameters import Parameters, parameters_of
@@ -170,7 +169,7 @@ class Landmarks(NamedTuple):
     """
 
     nodes: Ints
-    places_m: Floats
+    places_m: NDArray[np.float64]
     is_visited: NDArray[np.bool_]
 
 
@@ -210,12 +209,12 @@ class Log(NamedTuple):
         noted: Shape (1,): events so far.
     """
 
-    steps: Floats
-    events: Floats
+    steps: NDArray[np.float64]
+    events: NDArray[np.float64]
     noted: Ints
 
 
-def drive_one(p: Parameters, seed: np.uint64, row: Floats, log: Log) -> None:
+def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log) -> None:
     """Drive once.
 
     Args:
@@ -296,7 +295,7 @@ def drive_one(p: Parameters, seed: np.uint64, row: Floats, log: Log) -> None:
     _finish(p, row, vehicle, belief, tally, steps)
 
 
-def drive_each(p: Parameters, seeds: Keys, rows: Floats, log: Log) -> None:
+def drive_each(p: Parameters, seeds: Keys, rows: NDArray[np.float64], log: Log) -> None:
     """``drive_one`` for each of N seeds; rows have shape (N, 22)."""
     for i in range(len(seeds)):
         drive_one(p, seeds[i], rows[i], log)
@@ -543,14 +542,19 @@ def _passed(tally: Tally, vehicle: Vehicle, is_fused: bool, is_refused: bool) ->
 
 
 def _describe_start(
-    row: Floats, streets: Streets, targets: Targets, goal_dx: float, goal_dy: float
+    row: NDArray[np.float64], streets: Streets, targets: Targets, goal_dx: float, goal_dy: float
 ) -> None:
     row[4], row[5] = math.hypot(goal_dx, goal_dy), abs(goal_dx) + abs(goal_dy)
     row[6], row[7] = streets.area_km2, len(targets.landmarks.nodes)
 
 
 def _finish(
-    p: Parameters, row: Floats, vehicle: Vehicle, belief: State, tally: Tally, steps: int
+    p: Parameters,
+    row: NDArray[np.float64],
+    vehicle: Vehicle,
+    belief: State,
+    tally: Tally,
+    steps: int,
 ) -> None:
     """The rest of the drive's ``Result``."""
     axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
@@ -567,7 +571,7 @@ def _finish(
     row[21] = max(tally.longest_gap_m, vehicle.travelled_m - tally.last_fix_m)
 
 
-def _keep(kept: Floats, vehicle: Vehicle, reading: Reading, belief: State) -> None:
+def _keep(kept: NDArray[np.float64], vehicle: Vehicle, reading: Reading, belief: State) -> None:
     b = belief
     kept[0], kept[1], kept[2] = vehicle.x_m, vehicle.y_m, vehicle.heading_rad
     kept[3] = vehicle.speed_mps
@@ -610,7 +614,7 @@ def drive(settings: settings_of.Drive, seed: int, log: Log | None = None) -> Res
     return as_result(row)
 
 
-def drive_many(settings: settings_of.Drive, seeds: Keys) -> Floats:
+def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
     """Drive once for each seed; other threads run meanwhile.
 
     Args:
@@ -653,13 +657,13 @@ class Traced:
     """
 
     result: Result
-    steps: Floats
-    events: Floats
+    steps: NDArray[np.float64]
+    events: NDArray[np.float64]
     first_belief: tuple[float, float, float]
 
-    def of_kind(self, *kinds: int) -> Floats:
+    def of_kind(self, *kinds: int) -> NDArray[np.float64]:
         """Shape (K, 6): events of these kinds."""
-        chosen: Floats = self.events[np.isin(self.events[:, 1], kinds)]
+        chosen: NDArray[np.float64] = self.events[np.isin(self.events[:, 1], kinds)]
         return chosen
 
     def goal_to_goal_m(self) -> float:
@@ -689,7 +693,7 @@ def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
     return Traced(result, log.steps, log.events[: log.noted[0]], (x, y, heading))
 
 
-def as_result(row: Floats) -> Result:
+def as_result(row: NDArray[np.float64]) -> Result:
     """One row as a record, its counts whole numbers again."""
     kinds = get_type_hints(Result)
     pairs = zip(Result._fields, row.tolist(), strict=True)

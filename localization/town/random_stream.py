@@ -16,8 +16,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 GOLDEN: Final = np.uint64(0x9E3779B97F4A7C15)
 MIX_1: Final = np.uint64(0xBF58476D1CE4E5B9)
@@ -112,7 +111,7 @@ def _tail(stream: Stream) -> tuple[float, Stream]:
             return TAIL_FROM - x, stream
 
 
-def _layers() -> tuple[Floats, Floats]:
+def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Right edges of the layers, shape (257,), and how much of each lies inside the next, (256,).
 
     All layers have the same area; the first holds the tail's.

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crosscue.localization.pose_filter import arc
-from crosscue.replay.columns import Floats
 
 from .parameters import Parameters
 from .streets import COSINES, HEADINGS_RAD, SINES, Streets, place_of, step_of
@@ -63,7 +65,9 @@ def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: Vehicle) 
     return min(p.cruise_mps, math.sqrt(p.turn_mps**2 + 2.0 * p.accel_mps2 * room_m))
 
 
-def lane_of(p: Parameters, streets: Streets, route: Route, arcs: Floats, vehicle: Vehicle) -> Lane:
+def lane_of(
+    p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64], vehicle: Vehicle
+) -> Lane:
     """How the vehicle lies to its lane."""
     c, s = math.cos(vehicle.heading_rad), math.sin(vehicle.heading_rad)
     if route.arc < route.arcs:
@@ -81,11 +85,11 @@ def lane_of(p: Parameters, streets: Streets, route: Route, arcs: Floats, vehicle
     return Lane(across + p.lane_offset_m, street_c * s - street_s * c, 0.0)
 
 
-def _arc_at(arcs: Floats, i: int) -> tuple[float, float, float, float, float]:
+def _arc_at(arcs: NDArray[np.float64], i: int) -> tuple[float, float, float, float, float]:
     return arcs[i, 0], arcs[i, 1], arcs[i, 2], arcs[i, 3], arcs[i, 4]
 
 
-def advance(route: Route, arcs: Floats, lane: Lane, distance_m: float) -> Route:
+def advance(route: Route, arcs: NDArray[np.float64], lane: Lane, distance_m: float) -> Route:
     """Go on along the arc of a turn, if the vehicle is on one."""
     if route.arc == route.arcs:
         return route
@@ -93,7 +97,7 @@ def advance(route: Route, arcs: Floats, lane: Lane, distance_m: float) -> Route:
     return Route(route.way, route.node, route.turn, route.arc, route.arcs, along_m)
 
 
-def next_arc(route: Route, arcs: Floats) -> Route:
+def next_arc(route: Route, arcs: NDArray[np.float64]) -> Route:
     """The next arc, or the street, once this arc has been driven."""
     length_m = arcs[route.arc, 4]
     if route.along_m < length_m:
@@ -103,7 +107,7 @@ def next_arc(route: Route, arcs: Floats) -> Route:
     return Route(route.way, route.node, route.turn, route.arc + 1, route.arcs, along_m)
 
 
-def enter(p: Parameters, streets: Streets, route: Route, arcs: Floats) -> Route:
+def enter(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64]) -> Route:
     """Lay the arcs of the decided turn into ``arcs``, and head for the next intersection."""
     count = _lay_turn(p, streets, route, arcs)
     way = (route.way + route.turn) & 3
@@ -111,7 +115,7 @@ def enter(p: Parameters, streets: Streets, route: Route, arcs: Floats) -> Route:
     return Route(way, node, UNDECIDED, 0, count, 0.0)
 
 
-def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: Floats) -> int:
+def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64]) -> int:
     if route.turn == STRAIGHT:
         return 0
     c, s, heading = COSINES[route.way], SINES[route.way], HEADINGS_RAD[route.way]
@@ -126,7 +130,12 @@ def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: Floats) -> in
 
 
 def _lay_turning_circle(
-    arcs: Floats, x_m: float, y_m: float, heading_rad: float, radius_m: float, offset_m: float
+    arcs: NDArray[np.float64],
+    x_m: float,
+    y_m: float,
+    heading_rad: float,
+    radius_m: float,
+    offset_m: float,
 ) -> int:
     """Out of the lane to the right, round to the left, and into the lane back."""
     swing = math.acos((offset_m + radius_m) / (2.0 * radius_m))
@@ -141,6 +150,12 @@ def _lay_turning_circle(
 
 
 def _lay(
-    arcs: Floats, i: int, x: float, y: float, heading: float, curvature: float, length: float
+    arcs: NDArray[np.float64],
+    i: int,
+    x: float,
+    y: float,
+    heading: float,
+    curvature: float,
+    length: float,
 ) -> None:
     arcs[i, 0], arcs[i, 1], arcs[i, 2], arcs[i, 3], arcs[i, 4] = x, y, heading, curvature, length

@@ -14,12 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
-
 from .parameters import Parameters
 from .random_stream import Stream, below, uniform
 
-Bytes = NDArray[np.uint8]
 HEADINGS_RAD: Final = (0.0, math.pi / 2.0, math.pi, -math.pi / 2.0)
 COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
 SINES: Final = tuple(math.sin(heading) for heading in HEADINGS_RAD)
@@ -41,9 +38,9 @@ class Streets(NamedTuple):
         area_km2: As asked for; the grid ends within a block of it.
     """
 
-    xs_m: Floats
-    ys_m: Floats
-    ways: Bytes
+    xs_m: NDArray[np.float64]
+    ys_m: NDArray[np.float64]
+    ways: NDArray[np.uint8]
     inside: NDArray[np.bool_]
     area_km2: float
 
@@ -53,7 +50,7 @@ def step_of(way: int, columns: int) -> int:
     return (1, columns, -1, -columns)[way]
 
 
-def has_way(ways: Bytes, node: int, way: int) -> bool:
+def has_way(ways: NDArray[np.uint8], node: int, way: int) -> bool:
     """May intersection ``node`` be left in this direction?"""
     return (int(ways[node]) >> way) & 1 == 1
 
@@ -93,7 +90,9 @@ def make_streets(stream: Stream, p: Parameters) -> Streets:
     return Streets(xs, ys, ways, inside, area_km2)
 
 
-def _coordinates(stream: Stream, side_m: float, p: Parameters) -> tuple[Floats, Stream]:
+def _coordinates(
+    stream: Stream, side_m: float, p: Parameters
+) -> tuple[NDArray[np.float64], Stream]:
     span = p.max_block_m - p.min_block_m
     places = np.empty(3 + int(side_m / p.min_block_m))
     places[0], count = 0.0, 1
@@ -106,7 +105,7 @@ def _coordinates(stream: Stream, side_m: float, p: Parameters) -> tuple[Floats, 
         count += 1
 
 
-def _all_ways(columns: int, size: int) -> Bytes:
+def _all_ways(columns: int, size: int) -> NDArray[np.uint8]:
     ways = np.full(size, 15, np.uint8)
     for node in range(0, size, columns):
         _close(ways, node, 2)
@@ -117,15 +116,15 @@ def _all_ways(columns: int, size: int) -> Bytes:
     return ways
 
 
-def _close(ways: Bytes, node: int, way: int) -> None:
+def _close(ways: NDArray[np.uint8], node: int, way: int) -> None:
     ways[node] = np.uint8(int(ways[node]) & (15 - (1 << way)))
 
 
-def _open(ways: Bytes, node: int, way: int) -> None:
+def _open(ways: NDArray[np.uint8], node: int, way: int) -> None:
     ways[node] = np.uint8(int(ways[node]) | (1 << way))
 
 
-def _make_dead_end(ways: Bytes, columns: int, node: int, keep: int) -> None:
+def _make_dead_end(ways: NDArray[np.uint8], columns: int, node: int, keep: int) -> None:
     """Leave one street of an intersection: the first one there is, from ``keep`` on."""
     kept = False
     for turn in range(4):
@@ -138,7 +137,7 @@ def _make_dead_end(ways: Bytes, columns: int, node: int, keep: int) -> None:
         kept = True
 
 
-def _gates_of(ways: Bytes, columns: int) -> Bytes:
+def _gates_of(ways: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
     """Shape (4, N): which kinds of reach come into each place, from the neighbour on each side."""
     size = len(ways)
     gates = np.zeros((4, size), np.uint8)
@@ -152,7 +151,7 @@ def _gates_of(ways: Bytes, columns: int) -> Bytes:
     return gates
 
 
-def _spread(reach: Bytes, gates: Bytes, columns: int) -> None:
+def _spread(reach: NDArray[np.uint8], gates: NDArray[np.uint8], columns: int) -> None:
     """Let all kinds of reach go on through the gates, sweep by sweep, until none grows.
 
     Cities are mostly open: a few sweeps do, each as quick as one pass over all places.
@@ -168,7 +167,9 @@ def _spread(reach: Bytes, gates: Bytes, columns: int) -> None:
             grows |= _reach_from(reach, gates, i, i + 1, 0)
 
 
-def _reach_from(reach: Bytes, gates: Bytes, node: int, neighbour: int, way: int) -> bool:
+def _reach_from(
+    reach: NDArray[np.uint8], gates: NDArray[np.uint8], node: int, neighbour: int, way: int
+) -> bool:
     """Reach a place from its neighbour in direction ``way``; is there more than before?"""
     if neighbour < 0 or neighbour >= len(reach):
         return False
@@ -177,7 +178,7 @@ def _reach_from(reach: Bytes, gates: Bytes, node: int, neighbour: int, way: int)
     return bool(reach[node] != before)
 
 
-def _largest_part(gates: Bytes, columns: int) -> Bytes:
+def _largest_part(gates: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
     """What can be reached, and how, from the first place of the part with most places."""
     size = gates.shape[1]
     best, seen = np.zeros(size, np.uint8), np.zeros(size, np.bool_)
@@ -201,7 +202,9 @@ def _largest_part(gates: Bytes, columns: int) -> Bytes:
     return best
 
 
-def _open_traps(ways: Bytes, columns: int, reach: Bytes, gates: Bytes) -> None:
+def _open_traps(
+    ways: NDArray[np.uint8], columns: int, reach: NDArray[np.uint8], gates: NDArray[np.uint8]
+) -> None:
     """Open one-way streets both ways where they lead into, or out of, what has no way back."""
     opened = True
     while opened:

@@ -21,7 +21,7 @@ PACKAGES = [
 TOP = ("crosscue", "crosscue.testing")
 """Modules of the package itself, whose links to the other folders grimp does not follow."""
 LONGEST_CHAIN = 12
-IMPORTS_PER_MODULE = 3.76
+IMPORTS_PER_MODULE = 3.67
 FILES_PER_FOLDER = 13
 Graph = dict[str, set[str]]
 
@@ -30,7 +30,9 @@ Graph = dict[str, set[str]]
 def imports() -> Graph:
     """From a module to those of ours that it imports, wherever in the file it does."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
-    found = {one: set(graph.find_modules_directly_imported_by(one)) for one in graph.modules}
+    # The six folders have no file of their own, so they would only lower the average.
+    named = graph.modules - set(PACKAGES)
+    found = {one: set(graph.find_modules_directly_imported_by(one)) for one in named}
     folder = Path(crosscue.__file__).parent
     files = {"crosscue": folder / "__init__.py", "crosscue.testing": folder / "testing.py"}
     known = {*found, *TOP}

@@ -18,8 +18,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 CAR_HEIGHT_M: Final = 1.55
 """Of a usual car; between 1.4 (sports car) and 1.8 (van), so 15 % either way."""
@@ -154,7 +153,7 @@ def place_of_end(one: Observation, side: int, newest: Observation) -> tuple[floa
     return east * cos + north * sin, east * sin - north * cos
 
 
-def _weights(seen: Sequence[Observation], side: int, newest: Observation) -> Floats:
+def _weights(seen: Sequence[Observation], side: int, newest: Observation) -> NDArray[np.float64]:
     """Inverse covariances of ``place_of_end``, shape (N, 2, 2): large along the line of sight."""
     rows = [
         (newest.pose[2] - one.pose[2] + one.edges_rad[side], one.error, one.distance_m)

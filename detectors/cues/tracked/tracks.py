@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
@@ -25,7 +26,6 @@ from crosscue.detectors.cues.tracked.motion import (
     place_of_end,
 )
 from crosscue.detectors.ranging.object_tracks import Motion, iou
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 BOX_PX: Final = 1.0
@@ -53,12 +53,12 @@ MAX_COVERED: Final = 0.3
 @dataclass(slots=True)
 class _Track:
     number: int
-    box_px: Floats
-    edges_pxps: Floats
+    box_px: NDArray[np.float64]
+    edges_pxps: NDArray[np.float64]
     seen: list[Observation] = field(default_factory=list)
     step_px: tuple[float, float] = (0.0, 0.0)
 
-    def take(self, box_px: Floats, one: Observation, settings: Cars) -> None:
+    def take(self, box_px: NDArray[np.float64], one: Observation, settings: Cars) -> None:
         """The car in the newest frame."""
         steps_px = box_px - self.box_px
         edges_pxps = steps_px / (one.t_s - self.seen[-1].t_s)
@@ -125,7 +125,9 @@ class CarTracks:
         """
         return [_steady_motion(track, self._settings) for track in self._again]
 
-    def _observed(self, found: Sequence[Detections]) -> list[tuple[Floats, Observation]]:
+    def _observed(
+        self, found: Sequence[Detections]
+    ) -> list[tuple[NDArray[np.float64], Observation]]:
         rows = [
             (detections, i)
             for detections in found
@@ -158,7 +160,7 @@ class CarTracks:
         long = (x1 - x0) / (y1 - y0)
         return Observation(self._t_s, self._pose, edges, distance_m, error, long, nose, is_hidden)
 
-    def _assign(self, cars: Sequence[tuple[Floats, Observation]]) -> list[_Track]:
+    def _assign(self, cars: Sequence[tuple[NDArray[np.float64], Observation]]) -> list[_Track]:
         """Cars that are where they were on their way to first; new cars begin a track.
 
         What is left after that is looked for where a standing car must be now.
@@ -187,7 +189,7 @@ class CarTracks:
         return again
 
 
-def are_hidden(boxes_px: Floats) -> list[bool]:
+def are_hidden(boxes_px: NDArray[np.float64]) -> list[bool]:
     """Which of N boxes, shape (N, 4), have their lower end behind another car's box.
 
     On a road the lower edge of a nearer car is the lower one.
@@ -225,7 +227,7 @@ def _steady_motion(track: _Track, settings: Cars) -> CarMotion:
     return found
 
 
-def _astray(track: _Track, box_px: Floats, one: Observation) -> float:
+def _astray(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
     """How little a box overlaps with the one predicted from how its edges moved; infinite if not.
 
     Nothing is predicted of a car that was seen once.
@@ -237,7 +239,7 @@ def _astray(track: _Track, box_px: Floats, one: Observation) -> float:
     return 1.0 - overlap if overlap > MIN_OVERLAP and 1.0 / GROWTH < grown < GROWTH else math.inf
 
 
-def _away(track: _Track, box_px: Floats, one: Observation) -> float:
+def _away(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
     """Metres across the line of sight from where a standing car must be; infinite if another's."""
     last = track.seen[-1]
     places = [place_of_end(last, side, one) for side in (0, 1)]

@@ -14,15 +14,13 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crosscue.replay.columns import Int64s
-
 Boxes = NDArray[np.float32]
 FEW: Final = 1000
 """Up to as many, torchvision compares boxes that it moved far apart, which rounds otherwise."""
 
 
 def likeliest_apart(
-    rpn: Any, boxes: Tensor, logits: Tensor, levels: Int64s, size_px: tuple[int, int]
+    rpn: Any, boxes: Tensor, logits: Tensor, levels: NDArray[np.int64], size_px: tuple[int, int]
 ) -> Tensor:
     """Those of one picture that are likely and large enough, the best first; shape (M, 4).
 
@@ -47,7 +45,7 @@ def likeliest_apart(
 
 
 @njit(cache=True)
-def _apart(boxes: Boxes, levels: Int64s, overlap: float, most: int) -> Int64s:
+def _apart(boxes: Boxes, levels: NDArray[np.int64], overlap: float, most: int) -> NDArray[np.int64]:
     """Rows of boxes that no better kept one of their level overlaps more than that."""
     kept = np.empty(min(most, len(boxes)), np.int64)
     areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])

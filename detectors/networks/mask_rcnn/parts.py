@@ -16,8 +16,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crosscue.replay.columns import Bytes
-
 from .network import MEAN, SPREAD
 from .nms import FEW, likeliest_apart
 from .roi_align import Pooler
@@ -40,7 +38,7 @@ class Body(NamedTuple):
 class Parts(Protocol):
     """The parts of a Mask R-CNN that take the time."""
 
-    def body(self, pictures: Bytes, /) -> Body:
+    def body(self, pictures: NDArray[np.uint8], /) -> Body:
         """Of pictures (N, H, W, 3), blue, green, red, sides in whole strides."""
         ...
 
@@ -53,7 +51,7 @@ class Parts(Protocol):
         ...
 
 
-def detected(network: Any, parts: Parts, pictures: Bytes) -> list[dict[str, Tensor]]:
+def detected(network: Any, parts: Parts, pictures: NDArray[np.uint8]) -> list[dict[str, Tensor]]:
     """Boxes in the pixels given, labels, scores and masks (M, 1, 28, 28), never pasted.
 
     Args:
@@ -150,7 +148,7 @@ class TorchParts:
         self._network = network
         self._device = device
 
-    def body(self, pictures: Bytes, /) -> Body:
+    def body(self, pictures: NDArray[np.uint8], /) -> Body:
         """As ``Parts``."""
         given = as_input(pictures, self._device)
         levels = list(self._network.backbone(given).values())
@@ -170,7 +168,7 @@ class TorchParts:
         return logits
 
 
-def as_input(pictures: Bytes, device: torch.device) -> Tensor:
+def as_input(pictures: NDArray[np.uint8], device: torch.device) -> Tensor:
     """From (N, H, W, 3) blue, green, red bytes to normalised (N, 3, H, W)."""
     mean, spread = (255.0 * torch.tensor(v, device=device)[:, None] for v in (MEAN, SPREAD))
     if device.type == "cpu":
@@ -181,7 +179,7 @@ def as_input(pictures: Bytes, device: torch.device) -> Tensor:
     return normal.contiguous(memory_format=torch.channels_last)
 
 
-def _looked_up(pictures: Bytes, table: NDArray[np.float32]) -> NDArray[np.float32]:
+def _looked_up(pictures: NDArray[np.uint8], table: NDArray[np.float32]) -> NDArray[np.float32]:
     """Planes of red, green and blue, each byte replaced by its entry in the colour's row."""
     import cv2
 

@@ -15,8 +15,6 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
-from crosscue.replay.columns import Int64s
-
 Grid = NDArray[np.float32]
 _ROUNDING: Final = 1e-6
 """Added before a level is rounded down, as torchvision does."""
@@ -63,7 +61,7 @@ class Pooler:
                 )
         return torch.from_numpy(pooled).permute(0, 3, 1, 2)
 
-    def _levels_of(self, boxes: Tensor, pool: Any) -> Int64s:
+    def _levels_of(self, boxes: Tensor, pool: Any) -> NDArray[np.int64]:
         """Larger boxes from coarser levels (Lin et al. 2017, eq. 1)."""
         width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
         size = torch.sqrt(width * height) / pool.canonical_scale
@@ -78,8 +76,8 @@ def _places(
     cell: np.float32,
     samples: int,
     size: int,
-    low: Int64s,
-    high: Int64s,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
     share: Grid,
 ) -> None:
     """Where samples fall between the places of a row, and how far from the lower one.
@@ -121,8 +119,8 @@ def _pool(
     level: Grid,
     scale: np.float32,
     boxes: Grid,
-    pictures: Int64s,
-    rows: Int64s,
+    pictures: NDArray[np.int64],
+    rows: NDArray[np.int64],
     samples: int,
     pooled: Grid,
 ) -> None:

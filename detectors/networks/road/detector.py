@@ -12,13 +12,13 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Found, Frame, RoadMask, View
 from crosscue.detectors.devices import chosen_device
 from crosscue.detectors.settings import Settings, identity_of, settings_of
-from crosscue.replay.columns import Bytes
 
 from .checkpoint import RoadCheckpoint, load_road
 from .network import embedded_path, logits_of
@@ -91,7 +91,7 @@ class RoadNetworkDetector:
         ]
 
 
-def resized(pixels: Bytes, size_px: tuple[int, int]) -> Bytes:
+def resized(pixels: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """A picture at the network's size, grey ones as three equal channels."""
     import cv2
 

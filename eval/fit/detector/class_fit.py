@@ -13,7 +13,6 @@ from crosscue.detectors.catalog.class_scores import ClassScores, Isotonic, Platt
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.scoring.boxes.reliability import reliability
 from crosscue.eval.scoring.intervals import Interval, wilson
-from crosscue.replay.columns import Floats
 
 from .threshold import best_bound, fewest_detections, round_between, threshold_for
 
@@ -35,7 +34,7 @@ class Judged:
         labels: Boxes to be found.
     """
 
-    scores: Floats
+    scores: NDArray[np.float64]
     is_right: NDArray[np.bool_]
     labels: int
 
@@ -160,7 +159,9 @@ def _calibration(judged: Judged, kind: CalibrationKind) -> Platt | Isotonic | No
     return (fit_platt if kind == "platt" else fit_isotonic)(judged.scores, judged.is_right)
 
 
-def _applied(calibration: Platt | Isotonic | None, scores: Floats) -> Floats:
+def _applied(
+    calibration: Platt | Isotonic | None, scores: NDArray[np.float64]
+) -> NDArray[np.float64]:
     return scores if calibration is None else calibration.probabilities(scores)
 
 

@@ -18,8 +18,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
-
 TRIED: Final = 8
 
 
@@ -62,7 +60,7 @@ def fewest_detections(precision: float, confidence: float) -> int:
 
 
 def best_bound(
-    scores: Floats, is_right: NDArray[np.bool_], precision: float, confidence: float
+    scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> float:
     """The highest bound that any candidate reaches; NaN without candidates."""
     found = _candidates(scores, is_right, precision, confidence)
@@ -70,7 +68,7 @@ def best_bound(
 
 
 def threshold_for(
-    scores: Floats, is_right: NDArray[np.bool_], precision: float, confidence: float
+    scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> Threshold | None:
     """The lowest candidate whose bound is high enough; None where none is.
 
@@ -86,7 +84,7 @@ def threshold_for(
 
 
 def _candidates(
-    scores: Floats, is_right: NDArray[np.bool_], precision: float, confidence: float
+    scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> list[Threshold]:
     """Those with more and more detections above them, evenly in ratio."""
     n, fewest = len(scores), fewest_detections(precision, confidence)

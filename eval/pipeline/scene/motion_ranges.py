@@ -22,6 +22,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.object_tracks import (
     Facing,
@@ -32,7 +35,6 @@ from crosscue.detectors.ranging.object_tracks import (
 )
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import TRAFFIC_LIGHT, Vehicle
 
 from .usable import MEASURED, Usable, source_of, usable
@@ -94,7 +96,7 @@ class MotionRanges:
         evidence: FrameEvidence,
         seconds: float,
         found: Sequence[Detections],
-        heights_px: Sequence[Floats],
+        heights_px: Sequence[NDArray[np.float64]],
         without: frozenset[str] = frozenset(),
     ) -> tuple[RangePosterior, ...]:
         """The next frame: at most one range for each reference.

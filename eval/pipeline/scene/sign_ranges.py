@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import Candidates, scores_of, thresholds_met
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.eval.pipeline.scene.usable import MEASURED, source_of, why_not
 from crosscue.fusion.evidence import SignRange
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
 
@@ -31,7 +31,7 @@ class SignRanges:
     by_cue: dict[str, Candidates] = field(default_factory=dict)
 
     def __call__(
-        self, found: Sequence[Detections], heights_px: Sequence[Floats]
+        self, found: Sequence[Detections], heights_px: Sequence[NDArray[np.float64]]
     ) -> tuple[SignRange, ...]:
         """Ranges of one frame.
 
@@ -44,7 +44,7 @@ class SignRanges:
         )
 
     def _of_cue(
-        self, found: Sequence[Detections], heights_px: Sequence[Floats], row: int
+        self, found: Sequence[Detections], heights_px: Sequence[NDArray[np.float64]], row: int
     ) -> list[SignRange]:
         """Of one row of ``MEASURED``."""
         cue, reference = MEASURED[row]

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, Vehicle
 
 BORDER_PX: Final = 2.0
@@ -34,7 +33,7 @@ def source_of(vehicle: Vehicle, cue: str) -> Source | None:
 
 def why_not(
     found: Detections,
-    heights_px: Floats,
+    heights_px: NDArray[np.float64],
     i: int,
     are_sure: NDArray[np.bool_],
     source: Source | None,
@@ -60,13 +59,16 @@ class Usable(NamedTuple):
         lenses: N lenses of lights, empty where nobody looked.
     """
 
-    boxes_px: Floats
-    heights_px: Floats
+    boxes_px: NDArray[np.float64]
+    heights_px: NDArray[np.float64]
     lenses: tuple[str, ...]
 
 
 def usable(
-    vehicle: Vehicle, row: int, found: Sequence[Detections], heights_px: Sequence[Floats]
+    vehicle: Vehicle,
+    row: int,
+    found: Sequence[Detections],
+    heights_px: Sequence[NDArray[np.float64]],
 ) -> Usable:
     """Detections of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
     cue, _ = MEASURED[row]

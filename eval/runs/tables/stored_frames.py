@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.observed import RoadShares, Role, Seen, all_labels
 from crosscue.eval.runs.manifest import DetectorRow
-from crosscue.replay.columns import Floats
 
 from .parquet import TableFolder
 
@@ -31,7 +31,7 @@ class StoredFrame:
 
     seen: Seen
     size_px: tuple[int, int]
-    heights_px: tuple[Floats, ...]
+    heights_px: tuple[NDArray[np.float64], ...]
 
 
 @dataclass(slots=True)

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, UNKNOWN, Interval
-from crosscue.replay.columns import Floats, Int64s
 
 from .matching import ALL, OVERLAPS, RANGES, SIZES, Boxes, Matched, Part, match
 
@@ -72,7 +72,7 @@ def score_parts(
     found: Boxes,
     classes: Sequence[str],
     thresholds: Mapping[str, float],
-    blocks: Int64s,
+    blocks: NDArray[np.int64],
     overlap: float = 0.5,
     seed: int = SEED,
 ) -> list[PartScore]:
@@ -109,7 +109,7 @@ def score_parts(
     return scores
 
 
-def drawn(blocks: Int64s, seed: int, rounds: int = ROUNDS) -> Floats | None:
+def drawn(blocks: NDArray[np.int64], seed: int, rounds: int = ROUNDS) -> NDArray[np.float64] | None:
     """How often each picture is drawn, shape (R, P); None for fewer blocks than make an interval.
 
     Args:
@@ -125,7 +125,7 @@ def drawn(blocks: Int64s, seed: int, rounds: int = ROUNDS) -> Floats | None:
     return np.asarray(times[:, which], np.float64)
 
 
-def interval_of(values: Floats) -> Interval:
+def interval_of(values: NDArray[np.float64]) -> Interval:
     """Where 95 % of the finite ones are."""
     kept = values[np.isfinite(values)]
     if not len(kept):
@@ -134,7 +134,9 @@ def interval_of(values: Floats) -> Interval:
     return Interval(float(low), float(high))
 
 
-def average_precision(matched: Matched, step: int, weights: Floats | None = None) -> Floats:
+def average_precision(
+    matched: Matched, step: int, weights: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """At one overlap: as it is, or for each of R rounds of pictures drawn, shape (R,).
 
     Args:
@@ -167,14 +169,14 @@ class _Row:
     """One class in one part, with the values of every round of the bootstrap."""
 
     matched: Matched
-    weights: Floats | None
-    ap: Floats
-    ap50: Floats
-    ap_rounds: Floats
-    ap50_rounds: Floats
+    weights: NDArray[np.float64] | None
+    ap: NDArray[np.float64]
+    ap50: NDArray[np.float64]
+    ap_rounds: NDArray[np.float64]
+    ap50_rounds: NDArray[np.float64]
 
     @classmethod
-    def of(cls, matched: Matched, weights: Floats | None) -> _Row:
+    def of(cls, matched: Matched, weights: NDArray[np.float64] | None) -> _Row:
         steps = range(len(OVERLAPS))
         each = np.stack([average_precision(matched, step) for step in steps])
         rounds = (
@@ -227,11 +229,13 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
     )
 
 
-def _measured(value: float, rounds: Floats) -> Measured:
+def _measured(value: float, rounds: NDArray[np.float64]) -> Measured:
     return Measured(value, *interval_of(rounds))
 
 
-def _fraction_of(right: Int64s, of: Int64s, weights: Floats | None) -> Measured:
+def _fraction_of(
+    right: NDArray[np.int64], of: NDArray[np.int64], weights: NDArray[np.float64] | None
+) -> Measured:
     """Pictures of what is right, of those of everything."""
     value = len(right) / len(of) if len(of) else math.nan
     if weights is None or not len(of):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from crosscue.replay.columns import Floats, Int64s
+import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,6 +18,6 @@ class TruthTrack:
         y_m: Shape (N,).
     """
 
-    t_ns: Int64s
-    x_m: Floats
-    y_m: Floats
+    t_ns: NDArray[np.int64]
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]

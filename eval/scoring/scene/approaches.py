@@ -28,7 +28,6 @@ from crosscue.datasets.truth.truth import Approach
 from crosscue.eval.scoring.columns import NONE, BeliefRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
-from crosscue.replay.columns import Floats, Int64s
 
 from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
 
@@ -93,9 +92,9 @@ class Curve:
     drive: str
     approach: int
     intersection: str
-    t_ns: Int64s
-    distance_m: Floats
-    features: Mapping[str, Floats]
+    t_ns: NDArray[np.int64]
+    distance_m: NDArray[np.float64]
+    features: Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +317,7 @@ def _result(
 
 
 def _is_range_right(
-    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: Int64s
+    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """As ``is_range_right``; where the truth has no ranges, nothing can be wrong."""
     rows = tables.ranges
@@ -332,7 +331,7 @@ def _overlap_s(steps: BeliefRows) -> float:
     return float(steps.t_ns[-1] - steps.t_ns[0]) * 1e-9 if len(steps.t_ns) else 0.0
 
 
-def _first(holds: NDArray[np.bool_], distance_m: Floats) -> float | None:
+def _first(holds: NDArray[np.bool_], distance_m: NDArray[np.float64]) -> float | None:
     places = np.flatnonzero(holds)
     return float(distance_m[places[0]]) if len(places) else None
 
@@ -371,7 +370,7 @@ def _never_changes(steps: BeliefRows, name: str) -> bool:
     return len(values) > 0 and bool((values == values[0]).all())
 
 
-def _has_range(tables: RunTables, number: int | None, t_ns: Int64s) -> NDArray[np.bool_]:
+def _has_range(tables: RunTables, number: int | None, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """From the first range of an approach on its filter always has one."""
     if tables.ranges is None or number is None:
         return np.zeros(len(t_ns), np.bool_)

@@ -20,7 +20,6 @@ from crosscue.eval.scoring.columns import NONE, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
 from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
-from crosscue.replay.columns import Floats, Int64s
 
 CLIP: Final = 1e-6
 """Log scores are taken of probabilities clipped to this and one minus this."""
@@ -44,9 +43,9 @@ class BeliefJudged:
 
     drive: str
     feature: str
-    t_ns: Int64s
-    approach: Int64s
-    probability: Floats
+    t_ns: NDArray[np.int64]
+    approach: NDArray[np.int64]
+    probability: NDArray[np.float64]
     is_there: NDArray[np.bool_]
     left_out: dict[str, int]
 
@@ -162,7 +161,7 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
     return judged
 
 
-def _labels(feature: str, at: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
+def _labels(feature: str, at: NDArray[np.int64], truth: DriveTruth) -> NDArray[np.int8]:
     label = np.full(len(at), 0 if feature == "intersection" else NONE, np.int8)
     for one in truth.truth.approaches:
         there = has_feature(one, feature)
@@ -196,7 +195,9 @@ def _score(rows: Sequence[BeliefJudged]) -> BeliefScore:
     )
 
 
-def _pooled(rows: Sequence[BeliefJudged]) -> tuple[Floats, NDArray[np.bool_], Int64s]:
+def _pooled(
+    rows: Sequence[BeliefJudged],
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
     return (
         np.concatenate([one.probability for one in rows]),
         np.concatenate([one.is_there for one in rows]),
@@ -204,19 +205,24 @@ def _pooled(rows: Sequence[BeliefJudged]) -> tuple[Floats, NDArray[np.bool_], In
     )
 
 
-def brier(probability: Floats, is_there: NDArray[np.bool_]) -> Floats:
+def brier(probability: NDArray[np.float64], is_there: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Squared errors, shape (N,); G. W. Brier, Monthly Weather Review 78, 1950, for one event."""
     return np.asarray((probability - is_there) ** 2)
 
 
-def log_score(probability: Floats, is_there: NDArray[np.bool_], clip: float = CLIP) -> Floats:
+def log_score(
+    probability: NDArray[np.float64], is_there: NDArray[np.bool_], clip: float = CLIP
+) -> NDArray[np.float64]:
     """Minus the logarithm of the probability given to what is so, clipped, shape (N,)."""
     said = np.where(is_there, probability, 1.0 - probability)
     return np.asarray(-np.log(np.clip(said, clip, 1.0 - clip)))
 
 
 def reliability(
-    probability: Floats, is_there: NDArray[np.bool_], clusters: Int64s, bins: int = BINS
+    probability: NDArray[np.float64],
+    is_there: NDArray[np.bool_],
+    clusters: NDArray[np.int64],
+    bins: int = BINS,
 ) -> tuple[ReliabilityBin, ...]:
     """Equally wide bins of probability; empty ones are left out."""
     place = np.minimum((probability * bins).astype(np.int64), bins - 1)

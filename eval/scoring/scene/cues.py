@@ -34,7 +34,6 @@ from crosscue.eval.scoring.pooling import (
     summed,
 )
 from crosscue.eval.scoring.truth import DriveTruth, cue_at, has_feature
-from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.vehicle import CUES, Scoring
 
 Reading = Scoring
@@ -68,14 +67,14 @@ class CueFrames:
 
     drive: str
     cue: str
-    t_ns: Int64s
-    count: Int64s
-    approach: Int64s
-    distance_m: Floats
+    t_ns: NDArray[np.int64]
+    count: NDArray[np.int64]
+    approach: NDArray[np.int64]
+    distance_m: NDArray[np.float64]
     is_object: NDArray[np.int8]
     is_feature: NDArray[np.int8]
-    true_count: Int64s
-    visible: Floats
+    true_count: NDArray[np.int64]
+    visible: NDArray[np.float64]
     frames: int
     moments_unmatched: int
     left_out: Mapping[Reading, Mapping[str, int]]
@@ -181,7 +180,9 @@ def match_cues(tables: RunTables, truth: DriveTruth) -> list[CueFrames]:
     return [_judge(cue, rows, frames, truth, ambiguous) for cue in (*CUES, *others)]
 
 
-def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous: int) -> CueFrames:
+def _judge(
+    cue: str, rows: CueRows, frames: NDArray[np.int64], truth: DriveTruth, ambiguous: int
+) -> CueFrames:
     looked, count = _largest(rows, cue)
     spans = [one for one in truth.truth.cues if one.cue == cue]
     is_object = cue in CUES and CUES[cue].scored_as == "object"
@@ -215,7 +216,7 @@ def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous
     )
 
 
-def _largest(rows: CueRows, cue: str) -> tuple[Int64s, Int64s]:
+def _largest(rows: CueRows, cue: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Times in which a cue was looked for, each once, and the largest count given for each."""
     mine = rows.cue == cue
     times, which = np.unique(rows.t_ns[mine], return_inverse=True)
@@ -224,7 +225,7 @@ def _largest(rows: CueRows, cue: str) -> tuple[Int64s, Int64s]:
     return times, count
 
 
-def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
+def _feature_at(cue: str, t_ns: NDArray[np.int64], truth: DriveTruth) -> NDArray[np.int8]:
     """Whether what the cue stands for is true, at each time; ``NONE`` unknown."""
     found = np.full(len(t_ns), NONE, np.int8)
     if cue not in CUES or not truth.truth.approaches:
@@ -261,7 +262,7 @@ class _Pooled:
     """One cue's rows of all drives, with a number for each approach of each drive."""
 
     rows: Sequence[CueFrames]
-    cluster: Int64s = field(init=False)
+    cluster: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
         self.cluster = cluster_numbers(
@@ -284,10 +285,10 @@ class _Pooled:
         has["no tag"] = [not one for one in by_cluster]
         return {name: np.array(holds, np.bool_)[self.cluster] for name, holds in has.items()}
 
-    def ints(self, name: str) -> Int64s:
+    def ints(self, name: str) -> NDArray[np.int64]:
         return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.int64)
 
-    def floats(self, name: str) -> Floats:
+    def floats(self, name: str) -> NDArray[np.float64]:
         return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.float64)
 
 
@@ -364,9 +365,9 @@ def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> Cu
 class _Cut:
     """Shares over any subset of frames."""
 
-    truth: Int64s
+    truth: NDArray[np.int64]
     is_found: NDArray[np.bool_]
-    cluster: Int64s
+    cluster: NDArray[np.int64]
     has_recall: bool
 
     def precision(self, rows: NDArray[np.bool_]) -> Proportion:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import RangeRows
-from crosscue.replay.columns import Floats, Int64s
 
 Definition = Literal["confirmed", "published"]
 CONFIRM_FRAMES: Final = 3
@@ -52,7 +51,10 @@ def held(holds: Flags, frames: int) -> Flags:
 
 
 def is_range_right(
-    rows: RangeRows, true_m: tuple[Floats, Floats], number: int, t_ns: Int64s
+    rows: RangeRows,
+    true_m: tuple[NDArray[np.float64], NDArray[np.float64]],
+    number: int,
+    t_ns: NDArray[np.int64],
 ) -> Flags:
     """Is the latest range at each time within its 95 % interval of the true one?
 

@@ -21,7 +21,6 @@ from crosscue.eval.scoring.pooling import (
 )
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
-from crosscue.replay.columns import Floats, Int64s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,11 +41,11 @@ class RangeJudged:
 
     drive: str
     reference: str
-    t_ns: Int64s
-    approach: Int64s
-    true_m: Floats
-    error_m: Floats
-    var_m2: Floats
+    t_ns: NDArray[np.int64]
+    approach: NDArray[np.int64]
+    true_m: NDArray[np.float64]
+    error_m: NDArray[np.float64]
+    var_m2: NDArray[np.float64]
     left_out: dict[str, int]
     controls: Mapping[int, str]
 
@@ -170,11 +169,11 @@ def _by_control(rows: Sequence[RangeJudged]) -> dict[str, NDArray[np.bool_]]:
     return {name: found == name for name in sorted(set(names) - {""})}
 
 
-def _rms(error: Floats) -> float:
+def _rms(error: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
 
 
-def _bin(error: Floats, nees: NDArray[np.float64]) -> RangeBin:
+def _bin(error: NDArray[np.float64], nees: NDArray[np.float64]) -> RangeBin:
     return RangeBin(
         rows=len(error),
         bias_m=float(error.mean()),

@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
-def split(table: pa.Table) -> Iterator[dict[str, Floats]]:
+def split(table: pa.Table) -> Iterator[dict[str, NDArray[np.float64]]]:
     """The columns of each case in turn, by name."""
     cases = table["case"].to_numpy()
     columns = {name: table[name].to_numpy() for name in table.column_names if name != "case"}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap
-from crosscue.replay.columns import Floats
 
 
-def nees_along_the_arc(row: Floats) -> float:
+def nees_along_the_arc(row: NDArray[np.float64]) -> float:
     """NEES of the turn and shift that carry the estimate to the truth: errors on an arc.
 
     Long, Wolfe, Mashner, Chirikjian, *The banana distribution is Gaussian*, RSS 2012.

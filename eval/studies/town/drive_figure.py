@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.studies.pictures import figure, save
 from crosscue.localization.town.drive import (
@@ -20,7 +21,6 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.settings import Drive
 from crosscue.localization.town.streets import Streets, has_way, place_of, step_of
-from crosscue.replay.columns import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,9 +113,9 @@ def _draw_streets(axes: Axes, streets: Streets) -> None:
     )
 
 
-def _ellipse(row: Floats) -> Floats:
+def _ellipse(row: NDArray[np.float64]) -> NDArray[np.float64]:
     angle = np.linspace(0.0, 2.0 * np.pi, 61)
     values, vectors = np.linalg.eigh(np.array([[row[10], row[11]], [row[11], row[13]]]))
     axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))
-    ring: Floats = axes @ np.stack([np.cos(angle), np.sin(angle)]) + row[7:9, None]
+    ring: NDArray[np.float64] = axes @ np.stack([np.cos(angle), np.sin(angle)]) + row[7:9, None]
     return ring

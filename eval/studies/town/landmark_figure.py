@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.studies.intervals import fraction_of, logistic
 from crosscue.eval.studies.pictures import COLOURS, figure, save
 from crosscue.localization.town.drive import Outcome
-from crosscue.replay.columns import Floats
 
 from .landmark_study import PUBLISHED_POINT, Cell, LandmarkResult
 from .settings import LandmarkStudy
@@ -28,7 +28,7 @@ SHOWN_RATE: Final = 0.6
 def draw(
     study: LandmarkStudy,
     result: LandmarkResult,
-    rows: Sequence[dict[str, Floats]],
+    rows: Sequence[dict[str, NDArray[np.float64]]],
     folder: Path,
 ) -> list[Path]:
     """Write ``landmarks_range`` and ``landmarks_success`` as PNG and SVG; the PNGs' paths."""
@@ -111,7 +111,7 @@ def _range_line(axes: Axes, cells: Sequence[Cell], colour: str, top: float, shif
 def _successes(
     study: LandmarkStudy,
     result: LandmarkResult,
-    rows: Sequence[dict[str, Floats]],
+    rows: Sequence[dict[str, NDArray[np.float64]]],
     rate: float,
     folder: Path,
 ) -> Path:
@@ -140,7 +140,7 @@ def _successes(
     return save(made, folder, "landmarks_success")
 
 
-def _success(axes: Axes, part: dict[str, Floats], colour: str, label: str) -> None:
+def _success(axes: Axes, part: dict[str, NDArray[np.float64]], colour: str, label: str) -> None:
     distance_m = part["straight_m"]
     reached = (part["outcome"] == Outcome.REACHED).astype(np.float64)
     a, b = logistic(distance_m, reached, np.ones((1, len(reached))))

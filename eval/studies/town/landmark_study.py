@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.studies.intervals import (
     Measured,
@@ -26,7 +27,6 @@ from crosscue.eval.studies.page import Table
 from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import Outcome
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.columns import Floats
 
 from .cases import split
 from .settings import LandmarkStudy
@@ -155,7 +155,7 @@ def summarise(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
     return LandmarkResult(cells, tuple(_comparisons(cells[:grid], rows[:grid])))
 
 
-def _cell(settings: Drive, rows: dict[str, Floats]) -> Cell:
+def _cell(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> Cell:
     outcome = rows["outcome"]
     reached = outcome == Outcome.REACHED
     return Cell(
@@ -172,7 +172,9 @@ def _cell(settings: Drive, rows: dict[str, Floats]) -> Cell:
     )
 
 
-def comparisons_of(study: LandmarkStudy, rows: Sequence[dict[str, Floats]]) -> list[Comparison]:
+def comparisons_of(
+    study: LandmarkStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
+) -> list[Comparison]:
     """Strategies against straight to goal.
 
     Args:
@@ -184,7 +186,9 @@ def comparisons_of(study: LandmarkStudy, rows: Sequence[dict[str, Floats]]) -> l
     return _comparisons(cells[:grid], rows[:grid])
 
 
-def _comparisons(cells: Sequence[Cell], rows: Sequence[dict[str, Floats]]) -> list[Comparison]:
+def _comparisons(
+    cells: Sequence[Cell], rows: Sequence[dict[str, NDArray[np.float64]]]
+) -> list[Comparison]:
     places = {(c.strategy, c.landmarks_per_km2, c.detection_rate): i for i, c in enumerate(cells)}
     strategies = [s for s in dict.fromkeys(c.strategy for c in cells) if s != STRAIGHT]
     if not any(c.strategy == STRAIGHT for c in cells):
@@ -208,7 +212,7 @@ def _comparison(
     strategy: str,
     pairs: Sequence[tuple[int, int]],
     cells: Sequence[Cell],
-    rows: Sequence[dict[str, Floats]],
+    rows: Sequence[dict[str, NDArray[np.float64]]],
 ) -> Comparison:
     ours, theirs, better = [], [], []
     ways, reached = [], []
@@ -249,7 +253,7 @@ def _comparison(
     )
 
 
-def _extra(driven: Floats, there: Floats) -> Measured:
+def _extra(driven: NDArray[np.float64], there: NDArray[np.float64]) -> Measured:
     """Both of shape (2, N): this strategy above, straight to goal below."""
     return _less_one(ratio_of_means(driven[0], there[0], driven[1], there[1]))
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.studies.pictures import COLOURS, figure, save
 from crosscue.localization.town.drive import Outcome
-from crosscue.replay.columns import Floats
 
 from .range_study import CALIBRATED_DEG, PREDICTED, PUBLISHED_M, Choice, CompassResult, points
 
@@ -26,7 +26,7 @@ CHOICES: Final = "range_choices"
 
 def draw(
     results: Sequence[CompassResult],
-    rows: Sequence[dict[str, Floats]],
+    rows: Sequence[dict[str, NDArray[np.float64]]],
     limit_m: float,
     folder: Path,
 ) -> Path:
@@ -60,7 +60,9 @@ def name_of(result: CompassResult) -> str:
     return "no compass" if degrees is None else f"compass ±{degrees:g}° (2 sigma)"
 
 
-def _growth(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
+def _growth(
+    axes: Axes, result: CompassResult, columns: dict[str, NDArray[np.float64]], colour: str
+) -> None:
     distance_m, axis_m = points(columns)
     axes.plot(distance_m * KM, axis_m, ".", ms=1.5, alpha=0.35, color=colour, rasterized=True)
     curve_m = np.linspace(0.0, FIRST_GOAL_KM / KM, 400)
@@ -69,7 +71,9 @@ def _growth(axes: Axes, result: CompassResult, columns: dict[str, Floats], colou
     )
 
 
-def _survival(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
+def _survival(
+    axes: Axes, result: CompassResult, columns: dict[str, NDArray[np.float64]], colour: str
+) -> None:
     lost_m = np.sort(columns["travelled_m"][columns["outcome"] == Outcome.LOST])
     left = 1.0 - np.arange(len(lost_m) + 1) / result.drives
     end_m = max(60_000.0, float(lost_m[-1]) if len(lost_m) else 0.0)

@@ -13,13 +13,13 @@ from itertools import product
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.intervals import Measured, fraction_of, mean_of, measured, weights_of
 from crosscue.localization.town.drive import Outcome, Result, drive_many
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.columns import Floats
 
 from .cases import split
 from .settings import UNTIL_LOST, RangeStudy, changed
@@ -60,9 +60,9 @@ class Growth:
     square: float
     crossing_m: Measured
 
-    def axis_m(self, distance_m: Floats) -> Floats:
+    def axis_m(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """The curve."""
-        axis: Floats = np.sqrt(
+        axis: NDArray[np.float64] = np.sqrt(
             self.start_m2 + self.linear_m * distance_m + self.square * distance_m**2
         )
         return axis
@@ -115,7 +115,7 @@ def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
     ]
 
 
-def points(rows: dict[str, Floats]) -> tuple[Floats, Floats]:
+def points(rows: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Distance and major axis of each drive at its first goal, or where it was lost before."""
     reached = ~np.isnan(rows["first_goal_m"])
     distance = np.where(reached, rows["first_goal_m"], rows["travelled_m"])
@@ -172,7 +172,7 @@ def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
             interval_m *= mean_m / wanted_m
 
 
-def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
+def _of_case(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> CompassResult:
     sensors = settings.sensors
     n = len(rows["outcome"])
     is_lost = rows["outcome"] == Outcome.LOST
@@ -199,7 +199,9 @@ def _of_case(settings: Drive, rows: dict[str, Floats]) -> CompassResult:
     )
 
 
-def fit_growth(distance_m: Floats, axis_m: Floats, start_m: float, limit_m: float) -> Growth:
+def fit_growth(
+    distance_m: NDArray[np.float64], axis_m: NDArray[np.float64], start_m: float, limit_m: float
+) -> Growth:
     """Least squares on relative errors of axis^2, coefficients not negative.
 
     Args:
