@@ -45,6 +45,8 @@ _EXPORTS: Final = {
     "estimate_run": "eval.interface.runs.make",
     "score_run": "eval.interface.runs.score",
     "compare_runs": "eval.interface.runs.compare",
+    "catalog": "eval.catalog.query.catalog",
+    "Catalog": "eval.catalog.query.catalog",
     "save_recording": "eval.interface.runs.recording",
     "load_vehicle": "eval.interface.runs.run",
     "demo": "eval.interface.demo",
@@ -196,6 +198,8 @@ if TYPE_CHECKING:
     from crosscue.eval.batch.drive_list import DriveList as DriveList
     from crosscue.eval.catalog.compare import Comparison as Comparison
     from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
+    from crosscue.eval.catalog.query.catalog import Catalog as Catalog
+    from crosscue.eval.catalog.query.catalog import catalog as catalog
     from crosscue.eval.fit.signs.threshold import SignFit as SignFit
     from crosscue.eval.fit.signs.threshold import fit_signs as fit_signs
     from crosscue.eval.fit.truth_check import ImportedTruth as ImportedTruth

@@ -74,6 +74,7 @@ from .manifest import (
 )
 
 __all__ = [
+    "FORMAT_VERSION",
     "INPUT",
     "LOCK",
     "MANIFEST",

@@ -1,0 +1,1 @@
+"""The runs below a folder as tables, and SQL over them."""

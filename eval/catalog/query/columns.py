@@ -1,0 +1,211 @@
+"""Tables of a catalog: their columns, SQL types and what they mean.
+
+``runs``, ``approaches``, ``dropped`` and ``left_out`` are kept in the catalog's index. The others
+are the runs' own Parquet files; they may have more columns than are listed here, and a table that
+is not listed at all, such as ``detections``, can be asked for by the name of its file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+class Column(NamedTuple):
+    """One column.
+
+    Attributes:
+        kind: Its type in SQL.
+        meaning: In one phrase.
+    """
+
+    kind: str
+    meaning: str
+
+
+_RUN: Final = {"run": Column("VARCHAR", "path of the run, from the folder of the catalog")}
+_LOG_TIME: Final = {
+    "segment": Column("INTEGER", "time segment of the drive, from 0"),
+    "log_t_ns": Column("BIGINT", "time on the log's own clock"),
+}
+_STEP: Final = {
+    **_RUN,
+    "t_ns": Column("BIGINT", "log time"),
+    "approach": Column("BIGINT", "number of the approach in its run; null between approaches"),
+}
+INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
+    "runs": {
+        **_RUN,
+        "name": Column("VARCHAR", "last part of the path"),
+        "outcome": Column("VARCHAR", "whole, or losses where rows were dropped"),
+        "exit_status": Column("INTEGER", "0, or 3 where rows were dropped"),
+        "stage": Column("VARCHAR", "estimate, or detect where nothing has been estimated"),
+        "identity": Column("VARCHAR", "of the drive's logs, 64 hex digits: pairs runs of a drive"),
+        "logs": Column("VARCHAR[]", "names of the drive's logs"),
+        "is_simulated": Column("BOOLEAN", "whether a log is simulated"),
+        "vehicle": Column("VARCHAR", "name in the vehicle file"),
+        "crosscue": Column("VARCHAR", "version that made the run"),
+        "crosscue_commit": Column("VARCHAR", "its commit, where it ran from a checkout"),
+        "models": Column(
+            "STRUCT(name VARCHAR, identity VARCHAR)[]",
+            "detectors; the identity is a hash of weights, settings and code",
+        ),
+        "settings": Column("VARCHAR", "JSON of all settings: settings->>'$.fusion.established'"),
+        "settings_sha256": Column("VARCHAR", "of settings, models and the part of the logs"),
+        "tags": Column("MAP(VARCHAR, VARCHAR)", "set by crosscue tag: tags['weather']"),
+        "conditions": Column("VARCHAR[]", "of the drive's approaches, from the truth"),
+        "start_ns": Column("BIGINT", "drive time at which the drive starts"),
+        "end_ns": Column("BIGINT", "drive time at which it ends"),
+        "made_at": Column("TIMESTAMP", "when the run was finished, UTC"),
+        "seconds": Column("DOUBLE", "wall time of making it"),
+        "travelled_m": Column("DOUBLE", "length of the track; null without estimate"),
+        "frames": Column("BIGINT", "of the camera; null without detectors"),
+        "approaches": Column("BIGINT", "that the run saw"),
+        "is_scored": Column("BOOLEAN", "whether it has a score"),
+        "rows_in": Column("BIGINT", "account over all stages: taken in"),
+        "rows_used": Column("BIGINT", "used"),
+        "rows_skipped": Column("BIGINT", "skipped, with reasons in its manifest"),
+        "rows_dropped": Column("BIGINT", "dropped, with reasons in the table dropped"),
+        "notices": Column("VARCHAR[]", "what the run noted"),
+        "tables": Column("VARCHAR[]", "names of its Parquet files"),
+    },
+    "approaches": {
+        **_RUN,
+        "approach": Column("BIGINT", "number in its run; null where the run has none"),
+        "start_ns": Column("BIGINT", "first log time, as the run saw it"),
+        "end_ns": Column("BIGINT", "last log time"),
+        "detected_ns": Column("BIGINT", "log time of the detection; null without"),
+        "detected_range_m": Column("DOUBLE", "range that the run estimated then"),
+        "reference": Column("VARCHAR", "start or end of the intersection, which ranges are to"),
+        "probabilities": Column("MAP(VARCHAR, DOUBLE)", "last belief: probabilities['left']"),
+        "not_seen": Column("VARCHAR[]", "features that no cue spoke about"),
+        "truth": Column("BIGINT", "id in the truth; null without truth, and where none is"),
+        "intersection": Column("VARCHAR", "its name in the truth"),
+        "control": Column("VARCHAR", "stop_sign, traffic_light or none"),
+        "conditions": Column("VARCHAR[]", "of the truth: 'dusk' in conditions"),
+        "present": Column("VARCHAR[]", "features that are there"),
+        "detected_m": Column("DOUBLE", "true distance at which it was detected; null if never"),
+        "full_m": Column("DOUBLE", "the same for all features; null if never"),
+        "features_m": Column("MAP(VARCHAR, DOUBLE)", "true distance of each present feature"),
+        "false_features": Column("VARCHAR[]", "absent features that were detected"),
+        "why_not_detected": Column("VARCHAR", "empty where it was"),
+        "why_not_full": Column("VARCHAR", "empty where it was"),
+        "tags": Column("MAP(VARCHAR, VARCHAR)", "of the run"),
+    },
+    "dropped": {
+        **_RUN,
+        "stage": Column("VARCHAR", "reading, detecting or estimating"),
+        "stream": Column("VARCHAR", "topic, camera or input"),
+        "reason": Column("VARCHAR", "why"),
+        "rows": Column("BIGINT", "how many; null where nobody can know"),
+    },
+    "left_out": {
+        **_RUN,
+        "reason": Column("VARCHAR", "why the catalog does not hold it"),
+    },
+}
+"""Tables of the index, by name."""
+OWN: Final[Mapping[str, Mapping[str, Column]]] = {
+    "cues": {
+        **_STEP,
+        "cue": Column("VARCHAR", "its name"),
+        "count": Column("BIGINT", "how many were found in the frame"),
+        **_LOG_TIME,
+    },
+    "scores": {
+        **_RUN,
+        "metric": Column("VARCHAR", "its path, such as cues.stop_sign.precision"),
+        "kind": Column("VARCHAR", "mean, rms or sum: how drives are pooled"),
+        "total": Column("DOUBLE", "sum over the drive's rows, of squares for rms"),
+        "rows": Column("BIGINT", "how many"),
+        "value": Column("DOUBLE", "of this drive alone"),
+    },
+    "belief": {
+        **_STEP,
+        "intersection": Column("DOUBLE", "probability"),
+        "left": Column("DOUBLE", 'probability; SQL wants "left" in quotes'),
+        "right": Column("DOUBLE", 'probability; SQL wants "right" in quotes'),
+        "straight": Column("DOUBLE", "probability"),
+        "established": Column("BOOLEAN", "whether a road was established"),
+        **_LOG_TIME,
+    },
+    "range": {
+        **_STEP,
+        "reference": Column("VARCHAR", "start or end of the intersection"),
+        "range_m": Column("DOUBLE", "estimated"),
+        "var_m2": Column("DOUBLE", "its variance"),
+        "measured_m": Column("DOUBLE", "what was measured in this step; null without"),
+        **_LOG_TIME,
+    },
+    "pose": {
+        **_RUN,
+        "t_ns": Column("BIGINT", "log time"),
+        "x_m": Column("DOUBLE", "position"),
+        "y_m": Column("DOUBLE", "position"),
+        "heading_rad": Column("DOUBLE", "counterclockwise from the x axis"),
+        "speed_mps": Column("DOUBLE", "speed"),
+        "major_axis_m": Column("DOUBLE", "of the 2-sigma ellipse"),
+        "travelled_m": Column("DOUBLE", "since the start"),
+        "landmark": Column("VARCHAR", "that corrected this pose; null without"),
+        **_LOG_TIME,
+    },
+    "cue_frames": {
+        **_RUN,
+        "t_ns": Column("BIGINT", "log time"),
+        "cue": Column("VARCHAR", "its name"),
+        "count": Column("BIGINT", "how many were found in the frame"),
+        "approach": Column("BIGINT", "id in the truth"),
+        "distance_m": Column("DOUBLE", "true distance to the intersection"),
+        "object": Column("BIGINT", "1 where the object is there, 0 where not, null unknown"),
+        "feature": Column("BIGINT", "the same of what the cue stands for"),
+        "true_count": Column("BIGINT", "how many there are; null unknown"),
+        "visible": Column("DOUBLE", "visible fraction"),
+    },
+    "curves": {
+        **_RUN,
+        "approach": Column("BIGINT", "id in the truth"),
+        "t_ns": Column("BIGINT", "log time"),
+        "distance_m": Column("DOUBLE", "true distance to the intersection"),
+        "left": Column("DOUBLE", "probability"),
+        "right": Column("DOUBLE", "probability"),
+        "straight": Column("DOUBLE", "probability"),
+    },
+}
+"""Tables of the runs themselves, by name."""
+FILES: Final[Mapping[str, str]] = {
+    "scores": "score/by_drive.parquet",
+    "cue_frames": "score/cue_frames.parquet",
+    "curves": "score/curves.parquet",
+}
+"""Where a table lies in a run, if not under its own name."""
+VIEWS: Final[Mapping[str, str]] = {
+    "scores": "select run, metric, kind, total, rows, case kind when 'sum' then total "
+    "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
+    "from {table}",
+}
+"""What a table is made of, if it is not its file as it stands."""
+
+
+def arrow_schema(columns: Mapping[str, Column]) -> pa.Schema:
+    """The same columns in Arrow."""
+    import pyarrow as pa
+
+    texts = pa.list_(pa.string())
+    types = {
+        "VARCHAR": pa.string(),
+        "VARCHAR[]": texts,
+        "BIGINT": pa.int64(),
+        "INTEGER": pa.int32(),
+        "DOUBLE": pa.float64(),
+        "BOOLEAN": pa.bool_(),
+        "TIMESTAMP": pa.timestamp("us"),
+        "MAP(VARCHAR, VARCHAR)": pa.map_(pa.string(), pa.string()),
+        "MAP(VARCHAR, DOUBLE)": pa.map_(pa.string(), pa.float64()),
+        "STRUCT(name VARCHAR, identity VARCHAR)[]": pa.list_(
+            pa.struct({"name": pa.string(), "identity": pa.string()})
+        ),
+    }
+    return pa.schema({name: types[column.kind] for name, column in columns.items()})

@@ -1,0 +1,118 @@
+"""SQL over tables in memory and data sets, in a DuckDB that can touch nothing else.
+
+It has no file system, network, extensions, Python variables or temporary files, and its settings
+are locked before a query is read; only a single SELECT is run. So what a query can reach are the
+tables that were handed over, which Arrow reads.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.replay.base import UsageError, one_line
+
+if TYPE_CHECKING:
+    import duckdb
+    import pyarrow as pa
+
+LOCKED: Final[Mapping[str, str]] = {
+    "temp_directory": "''",
+    "autoinstall_known_extensions": "false",
+    "autoload_known_extensions": "false",
+    "allow_community_extensions": "false",
+    "allow_persistent_secrets": "false",
+    "python_enable_replacements": "false",
+    "errors_as_json": "true",
+    "enable_external_access": "false",
+    "lock_configuration": "true",
+}
+"""Settings, in an order in which each can still be set."""
+_QUOTED: Final = re.compile(r'"([^"]+)"')
+_SCHEMA: Final = "crosscue query --schema lists all"
+
+
+def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Table:
+    """The result of one SELECT.
+
+    Args:
+        sql: The query.
+        tables: By name, an Arrow table or data set, or SQL text over the others.
+        known: Names of all tables that there are, for messages.
+
+    Raises:
+        UsageError: No single SELECT, or one that names what does not exist; the nearest is named.
+    """
+    import duckdb
+
+    with duckdb.connect(":memory:") as database:
+        for name, content in tables.items():
+            if not isinstance(content, str):
+                database.register(name, content)
+        for name, content in tables.items():
+            if isinstance(content, str):
+                database.execute(f'create view "{name}" as {content}')
+        for name, value in LOCKED.items():
+            database.execute(f"set {name} = {value}")
+        columns = _columns(tables.values())
+        try:
+            _check(database, sql)
+            return database.sql(sql).to_arrow_table()
+        except duckdb.Error as error:
+            raise UsageError(_message(error, sorted(known), columns)) from None
+
+
+def _columns(contents: Iterable[Any]) -> list[str]:
+    return sorted(
+        {name for one in contents if not isinstance(one, str) for name in one.schema.names}
+    )
+
+
+def is_statement(text: str) -> bool:
+    """Is it a query of its own, and no condition on one?"""
+    first = text.split(maxsplit=1)
+    return bool(first) and first[0].lower() in ("select", "with", "from")
+
+
+def _check(database: duckdb.DuckDBPyConnection, sql: str) -> None:
+    """Refuse all but one SELECT, and names that do not exist.
+
+    Raises:
+        UsageError: Not a single SELECT.
+        duckdb.Error: It does not parse, or names what does not exist.
+    """
+    import duckdb
+
+    statements = database.extract_statements(sql)
+    kinds = [one.type for one in statements]
+    if kinds != [duckdb.StatementType.SELECT]:
+        found = ", ".join(kind.name for kind in kinds) or "nothing"
+        raise UsageError(f"query: expected a single SELECT, found {found}; a catalog is read-only")
+    # Errors of what is executed come as JSON, those of a relation do not.
+    database.execute(f"explain {statements[0].query}")
+
+
+def _message(error: duckdb.Error, tables: list[str], columns: list[str]) -> str:
+    """One line; of a misspelt table or column, with the nearest that exists."""
+    text = str(error)
+    try:
+        report = json.loads(text[text.index("{") :])
+        said = str(report["exception_message"])
+    except (ValueError, KeyError, TypeError):
+        return f"query: {one_line(error)}; {_SCHEMA}"
+    named = _QUOTED.findall(said.split("\n")[0])
+    name = str(report.get("name") or (named[-1] if named else ""))
+    if report.get("type") == "Table":
+        return f"query: no table {name}; {_nearest(name, tables)}"
+    if report.get("exception_type") == "Binder" and name and name not in columns:
+        return f"query: no column {name}; {_nearest(name, columns)}"
+    return f"query: {one_line(ValueError(said))}; {_SCHEMA}"
+
+
+def _nearest(name: str, there: list[str]) -> str:
+    plain = name.rpartition(".")[2].lower()
+    close = difflib.get_close_matches(plain, there, n=1, cutoff=0.5)
+    return (f"did you mean {close[0]}? " if close else "") + _SCHEMA

@@ -1,0 +1,100 @@
+"""Tables that lie in the runs: one data set over the Parquet files of all runs.
+
+Arrow reads them, with page checksums verified, and only the columns and row groups that are asked
+for; the run is a column that every file has one value of, so files of other runs are not opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final
+
+from .columns import FILES, OWN, arrow_schema
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.dataset as ds
+    import pyarrow.fs
+
+WORKERS: Final = 8
+SCORE: Final = "score/"
+
+
+def file_of(table: str) -> str:
+    """Where a table lies in a run."""
+    return FILES.get(table, f"{table}.parquet")
+
+
+def tables_of(files: Iterable[str]) -> set[str]:
+    """Names of the tables that such files hold."""
+    inside = {name: table for table, name in FILES.items()}
+    plain = {name.removesuffix(".parquet") for name in files if not name.startswith(SCORE)}
+    return plain | {inside[name] for name in files if name in inside}
+
+
+class Parts:
+    """One table over many runs.
+
+    Attributes:
+        dataset: Its rows.
+        left_out: By run, why its file could not be read.
+    """
+
+    def __init__(
+        self, table: str, runs: Mapping[str, str], filesystem: pyarrow.fs.FileSystem
+    ) -> None:
+        """Read the schema of every file.
+
+        Args:
+            table: Its name.
+            runs: By run, the path of its file in the file system.
+            filesystem: Where they lie.
+        """
+        import pyarrow as pa
+        import pyarrow.dataset as ds
+
+        self.left_out: Final[dict[str, str]] = {}
+        scan = ds.ParquetFragmentScanOptions(pre_buffer=True, page_checksum_verification=True)
+        form = ds.ParquetFileFormat(default_fragment_scan_options=scan)
+        schema = pa.schema([("run", pa.string())])
+        fragments = []
+        for run, fragment, found in _opened(runs, filesystem, form):
+            try:
+                if isinstance(found, Exception):
+                    raise found
+                schema = pa.unify_schemas([schema, found], promote_options="permissive")
+            except (OSError, pa.ArrowException) as error:
+                self.left_out[run] = _why(runs[run], error)
+                continue
+            fragments.append(fragment)
+        if not fragments:
+            schema = arrow_schema(OWN[table])
+        self.dataset: Final = ds.FileSystemDataset(fragments, schema, form, filesystem)
+
+
+def _opened(
+    runs: Mapping[str, str], filesystem: pyarrow.fs.FileSystem, form: ds.ParquetFileFormat
+) -> Iterator[tuple[str, ds.Fragment, pa.Schema | Exception]]:
+    import pyarrow as pa
+    import pyarrow.dataset as ds
+
+    def schema_of(fragment: ds.Fragment) -> pa.Schema | Exception:
+        try:
+            return fragment.physical_schema.remove_metadata()
+        except (OSError, pa.ArrowException) as error:
+            return error
+
+    fragments = [
+        form.make_fragment(path, filesystem, partition_expression=ds.field("run") == run)
+        for run, path in runs.items()
+    ]
+    with ThreadPoolExecutor(WORKERS) as pool:
+        yield from zip(runs, fragments, pool.map(schema_of, fragments), strict=True)
+
+
+def _why(path: str, error: Exception) -> str:
+    name = path.rpartition("/")[2]
+    if isinstance(error, FileNotFoundError):
+        return f"{name}: gone; open the catalog again"
+    return f"{name}: damaged or of other types ({' '.join(str(error).split())[:200]}); replay again"

@@ -1,0 +1,199 @@
+"""The runs below a folder as tables."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.eval.batch.merge import gathered, merge_runs
+from crosscue.eval.runs.account import Account, Line
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, create
+from crosscue.replay.base import UnreadableRunError, UsageError
+from support.catalog_runs import add_run, runs_below, scene, seen
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives, each with two settings."""
+    return runs_below(tmp_path_factory.mktemp("fleet"))
+
+
+def test_every_run_is_a_row(runs: Path) -> None:
+    found = crosscue.catalog(runs)
+
+    assert found.runs == tuple(
+        runs / name for name in ("a/monday", "a/tuesday", "b/monday", "b/tuesday")
+    )
+    rows = found.query("select * from runs order by run").to_pylist()
+    assert [row["vehicle"] for row in rows] == ["car"] * 4
+    assert [row["outcome"] for row in rows] == ["whole"] * 4
+    assert rows[0]["identity"] == rows[2]["identity"] != rows[1]["identity"]
+    assert rows[0]["settings_sha256"] != rows[2]["settings_sha256"]
+    assert found.left_out == {}
+
+
+def test_a_row_says_what_the_manifest_says(runs: Path) -> None:
+    manifest = RunFolder(runs / "a/monday").drive_manifest()
+
+    [row] = crosscue.catalog(runs).query("from runs where run = 'a/monday'").to_pylist()
+
+    assert json.loads(row["settings"]) == manifest.settings.model_dump(mode="json")
+    assert row["rows_in"] == sum(one.entered for _, _, one in manifest.account.lines())
+    assert row["crosscue"] == manifest.versions["crosscue"]
+    assert row["logs"] == ["monday.mcap"]
+    assert "belief.parquet" in row["tables"]
+
+
+def test_settings_are_hashed_as_merge_hashes_them(runs: Path, tmp_path: Path) -> None:
+    gathered_runs, failures = gathered([runs / "a"])
+    merged = merge_runs(gathered_runs, create(tmp_path / "all", overwrite=False), failures)
+    manifest = merged.run.manifest()
+
+    rows = crosscue.catalog(runs / "a").query("select name, settings_sha256 from runs")
+
+    assert {row["name"]: row["settings_sha256"] for row in rows.to_pylist()} == {
+        one.name: one.settings_sha256 for one in getattr(manifest, "drives", ())
+    }
+
+
+def test_tables_of_the_runs_are_one_table(runs: Path) -> None:
+    found = crosscue.catalog(runs)
+
+    for table in ("belief", "cues", "range", "frames"):
+        parts = {
+            str(path.relative_to(runs)): RunFolder(path).table(table).num_rows
+            for path in found.runs
+        }
+        counted = found.query(f'select run, count(*) as n from "{table}" group by run').to_pylist()
+        assert {row["run"]: row["n"] for row in counted} == parts
+
+
+def test_an_empty_table_has_its_columns(runs: Path) -> None:
+    found = crosscue.catalog(runs)
+
+    for table in ("pose", "scores", "curves", "cue_frames", "dropped", "left_out"):
+        result = found.query(f"select * from {table}")
+        listed = found.schema().filter(_is(table)).column("column").to_pylist()
+        assert result.num_rows == 0
+        assert result.column_names == listed
+
+
+def _is(table: str) -> object:
+    import pyarrow.compute as pc
+
+    return pc.field("table") == table
+
+
+def test_approaches_are_those_of_every_run(tmp_path: Path) -> None:
+    add_run(tmp_path / "one", "one", scene=scene(seen(1, 12.5), seen(2, None)))
+    add_run(tmp_path / "two", "two", scene=None)
+
+    rows = crosscue.catalog(tmp_path).query(
+        "select run, approach, detected_range_m, probabilities['left'] as p from approaches"
+    )
+
+    assert rows.to_pylist() == [
+        {"run": "one", "approach": 1, "detected_range_m": 12.5, "p": 0.97},
+        {"run": "one", "approach": 2, "detected_range_m": None, "p": 0.97},
+    ]
+
+
+def test_what_was_dropped_is_counted_with_its_reason(tmp_path: Path) -> None:
+    lost = Line(entered=5, used=2, skipped={}, dropped={"cut": 3}, dropped_unknown=("torn",))
+    account = Account(reading=(), detecting={"front": lost}, estimating={}, is_whole=False)
+    add_run(tmp_path / "one", "one", account=account)
+
+    found = crosscue.catalog(tmp_path)
+
+    rows = found.query("select stage, stream, reason, rows from dropped order by reason")
+    assert [tuple(row.values()) for row in rows.to_pylist()] == [
+        ("detecting", "front", "cut", 3),
+        ("detecting", "front", "torn", None),
+    ]
+    [run] = found.query("select outcome, exit_status, rows_dropped from runs").to_pylist()
+    assert run == {"outcome": "losses", "exit_status": 3, "rows_dropped": 3}
+
+
+@pytest.mark.parametrize(
+    ("query", "named"),
+    [
+        ("settings->>'$.fusion.established' = '0.3'", ["b/monday", "b/tuesday"]),
+        ("name = 'monday' -- both", ["a/monday", "b/monday"]),
+        ("", ["a/monday", "a/tuesday", "b/monday", "b/tuesday"]),
+        ("select run from runs where name = 'monday' order by run desc", ["b/monday", "a/monday"]),
+        ("from belief where run = 'a/monday'", ["a/monday"]),
+        ("with x as (from runs) select run from x where false", []),
+    ],
+)
+def test_a_condition_or_a_query_selects_runs(runs: Path, query: str, named: list[str]) -> None:
+    assert crosscue.catalog(runs).select(query) == tuple(runs / name for name in named)
+
+
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("select name from runs", r"no column run in the result \(name\)"),
+        ("select 'x' as run", "column run holds 'x', which is no run of"),
+        ("vehcle = 'car'", r"no column vehcle; did you mean vehicle\?"),
+    ],
+)
+def test_a_selection_that_selects_no_runs_is_refused(runs: Path, query: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        crosscue.catalog(runs).select(query)
+
+
+def test_a_single_run_is_a_catalog(runs: Path) -> None:
+    found = crosscue.catalog(runs / "a/monday")
+
+    assert found.select("name = 'monday'") == (runs / "a/monday",)
+
+
+def test_runs_that_were_merged_count_once(tmp_path: Path) -> None:
+    run = add_run(tmp_path / "runs/one", "one")
+    merge_runs({"one": run}, create(tmp_path / "runs/merged", overwrite=False), {})
+
+    found = crosscue.catalog(tmp_path)
+
+    assert [path.name for path in found.runs] == ["one"]
+    assert found.query("select count(*) as n from belief").to_pylist() == [{"n": 50}]
+
+
+def test_what_cannot_be_read_is_left_out_and_reported(tmp_path: Path) -> None:
+    add_run(tmp_path / "good", "good")
+    manifest = add_run(tmp_path / "other", "other").file(MANIFEST)
+    manifest.write_text(manifest.read_text().replace('"format_version": 5', '"format_version": 4'))
+    add_run(tmp_path / "half", "half").file(MANIFEST).unlink()
+    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 5, "stage"')
+
+    found = crosscue.catalog(tmp_path)
+
+    assert [path.name for path in found.runs] == ["good"]
+    assert found.left_out.keys() == {"other", "half", "torn"}
+    assert "format 4, this crosscue reads 5; replay again" in found.left_out["other"]
+    assert "cut short" in found.left_out["half"]
+    assert "unreadable" in found.left_out["torn"]
+    listed = found.query("select run, reason from left_out").to_pylist()
+    assert {row["run"]: row["reason"] for row in listed} == found.left_out
+
+
+def test_a_damaged_table_costs_its_run_that_table_only(tmp_path: Path) -> None:
+    for name in ("good", "gone", "torn"):
+        add_run(tmp_path / name, name)
+    found = crosscue.catalog(tmp_path)
+    (tmp_path / "gone/belief.parquet").unlink()
+    (tmp_path / "torn/belief.parquet").write_bytes(b"PAR1")
+
+    rows = found.query("select distinct run from belief").to_pylist()
+
+    assert rows == [{"run": "good"}]
+    assert found.left_out.keys() == {"gone", "torn"}
+    assert "belief.parquet: gone" in found.left_out["gone"]
+    assert len(found.select("true")) == 3
+
+
+def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(UnreadableRunError, match="neither a run folder nor a folder of some"):
+        crosscue.catalog(tmp_path)
+    with pytest.raises(UnreadableRunError, match="no folder; give a folder of runs"):
+        crosscue.catalog(tmp_path / "gone")

@@ -1,0 +1,78 @@
+"""A few finished runs below one folder, quickly made: two drives, each with two settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.eval.runs.folder import RunFolder, write_manifest
+from crosscue.eval.runs.manifest import ApproachRow, LogRow, SceneSummary
+from crosscue.replay.files.log_identity import Identity
+from crosscue.replay.vehicle.fusion import Fusion
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .manifests import estimate_manifest
+from .scoring import run_folder
+
+ESTABLISHED: Final = {"a": 0.9, "b": 0.3}
+"""By folder of runs, the setting that they differ in."""
+
+
+def seen(number: int, detected_m: float | None) -> ApproachRow:
+    """An approach as a run saw it."""
+    return ApproachRow(
+        number=number,
+        start_ns=1_000_000_000,
+        end_ns=5_900_000_000,
+        detected_ns=None if detected_m is None else 2_000_000_000,
+        detected_m=detected_m,
+        reference="start",
+        probabilities={"intersection": 0.95, "left": 0.97},
+        not_seen=("straight",),
+    )
+
+
+def scene(*approaches: ApproachRow) -> SceneSummary:
+    """With these approaches."""
+    return SceneSummary(
+        frames=50,
+        positive={},
+        counts={},
+        without_odometry=0,
+        approaches=approaches,
+        candidates={},
+        not_looked_for={},
+        ranged={},
+    )
+
+
+def add_run(path: Path, drive: str, established: float = 0.9, **changes: Any) -> RunFolder:
+    """One run of a drive, with cues, belief and range."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    log = LogRow(
+        name=f"{drive}.mcap",
+        path=f"../../{drive}.mcap",
+        format="mcap",
+        cameras=(),
+        identity=Identity(f"{drive}.mcap", 1, drive[0].encode().hex() * 32),
+        sha256={},
+    )
+    content: dict[str, Any] = {
+        "logs": (log,),
+        "settings": Vehicle(version=1, name="car", fusion=Fusion(established=established)),
+        "scene": scene(seen(7, 30.0)),
+    }
+    return run_folder(path, **(content | changes))
+
+
+def runs_below(folder: Path) -> Path:
+    """Runs ``a/monday``, ``a/tuesday``, ``b/monday`` and ``b/tuesday`` below a folder."""
+    for name, established in ESTABLISHED.items():
+        for drive in ("monday", "tuesday"):
+            add_run(folder / name / drive, drive, established)
+    return folder
+
+
+def change(run: RunFolder, **changes: Any) -> None:
+    """Replace parts of a run's manifest."""
+    write_manifest(run, estimate_manifest(run).model_copy(update=changes))
