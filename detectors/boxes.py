@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.columns import Floats, Int64s
+
+_BLOCK: Final = 128
+"""So many boxes are compared with all others at a time; a table of all pairs could be large."""
 
 
 def overlaps(box: Floats, others: Floats) -> Floats:
@@ -32,8 +38,26 @@ def best_of(
     left = left[np.argsort(-scores[left], kind="stable")]
     kept: list[int] = []
     while len(left):
-        first, left = int(left[0]), left[1:]
-        kept.append(first)
-        is_rival = overlaps(boxes[first], boxes[left]) > max_overlap
-        left = left[~(is_rival & (groups[left] == groups[first]))]
+        block, rest = left[:_BLOCK], left[_BLOCK:]
+        rivals = _rivals(boxes, groups, block, left, max_overlap)
+        is_left = np.ones(len(left), np.bool_)
+        for i in range(len(block)):
+            if is_left[i]:
+                kept.append(int(block[i]))
+                is_left[i:] &= ~rivals[i, i:]
+        left = rest[is_left[len(block) :]]
     return np.array(kept, np.int64)
+
+
+def _rivals(
+    boxes: Floats, groups: Int64s, some: Int64s, others: Int64s, max_overlap: float
+) -> NDArray[np.bool_]:
+    """Which of the others are of each one's group and overlap it more, shape (some, others)."""
+    mine, theirs = boxes[some, None], boxes[others]
+    sides = np.minimum(mine[..., 2:], theirs[:, 2:]) - np.maximum(mine[..., :2], theirs[:, :2])
+    sides = np.maximum(sides, 0.0)
+    both = sides[..., 0] * sides[..., 1]
+    own, other = (np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes[some], theirs))
+    union = own[:, None] + other - both
+    is_over = both / np.maximum(union, 1e-12) > max_overlap
+    return np.asarray(is_over & (groups[some, None] == groups[others]))

@@ -58,6 +58,10 @@ class Input(Settings):
     shorter side to the smaller of width and height, the longer one to at most the larger, as
     torchvision's do."""
     pad: Annotated[int, Field(ge=0, le=255)] = 114
+    decode: Literal["reduced", "full"] = "reduced"
+    """Reduced: a JPEG is decoded no finer than the input needs, which averages pixels and saves
+    time. Full: at its own size and then interpolated, as most published scripts do; where the
+    picture is more than twice as wide as the input, interpolation skips most pixels."""
     layout: Literal["nchw", "nhwc", "chw"] = "nchw"
     """``chw`` has no batch axis, as torchvision exports its detectors."""
     dtype: Literal["float32", "uint8"] = "float32"

@@ -210,7 +210,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     classes = tuple(str(i) for i in range(guess.class_count))
     decoder = next(one for one in DECODERS if kind_of(one) == guess.settings["kind"])
-    output = decoder.model_validate({**guess.settings, "classes": classes})
+    output = decoder.model_validate({**guess.settings, "classes": classes, "score": 0.0})
     try:
         found = output.candidates(network(prepared(noise, given)[0]), (width, height))
     except ValueError:

@@ -31,7 +31,7 @@ class Masks(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Everything a network proposes for one picture, before thresholds, as columns of length N.
+    """What a network proposes for one picture, before thresholds, as columns of length N.
 
     Attributes:
         boxes_px: Shape (N, 4), float64: x0, y0, x1, y1 in pixels of the network's input.
@@ -111,6 +111,8 @@ class BoxOutput(Settings):
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
         """Decode the outputs for one picture of ``size_px``, the network's input.
 
+        Candidates below ``score`` may be left out.
+
         Raises:
             ValueError: The outputs do not have the shape that the card asks for.
         """
@@ -164,6 +166,7 @@ def best_class(scores: Array) -> tuple[Floats, Int64s]:
     """
     if not scores.shape[1]:
         raise ValueError("0 classes; a detector needs at least one")
+    scores = np.ascontiguousarray(scores)
     classes = scores.argmax(axis=1)
     best = np.take_along_axis(scores, classes[:, None], axis=1)[:, 0]
     return np.asarray(best, np.float64), classes.astype(np.int64)

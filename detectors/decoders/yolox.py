@@ -43,12 +43,15 @@ class YoloxOutput(BoxOutput):
                 f"expected {shape} for {len(self.classes)} classes at {size_px[0]} x {size_px[1]}, "
                 f"got {rows.shape}"
             )
-        table: Floats = np.asarray(rows[0, :, :5], np.float64)
-        corner, stride = cells(size_px, self.strides)
+        # Most cells are empty. No class score is above 1, so objectness alone rules those out.
+        is_able = ~(np.asarray(rows[0, :, 4], np.float64) < self.score)
+        able = rows[0, is_able]
+        table: Floats = np.asarray(able[:, :5], np.float64)
+        corner, stride = (cell[is_able] for cell in cells(size_px, self.strides))
         center = (table[:, :2] + corner) * stride
         # A width of e^20 cells is wider than any picture; more would overflow.
         half = np.exp(np.minimum(table[:, 2:4], 20.0)) * stride / 2.0
-        best, classes = best_class(np.asarray(rows[0, :, 5:]))
+        best, classes = best_class(able[:, 5:])
         return Candidates(np.hstack([center - half, center + half]), table[:, 4] * best, classes)
 
     @override

@@ -15,7 +15,7 @@ from crosscue.detectors.decoders.base import Array, BoxOutput, Candidates
 from crosscue.replay.base import Bytes, Floats, Int64s, VehicleError
 
 from .backends import Network
-from .picture_input import Placement, prepared
+from .picture_input import Placement, prepared, view_of
 from .tiles import Corner, corners, is_whole
 
 
@@ -45,8 +45,7 @@ class BoxModel:
 
     Attributes:
         card: How to prepare pictures.
-        output: The card's, how to read results.
-        score: Lower ones are not reported.
+        output: How to read results, with the lowest score that is reported.
         network: What runs.
         where: The card's file, for errors.
         identity: Of card, settings and back end.
@@ -54,7 +53,6 @@ class BoxModel:
 
     card: ModelCard
     output: BoxOutput
-    score: float
     network: Network
     where: str
     identity: str
@@ -82,10 +80,8 @@ class BoxModel:
 
     @property
     def view(self) -> View:
-        """No finer than the network's input; the full size for tiles, or if it scales itself."""
-        if self.card.tiles is not None or self.card.input.fit == "network":
-            return View()
-        return View(min_width_px=self.card.input.width_px)
+        """No finer than the card's input needs; the full size for tiles."""
+        return View() if self.card.tiles is not None else view_of(self.card.input)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Detect."""
@@ -130,7 +126,9 @@ class BoxModel:
         )
         if bad:
             raise ValueError(f"{bad} of {len(some)} candidates are not finite numbers")
-        keep = best_of(some.boxes_px, some.scores, some.classes, self.score, self.output.overlap)
+        keep = best_of(
+            some.boxes_px, some.scores, some.classes, self.output.score, self.output.overlap
+        )
         boxes = placement.to_picture(some.boxes_px[keep])
         if part.corner is not None:
             boxes = boxes + np.tile(part.corner, 2)
@@ -176,7 +174,7 @@ class BoxModel:
         keep = np.arange(len(scores))
         if len(some) > 1:
             overlap = min(self.output.overlap, 0.45) if self.card.tiles else self.output.overlap
-            keep = best_of(boxes, scores, classes, self.score, overlap)
+            keep = best_of(boxes, scores, classes, self.output.score, overlap)
         width, height = frame.size_px
         inside = np.clip(boxes * np.tile(frame.scale, 2), 0.0, [width, height, width, height])
         is_seen = (inside[keep, 2:] > inside[keep, :2]).all(axis=1)

@@ -23,7 +23,7 @@ from crosscue.replay.errors import VehicleError, one_line
 
 from .backends import Network, load_network
 from .box_model import BoxModel
-from .picture_input import Placement, prepared
+from .picture_input import Placement, prepared, view_of
 from .weights import Weights
 
 VERSION: Final = 2
@@ -55,10 +55,12 @@ def build(**given: Any) -> Detector:
         network = _network(card, weights, settings, 0.0)
         identity = _identity(card, settings, network)
         return _tried(RoadModel(card, card.output, network, str(path), identity), card, path)
-    score = card.output.score if settings.score is None else settings.score
-    network = _network(card, weights, settings, score)
+    output = card.output
+    if settings.score is not None:
+        output = output.model_copy(update={"score": settings.score})
+    network = _network(card, weights, settings, output.score)
     identity = _identity(card, settings, network)
-    return _tried(BoxModel(card, card.output, score, network, str(path), identity), card, path)
+    return _tried(BoxModel(card, output, network, str(path), identity), card, path)
 
 
 def _network(card: ModelCard, weights: Weights, settings: ModelSettings, score: float) -> Network:
@@ -108,8 +110,8 @@ class RoadModel:
 
     @property
     def view(self) -> View:
-        """No finer than the network's input."""
-        return View(min_width_px=self.card.input.width_px)
+        """No finer than the card's input needs."""
+        return view_of(self.card.input)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Segment."""

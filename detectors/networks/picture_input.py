@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
+from crosscue.detectors.base import View
 from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.decoders.base import Array, Size
 from crosscue.replay.columns import Bytes, Floats
-
-_AXES: Final = {"nchw": (2, 0, 1), "chw": (2, 0, 1), "nhwc": (0, 1, 2)}
-"""Of a picture's rows, columns and colours, in a network's order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +29,13 @@ class Placement:
     def to_picture(self, boxes_px: Floats) -> Floats:
         """Boxes (N, 4) in input pixels as boxes in the picture's."""
         return np.asarray((boxes_px - np.tile(self.offset, 2)) / np.tile(self.scale, 2), np.float64)
+
+
+def view_of(want: Input) -> View:
+    """How finely pictures are decoded; in full for a network that scales them itself."""
+    if want.decode == "full" or want.fit == "network":
+        return View()
+    return View(min_width_px=want.width_px)
 
 
 def place(picture: Size, want: Input) -> Placement:
@@ -59,47 +63,53 @@ def prepared(pixels: Bytes, want: Input) -> tuple[Array, Placement]:
     """A picture (H, W, 3) as a network's input with its batch axis, and where it lies there."""
     height, width = pixels.shape[:2]
     placement = place((width, height), want)
-    fitted = pixels if want.fit == "network" else _fitted(pixels, want, placement)
-    return _numbers(fitted, want)[None], placement
+    if want.fit == "network":
+        return _numbers(pixels, want, (0, 0), (width, height))[None], placement
+    left, top = (max(int(o), 0) for o in placement.offset)
+    fitted = _fitted(pixels, want, placement)
+    return _numbers(fitted, want, (left, top), placement.size_px)[None], placement
 
 
 def _fitted(pixels: Bytes, want: Input, placement: Placement) -> Bytes:
-    """The picture in an input of the wanted size."""
+    """The picture at the size that it has in the input."""
     import cv2
 
     height, width = pixels.shape[:2]
-    whole_size = (want.width_px, want.height_px)
+    size = (want.width_px, want.height_px)
     if want.fit == "crop":
         x, y = (round(-o / s) for o, s in zip(placement.offset, placement.scale, strict=True))
         pixels = pixels[y : height - y or None, x : width - x or None]
-    size = whole_size if want.fit in ("crop", "stretch") else _inside((width, height), want)
-    scaled = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-    if size == whole_size:
-        return scaled
-    left, top = (int(o) for o in placement.offset)
-    right, bottom = (w - s - o for w, s, o in zip(whole_size, size, (left, top), strict=True))
-    border = (want.pad,) * 3
-    return np.asarray(
-        cv2.copyMakeBorder(scaled, top, bottom, left, right, cv2.BORDER_CONSTANT, value=border),
-        np.uint8,
-    )
+    elif want.fit != "stretch":
+        size = _inside((width, height), want)
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-def _numbers(pixels: Bytes, want: Input) -> Array:
-    """Pixels in the network's order, type and scale."""
+def _numbers(pixels: Bytes, want: Input, corner: Size, size_px: Size) -> Array:
+    """Pixels in the network's order, type and scale, the pad's value around them.
+
+    Args:
+        pixels: Shape (h, w, 3), blue, green, red.
+        want: The network's input.
+        corner: Left and top of the pixels in the input.
+        size_px: Width and height of the input.
+    """
     import cv2
 
-    is_turned = want.colour == "rgb"
-    if want.dtype == "uint8":
-        turned = pixels[:, :, ::-1] if is_turned else pixels
-        return np.ascontiguousarray(turned.transpose(_AXES[want.layout]))
-    mean, scale = np.array(want.mean, np.float32), np.array(want.scale, np.float32)
-    # A byte has 256 values: their numbers are looked up, a colour at a time.
-    table = (np.arange(256, dtype=np.float32)[:, None] - mean) * scale
+    (left, top), (height, width) = corner, pixels.shape[:2]
+    numbers = np.empty((3, size_px[1], size_px[0]), want.dtype)
     planes = cv2.split(pixels)
-    numbers = np.empty((3, *pixels.shape[:2]), np.float32)
-    for i, plane in enumerate(reversed(planes) if is_turned else planes):
-        cv2.LUT(plane, table[:, i], numbers[i])
+    for i, plane in enumerate(reversed(planes) if want.colour == "rgb" else planes):
+        around = numbers[i]
+        inside = around[top : top + height, left : left + width]
+        if inside.shape != around.shape:
+            around[:] = want.pad
+        inside[:] = plane
+        if want.dtype == "float32":
+            # The types of NumPy's scalars keep a plane from being converted twice.
+            if want.mean[i]:
+                around -= np.float32(want.mean[i])
+            if want.scale[i] != 1.0:
+                around *= np.float32(want.scale[i])
     return numbers if want.layout != "nhwc" else np.ascontiguousarray(numbers.transpose(1, 2, 0))
 
 

@@ -11,7 +11,9 @@ import pytest
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Frame
+from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.networks.model_detector import build
+from crosscue.detectors.networks.picture_input import prepared
 from crosscue.replay.base import VehicleError
 from support.data import shared
 from support.detecting import yolox_card
@@ -68,6 +70,30 @@ def test_a_batch_gives_what_single_pictures_give(tmp_path: Path) -> None:
         found.append([one.boxes_px for one in only(build(card=str(path)), *frames)])
 
     np.testing.assert_array_equal(found[0], found[1])
+
+
+@pytest.mark.parametrize(("decode", "width_px"), [("reduced", 128), ("full", None)])
+def test_the_card_says_how_finely_pictures_are_decoded(
+    tmp_path: Path, decode: str, width_px: int | None
+) -> None:
+    given = f'width_px = 128\nheight_px = 64\ndecode = "{decode}"'
+    detector = build(card=str(card(tmp_path, bright_box_model(), BRIGHT, input=given)))
+
+    assert detector.view.min_width_px == width_px
+
+
+def test_the_network_gets_scaled_pixels_with_the_pad_around_them() -> None:
+    pixels = np.random.default_rng(3).integers(0, 256, (20, 40, 3), np.uint8)
+    want = Input(
+        width_px=40, height_px=30, fit="letterbox-center", pad=7, colour="rgb",
+        mean=(1.0, 2.0, 3.0), scale=(0.5, 0.25, 2.0),
+    )  # fmt: skip
+
+    (numbers,), _ = prepared(pixels, want)
+
+    around = np.pad(pixels[:, :, ::-1], ((5, 5), (0, 0), (0, 0)), constant_values=7)
+    expected = (around.astype(np.float32) - [1.0, 2.0, 3.0]) * [0.5, 0.25, 2.0]
+    np.testing.assert_array_equal(numbers, expected.transpose(2, 0, 1))
 
 
 def test_tiles_find_what_the_whole_picture_loses(tmp_path: Path) -> None:

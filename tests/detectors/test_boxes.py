@@ -1,0 +1,21 @@
+"""Suppression of double boxes."""
+
+import numpy as np
+
+from crosscue.detectors.boxes import best_of, overlaps
+
+
+def test_the_best_box_of_each_heap_stays() -> None:
+    rng = np.random.default_rng(5)
+    corners = rng.uniform(0.0, 60.0, (700, 2))
+    boxes = np.hstack([corners, corners + rng.uniform(5.0, 30.0, (700, 2))])
+    scores, groups = rng.uniform(0.0, 1.0, 700), rng.integers(0, 3, 700)
+
+    expected: list[int] = []
+    for i in np.argsort(-scores):
+        rivals = [k for k in expected if groups[k] == groups[i]]
+        if scores[i] >= 0.2 and not (overlaps(boxes[i], boxes[rivals]) > 0.45).any():
+            expected.append(int(i))
+
+    assert best_of(boxes, scores, groups, 0.2, 0.45).tolist() == expected
+    assert not len(best_of(boxes, scores, groups, 2.0, 0.45))
