@@ -48,6 +48,9 @@ _EXPORTS: Final = {
     "catalog": "eval.catalog.query.catalog",
     "Catalog": "eval.catalog.query.catalog",
     "save_recording": "eval.interface.runs.recording",
+    "failures": "eval.interface.failures.failures",
+    "Failures": "eval.interface.failures.failures",
+    "Failure": "eval.failures.record",
     "load_vehicle": "eval.interface.runs.run",
     "demo": "eval.interface.demo",
     "Demo": "eval.interface.demo",
@@ -200,6 +203,7 @@ if TYPE_CHECKING:
     from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
     from crosscue.eval.catalog.query.catalog import Catalog as Catalog
     from crosscue.eval.catalog.query.catalog import catalog as catalog
+    from crosscue.eval.failures.record import Failure as Failure
     from crosscue.eval.fit.signs.threshold import SignFit as SignFit
     from crosscue.eval.fit.signs.threshold import fit_signs as fit_signs
     from crosscue.eval.fit.truth_check import ImportedTruth as ImportedTruth
@@ -210,6 +214,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.demo import KnownDrive as KnownDrive
     from crosscue.eval.interface.demo import demo as demo
     from crosscue.eval.interface.demo import fetch_drive as fetch_drive
+    from crosscue.eval.interface.failures.failures import Failures as Failures
+    from crosscue.eval.interface.failures.failures import failures as failures
     from crosscue.eval.interface.fits.compass import FittedCompass as FittedCompass
     from crosscue.eval.interface.fits.compass import fit_compass as fit_compass
     from crosscue.eval.interface.fits.detector import FittedDetector as FittedDetector

@@ -46,6 +46,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "compare": ("runs.compare", "compare two runs, with tolerances"),
     "merge": ("runs.merge", "merge the runs of several batches into one folder of tables"),
     "view": ("runs.view", "show a run in Rerun"),
+    "failures": ("failures.find", "list what went wrong in runs, worst first, by cause"),
     "model list": ("model.list", "list the networks of the catalog"),
     "model show": ("model.show", "show what a network is, its classes and its measurements"),
     "model fetch": ("model.fetch", "fetch the weights of a network of the catalog"),

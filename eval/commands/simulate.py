@@ -27,7 +27,10 @@ PUBLISHED_RUNS = 10
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument(
-        "layouts", nargs="*", metavar="LAYOUT", help="layouts: A to H, or L0, L1, ... and M0, M1, ..."
+        "layouts",
+        nargs="*",
+        metavar="LAYOUT",
+        help="layouts: A to H, or L0, L1, ... and M0, M1, ...",
     )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder per drive"

@@ -12,12 +12,10 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import Gap, broken_at
-from crosscue.eval.scoring.columns import NONE
 from crosscue.eval.scoring.scene.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.scene.belief import BeliefScore
-from crosscue.eval.scoring.scene.cues import CueFrames
+from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
 from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore
-from crosscue.replay.vehicle.cue_table import CUES
 
 from .svg_plot import Drawing, Panel
 
@@ -246,15 +244,6 @@ class WorstFrame:
     frames: int
     picture: str = ""
     size_px: tuple[int, int] = (0, 0)
-
-
-def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
-    """Rows in which the cue was found and, in the reading that leads its score, is not so."""
-    readings = [cue.is_object, cue.is_feature]
-    if cue.cue in CUES and CUES[cue.cue].scored_as == "feature":
-        readings.reverse()
-    leading = next((one for one in readings if (one != NONE).any()), readings[0])
-    return np.asarray((cue.count > 0) & (leading == 0))
 
 
 WIDEST_BIN_M: Final = 20.0

@@ -17,11 +17,11 @@ from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import camera_of, picture_at
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.eval.scoring.scene.cues import CueFrames
+from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.vehicle import CUES, Vehicle
 
-from .scene_figures import WorstFrame, is_wrong
+from .scene_figures import WorstFrame
 
 MOST: Final = 6
 APART_NS: Final = 2_000_000_000

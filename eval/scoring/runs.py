@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
 from .truth import DriveTruth
 
-if TYPE_CHECKING:
-    pass
-
 TABLES: Final = ("frames", "cues", "range", "belief")
 """Of a run, that are scored."""
 SLACK_NS: Final = 1_000_000_000
@@ -69,6 +66,13 @@ class RunScored:
     pose: PoseScore | None
     poses: ScoredPoses | None
     why_no_pose: str
+
+
+class SceneJudged(NamedTuple):
+    """A run laid beside its truth, but for the pose."""
+
+    truth: DriveTruth
+    judged: DriveJudged
 
 
 def find_truth(run: RunFolder, given: Path | None) -> Path:
@@ -121,13 +125,7 @@ def judge_run(
         RunError: A table is damaged, or it holds many drives merged.
         SchemaError: The truth does not fit the run, or there is nothing to score.
     """
-    run.drive_manifest()
-    truth = score_truth.load(truth_path, str(run.path))
-    if not any_log:
-        _check_log(run, truth.truth, truth_path)
-    tables = _tables_of(run)
-    _check_times(run, truth.truth, tables, truth_path)
-    judged = judge(tables, truth, settings)
+    truth, judged = judge_scene(run, truth_path, settings, any_log=any_log)
     why = _why_no_pose(run, truth.truth)
     pose, poses = (None, None) if why else score_pose.measure(run, truth_path, rpe_m)
     nothing = judged.coverage.not_scored
@@ -137,7 +135,29 @@ def judge_run(
     return RunScored(run, truth_path, truth, judged, pose, poses, why)
 
 
-def _tables_of(run: RunFolder) -> RunTables:
+def judge_scene(
+    run: RunFolder,
+    truth_path: Path,
+    settings: ScoreSettings = DEFAULTS,
+    *,
+    any_log: bool = False,
+) -> SceneJudged:
+    """Lay everything but the pose of a run beside its truth; nothing is written.
+
+    Raises:
+        RunError: A table is damaged, or it holds many drives merged.
+        SchemaError: The truth does not fit the run.
+    """
+    run.drive_manifest()
+    truth = score_truth.load(truth_path, str(run.path))
+    if not any_log:
+        _check_log(run, truth.truth, truth_path)
+    tables = tables_of(run)
+    _check_times(run, truth.truth, tables, truth_path)
+    return SceneJudged(truth, judge(tables, truth, settings))
+
+
+def tables_of(run: RunFolder) -> RunTables:
     """Read a run's tables; one that is not there becomes None.
 
     Raises:

@@ -34,6 +34,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "fit detector": ("runs/a --labels road/coco.json", 1),
     "compare": ("runs/a runs/a", 0),
     "merge": ("runs -o merged", 0),
+    "failures": ("runs/a --truth TRUTH -o worst.parquet", 0),
     "truth check": ("TRUTH --log LOG", 0),
     "truth schema": ("", 0),
     "run schema": ("", 0),

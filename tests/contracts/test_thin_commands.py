@@ -45,6 +45,7 @@ CALLS: Final = {
         "open_run",
         "save_recording",
     ),
+    "failures": ("failures",),
     "plugins": ("plugins",),
     "info": ("open",),
     "landmarks add": (

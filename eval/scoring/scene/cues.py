@@ -257,6 +257,15 @@ def _reasons(
     return first_reasons(np.ones(len(has_truth), np.bool_), reasons)[1]
 
 
+def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
+    """Rows in which the cue was found and, in the reading that leads its score, is not so."""
+    readings = [cue.is_object, cue.is_feature]
+    if cue.cue in CUES and CUES[cue.cue].scored_as == "feature":
+        readings.reverse()
+    leading = next((one for one in readings if (one != NONE).any()), readings[0])
+    return np.asarray((cue.count > 0) & (leading == 0))
+
+
 @dataclass(slots=True)
 class _Pooled:
     """One cue's rows of all drives, with a number for each approach of each drive."""

@@ -89,6 +89,11 @@ class RangeScore:
     by_control: dict[str, RangeBin]
 
 
+def sds_off(judged: RangeJudged) -> NDArray[np.float64]:
+    """Errors in standard deviations, without sign, shape (N,)."""
+    return np.asarray(np.abs(judged.error_m) / np.sqrt(judged.var_m2), np.float64)
+
+
 def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
     """Lay the run's ranges beside the true ones; nothing without either."""
     if tables.ranges is None or truth.ranges is None:

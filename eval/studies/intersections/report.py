@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.eval.batch.jobs import Done
+from crosscue.eval.failures.causes import Finding, by_cause, findings
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
@@ -19,7 +20,7 @@ from crosscue.eval.scoring.runs import metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.replay.base import strict_json, versions, write_text
 
-from .causes import Finding, by_cause, condition_costs, findings
+from .conditions import condition_costs
 from .contact_sheet import write_sheet
 from .figures import draw_beliefs, draw_distances, draw_reliability
 from .settings import IntersectionStudy

@@ -8,14 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from crosscue.eval.failures.causes import Finding, approach_findings, by_cause
 from crosscue.eval.scoring.scene.approaches import ApproachResult
 from crosscue.eval.scoring.scene.cues import CueFrames
-from crosscue.eval.studies.intersections.causes import (
-    Finding,
-    approach_findings,
-    by_cause,
-    condition_costs,
-)
+from crosscue.eval.studies.intersections.conditions import condition_costs
 
 FRAMES = 40
 DISTANCE_M = np.linspace(90.0, 0.0, FRAMES)

@@ -9,7 +9,8 @@ from typing import Final
 
 import pytest
 
-from crosscue.eval.studies.intersections.causes import ConditionCost, Finding
+from crosscue.eval.failures.causes import Finding
+from crosscue.eval.studies.intersections.conditions import ConditionCost
 
 PAGE: Final = Path(__file__).parents[3] / "eval" / "report" / "templates" / "intersections.html.j2"
 

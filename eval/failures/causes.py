@@ -8,7 +8,6 @@ drive are reported beside the cause, since the source names its own by them.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.drives import DriveJudged
-from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.scene.approaches import NEAR_M, ApproachResult
 from crosscue.eval.scoring.scene.cues import SEEN, CueFrames
 from crosscue.replay.vehicle.cue_table import CUES
@@ -64,6 +62,7 @@ class Finding:
 
     Attributes:
         drive: Name.
+        approach: Its id in the truth.
         intersection: Its name.
         conditions: Tags that are not good weather.
         feature: Which.
@@ -75,6 +74,7 @@ class Finding:
     """
 
     drive: str
+    approach: int
     intersection: str
     conditions: tuple[str, ...]
     feature: str
@@ -83,83 +83,6 @@ class Finding:
     cause: Cause
     reported: str
     cues: tuple[CueEvidence, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ConditionCost:
-    """What a condition cost, against runs at the same intersections in good conditions.
-
-    Attributes:
-        condition: Tag.
-        approaches: With it, at intersections that were also approached in good conditions.
-        detected_m: How much further away it was detected; negative is later.
-        full_m: The same for the full intersection.
-        undetected: Approaches with the tag that were never detected, though good ones were.
-        not_full: The same for the full intersection.
-    """
-
-    condition: str
-    approaches: int
-    detected_m: Mean
-    full_m: Mean
-    undetected: int
-    not_full: int
-
-
-def condition_costs(results: Sequence[ApproachResult]) -> tuple[ConditionCost, ...]:
-    """Every bad condition against good ones at the same intersection.
-
-    What always holds at an intersection (its vegetation) has nothing to be compared with and is
-    left out of the tags that separate good from bad.
-    """
-    always = _always(results)
-    tags = sorted({tag for one in results for tag in one.conditions} - GOOD)
-    return tuple(
-        _cost(tag, results, always)
-        for tag in tags
-        if any(tag in _changing(one, always) for one in results)
-    )
-
-
-def _always(results: Sequence[ApproachResult]) -> dict[str, frozenset[str]]:
-    shared: dict[str, frozenset[str]] = {}
-    for one in results:
-        tags = frozenset(one.conditions)
-        shared[one.intersection] = shared.get(one.intersection, tags) & tags
-    return shared
-
-
-def _changing(one: ApproachResult, always: Mapping[str, frozenset[str]]) -> set[str]:
-    return set(one.conditions) - GOOD - always[one.intersection]
-
-
-def _cost(
-    tag: str, results: Sequence[ApproachResult], always: Mapping[str, frozenset[str]]
-) -> ConditionCost:
-    good: dict[str, list[ApproachResult]] = {}
-    for one in results:
-        if not _changing(one, always):
-            good.setdefault(one.intersection, []).append(one)
-    bad = [one for one in results if tag in _changing(one, always) and one.intersection in good]
-    pairs = [(one, good[one.intersection]) for one in bad]
-    detected = [_less(one.detected_m, [g.detected_m for g in some]) for one, some in pairs]
-    full = [_less(one.full_m, [g.full_m for g in some]) for one, some in pairs]
-    return ConditionCost(
-        tag,
-        len(bad),
-        mean(np.array(detected), np.arange(len(bad))),
-        mean(np.array(full), np.arange(len(bad))),
-        sum(
-            one.detected_m is None and any(g.detected_m is not None for g in some)
-            for one, some in pairs
-        ),
-        sum(one.full_m is None and any(g.full_m is not None for g in some) for one, some in pairs),
-    )
-
-
-def _less(value: float | None, others: Sequence[float | None]) -> float:
-    known = [one for one in others if one is not None]
-    return math.nan if value is None or not known else value - sum(known) / len(known)
 
 
 def findings(drives: Sequence[DriveJudged]) -> tuple[Finding, ...]:
@@ -231,6 +154,7 @@ def _absent(
     cause, reported = _cause(result, feature, for_it, against)
     return Finding(
         drive=result.drive,
+        approach=result.approach,
         intersection=result.intersection,
         conditions=_bad(result),
         feature=feature,
@@ -273,6 +197,7 @@ def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEviden
     reported = ", ".join(f"{_name(one.cue)} in {one.found} of {one.frames}" for one in loud)
     return Finding(
         drive=result.drive,
+        approach=result.approach,
         intersection=result.intersection,
         conditions=_bad(result),
         feature=feature,

@@ -1,0 +1,1 @@
+"""Commands about what went wrong in runs."""

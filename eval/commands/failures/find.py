@@ -1,0 +1,75 @@
+"""List what went wrong in runs, worst first: by kind, by what it is about, by cause.
+
+Five kinds: a feature or cue that is there and was missed; a feature believed only within 8 m of the
+intersection (late); one believed or found that is not there (false); a range outside its own 95 %
+interval; a belief that was decided and then flipped. Without truth only the last is known.
+Severity is in bits; docs/howto/failures.md says how it is computed. --top picks the worst of every
+cause and run before a second of any.
+
+examples:
+  crosscue failures runs
+  crosscue failures runs --top 20 -o worst.parquet
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.terminal import print_result, progress_line, refuse_existing
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="T.json",
+        help="truth of all runs (default: truth.json beside each run's log)",
+    )
+    parser.add_argument(
+        "--any-log",
+        action="store_true",
+        help="accept truth made for another file of the same drive, such as a converted log",
+    )
+    parser.add_argument(
+        "--top",
+        type=int,
+        metavar="N",
+        help="only N failures, of as many causes and runs as possible (default: all)",
+    )
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        default=0.9,
+        metavar="P",
+        help="a feature is believed above this probability (default: 0.9)",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="TABLE", help="table to write: .parquet or .json"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing table")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of runs in parallel"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Find and print; 3 when a run could not be examined."""
+    refuse_existing(args)
+    with progress_line(args, "examining") as line:
+        found = crosscue.failures(
+            args.runs,
+            truth=args.truth,
+            output=args.output,
+            top=args.top,
+            threshold=args.threshold,
+            any_log=args.any_log,
+            workers=args.workers,
+            on_runs=line.counting("runs"),
+        )
+    print_result(found, args)
+    return 3 if found.failed else 0

@@ -1,0 +1,197 @@
+"""What went wrong over a whole approach: features missed, late or invented, and beliefs flipped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.columns import BeliefRows
+from crosscue.eval.scoring.scene.approaches import NEAR_M, ApproachesJudged, Curve, run_spans
+from crosscue.eval.scoring.scene.cues import CueFrames
+from crosscue.replay.vehicle.cue_table import CUES
+
+from .causes import Finding, approach_findings
+from .record import About, Failure, Kind
+
+SURE: Final = 1e-6
+"""No probability counts as surer than this: 20 bits."""
+EVEN: Final = 0.5
+AGAINST: Final = "a cue speaks against it"
+NOTHING: Final = "no cue speaks against it"
+
+
+def bits(probability: float) -> float:
+    """How surprised a belief is when what it calls so probable happens."""
+    return -math.log2(min(max(probability, SURE), 1.0))
+
+
+def of_approaches(
+    judged: ApproachesJudged,
+    cues: Sequence[CueFrames],
+    abouts: Mapping[int, About],
+    threshold: float,
+) -> Iterator[Failure]:
+    """Failures of all approaches of a drive beside its truth.
+
+    Args:
+        judged: The approaches.
+        cues: Of the same drive.
+        abouts: By id.
+        threshold: A feature is believed above it.
+    """
+    curves = {one.approach: one for one in judged.curves}
+    positives = {one.cue: one.t_ns[one.count > 0] for one in cues}
+    for result in judged.results:
+        about, curve = abouts[result.approach], curves.get(result.approach)
+        for found in approach_findings(result, cues):
+            yield from_finding(found, curve, about, threshold)
+        if curve is not None:
+            yield from flips(curve, positives, about, threshold)
+
+
+def flips_without_truth(
+    belief: BeliefRows, positives: Mapping[str, NDArray[np.int64]], run: str, threshold: float
+) -> list[Failure]:
+    """Flipped beliefs in a run's own approaches.
+
+    Args:
+        belief: Of the run.
+        positives: From cue to the times at which it was positive.
+        run: Its folder.
+        threshold: An answer counts as decided above it.
+    """
+    found: list[Failure] = []
+    for number, (first, last) in sorted(run_spans(belief).items()):
+        rows = np.flatnonzero(belief.approach == number)
+        rows = rows[np.argsort(belief.t_ns[rows], kind="stable")]
+        features = {name: values[rows] for name, values in belief.features.items()}
+        unknown = np.full(len(rows), np.nan)
+        curve = Curve(run, number, "", belief.t_ns[rows], unknown, features)
+        found += flips(curve, positives, About(run, number, "", (), first, last), threshold)
+    return found
+
+
+def from_finding(found: Finding, curve: Curve | None, about: About, threshold: float) -> Failure:
+    """A feature that was missed, late or invented, at the moment that shows it best."""
+    kinds: Mapping[str, Kind] = {"missing": "missed", "late": "late", "invented": "false"}
+    kind = kinds[found.failing]
+    values = None if curve is None else curve.features.get(found.feature)
+    if curve is None or values is None:
+        # Nothing was said of it: even odds.
+        return _failure(about, kind, found.feature, (found.cause, found.reported), severity=1.0)
+    if kind == "false":
+        row = int(values.argmax())
+        rows = np.flatnonzero(values > threshold)
+        severity = bits(1.0 - float(values[row]))
+    else:
+        # What was believed when it had to be.
+        far = np.flatnonzero(~(curve.distance_m < NEAR_M))
+        row = int(far[-1]) if len(far) else 0
+        rows = np.flatnonzero(values <= threshold)
+        severity = bits(float(values[row]))
+    return _failure(
+        about,
+        kind,
+        found.feature,
+        (found.cause, found.reported),
+        severity=severity,
+        at=(int(curve.t_ns[row]), float(curve.distance_m[row])),
+        frames=len(rows),
+    )
+
+
+def flips(
+    curve: Curve, positives: Mapping[str, NDArray[np.int64]], about: About, threshold: float
+) -> Iterator[Failure]:
+    """Beliefs that had passed the threshold for one answer and then went over to the other.
+
+    Args:
+        curve: Of an approach.
+        positives: From cue to the times at which it was positive.
+        about: The approach.
+        threshold: An answer counts as decided above it; what no evidence has moved is undecided.
+    """
+    for name, values in curve.features.items():
+        for decided, row, is_yes in _crossings(values, threshold):
+            later = values[row:] if is_yes else 1.0 - values[row:]
+            loud = _against(name, is_yes, positives, int(curve.t_ns[decided]), int(curve.t_ns[row]))
+            words = "there" if is_yes else "not there", "not there" if is_yes else "there"
+            swing = f"{words[0]} ({values[decided]:.2f}), then {words[1]} ({values[row]:.2f})"
+            said = ", ".join(f"{cue.replace('_', ' ')} in {count}" for cue, count in loud)
+            yield _failure(
+                about,
+                "flipped",
+                name,
+                (AGAINST, f"{swing}; {said} frames") if loud else (NOTHING, swing),
+                severity=bits(float(later.min())),
+                at=(int(curve.t_ns[row]), float(curve.distance_m[row])),
+                span_ns=(int(curve.t_ns[decided]), int(curve.t_ns[row])),
+                frames=row - decided + 1,
+            )
+
+
+def _crossings(values: NDArray[np.float64], threshold: float) -> Iterator[tuple[int, int, bool]]:
+    """Last row of a decision, the row in which it is given up, and whether it was a yes."""
+    decided: tuple[int, bool] | None = None
+    for row, value in enumerate(values.tolist()):
+        if value == values[0]:
+            continue
+        if decided is not None and (value < EVEN) == decided[1] and value != EVEN:
+            yield decided[0], row, decided[1]
+            decided = None
+        if value > threshold or value < 1.0 - threshold:
+            decided = row, value > threshold
+
+
+def _against(
+    feature: str,
+    is_yes: bool,
+    positives: Mapping[str, NDArray[np.int64]],
+    after_ns: int,
+    until_ns: int,
+) -> Sequence[tuple[str, int]]:
+    """Cues that claim the opposite in a span, with the number of frames."""
+    found = []
+    for cue, times in positives.items():
+        if cue in CUES and CUES[cue].claim == (feature, not is_yes):
+            count = int(((times > after_ns) & (times <= until_ns)).sum())
+            if count:
+                found.append((cue, count))
+    return sorted(found, key=lambda pair: (-pair[1], pair[0]))
+
+
+def _failure(
+    about: About,
+    kind: Kind,
+    what: str,
+    why: tuple[str, str],
+    *,
+    severity: float,
+    at: tuple[int, float] | None = None,
+    span_ns: tuple[int, int] | None = None,
+    frames: int = 0,
+) -> Failure:
+    t_ns, distance_m = (about.end_ns, math.nan) if at is None else at
+    start_ns, end_ns = (about.start_ns, about.end_ns) if span_ns is None else span_ns
+    return Failure(
+        run=about.run,
+        kind=kind,
+        level="approach",
+        what=what,
+        cause=why[0],
+        reported=why[1],
+        t_ns=t_ns,
+        at_s=0.0,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        frames=frames,
+        approach=about.approach,
+        intersection=about.intersection,
+        conditions=about.conditions,
+        distance_m=distance_m if math.isfinite(distance_m) else None,
+        severity=severity,
+    )

@@ -1,0 +1,185 @@
+"""What went wrong in consecutive frames: cues missed or found wrongly, ranges outside intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.scene.cues import SEEN, CueFrames, is_wrong
+from crosscue.eval.scoring.scene.ranges import RangeJudged, sds_off
+
+from .record import About, Failure, Kind
+
+APART_NS: Final = 2_000_000_000
+"""Failures of one cue closer than this are one."""
+NARROW: Final = 0.1
+"""An error below this fraction of the range is laid to the interval, a larger one to the range."""
+MOSTLY: Final = 0.5
+SDS_95: Final = 1.959964
+
+Detected = Mapping[int, Sequence[Mapping[str, Any]]]
+"""From a frame's time to rows of ``detections.parquet``."""
+
+
+def missed_and_false(
+    cue: CueFrames,
+    others: Sequence[CueFrames],
+    labels: Sequence[str],
+    least: float | None,
+    detected: Detected,
+    about: Mapping[int, About],
+    run: str,
+) -> Iterator[Failure]:
+    """One cue's misses of what can be seen, and its positives where nothing is.
+
+    Args:
+        cue: In all frames of a drive.
+        others: All cues of the drive.
+        labels: Of the detections that it is made of; none for road and Mobileye.
+        least: Score that they need; None for any.
+        detected: What detectors found at the times of failures.
+        about: Approaches by id.
+        run: The run's folder.
+    """
+    is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
+    for rows in _episodes(cue.t_ns, np.flatnonzero(is_missed), cue.approach):
+        why = _why_missed(cue, rows, labels, least, detected)
+        # The nearest frame: there it should have been easiest.
+        yield _failure("missed", cue.cue, why, cue, rows, int(rows[-1]), about, run)
+    for rows in _episodes(cue.t_ns, np.flatnonzero(is_wrong(cue)), cue.approach):
+        sure = [_highest(detected.get(int(cue.t_ns[i]), ()), labels) for i in rows]
+        row = int(rows[int(np.argmax(sure))])
+        why = _why_false(cue, rows, others, max(sure))
+        yield _failure("false", cue.cue, why, cue, rows, row, about, run)
+
+
+def failing_times(cues: Sequence[CueFrames]) -> NDArray[np.int64]:
+    """Frames in which a cue was missed or wrongly found: those whose detections are needed."""
+    wanted = [np.empty(0, np.int64)]
+    for cue in cues:
+        is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
+        wanted.append(cue.t_ns[is_missed | is_wrong(cue)])
+    return np.unique(np.concatenate(wanted))
+
+
+def wrong_ranges(
+    judged: Sequence[RangeJudged], about: Mapping[int, About], run: str
+) -> Iterator[Failure]:
+    """Ranges that leave their own 95 % interval around the true one."""
+    for one in judged:
+        off = sds_off(one)
+        for rows in _episodes(one.t_ns, np.flatnonzero(off > SDS_95), one.approach):
+            row = int(rows[int(off[rows].argmax())])
+            error_m, true_m = float(one.error_m[row]), float(one.true_m[row])
+            cause = "too far" if error_m > 0.0 else "too near"
+            if abs(error_m) < NARROW * abs(true_m):
+                cause = "interval too narrow"
+            text = f"{error_m:+.1f} m at {true_m:.1f} m, s.d. {math.sqrt(one.var_m2[row]):.1f} m"
+            where = about.get(int(one.approach[row]))
+            yield Failure(
+                run=run,
+                kind="range",
+                level="frames",
+                what=f"range to {one.reference}",
+                cause=cause,
+                reported=text,
+                t_ns=int(one.t_ns[row]),
+                at_s=0.0,
+                start_ns=int(one.t_ns[rows[0]]),
+                end_ns=int(one.t_ns[rows[-1]]),
+                frames=len(rows),
+                approach=None if where is None else where.approach,
+                intersection="" if where is None else where.intersection,
+                conditions=() if where is None else where.conditions,
+                distance_m=true_m,
+                severity=float(off[row]) ** 2 / (2.0 * math.log(2.0)),
+            )
+
+
+def _episodes(
+    t_ns: NDArray[np.int64], rows: NDArray[np.intp], approach: NDArray[np.int64]
+) -> list[NDArray[np.intp]]:
+    """Rows close in time and of one approach, together."""
+    breaks = (np.diff(t_ns[rows]) > APART_NS) | (np.diff(approach[rows]) != 0)
+    return [part for part in np.split(rows, np.flatnonzero(breaks) + 1) if len(part)]
+
+
+def _why_missed(
+    cue: CueFrames,
+    rows: NDArray[np.intp],
+    labels: Sequence[str],
+    least: float | None,
+    detected: Detected,
+) -> tuple[str, str]:
+    if not labels:
+        return "not found", f"there in {len(rows)} frames"
+    scores = [_highest(detected.get(int(cue.t_ns[i]), ()), labels) for i in rows]
+    found = [score for score in scores if score >= 0.0]
+    names = ", ".join(labels[:3])
+    if not found:
+        return "not detected", f"no {names} detected in {len(rows)} frames"
+    text = f"{names} detected in {len(found)} of {len(rows)} frames, at most {max(found):.2f}"
+    if least is not None and max(found) < least:
+        return "score too low", f"{text}; {least:g} is needed"
+    return "detected, but ruled out", text
+
+
+def _why_false(
+    cue: CueFrames,
+    rows: NDArray[np.intp],
+    others: Sequence[CueFrames],
+    surest: float,
+) -> tuple[str, str]:
+    sure = "" if surest < 0.0 else f", score up to {surest:.2f}"
+    text = f"found in {len(rows)} frames{sure}"
+    times = cue.t_ns[rows]
+    best, name = 0, ""
+    for other in others:
+        mine = np.isin(other.t_ns, times) & (other.is_object == 1) & (other.count == 0)
+        if other.cue != cue.cue and int(mine.sum()) > best:
+            best, name = int(mine.sum()), other.cue
+    if best >= MOSTLY * len(rows):
+        words = name.replace("_", " ")
+        return "another cue is there", f"{text}; {words} is there in {best} and was not found"
+    return "nothing is there", text
+
+
+def _highest(rows: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> float:
+    """The best score of these labels; -1 without any."""
+    return max((float(row["score"]) for row in rows if row["label"] in labels), default=-1.0)
+
+
+def _failure(
+    kind: Kind,
+    what: str,
+    why: tuple[str, str],
+    cue: CueFrames,
+    rows: NDArray[np.intp],
+    row: int,
+    about: Mapping[int, About],
+    run: str,
+) -> Failure:
+    where = about.get(int(cue.approach[row]))
+    distance_m = float(cue.distance_m[row])
+    return Failure(
+        run=run,
+        kind=kind,
+        level="frames",
+        what=what,
+        cause=why[0],
+        reported=why[1],
+        t_ns=int(cue.t_ns[row]),
+        at_s=0.0,
+        start_ns=int(cue.t_ns[rows[0]]),
+        end_ns=int(cue.t_ns[rows[-1]]),
+        frames=len(rows),
+        approach=None if where is None else where.approach,
+        intersection="" if where is None else where.intersection,
+        conditions=() if where is None else where.conditions,
+        distance_m=distance_m if math.isfinite(distance_m) else None,
+        severity=math.log2(1 + len(rows)),
+    )

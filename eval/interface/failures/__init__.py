@@ -1,0 +1,1 @@
+"""Failures of runs: found, browsed, exported for labelling."""
