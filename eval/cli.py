@@ -45,6 +45,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "compare": ("runs.compare", "compare two runs, with tolerances"),
     "merge": ("runs.merge", "merge the runs of several batches into one folder of tables"),
+    "query": ("runs.query", "ask all runs below a folder with SQL"),
     "view": ("runs.view", "show a run in Rerun"),
     "failures": ("failures.find", "list what went wrong in runs, worst first, by cause"),
     "model list": ("model.list", "list the networks of the catalog"),

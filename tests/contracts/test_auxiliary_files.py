@@ -60,6 +60,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("compare", "RUN_A"): ("{gone} {run}", INPUT),
     ("compare", "RUN_B"): ("{run} {gone}", INPUT),
     ("merge", "RUNS"): ("{gone} -o {out}", INPUT),
+    ("query", "RUNS"): ("{gone} --schema", INPUT),
     ("fit messages", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
     ("fit signs", "LABELS"): ("{gone}.csv --label stop", INPUT),
     ("fit ranges", "TABLE"): ("{gone} --cue stop_sign", INPUT),
@@ -165,6 +166,8 @@ NAMED_IN_THE_VEHICLE_FILE: Final[dict[str, str]] = {
 """Commands that read the DBC files of a vehicle file."""
 WRITTEN: Final = {"--output", "--cache", "--figure", "--sheet"}
 """Options whose file is made if it is missing."""
+NO_FILES: Final = {"LAYOUT", "SQL"}
+"""Arguments that are no files."""
 ANY_BYTES: Final = {"seal", "model fetch", "completion"}
 """Their arguments are no files that could be of another kind."""
 MADE: Final = {("landmarks add", "DB")}
@@ -173,7 +176,7 @@ FOLDERS: Final = {
     ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"),
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
     ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
-    ("merge", "RUNS"),
+    ("merge", "RUNS"), ("query", "RUNS"),
 }  # fmt: skip
 """An empty folder in their place lacks a file, which is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
@@ -195,7 +198,7 @@ def _named_files() -> set[tuple[str, str]]:
                 found.add((name, action.option_strings[-1]))
             elif not action.option_strings and name not in ANY_BYTES:
                 found.add((name, str(action.metavar)))
-    return {(name, option) for name, option in found if option not in {*WRITTEN, "LAYOUT"}}
+    return {(name, option) for name, option in found if option not in {*WRITTEN, *NO_FILES}}
 
 
 def test_the_table_is_whole() -> None:

@@ -30,6 +30,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "score detector": ("gone --labels gone.json", INPUT),
     "compare": ("gone gone2", INPUT),
     "merge": ("gone -o out", INPUT),
+    "query": ("gone --schema", INPUT),
     "view": ("gone -o x.rrd", INPUT),
     "failures": ("gone", INPUT),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),

@@ -35,6 +35,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "compare": ("runs/a runs/a", 0),
     "merge": ("runs -o merged", 0),
     "failures": ("runs/a --truth TRUTH -o worst.parquet", 0),
+    "query": ("runs SQL", 0),
     "truth check": ("TRUTH --log LOG", 0),
     "truth schema": ("", 0),
     "run schema": ("", 0),
@@ -109,7 +110,7 @@ def test_every_result_is_one_strict_document(
     log = write_drive(tmp_path, Clock(pause_s=(5.0, 9.0)))
     database_of(tmp_path / "marks.sqlite", np.array([[0.0, 1.0], [2.0, 3.0]]))
     _write_road(tmp_path / "road")
-    places = {"LOG": str(log), "CAR": "car.toml", "TRUTH": "truth.json"}
+    places = {"LOG": str(log), "CAR": "car.toml", "TRUTH": "truth.json", "SQL": "from runs"}
     _run(LINES, places, capsys)
 
 

@@ -20,6 +20,7 @@ CALLS: Final = {
     "seal": ("seal", "check_seal"),
     "decode": ("decode",),
     "merge": ("merge",),
+    "query": ("catalog",),
     "compare": ("compare_runs",),
     "vehicle init": ("draft_vehicle",),
     "vehicle check": ("check_vehicle",),

@@ -1,0 +1,125 @@
+"""Rows of a table as text, CSV or JSON, printed or written."""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import csv
+import io
+import json
+from collections.abc import Callable, Iterator
+from datetime import date, datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from crosscue.replay.base import UsageError, strict_json, write_bytes, write_text, write_whole
+from crosscue.replay.safe_text import table, terminal_width
+
+from .terminal import print_json
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def print_rows(found: pa.Table, args: argparse.Namespace) -> None:
+    """The rows on stdout: with ``--json`` or ``--csv`` so, else as a table of text."""
+    if args.json:
+        print_json(_records(found))
+    elif args.csv:
+        print(_csv(found), end="")
+    elif not args.quiet:
+        print("\n".join(_lines(found)))
+
+
+def write_rows(found: pa.Table, args: argparse.Namespace) -> None:
+    """The rows into the file of ``--output``, in the format of its suffix; then how many.
+
+    Raises:
+        UsageError: Another suffix.
+        OutputError: It cannot be written.
+    """
+    write = WRITERS.get(args.output.suffix.lower())
+    if write is None:
+        raise UsageError(f"{args.output}: expected a name in {', '.join(WRITERS)}; rename it")
+    write(args.output, found)
+    if args.json:
+        print_json({"output": str(args.output), "rows": found.num_rows})
+    elif not args.quiet:
+        print(f"{args.output}: {found.num_rows} rows")
+
+
+def _lines(found: pa.Table) -> Iterator[str]:
+    import pyarrow as pa
+
+    rows = [[_cell(value) for value in row.values()] for row in _records(found)]
+    numbers = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
+    texts = [i for i, one in enumerate(found.schema) if not any(is_a(one.type) for is_a in numbers)]
+    yield from table(found.column_names, rows, terminal_width(), texts)
+    yield f"{len(rows)} row{'' if len(rows) == 1 else 's'}"
+
+
+def _records(found: pa.Table) -> list[dict[str, Any]]:
+    """As plain values that JSON can hold."""
+    import pyarrow as pa
+
+    maps = {one.name for one in found.schema if pa.types.is_map(one.type)}
+    return [
+        {
+            name: _plain(dict(value) if name in maps and value is not None else value)
+            for name, value in zip(found.column_names, row, strict=True)
+        }
+        for row in zip(*(column.to_pylist() for column in found.columns), strict=True)
+    ]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Decimal):
+        return int(value) if value == value.to_integral_value() else float(value)
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return value if isinstance(value, str | int | float | None) else str(value)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{name}={_cell(one)}" for name, one in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_cell, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _csv(found: pa.Table) -> str:
+    """Lists and maps are JSON in their cell; what is not known is empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(found.column_names)
+    for row in _records(found):
+        writer.writerow(
+            json.dumps(one) if isinstance(one, dict | list) else one for one in row.values()
+        )
+    return stream.getvalue()
+
+
+def _write_parquet(path: Path, found: pa.Table) -> None:
+    import pyarrow.parquet as pq
+
+    write_whole(path, lambda partial: pq.write_table(found, partial, write_page_checksum=True))
+
+
+WRITERS: Final[dict[str, Callable[[Path, Any], None]]] = {
+    ".parquet": _write_parquet,
+    ".csv": lambda path, found: write_bytes(path, _csv(found).encode()),
+    ".json": lambda path, found: write_text(path, strict_json(_records(found)) + "\n"),
+}
+"""By suffix of the file."""

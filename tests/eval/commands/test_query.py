@@ -1,0 +1,166 @@
+"""``crosscue query``: what it prints and writes, and that it can only read."""
+
+import csv
+import json
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.replay.base import UsageError
+from support.catalog_runs import add_run, runs_below
+from support.trees import tree
+
+SQL = "select run, approaches, tags, conditions, travelled_m, made_at from runs order by run"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives, each with two settings."""
+    return runs_below(tmp_path_factory.mktemp("fleet"))
+
+
+def test_it_prints_a_table(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["query", str(runs), "select name, count(*) as n from runs group by 1"]) == 0
+
+    head, *rows, last = capsys.readouterr().out.splitlines()
+    assert head.split() == ["name", "n"]
+    assert sorted(row.split() for row in rows) == [["monday", "2"], ["tuesday", "2"]]
+    assert last == "2 rows"
+
+
+def test_every_format_holds_the_same_rows(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["query", str(runs), SQL, "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert cli.run(["query", str(runs), SQL, "--csv"]) == 0
+    printed = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+    for suffix in ("parquet", "csv", "json"):
+        assert cli.run(["query", str(runs), SQL, "-o", str(tmp_path / f"x.{suffix}"), "-q"]) == 0
+
+    assert [row["run"] for row in records] == [row["run"] for row in printed]
+    assert records[0]["tags"] == json.loads(printed[0]["tags"]) == {}
+    assert json.loads((tmp_path / "x.json").read_text()) == records
+    assert list(csv.DictReader((tmp_path / "x.csv").read_text().splitlines())) == printed
+    assert pq.read_table(tmp_path / "x.parquet").equals(crosscue.catalog(runs).query(SQL))
+
+
+def test_the_schema_lists_tables_and_columns(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["query", str(runs), "--schema", "--json"]) == 0
+
+    listed = {(row["table"], row["column"]) for row in json.loads(capsys.readouterr().out)}
+    for table in ("runs", "approaches", "cues", "scores", "belief", "range", "pose", "dropped"):
+        assert (table, "run") in listed
+    assert ("frames", "run, ...") in listed
+
+
+def test_what_is_left_out_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    add_run(tmp_path / "good", "good")
+    add_run(tmp_path / "half", "half").file("manifest.json").unlink()
+
+    assert cli.run(["query", str(tmp_path), "select count(*) as n from runs", "--json"]) == 3
+
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == [{"n": 1}]
+    assert printed.err.startswith("crosscue: left out: half: no manifest.json: cut short")
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ([], "expected either SQL or --schema"),
+        (["from runs", "--schema"], "expected either SQL or --schema"),
+        (["from runs", "-o", "x.xlsx"], "x.xlsx: expected a name in .parquet, .csv, .json"),
+        (["select vehcle from runs"], "no column vehcle; did you mean vehicle?"),
+        (["select r.vehcle from runs r"], "no column vehcle; did you mean vehicle?"),
+        (["from belif"], "no table belif; did you mean belief?"),
+        (["selct 1"], "syntax error"),
+        (["select 1; select 2"], "expected a single SELECT, found SELECT, SELECT"),
+        (["select vehicle::int from runs"], "could not convert"),
+    ],
+)
+def test_wrong_usage_is_one_line(
+    runs: Path, argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["query", str(runs), *argv]) == 2
+
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    [line] = printed.err.splitlines()
+    assert said.lower() in line.lower()
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "copy runs to '{place}'",
+        "copy (select 1) to '{place}' (format parquet)",
+        "attach '{place}'",
+        "export database '{place}'",
+        "import database '{place}'",
+        "create table x as select 1",
+        "insert into runs select * from runs",
+        "drop view runs",
+        "install httpfs",
+        "load httpfs",
+        "pragma database_list",
+        "set enable_external_access = true",
+        "reset enable_external_access",
+        "call pragma_version()",
+        "explain analyze select 1",
+        "select 1; copy runs to '{place}'",
+        "create secret (type s3)",
+        "from read_csv('{secret}')",
+        "from read_text('{secret}')",
+        "from read_blob('{secret}')",
+        "from read_json('{secret}')",
+        "from read_parquet('{secret}')",
+        "from '{secret}'",
+        "from glob('{secret}')",
+        "from sniff_csv('{secret}')",
+        "from parquet_metadata('{secret}')",
+        "from read_csv('http://127.0.0.1:9/x.csv')",
+        "from read_parquet('s3://bucket/x.parquet')",
+        "from enable_logging(storage = 'file', storage_path = '{place}')",
+        "from query('copy runs to ''{place}''')",
+        "select getenv('HOME')",
+        "with x as (copy runs to '{place}') from x",
+        "from in_python",
+    ],
+)
+def test_a_query_reaches_nothing_but_the_tables(
+    runs: Path, tmp_path: Path, sql: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    in_python = pa.table({"run": ["secret"]})
+    secret = tmp_path / "secret.csv"
+    secret.write_text("a,b\n1,2\n")
+    found = crosscue.catalog(runs)
+    before = (tree(runs), sorted(tmp_path.iterdir()))
+
+    with pytest.raises(UsageError) as refused:
+        found.query(sql.format(place=tmp_path / "made", secret=secret))
+
+    assert "\n" not in str(refused.value)
+    assert in_python.num_rows
+    assert (tree(runs), sorted(tmp_path.iterdir())) == before
+
+
+def test_settings_cannot_be_changed_and_files_not_reached(runs: Path) -> None:
+    settings = crosscue.catalog(runs).query(
+        "select name, value from duckdb_settings() where name in "
+        "('enable_external_access', 'lock_configuration', 'autoload_known_extensions')"
+    )
+
+    assert dict(zip(*settings.to_pydict().values(), strict=True)) == {
+        "enable_external_access": "false",
+        "lock_configuration": "true",
+        "autoload_known_extensions": "false",
+    }
