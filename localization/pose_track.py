@@ -236,6 +236,29 @@ class NoLooks:
         return None
 
 
+@dataclass(slots=True)
+class BothLooks:
+    """Two ``Looks`` as one, each asked at its own times."""
+
+    first: Looks
+    second: Looks
+    _due: list[tuple[int, bool]] = field(default_factory=list)
+
+    def times_ns(self) -> Sequence[int]:
+        """Of both, in order."""
+        of_first = [(t_ns, False) for t_ns in self.first.times_ns()]
+        self._due = sorted(of_first + [(t_ns, True) for t_ns in self.second.times_ns()])
+        return [t_ns for t_ns, _ in self._due]
+
+    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+        """Ask the one whose time it is."""
+        while self._due[0][0] < belief.t_ns:
+            self._due.pop(0)
+        _, is_second = self._due.pop(0)
+        whose = self.second if is_second else self.first
+        return whose.weigh(belief, travelled_m)
+
+
 class Advance(NamedTuple):
     """One window's result."""
 

@@ -57,7 +57,7 @@ def smooth(
     headings: Headings,
     fixes: Fixes = NO_FIXES,
     at_ns: Int64s | None = None,
-    lever_m: tuple[float, float] = (0.0, 0.0),
+    lever_m: Floats | tuple[float, float] = (0.0, 0.0),
 ) -> Smoothed:
     """Poses at the wanted times that fit all measurements best.
 
@@ -65,10 +65,11 @@ def smooth(
         start: The first belief; its time is where the graph begins.
         increments: Odometry without holes, from the start's time on.
         headings: Those that count, with their variances.
-        fixes: Landmarks weighed in.
+        fixes: Landmarks and GNSS positions weighed in.
         at_ns: Wanted times; None: the graph's own, at most ``STEP_NS`` apart. Times outside the
             odometry are left out.
-        lever_m: The camera ahead of and to the left of the rear axle.
+        lever_m: What the fixes are positions of, ahead of and to the left of the rear axle: one
+            point, or shape (N, 2).
 
     Raises:
         UsageError: GTSAM is not installed.
@@ -242,22 +243,24 @@ def _add_fixes(
     guess: gtsam.Values,
     times: Int64s,
     fixes: Fixes,
-    lever_m: tuple[float, float],
+    lever_m: Floats | tuple[float, float],
 ) -> None:
-    """Each fix holds a pose of the camera, rigidly tied to the car's."""
+    """Each fix holds a pose of the camera or the antenna, rigidly tied to the car's."""
     import gtsam
 
-    lever = gtsam.Pose2(lever_m[0], lever_m[1], 0.0)
+    levers_m = np.broadcast_to(np.asarray(lever_m, np.float64), (len(fixes), 2))
     rigid = gtsam.noiseModel.Gaussian.Covariance(_MIN_VARIANCE)
     for i, t_ns in enumerate(fixes.t_ns.tolist()):
         key = int(np.searchsorted(times, t_ns))
         if key == len(times) or times[key] != t_ns:
             continue
-        camera = len(times) + i
-        guess.insert(camera, guess.atPose2(key).compose(lever))
-        graph.add(gtsam.BetweenFactorPose2(key, camera, lever, rigid))
+        ahead_m, left_m = levers_m[i].tolist()
+        lever = gtsam.Pose2(ahead_m, left_m, 0.0)
+        point = len(times) + i
+        guess.insert(point, guess.atPose2(key).compose(lever))
+        graph.add(gtsam.BetweenFactorPose2(key, point, lever, rigid))
         noise = gtsam.noiseModel.Gaussian.Covariance(fixes.cov_m2[i])
-        graph.add(gtsam.PoseTranslationPrior2D(camera, fixes.xy_m[i], noise))
+        graph.add(gtsam.PoseTranslationPrior2D(point, fixes.xy_m[i], noise))
 
 
 def _read(

@@ -11,7 +11,7 @@ from typing import Final, get_args
 import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic, geodetic_to_ecef
-from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
+from crosscue.eval.pipeline.pose import fused_positions, odometry_settings, turn_signal_of
 from crosscue.localization.fit.known_drive import KnownDrive
 from crosscue.localization.odometry import integrate
 from crosscue.localization.start_pose import START_S, start_pose
@@ -57,6 +57,15 @@ def with_start(
         if gnss not in get_args(GnssUse):
             raise UsageError(f"--gnss {gnss}: expected one of {', '.join(get_args(GnssUse))}")
         vehicle = vehicle.model_copy(update={"gnss": vehicle.gnss.model_copy(update={"use": gnss})})
+    vehicle = _started(logs, vehicle, selection, start)
+    # Refused here, before detectors have worked for an hour.
+    fused_positions(vehicle)
+    return vehicle
+
+
+def _started(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, start: str | None
+) -> Vehicle:
     if start is not None and (numbers := _numbers(start)) is not None:
         return _changed(vehicle, numbers)
     if start is not None:
@@ -67,7 +76,7 @@ def with_start(
                 f"first {READ_S:.0f} s, and a car that moves; try another part of the log"
             )
         return _changed(vehicle, found)
-    if vehicle.gnss.use != "start" or vehicle.start.heading_rad is not None:
+    if vehicle.gnss.use not in ("start", "fuse") or vehicle.start.heading_rad is not None:
         return vehicle
     found = _laid(logs, vehicle, selection, None)
     return vehicle if found is None else _changed(vehicle, found)
@@ -78,6 +87,16 @@ def with_start_of(run: Vehicle, vehicle: Vehicle) -> Vehicle:
     if not run.start.source or vehicle.start.heading_rad is not None:
         return vehicle
     return vehicle.model_copy(update={"start": run.start})
+
+
+def without_found_start(vehicle: Vehicle) -> Vehicle:
+    """A run's settings as they were before it looked for the first pose."""
+    start = vehicle.start
+    if not start.source:
+        return vehicle
+    # GNSS leaves x and y as the vehicle file has them; a truth file and a flag do not.
+    kept = {} if start.map_origin is None else {"x_m": start.x_m, "y_m": start.y_m}
+    return vehicle.model_copy(update={"start": Start.model_validate(kept)})
 
 
 def _changed(vehicle: Vehicle, start: dict[str, object]) -> Vehicle:

@@ -63,7 +63,7 @@ from .clocks import clock_changes, clock_rows
 from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments
 from .empty_result import empty_result, silent_roles
 from .landmarks import looking
-from .pose import PoseStage, estimating_of, turn_signal_of
+from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
 from .progress import OnTime, report_time, unwatched_time
 
 if TYPE_CHECKING:
@@ -109,7 +109,12 @@ def estimate_into(
     timeline = reading.timeline
     if found is not None:
         refuse_other_segments(run, timeline)
-    stage = PoseStage(vehicle, turn_signal_of(reading.planned, vehicle), timeline=timeline)
+    stage = PoseStage(
+        vehicle,
+        turn_signal_of(reading.planned, vehicle),
+        positions=fused_positions(vehicle),
+        timeline=timeline,
+    )
     if reading.camera is not None and landmarks is not None:
         at = reading.camera[0]
         looks = looking(landmarks, vehicle, reading.ledgers[at])

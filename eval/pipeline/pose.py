@@ -9,20 +9,24 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.eval.runs.folder import OWN_FRAME, Line, line
 from crosscue.eval.runs.tables.measurements import (
     gap_rows,
     heading_rows,
     landmark_rows,
     odometry_rows,
+    position_rows,
     start_rows,
 )
 from crosscue.localization import compass, odometry, pose_track
+from crosscue.localization.fixes import NO_FIXES, Fixes
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
+    BothLooks,
     Headings,
     Looks,
     NoLooks,
@@ -31,7 +35,8 @@ from crosscue.localization.pose_track import (
     TrackSettings,
     TrackState,
 )
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.localization.position_looks import PositionLooks
+from crosscue.replay.base import Floats, Int64s, VehicleError
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.windows import Window
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
@@ -76,6 +81,23 @@ def gap_settings(vehicle: Vehicle) -> GapSettings:
     """What the vehicle file says a car can do in a gap."""
     fields = vehicle.time.model_dump(exclude={"max_silence_s", "unknown_gap_s"})
     return GapSettings(**fields)
+
+
+def fused_positions(vehicle: Vehicle) -> PositionLooks | None:
+    """What weighs GNSS positions in, where the vehicle file asks for it.
+
+    Raises:
+        VehicleError: Where the map's zero lies is not known.
+    """
+    gnss = vehicle.gnss
+    if gnss.use != "fuse":
+        return None
+    if vehicle.start.map_origin is None:
+        raise VehicleError(
+            "gnss.use = 'fuse': where the map's zero lies is not known; expected GNSS in the first "
+            "seconds, with the car moving, or start.map_origin in the vehicle file"
+        )
+    return PositionLooks((gnss.x_m, gnss.y_m), gnss.interval_s, gnss.gate_nis, gnss.delay_s)
 
 
 class LandmarkLooks(Looks, Protocol):
@@ -135,6 +157,7 @@ class PoseStage:
         odometry_counts: What became of wheel rows.
         track_counts: What became of headings and intervals.
         landmarks: What looks for landmarks meanwhile.
+        positions: What weighs GNSS positions in, from ``fused_positions``.
         received: Samples that arrived, by signal.
         started_with: Headings that the first belief was made of.
         turn_early: Turn samples that came before the first wheel speeds.
@@ -144,6 +167,7 @@ class PoseStage:
     vehicle: Vehicle
     turn: Signal | None
     landmarks: LandmarkLooks = field(default_factory=NoLandmarks)
+    positions: PositionLooks | None = None
     notices: list[str] = field(default_factory=list)
     odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
     track_counts: TrackCounts = field(default_factory=TrackCounts)
@@ -183,7 +207,12 @@ class PoseStage:
     def finish(self) -> Iterator[PoseColumns]:
         """Rows that waited for more odometry."""
         yield from self._close()
-        self.landmarks.let_go(FOREVER_NS)
+        self._let_go(FOREVER_NS)
+
+    def _let_go(self, before_ns: int) -> None:
+        self.landmarks.let_go(before_ns)
+        if self.positions is not None:
+            self.positions.let_go(before_ns)
 
     def _close(self) -> Iterator[PoseColumns]:
         """Rows that waited for odometry that does not come."""
@@ -235,6 +264,7 @@ class PoseStage:
             "odometry": asdict(self.odometry_counts),
             "track": asdict(self.track_counts),
             "landmarks": self.landmarks.counts(),
+            "gnss": {} if self.positions is None else self.positions.as_dict(),
         }
 
     @property
@@ -245,6 +275,8 @@ class PoseStage:
     def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
         wheels = window.samples.get(Signal.WHEEL_SPEEDS)
         headings = self._headings(window)
+        if self.positions is not None:
+            self.positions.add(self._fixes(window))
         if self._state is None:
             first = odometry.first_reading(_wheels(wheels), odometry_settings(self.vehicle))
             if first is None:
@@ -252,7 +284,7 @@ class PoseStage:
                 self.odometry_counts += odometry.OdometryCounts(rows=n, not_finite=n)
                 self._missed(headings)
                 self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
-                self.landmarks.let_go(window.end_ns)
+                self._let_go(window.end_ns)
                 return
             headings = self._start(*first, headings)
         assert self._state is not None
@@ -261,7 +293,7 @@ class PoseStage:
             if wheels is None:
                 self._missed(headings)
                 self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
-                self.landmarks.let_go(window.end_ns)
+                self._let_go(window.end_ns)
                 return
             self._cross(self._gap, int(wheels.t_ns[0]))
         step = odometry.integrate(
@@ -278,15 +310,18 @@ class PoseStage:
             step.increments,
             track_settings(self.vehicle),
             headings,
-            looks=self.landmarks,
+            looks=self.landmarks
+            if self.positions is None
+            else BothLooks(self.landmarks, self.positions),
         )
         self._state = made.state
         self._measured += [
             odometry_rows(step.increments),
             heading_rows(made.headings),
             landmark_rows(self.landmarks.take_sightings()),
+            position_rows([] if self.positions is None else self.positions.take_used()),
         ]
-        self.landmarks.let_go(window.end_ns - FRAMES_WAIT_NS)
+        self._let_go(window.end_ns - FRAMES_WAIT_NS)
         self.track_counts += made.counts
         if len(made.poses):
             yield made.poses
@@ -336,6 +371,16 @@ class PoseStage:
         if found is None:
             return TurnSignal(np.empty(0, np.int64), np.empty(0), kind)
         return TurnSignal(found.t_ns, found.values, kind)
+
+    def _fixes(self, window: Window) -> Fixes:
+        """A window's GNSS positions, in the map frame."""
+        found, origin = window.samples.get(Signal.POSITION), self.vehicle.start.map_origin
+        if found is None or origin is None:
+            return NO_FIXES
+        lat, lon, alt, sd = found.values.T
+        xyz = geodetic_to_enu(lat, lon, np.where(np.isfinite(alt), alt, origin[2]), origin)
+        var = np.where(np.isfinite(sd), sd, self.vehicle.gnss.position_sd_m) ** 2
+        return Fixes(found.t_ns, xyz[:, :2], var[:, None, None] * np.eye(2))
 
     def _headings(self, window: Window) -> Headings:
         variance = self.vehicle.compass.heading_sd_rad**2
@@ -412,6 +457,17 @@ def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str,
             },
         ),
     }
+    if stage.positions is not None:
+        fused = stage.positions.counts
+        found["positions"] = line(
+            fused.received,
+            fused.accepted,
+            {
+                "too soon after the last one used": fused.thinned,
+                "rejected by the gate": fused.rejected,
+                "without wheel speeds": fused.late,
+            },
+        )
     if stage.turn is not None:
         found["turn rates"] = line(
             got[stage.turn],

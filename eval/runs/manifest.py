@@ -148,6 +148,8 @@ class EstimateCounts(Record):
     odometry: dict[str, int]
     track: dict[str, int]
     landmarks: dict[str, int]
+    gnss: dict[str, int] = Field(default_factory=dict)
+    """Of positions weighed in; empty unless ``gnss.use`` is ``fuse``."""
 
 
 class LandmarksUsed(Record):

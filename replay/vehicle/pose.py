@@ -9,7 +9,7 @@ from pydantic import Field
 
 from .section import Finite, NotNegative, Positive, Section
 
-GnssUse: TypeAlias = Literal["start", "truth", "off"]
+GnssUse: TypeAlias = Literal["start", "truth", "fuse", "off"]
 DEGREE: Final = math.pi / 180.0
 
 
@@ -87,7 +87,8 @@ class Gnss(Section):
     use: GnssUse = "start"
     """``start``: its first seconds say where the drive begins and which way the car faces, unless
     ``start.heading_rad`` does. ``truth``: it is kept for ``crosscue truth from-gnss`` alone.
-    ``off``: neither. It is never weighed into the pose, as published."""
+    ``fuse``: as ``start``, and positions are weighed into the pose, which the published method
+    never does; GNSS is then no independent truth. ``off``: nothing."""
     x_m: Finite = 0.0
     """The antenna, ahead of the rear axle."""
     y_m: Finite = 0.0
@@ -99,6 +100,10 @@ class Gnss(Section):
     """Below, the course is noise."""
     delay_s: Finite = 0.0
     """How long after they were true positions and courses are stamped."""
+    interval_s: NotNegative = 1.0
+    """With ``fuse``, time between two positions that count: a receiver's errors last."""
+    gate_nis: Positive = 13.8
+    """With ``fuse``, refuse a position further off: one good one in a thousand is."""
 
 
 class Start(Section):

@@ -14,6 +14,7 @@ from pathlib import Path
 import crosscue
 from crosscue.eval.commands.shared.terminal import (
     DriveLine,
+    add_first_pose_arguments,
     add_logs_argument,
     is_shown,
     limits_of,
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="V.toml",
         help="vehicle file with other settings (default: those of the run)",
     )
+    add_first_pose_arguments(parser, "as the run has it")
     add_logs_argument(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -38,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
     """Estimate; 3 when something was dropped."""
     run = crosscue.open_run(args.run, args.logs, limits=limits_of(args))
     with DriveLine("estimating", is_shown=is_shown(args)) as line:
-        made = crosscue.estimate_run(run, args.vehicle, on_time=line.at_time).made
+        made = crosscue.estimate_run(
+            run, args.vehicle, gnss=args.gnss, start=args.first_pose, on_time=line.at_time
+        ).made
     print_result(made, args)
     return made.exit_status

@@ -24,6 +24,7 @@ from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.terminal import (
     DriveLine,
     DrivesLine,
+    add_first_pose_arguments,
     add_part_arguments,
     is_shown,
     limits_of,
@@ -66,19 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, auto, or local"
     )
     add_detector_arguments(parser)
-    parser.add_argument(
-        "--gnss",
-        choices=("start", "truth", "off"),
-        help="what GNSS is for: the first pose and heading, truth alone, or nothing "
-        "(default: gnss.use of the vehicle file, which is start unless set)",
-    )
-    parser.add_argument(
-        "--start",
-        dest="first_pose",
-        metavar="POSE",
-        help="first pose: X,Y,HEADING in metres and degrees counter-clockwise from east, or a "
-        "truth file with a track",
-    )
+    add_first_pose_arguments(parser, "gnss.use of the vehicle file, which is start unless set")
     parser.add_argument(
         "--landmarks",
         type=Path,

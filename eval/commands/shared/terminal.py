@@ -55,6 +55,23 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
     add_limit_arguments(parser)
 
 
+def add_first_pose_arguments(parser: argparse.ArgumentParser, default: str) -> None:
+    """Declare ``--gnss`` and ``--start``."""
+    parser.add_argument(
+        "--gnss",
+        choices=("start", "truth", "fuse", "off"),
+        help="what GNSS is for: the first pose and heading, truth alone, the first pose and every "
+        f"position after it, or nothing (default: {default})",
+    )
+    parser.add_argument(
+        "--start",
+        dest="first_pose",
+        metavar="POSE",
+        help="first pose: X,Y,HEADING in metres and degrees counter-clockwise from east, or a "
+        "truth file with a track",
+    )
+
+
 def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
     """``--max-chunk``."""
     parser.add_argument(

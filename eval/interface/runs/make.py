@@ -45,8 +45,8 @@ def replay_drive(
         vehicle: The vehicle file; None for the ``vehicle.toml`` beside the log, if there is one.
         detectors: Names, model cards or ``module:factory``; None for the vehicle file's, and an
             empty list for pose alone.
-        gnss: What GNSS is for: ``start``, ``truth`` or ``off``; None for the vehicle file's
-            ``gnss.use``.
+        gnss: What GNSS is for: ``start``, ``truth``, ``fuse`` or ``off``; None for the vehicle
+            file's ``gnss.use``.
         start: The first pose: ``X,Y,HEADING`` in metres and degrees, or a truth file with a track.
         landmarks: Database that frames are compared with.
         cache: File in which results of detectors are kept; see ``default_cache``.
@@ -138,6 +138,8 @@ def estimate_run(
     vehicle: Vehicle | Path | str | None = None,
     output: Path | str | None = None,
     *,
+    gnss: GnssUse | None = None,
+    start: Path | str | None = None,
     on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
 ) -> Run:
     """Estimate again from what detectors found before; no picture is opened.
@@ -147,22 +149,44 @@ def estimate_run(
         vehicle: Other settings; the run's own, if left out. A first pose that the run took from
             GNSS or a truth file stays, unless the settings have one.
         output: A new folder beside the run; if left out, the run's tables are replaced.
+        gnss: As in ``replay_drive``; the first pose is looked for again.
+        start: As in ``replay_drive``.
         on_time: Called with the seconds of log that are done, and of how many.
 
     Raises:
         RunError: The run is damaged, or its log is gone.
         OutputError: The new folder exists.
     """
-    from crosscue.eval.fit.first_pose import with_start_of
     from crosscue.eval.pipeline.reestimate import estimate_run as estimate_in
 
     folder = run_given(run).folder
+    settings = _settings_again(
+        folder,
+        None if vehicle is None else vehicle_given(vehicle),
+        gnss,
+        None if start is None else str(start),
+    )
     if output is not None:
         folder = _copied(folder, Path(output))
-    settings = None
-    if vehicle is not None:
-        settings = with_start_of(folder.drive_manifest().settings, vehicle_given(vehicle))
     return Run(folder, estimate_in(folder, settings, on_time))
+
+
+def _settings_again(
+    folder: RunFolder, vehicle: Vehicle | None, gnss: GnssUse | None, start: str | None
+) -> Vehicle | None:
+    """Settings to estimate a run again with; None for its own."""
+    from crosscue.eval.fit.first_pose import with_start, with_start_of, without_found_start
+    from crosscue.eval.runs.logs import reopened
+
+    if vehicle is None and gnss is None and start is None:
+        return None
+    manifest = folder.drive_manifest()
+    if gnss is None and start is None:
+        return with_start_of(manifest.settings, vehicle or manifest.settings)
+    vehicle = vehicle or without_found_start(manifest.settings)
+    with ExitStack() as stack:
+        logs = [stack.enter_context(reopened(folder, said)) for said in manifest.logs]
+        return with_start(logs, vehicle, manifest.selection.selection, gnss, start)
 
 
 def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choice, ...]:

@@ -2,8 +2,8 @@
 
 ``measurements.parquet`` has one row a measurement and nulls where a column does not apply:
 ``start`` (the first belief), ``odometry`` (from ``start_ns`` to ``t_ns``), ``gap`` (likewise: what
-was assumed between two time segments), ``heading`` (those that counted), ``landmark`` (those
-weighed in).
+was assumed between two time segments), ``heading`` (those that counted), ``landmark`` and
+``position`` (those weighed in: of the camera, and of the antenna by GNSS).
 """
 
 from __future__ import annotations
@@ -123,6 +123,13 @@ def landmark_rows(sightings: list[Sighting]) -> dict[str, object]:
         "landmark": [s.name for s in good],
     }
     return _rows("landmark", np.array([s.t_ns for s in good], np.int64), columns)
+
+
+def position_rows(used: list[tuple[int, float, float, float, float, float]]) -> dict[str, object]:
+    """GNSS positions weighed in as rows: time, x, y, xx, xy, yy."""
+    names = ("x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
+    columns = {name: [one[i] for one in used] for i, name in enumerate(names, start=1)}
+    return _rows("position", np.array([one[0] for one in used], np.int64), columns)
 
 
 def _rows(kind: str, t_ns: object, columns: Mapping[str, object]) -> dict[str, object]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.measurements import NUMBERS, TABLE
@@ -24,13 +25,15 @@ class Measured:
         start: The first belief.
         increments: Odometry.
         headings: Those that counted.
-        fixes: Positions of the camera by landmarks.
+        fixes: Positions of the camera by landmarks, and of the antenna by GNSS.
+        is_gnss: Shape (N,): which of the fixes are GNSS positions.
     """
 
     start: PoseBelief
     increments: Increments
     headings: Headings
     fixes: Fixes
+    is_gnss: NDArray[np.bool_]
 
 
 def read_measured(run: RunFolder) -> Measured:
@@ -49,8 +52,8 @@ def read_measured(run: RunFolder) -> Measured:
         names = ("start_ns", "t_ns", *NUMBERS)
         return {name: part[name].to_numpy() for name in names}
 
-    start, heading, landmark = map(of, ("start", "heading", "landmark"))
-    odometry, gaps = of("odometry", "gap"), of("gap")
+    start, heading, gaps = map(of, ("start", "heading", "gap"))
+    odometry, fixes = of("odometry", "gap"), of("landmark", "position")
     is_gap = np.isin(odometry["t_ns"], gaps["t_ns"]) & np.isin(
         odometry["start_ns"], gaps["start_ns"]
     )
@@ -78,10 +81,11 @@ def read_measured(run: RunFolder) -> Measured:
             heading["t_ns"].astype(np.int64), heading["heading_rad"], heading["heading_var_rad2"]
         ),
         Fixes(
-            landmark["t_ns"].astype(np.int64),
-            np.column_stack([landmark["x_m"], landmark["y_m"]]),
-            _matrices(landmark),
+            fixes["t_ns"].astype(np.int64),
+            np.column_stack([fixes["x_m"], fixes["y_m"]]),
+            _matrices(fixes),
         ),
+        np.isin(fixes["t_ns"], of("position")["t_ns"]),
     )
 
 

@@ -69,7 +69,8 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
         raise SchemaError(
             f"{truth_path}: its times are not those of the run; it belongs to another log"
         )
-    lever_m = (vehicle.camera.x_m, vehicle.camera.y_m)
+    camera, antenna = (np.array([at.x_m, at.y_m]) for at in (vehicle.camera, vehicle.gnss))
+    lever_m = np.where(measured.is_gnss[:, None], antenna, camera)
     found = smooth(
         measured.start, measured.increments, measured.headings, measured.fixes, wanted, lever_m
     )

@@ -8,16 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic, geodetic_to_ecef
+from crosscue.datasets.geodesy import (
+    ecef_to_enu_matrix,
+    ecef_to_geodetic,
+    geodetic_to_ecef,
+    geodetic_to_enu,
+)
 from crosscue.datasets.truth.truth import load
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.fit.first_pose import with_start
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING, Block, Floats, Table, Topic, UsageError, VehicleError
-from crosscue.replay.vehicle.pose import Gnss, Start
+from crosscue.replay.vehicle.pose import Gnss, GnssUse, Odometry, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
@@ -137,3 +143,54 @@ def test_a_truth_that_cannot_show_the_heading_is_refused(tmp_path: Path) -> None
 
     with pytest.raises(VehicleError, match="does not show the first pose"):
         with_start([driven(0.0)], Vehicle(version=1), EVERYTHING, start=str(path))
+
+
+LONG_WHEELS = Vehicle(version=1, odometry=Odometry(wheel_scale=1.05, slip_per_sqrt_m=1.0))
+"""Wheels that report five per cent too much: 12 m over the drive."""
+
+
+def test_fused_positions_hold_a_pose_that_odometry_alone_loses(tmp_path: Path) -> None:
+    errors_m: dict[str, float] = {}
+    at_end = along(np.array([29.9]), SPEED_MPS).columns
+    uses: tuple[GnssUse, ...] = ("start", "fuse")
+    for use in uses:
+        vehicle = with_start([driven()], LONG_WHEELS, EVERYTHING, gnss=use)
+        run = run_of(tmp_path / use, vehicle)
+        table = run.table("pose")
+        origin = vehicle.start.map_origin
+        assert origin is not None
+        x_m, y_m, _ = geodetic_to_enu(
+            at_end["latitude_deg"], at_end["longitude_deg"], at_end["altitude_m"], origin
+        )[0]
+        errors_m[use] = math.hypot(table["x_m"][-1].as_py() - x_m, table["y_m"][-1].as_py() - y_m)
+
+    assert errors_m["start"] > 5.0
+    assert errors_m["fuse"] < 1.0
+
+
+def test_what_became_of_every_position_is_counted(tmp_path: Path) -> None:
+    vehicle = with_start([driven()], LONG_WHEELS, EVERYTHING, gnss="fuse")
+    run = run_of(tmp_path / "run", vehicle)
+    line = run.drive_manifest().account.estimating["positions"]
+
+    assert line.entered == 30
+    assert line.entered == line.used + sum(line.skipped.values())
+    table = run.table("measurements")
+    kinds = table["kind"].cast("string").to_pylist()
+    assert kinds.count("position") == line.used > 20
+
+
+def test_the_smoother_weighs_in_what_the_filter_was_given(tmp_path: Path) -> None:
+    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
+    vehicle = with_start([driven()], LONG_WHEELS, EVERYTHING, gnss="fuse")
+    run = run_of(tmp_path / "run", vehicle)
+    truth = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
+
+    assert score_smoother(run, truth).smoother_rmse_m < 1.0
+
+
+def test_positions_cannot_be_weighed_into_a_map_that_lies_nowhere() -> None:
+    with pytest.raises(
+        VehicleError, match=r"where the map's zero lies is not known; expected GNSS"
+    ):
+        with_start([driven(0.0)], Vehicle(version=1), EVERYTHING, gnss="fuse")

@@ -1,0 +1,74 @@
+"""GNSS positions weighed into the pose: as landmarks are, at their own times. Simulated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.localization.fixes import Fixes
+from crosscue.localization.landmarks.update import update_camera_position
+from crosscue.localization.pose_track import BothLooks, start_belief
+from crosscue.localization.position_looks import PositionLooks
+
+SECOND = 1_000_000_000
+LEVER_M = (1.3, -0.4)
+COV = np.array([[2.0, 0.3], [0.3, 1.0]])
+
+
+def fixes(*rows: tuple[int, float, float]) -> Fixes:
+    return Fixes(
+        np.array([t for t, _, _ in rows], np.int64),
+        np.array([[x, y] for _, x, y in rows]),
+        np.tile(COV, (len(rows), 1, 1)),
+    )
+
+
+def test_a_position_is_weighed_in_as_the_antennas() -> None:
+    belief = start_belief(SECOND, 4.0, 5.0, 0.7, 8.0, 1.5, 0.02, 0.5)
+    looks = PositionLooks(LEVER_M)
+    looks.add(fixes((SECOND, 5.5, 5.2)))
+    found = looks.weigh(belief, 0.0)
+    wanted = update_camera_position(belief, np.array([5.5, 5.2]), COV, LEVER_M, None).belief
+
+    assert found is not None
+    # The landmark's update is linear in the heading; this one turns the lever with it.
+    np.testing.assert_allclose(found.mean, wanted.mean, atol=2e-4)
+    np.testing.assert_allclose(found.cov, wanted.cov, atol=2e-3)
+
+
+def test_a_position_stamped_late_is_carried_ahead() -> None:
+    belief = start_belief(SECOND, 0.0, 0.0, math.pi / 2, 10.0, 1.0, 1e-6, 1e-6)
+    looks = PositionLooks(delay_s=0.2)
+    looks.add(fixes((SECOND, 0.0, -2.0)))
+    found = looks.weigh(belief, 0.0)
+
+    assert found is not None
+    np.testing.assert_allclose(found.mean[:2], 0.0, atol=1e-9)
+
+
+def test_positions_too_soon_or_too_far_off_do_not_count() -> None:
+    belief = start_belief(SECOND, 0.0, 0.0, 0.0, 0.0, 1.0)
+    looks = PositionLooks(interval_s=1.0)
+    looks.add(
+        fixes((SECOND // 2, 0.0, 0.0), (SECOND, 100.0, 0.0), (SECOND, 0.1, 0.0), (SECOND, 0.1, 0.0))
+    )
+
+    assert looks.weigh(belief, 0.0) is None
+    assert looks.weigh(belief, 0.0) is not None
+    assert looks.weigh(belief, 0.0) is None
+    assert looks.as_dict() == {"received": 4, "accepted": 1, "thinned": 1, "rejected": 1, "late": 1}
+
+
+@pytest.mark.parametrize("is_second", [False, True])
+def test_each_is_asked_at_its_own_times(is_second: bool) -> None:
+    belief = start_belief(2 * SECOND, 0.0, 0.0, 0.0, 0.0, 1.0)
+    early, due = PositionLooks(), PositionLooks()
+    early.add(fixes((SECOND, 0.0, 0.0)))
+    due.add(fixes((2 * SECOND, 0.1, 0.0)))
+    both = BothLooks(early, due) if is_second else BothLooks(due, early)
+
+    assert both.times_ns() == [SECOND, 2 * SECOND]
+    assert both.weigh(belief, 0.0) is not None
+    assert (early.counts.accepted, due.counts.accepted) == (0, 1)
