@@ -166,6 +166,8 @@ _EXPORTS: Final = {
     "find_drives": "eval.interface.runs.batch",
     "DriveList": "eval.batch.drive_list",
     "replay_drives": "eval.interface.runs.batch",
+    "batch_status": "eval.interface.runs.status",
+    "BatchStatus": "eval.interface.runs.status",
     "ReplayedDrives": "eval.interface.runs.batch",
     "render_training_frames": "eval.interface.training.frames",
     "TrainingFrames": "eval.interface.training.frames",
@@ -279,6 +281,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.score import score_run as score_run
     from crosscue.eval.interface.runs.scores import ScoredRuns as ScoredRuns
     from crosscue.eval.interface.runs.scores import score_runs as score_runs
+    from crosscue.eval.interface.runs.status import BatchStatus as BatchStatus
+    from crosscue.eval.interface.runs.status import batch_status as batch_status
     from crosscue.eval.interface.runs.tables import MergedRuns as MergedRuns
     from crosscue.eval.interface.runs.tables import decode as decode
     from crosscue.eval.interface.runs.tables import merge as merge

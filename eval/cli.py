@@ -44,6 +44,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "score a detector of a run against labelled boxes of its images",
     ),
     "compare": ("runs.compare", "compare two runs, with tolerances"),
+    "status": ("runs.status", "show how far batches of drives have come"),
     "merge": ("runs.merge", "merge the runs of several batches into one folder of tables"),
     "query": ("runs.query", "ask all runs below a folder with SQL"),
     "view": ("runs.view", "show a run in Rerun"),

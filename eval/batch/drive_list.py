@@ -30,6 +30,8 @@ from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
 from crosscue.replay.remote.logs import is_remote, matches
 
+from .shards import Shard
+
 VEHICLE: Final = "vehicle.toml"
 TRUTH: Final = "truth.json"
 LIST_BYTES: Final = 64 * MIB
@@ -75,18 +77,40 @@ class DriveInput:
     vehicle: Path | None = None
     truth: Path | None = None
 
+    @property
+    def identity(self) -> str:
+        """Of its logs, wherever they lie."""
+        return self.name[-SHORT:]
+
 
 @dataclass(frozen=True, slots=True)
 class DriveList:
     """What a command line means.
 
     Attributes:
-        drives: At least one.
+        drives: At least one, or those of a shard, which may be none.
         is_many: Does each get a run folder of its own below the one asked for?
+        shard: Which part of the drives named these are; None for all.
+        of: How many drives were named.
     """
 
     drives: tuple[DriveInput, ...]
     is_many: bool
+    shard: Shard | None = None
+    of: int = 0
+
+    def part(self, shard: Shard) -> DriveList:
+        """The drives of one shard.
+
+        Raises:
+            UsageError: It is a single drive.
+        """
+        if not self.is_many:
+            raise UsageError(
+                f"--shard {shard}: for many drives; this is one (--each makes it many)"
+            )
+        mine = tuple(one for one in self.drives if shard.holds(one.identity))
+        return replace(self, drives=mine, shard=shard, of=len(self.drives))
 
 
 @dataclass(frozen=True, slots=True)

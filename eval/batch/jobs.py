@@ -1,40 +1,40 @@
 """Many drives, one after another or side by side; one that fails costs only itself.
 
 A drive is a ``Job``: its logs, its run folder and a fingerprint of every setting. Engines work
-through jobs: ``in_turn`` in this process, ``worker_pool.Processes`` on this machine's cores,
-``ray_drives.OnRay`` on a Ray cluster. What has been done stands in a journal beside the run
+through jobs: ``in_turn`` in this process, ``processes.Processes`` on this machine's cores,
+``ray_jobs.OnRay`` on a Ray cluster. What has been done stands in a ``journal`` beside the run
 folders, written before and after each drive, so that a second start does only what is missing,
-however the first one ended.
+however the first one ended. Why a drive failed stands in ``failure.log`` in its run folder.
 """
 
 from __future__ import annotations
 
 import hashlib
 import time
+import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
-from crosscue.eval.runs.folder import MANIFEST, RunFolder
+from crosscue.eval.runs.folder import FAILURE, MANIFEST, RunFolder, signature
 from crosscue.replay.base import (
     CrosscueError,
     RunError,
     UsageError,
-    json_tree,
     losses_heard,
     one_line,
     strict_json,
+    versions,
     warn_again,
     write_text,
 )
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
 
-JOURNAL: Final = ".drives"
-FORMAT_VERSION: Final = 2
+from .journal import beating, read_entry, write_entry
 
 
 class Result(Protocol):
@@ -232,16 +232,46 @@ def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
 
 
 def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Done[R]:
+    inputs: dict[str, object] | None = None
     try:
         inputs = _inputs(job)
-        _write_entry(job, {"inputs": inputs})
-        result = work(job)
+        write_entry(job.run, {"inputs": inputs, "worker": signature()})
+        with beating(job.run):
+            result = work(job)
         manifest = _manifest_hash(job)
         status = result.exit_status or (3 if losses else 0)
-        _write_entry(job, {"inputs": inputs, "manifest": manifest, "exit_status": status})
+        write_entry(job.run, {"inputs": inputs, "manifest": manifest, "exit_status": status})
     except Exception as error:
-        return Done(job, *reported_error(error))
+        failed: Done[R] = Done(job, *reported_error(error))
+        record_failure(failed, inputs, traceback.format_exc())
+        return failed
     return Done(job, status, None, result)
+
+
+def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: str) -> None:
+    """Write why a drive failed into its journal entry and its run folder, where that is possible.
+
+    Args:
+        failed: With its error.
+        inputs: What decides the result, as far as it is known.
+        details: A traceback, or how its worker ended.
+    """
+    job = failed.job
+    lines = {
+        "drive": job.name,
+        "logs": " ".join(job.logs),
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "worker": signature(),
+        "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+        "error": str(failed.error),
+    }
+    text = "".join(f"{name:10}{value}\n" for name, value in lines.items())
+    # The disk may be full or gone, and what led here matters more.
+    with suppress(CrosscueError, OSError):
+        write_text(job.run / FAILURE, f"{text}\n{details.rstrip()}\n")
+    with suppress(CrosscueError, OSError):
+        entry = {"error": failed.error, "exit_status": failed.exit_status}
+        write_entry(job.run, {"inputs": inputs, **entry})
 
 
 def reported_error(error: Exception) -> tuple[int, str]:
@@ -263,7 +293,7 @@ def state_of(job: Job) -> State:
     Raises:
         CrosscueError: A log cannot be examined.
     """
-    entry = _entry(job)
+    entry = read_entry(job.run)
     if not _holds_anything(job.run):
         return State.MISSING
     if not job.run.joinpath(MANIFEST).exists():
@@ -299,7 +329,7 @@ def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
     try:
         state = state_of(job)
         if state is State.DONE:
-            entry = _entry(job)
+            entry = read_entry(job.run)
             return Done(job, 0 if entry is None else int(entry["exit_status"]), attempts=0)
         if state is State.OTHER and not overwrite:
             raise RunError(
@@ -324,28 +354,12 @@ def _manifest_hash(job: Job) -> str:
 
 
 def _holds_anything(folder: Path) -> bool:
-    return folder.is_dir() and next(folder.iterdir(), None) is not None
-
-
-def _entry_path(job: Job) -> Path:
-    return job.run.parent / JOURNAL / f"{job.name}.json"
-
-
-def _write_entry(job: Job, entry: dict[str, object]) -> None:
-    write_text(_entry_path(job), strict_json({"format_version": FORMAT_VERSION, **entry}) + "\n")
-
-
-def _entry(job: Job) -> dict[str, Any] | None:
-    """The journal's entry; None where none exists, or none that can be believed."""
-    try:
-        entry = json_tree(_entry_path(job).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    is_ours = isinstance(entry, dict) and entry.get("format_version") == FORMAT_VERSION
-    return entry if is_ours and "inputs" in entry else None
+    return folder.is_dir() and any(entry.name != FAILURE for entry in folder.iterdir())
 
 
 def worker_crashed(done: Done[R], attempts: int, how: str) -> Done[R]:
     """A job whose worker died as often as it may: a failure with a line of its own."""
     line = f"{done.job.name}: its worker {how}, {attempts} times; replay this drive alone"
-    return replace(done, error=line, attempts=attempts)
+    failed = replace(done, error=line, attempts=attempts)
+    record_failure(failed, None, f"its worker {how}: it left no traceback")
+    return failed

@@ -41,12 +41,14 @@ from crosscue.replay.base import (
     strict_json,
 )
 
+from .journal import MERGED
+from .status import NO_RUN, unfinished
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
 DRIVE: Final = "drive"
-FOLDER: Final = "merged"
-"""What the merged run is called among those that it was made of."""
+FOLDER: Final = MERGED
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,14 +183,24 @@ def _manifest(
 
 
 def _settings_hash(manifest: DriveManifest) -> str:
-    """Of the settings and detectors that a run was made with."""
+    """Of the settings and detectors that a run was made with, wherever their files lay."""
     detected = manifest.detect if isinstance(manifest, EstimateManifest) else None
     made_with = [
         manifest.settings.model_dump(mode="json"),
         None if detected is None else [one.as_json() for one in detected.detectors],
         manifest.selection.as_json(),
     ]
-    return hashlib.sha256(strict_json(made_with).encode()).hexdigest()
+    return hashlib.sha256(strict_json(_without_places(made_with)).encode()).hexdigest()
+
+
+def _without_places(value: object) -> object:
+    """Settings with the names of their files in place of the paths: another place, the same run."""
+    if isinstance(value, Mapping):
+        return {name: _without_places(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_without_places(one) for one in value]
+    is_path = isinstance(value, str) and "/" in value and "." in value.rpartition("/")[2]
+    return str(value).rpartition("/")[2] if is_path else value
 
 
 def _tables_hash(run: RunFolder) -> str:
@@ -204,7 +216,9 @@ def _tables_hash(run: RunFolder) -> str:
 def gathered(
     folders: Sequence[Path],
 ) -> tuple[dict[str, RunFolder], dict[str, str]]:
-    """All runs of batches, and the failures of drives that none of them has a run of.
+    """All runs of batches, and why drives that none of them has a run of have none.
+
+    A drive that was planned and not done is among these, too, so that none is dropped in silence.
 
     Args:
         folders: Run folders, or folders of them, as ``replay`` of many drives writes.
@@ -217,9 +231,13 @@ def gathered(
         RunError: A run is damaged or of another version.
     """
     runs: dict[str, RunFolder] = {}
-    failures: dict[str, str] = {}
+    reasons: dict[str, set[str]] = {}
     for folder in folders:
+        missing = unfinished(folder)
         for path in _finished(folder):
+            if path.name in missing:
+                # It is of other settings: the last attempt, which should replace it, has failed.
+                continue
             run = open_run(path)
             first = runs.setdefault(path.resolve().name, run)
             if first is not run and _content(first) != _content(run):
@@ -228,10 +246,16 @@ def gathered(
                     "drop one: rename it, or replay it as the other was"
                 )
         merged = _merged_in(RunFolder(folder / FOLDER))
-        if merged is not None:
-            for name, why in merged.failures.items():
-                failures.setdefault(name, why)
-    return runs, {name: why for name, why in failures.items() if name not in runs}
+        reported = {} if merged is None else merged.failures
+        for name, why in (reported | missing).items():
+            reasons.setdefault(name, set()).add(why)
+    # Whichever folder came first, and an error before the want of one.
+    chosen = {
+        name: min(whys, key=lambda why: (why.startswith(NO_RUN), why))
+        for name, whys in reasons.items()
+        if name not in runs
+    }
+    return runs, dict(sorted(chosen.items()))
 
 
 def _finished(folder: Path) -> list[Path]:

@@ -74,6 +74,7 @@ from .manifest import (
 )
 
 __all__ = [
+    "FAILURE",
     "FORMAT_VERSION",
     "INPUT",
     "LOCK",
@@ -117,6 +118,7 @@ __all__ = [
     "create",
     "details_of",
     "detecting_of",
+    "is_alive",
     "joined_accounts",
     "json_schema",
     "line",
@@ -125,6 +127,7 @@ __all__ = [
     "open_run",
     "part_of",
     "reading_of",
+    "signature",
     "staged",
     "summed",
     "write_input",
@@ -135,6 +138,8 @@ MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 INPUT: Final = "input.json"
 """What a run is made of, written before anything else: a run cut short has no manifest."""
+FAILURE: Final = "failure.log"
+"""Why the last attempt at a run failed; a finished run takes its place."""
 MAX_MANIFEST_BYTES: Final = 256 << 20
 STAGED: Final = ".new"
 """Folder inside a run that holds what is to replace it, until that is whole."""
@@ -205,7 +210,7 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        leftovers = [entry for entry in path.iterdir() if entry.name != LOCK]
+        leftovers = [entry for entry in path.iterdir() if entry.name not in (LOCK, FAILURE)]
     except FileExistsError:
         raise RunError(f"{path}: is a file; give a folder for the run") from None
     except OSError as error:
@@ -339,7 +344,7 @@ def open_run(
 
 
 def _looks_like_run(entries: list[Path]) -> bool:
-    ours = {MANIFEST, STAGED, "score", "view", "pictures"}
+    ours = {MANIFEST, FAILURE, STAGED, "score", "view", "pictures"}
     return all(
         e.name in ours or e.suffix in (".parquet", ".rrd", ".json") or is_partial(e.name)
         for e in entries
@@ -390,10 +395,9 @@ def _lock_file(path: Path) -> int:
 
 def _sign(handle: int, path: Path) -> None:
     """Write into the lock who holds it; a lock that cannot be written is taken away."""
-    me = f"{os.getpid()} {socket.gethostname()} {_started(os.getpid())}"
     try:
         os.ftruncate(handle, 0)
-        os.pwrite(handle, me.encode(), 0)
+        os.pwrite(handle, signature().encode(), 0)
     except OSError:
         with suppress(OSError):
             path.unlink(missing_ok=True)
@@ -420,6 +424,19 @@ def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool | None) -> None:
     if is_ours is False or (is_ours is None and is_alive):
         who = f"process {pid} on {host}" if pid else "another process"
         raise RunError(f"{path.parent}: {who} is writing it; wait or stop that")
+
+
+def signature() -> str:
+    """This process: its number, its host, and when it began."""
+    return f"{os.getpid()} {socket.gethostname()} {_started(os.getpid())}"
+
+
+def is_alive(signed: str) -> bool | None:
+    """Does the process of a signature still run? None where it is another machine's."""
+    pid, host, started = [*signed.split(" ", 2), "", "", ""][:3]
+    if host != socket.gethostname():
+        return None
+    return pid.isdigit() and started == _started(int(pid)) != ""
 
 
 def _started(pid: int) -> str:

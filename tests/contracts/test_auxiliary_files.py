@@ -61,6 +61,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("compare", "RUN_B"): ("{run} {gone}", INPUT),
     ("merge", "RUNS"): ("{gone} -o {out}", INPUT),
     ("query", "RUNS"): ("{gone} --schema", INPUT),
+    ("status", "RUNS"): ("{gone}", INPUT),
     ("fit messages", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
     ("fit signs", "LABELS"): ("{gone}.csv --label stop", INPUT),
     ("fit ranges", "TABLE"): ("{gone} --cue stop_sign", INPUT),
@@ -177,6 +178,7 @@ FOLDERS: Final = {
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
     ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
     ("merge", "RUNS"), ("query", "RUNS"),
+    ("merge", "RUNS"), ("status", "RUNS"),
 }  # fmt: skip
 """An empty folder in their place lacks a file, which is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {

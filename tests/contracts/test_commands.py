@@ -31,6 +31,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "compare": ("gone gone2", INPUT),
     "merge": ("gone -o out", INPUT),
     "query": ("gone --schema", INPUT),
+    "status": ("gone", INPUT),
     "view": ("gone -o x.rrd", INPUT),
     "failures": ("gone", INPUT),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),

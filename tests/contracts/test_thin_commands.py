@@ -21,6 +21,7 @@ CALLS: Final = {
     "decode": ("decode",),
     "merge": ("merge",),
     "query": ("catalog",),
+    "status": ("batch_status",),
     "compare": ("compare_runs",),
     "vehicle init": ("draft_vehicle",),
     "vehicle check": ("check_vehicle",),

@@ -6,11 +6,13 @@ run had finished.
 
 Many drives (a folder of drives, a quoted pattern, @list.txt, or --each) get a run folder each below
 the one given, side by side with --workers or on a Ray cluster with --ray. One that fails does not
-stop the rest, and a second start does only what is missing.
+stop the rest, and a second start does only what is missing. --shard divides them over the tasks of
+a scheduler; crosscue status shows how far all have come, and crosscue merge joins what they made.
 
 examples:
   crosscue replay drive.mcap --vehicle car.toml -o runs/drive
   crosscue replay 'drives/*/drive.mcap' --vehicle car.toml -o runs --workers 8
+  crosscue replay drives -o runs --shard auto
 """
 
 from __future__ import annotations
@@ -58,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--each", action="store_true", help="treat each LOG as a separate drive")
     parser.add_argument(
+        "--shard",
+        metavar="I/N",
+        help="only part I of N of the drives, by a hash of each drive's identity; auto: as "
+        "SLURM_ARRAY_TASK_ID and _COUNT say, or RANK and WORLD_SIZE",
+    )
+    parser.add_argument(
         "--workers",
         type=int,
         metavar="N",
@@ -78,6 +86,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="continue an interrupted run and keep finished parts"
     )
+    parser.add_argument(
+        "--retry-failed",
+        action="store_true",
+        help="of many drives, only those whose last attempt failed",
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -85,11 +98,13 @@ def run(args: argparse.Namespace) -> int:
     """Replay; 3 when something was dropped."""
     if args.draw < 0:
         raise UsageError(f"--draw {args.draw}: expected 0 or more")
-    found = crosscue.find_drives(*args.logs, each=args.each)
+    found = crosscue.find_drives(*args.logs, each=args.each, shard=args.shard)
     if found.is_many:
         return _run_many(args, found)
-    if args.workers is not None or args.ray is not None:
-        raise UsageError("--workers, --ray: for many drives; this is one (--each makes it many)")
+    if args.workers is not None or args.ray is not None or args.retry_failed:
+        raise UsageError(
+            "--workers, --ray, --retry-failed: for many drives; this is one (--each makes it many)"
+        )
     (drive,) = found.drives
     with (
         DriveLine("replaying", is_shown=is_shown(args)) as line,
@@ -135,6 +150,7 @@ def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
             ray=args.ray,
             overwrite=args.overwrite,
             resume=args.resume,
+            retry_failed=args.retry_failed,
             on_progress=line,
         )
     print_result(done, args)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +17,12 @@ from crosscue.eval.batch.jobs import (
     fingerprint_of,
     run_many,
 )
+from crosscue.eval.batch.journal import error_of, write_plan
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
+from crosscue.eval.batch.shards import read_shard
 from crosscue.eval.interface.logs.log import open as open_drive
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.runs.folder import create
+from crosscue.eval.runs.folder import FAILURE, create
 from crosscue.eval.runs.input import files_named_in
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, versions, visible
 from crosscue.replay.logs.log_part import part_in_words
@@ -36,13 +39,16 @@ class ReplayedDrives:
 
     Attributes:
         drives: Each with its job, what the replay counted, or why it failed.
-        merged: Folder of the tables of all runs.
+        merged: Folder of the tables of all runs; None of a shard, whose runs are merged with those
+            of the others when all are done.
         not_merged: Why they could not be merged, or None.
+        shard: Which part of how many drives these are, as ``2/4 of 100 drives``; empty for all.
     """
 
     drives: tuple[Done[Outcome], ...]
-    merged: Path
+    merged: Path | None
     not_merged: str | None
+    shard: str = ""
 
     @property
     def exit_status(self) -> int:
@@ -54,8 +60,9 @@ class ReplayedDrives:
         """What ``crosscue replay --json`` prints of many drives."""
         return {
             "drives": [_as_dict(one) for one in self.drives],
-            "merged": str(self.merged),
+            "merged": None if self.merged is None else str(self.merged),
             "not_merged": self.not_merged,
+            "shard": self.shard or None,
         }
 
     def __repr__(self) -> str:
@@ -63,6 +70,8 @@ class ReplayedDrives:
         for one in self.drives:
             if one.error is not None:
                 lines.append(f"failed   {one.job.name}: {one.error}")
+                log = one.job.run / FAILURE
+                lines += [f"         {log}"] if log.exists() else []
             elif one.is_earlier:
                 lines.append(f"earlier  {one.job.name}: done before, kept")
             else:
@@ -70,8 +79,12 @@ class ReplayedDrives:
                 lines.append(f"done     {one.job.name}: {one.seconds:.1f} s{lost}")
         failed = sum(one.error is not None for one in self.drives)
         lines.append(f"drives   {len(self.drives) - failed} of {len(self.drives)}, {failed} failed")
-        why = self.not_merged
-        lines.append(f"tables   {self.merged if why is None else f'not merged: {why}'}")
+        if self.shard:
+            lines.append(f"shard    {self.shard}; crosscue merge them when every shard is done")
+        if self.not_merged is not None:
+            lines.append(f"tables   not merged: {self.not_merged}")
+        elif self.merged is not None:
+            lines.append(f"tables   {self.merged}")
         return "\n".join(map(visible, lines))
 
 
@@ -148,7 +161,7 @@ class _Work:
         return fingerprint_of(settings, flags, versions(), files_named_in([settings, flags]))
 
 
-def find_drives(*logs: Path | str, each: bool = False) -> DriveList:
+def find_drives(*logs: Path | str, each: bool = False, shard: str | None = None) -> DriveList:
     """The drives that paths mean: several logs are one drive, merged by time.
 
     Many drives are a folder of drives, a pattern (``drives/*/drive.mcap``), or ``@drives.txt``, a
@@ -157,16 +170,22 @@ def find_drives(*logs: Path | str, each: bool = False) -> DriveList:
     Args:
         logs: Paths or URLs.
         each: Every one of them is a drive, or a folder of drives.
+        shard: ``2/4``: only the drives of the second of four parts, chosen by a hash of each
+            drive's identity; ``auto``: the part that the scheduler's variables say,
+            ``SLURM_ARRAY_TASK_ID`` and ``_COUNT``, or ``RANK`` and ``WORLD_SIZE``.
 
     Returns:
         ``drives``, each with its logs, and the vehicle file and the truth beside them; and
         ``is_many``.
 
     Raises:
-        UsageError: Nothing matches, a list cannot be read, or a drive is named twice.
+        UsageError: Nothing matches, a list cannot be read, a drive is named twice, or ``shard`` is
+            neither or of one drive.
         LogError: A place that is not there or may not be looked into.
     """
-    return drives_of([str(log) for log in logs], each=each)
+    part = None if shard is None else read_shard(shard, os.environ)
+    found = drives_of([str(log) for log in logs], each=each)
+    return found if part is None else found.part(part)
 
 
 def replay_drives(
@@ -187,6 +206,7 @@ def replay_drives(
     ray: str | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    retry_failed: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> ReplayedDrives:
     """Replay many drives as ``replay_drive`` does; a second start does only what is missing.
@@ -210,6 +230,8 @@ def replay_drives(
         ray: Address of a Ray cluster to work on.
         overwrite: Replace runs of other logs or settings.
         resume: As in ``replay_drive``.
+        retry_failed: Only the drives whose last attempt failed; without it they are begun again
+            with all others that are not done.
         on_progress: Called about once a second with ``total``, ``earlier``, ``done`` and
             ``failed`` drives.
 
@@ -236,7 +258,14 @@ def replay_drives(
         Job(one.name, one.logs, folder / one.name, work.fingerprint(one), one.vehicle, one.truth)
         for one in found.drives
     ]
+    shard = "" if found.shard is None else f"{found.shard} of {found.of} drives"
+    if retry_failed:
+        jobs = [job for job in jobs if error_of(job.run) is not None]
+    else:
+        write_plan(folder, [job.name for job in jobs], str(found.shard or "all"))
     done = run_many(jobs, work, engine, overwrite=overwrite, on_progress=on_progress)
+    if shard:
+        return ReplayedDrives(done, None, None, shard)
     why = None
     try:
         _merge(done, folder)

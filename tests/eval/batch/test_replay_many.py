@@ -53,6 +53,11 @@ def test_one_failing_drive_does_not_stop_the_rest(
     assert reported["tuesday"]["earlier"]
     assert not reported["broken"]["earlier"]
 
+    assert run(["replay", str(drives), "-o", str(out), "--retry-failed", "--json"]) == 4
+    (only,) = json.loads(capsys.readouterr().out)["drives"]
+    assert only["name"][:-9] == "broken"
+    assert "does not begin like MCAP" in Path(only["run"], "failure.log").read_text()
+
 
 def test_two_workers_give_the_bytes_of_one(drives: Path, tmp_path: Path) -> None:
     pattern = str(drives / "*day" / "drive.mcap")
@@ -62,6 +67,33 @@ def test_two_workers_give_the_bytes_of_one(drives: Path, tmp_path: Path) -> None
 
     assert len(_tables(tmp_path / "1")) >= 6
     assert _tables(tmp_path / "1") == _tables(tmp_path / "2")
+
+
+def test_shards_in_any_order_and_place_merge_to_the_bytes_of_one_batch(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(drives, elsewhere)
+    quick = ["--to", "2.0", "-q"]
+    assert run(["replay", str(drives), "-o", str(tmp_path / "all"), *quick]) == 3
+
+    folders = []
+    for number in (3, 1, 2):
+        folders.append(str(tmp_path / f"shard{number}"))
+        arguments = ["replay", str(elsewhere), "-o", folders[-1], "--shard", f"{number}/3", *quick]
+        assert run(arguments) in (0, 3, 4)
+        assert not Path(folders[-1], "merged").exists()
+    assert run(["status", *folders, "--json"]) == 3
+    seen = json.loads(capsys.readouterr().out)
+    assert (seen["done"], seen["failed"], len(seen["drives"])) == (2, 1, 3)
+    assert run(["merge", *folders, "-o", str(tmp_path / "merged"), "-q"]) == 3
+
+    found, whole = ((tmp_path / name) for name in ("merged", "all/merged"))
+    for table in whole.glob("*.parquet"):
+        assert (found / table.name).read_bytes() == table.read_bytes()
+    shards, batch = (json.loads((at / "manifest.json").read_text()) for at in (found, whole))
+    assert shards.pop("failures").keys() == batch.pop("failures").keys()
+    assert shards == batch
 
 
 def test_workers_for_a_single_drive_are_refused(

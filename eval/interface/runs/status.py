@@ -1,0 +1,107 @@
+"""How far batches of drives have come."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.eval.batch.status import (
+    DriveState,
+    DriveStatus,
+    Pace,
+    drives_of_folder,
+    pace_of,
+)
+from crosscue.replay.base import UsageError, visible
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class BatchStatus:
+    """How far the drives of batches have come; printed as ``crosscue status`` prints it.
+
+    Attributes:
+        drives: Each with its run folder, its state, and why it failed.
+        pace: Of all folders together: drives an hour, and seconds left.
+    """
+
+    drives: tuple[DriveStatus, ...]
+    pace: Pace
+
+    def count(self, state: str) -> int:
+        """How many drives are in a state: done, running, failed, stale or waiting."""
+        return sum(one.state == state for one in self.drives)
+
+    @property
+    def is_whole(self) -> bool:
+        """No drive has failed, and none was left by a worker that is gone."""
+        return not any(self.count(state) for state in (DriveState.FAILED, DriveState.STALE))
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue status --json`` prints."""
+        states = Counter(one.state.value for one in self.drives)
+        return {
+            **{state.value: states[state.value] for state in DriveState},
+            "per_hour": self.pace.per_hour,
+            "seconds_left": self.pace.left_s,
+            "drives": [
+                {
+                    "run": str(one.run),
+                    "state": one.state.value,
+                    "silent_s": one.silent_s,
+                    "error": one.error,
+                    "log": None if one.log is None else str(one.log),
+                }
+                for one in self.drives
+            ],
+        }
+
+    def __repr__(self) -> str:
+        lines = []
+        for one in self.drives:
+            if one.error is not None:
+                lines.append(f"failed    {one.run.name}: {one.error}")
+                lines += [] if one.log is None else [f"          {one.log}"]
+            elif one.state is DriveState.STALE:
+                lines.append(f"stale     {one.run.name}: its worker is gone; replay again")
+        total = len(self.drives)
+        counted = (f"{self.count(state)} {state}" for state in DriveState)
+        lines.append(f"drives    {total}: {', '.join(counted)}")
+        if math.isfinite(self.pace.per_hour):
+            lines.append(f"rate      {self.pace.per_hour:.3g} drives an hour")
+        if math.isfinite(self.pace.left_s):
+            lines.append(f"time left {_duration(self.pace.left_s)}")
+        return "\n".join(map(visible, lines))
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60.0)
+    if minutes < 2:
+        return f"{seconds:.0f} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def batch_status(*folders: Path | str) -> BatchStatus:
+    """How far the drives in folders of runs have come: done, running, failed, stale or waiting.
+
+    Nothing is written, so it may be asked on any machine that sees the folders.
+
+    Args:
+        folders: What ``replay`` of many drives writes to, of one batch or of several.
+
+    Raises:
+        UsageError: No folder, or one named twice.
+        RunError: A folder is missing, or no batch has written into it.
+    """
+    places = [Path(folder) for folder in folders]
+    if not places or len({place.resolve() for place in places}) < len(places):
+        raise UsageError("status: expected folders of runs, each named once")
+    found = {place: drives_of_folder(place) for place in places}
+    paces = [pace_of(drives, place) for place, drives in found.items()]
+    rates = [pace.per_hour for pace in paces if math.isfinite(pace.per_hour)]
+    left = [pace.left_s for pace in paces if math.isfinite(pace.left_s)]
+    return BatchStatus(
+        tuple(one for drives in found.values() for one in drives),
+        Pace(sum(rates) if rates else math.nan, max(left, default=math.nan)),
+    )

@@ -1,0 +1,71 @@
+"""Shards of many drives: disjoint, whole, and stable by identity."""
+
+from collections.abc import Mapping
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crosscue.eval.batch.shards import Shard, read_shard
+from crosscue.replay.base import UsageError
+
+IDENTITIES = st.sets(st.text("0123456789abcdef", min_size=8, max_size=8), max_size=40)
+
+
+@given(IDENTITIES, st.integers(1, 9))
+def test_every_drive_is_in_exactly_one_shard(identities: set[str], count: int) -> None:
+    shards = [Shard(number, count) for number in range(1, count + 1)]
+
+    for identity in identities:
+        assert sum(shard.holds(identity) for shard in shards) == 1
+
+
+def test_shards_are_about_equal() -> None:
+    identities = [f"{number:08x}" for number in range(4000)]
+    sizes = [sum(map(Shard(number, 8).holds, identities)) for number in range(1, 9)]
+
+    # A binomial of 4000 and 1/8 has a standard deviation of 21.
+    assert max(abs(size - 500) for size in sizes) < 4 * 21
+
+
+def array(number: int, first: int, last: int, step: int, count: int) -> dict[str, str]:
+    values = {"ID": number, "MIN": first, "MAX": last, "STEP": step, "COUNT": count}
+    return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in values.items()}
+
+
+@pytest.mark.parametrize(
+    ("text", "variables", "shard"),
+    [
+        ("2/4", {}, Shard(2, 4)),
+        ("1/1", {"RANK": "7", "WORLD_SIZE": "8"}, Shard(1, 1)),
+        ("auto", {"RANK": "0", "WORLD_SIZE": "3"}, Shard(1, 3)),
+        ("auto", array(8, 1, 8, 1, 8), Shard(8, 8)),
+        ("auto", array(0, 0, 3, 1, 4), Shard(1, 4)),
+        ("auto", array(9, 1, 9, 4, 3), Shard(3, 3)),
+        ("auto", array(5, 5, 5, 1, 1), Shard(1, 1)),
+    ],
+)
+def test_a_shard_is_read(text: str, variables: Mapping[str, str], shard: Shard) -> None:
+    assert read_shard(text, variables) == shard
+    assert read_shard(str(shard), {}) == shard
+
+
+@pytest.mark.parametrize(
+    ("text", "variables", "what"),
+    [
+        ("0/4", {}, "expected i/n with i from 1 to n"),
+        ("5/4", {}, "expected i/n with i from 1 to n"),
+        ("1/0", {}, "expected i/n"),
+        ("two", {}, "expected i/n"),
+        ("auto", {}, "neither SLURM_ARRAY_TASK_ID nor RANK and WORLD_SIZE is set"),
+        ("auto", {"RANK": "1"}, "neither"),
+        ("auto", {"RANK": "3", "WORLD_SIZE": "3"}, "outside its own count"),
+        ("auto", {"RANK": "x", "WORLD_SIZE": "3"}, "RANK='x': expected a whole number"),
+        ("auto", array(3, 1, 7, 1, 3), "expected array tasks in equal steps"),
+        ("auto", array(1, 1, 7, 1, 3), "expected array tasks in equal steps"),
+        ("auto", {**array(1, 1, 2, 1, 2), "RANK": "0", "WORLD_SIZE": "2"}, "both"),
+    ],
+)
+def test_what_is_no_shard_is_refused(text: str, variables: Mapping[str, str], what: str) -> None:
+    with pytest.raises(UsageError, match=what):
+        read_shard(text, variables)

@@ -1,0 +1,124 @@
+"""How far a batch has come, and what is known of its failures."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.eval.batch import status
+from crosscue.eval.batch.jobs import Job, in_turn, run_many
+from crosscue.eval.batch.journal import entry_path, error_of, write_entry, write_plan
+from crosscue.eval.batch.merge import gathered
+from crosscue.eval.batch.status import DriveState, drives_of_folder, pace_of
+from crosscue.eval.cli import run
+from crosscue.eval.runs.folder import FAILURE, signature
+from crosscue.replay.base import UnreadableRunError
+from support.drive_work import letters, made_jobs
+
+WORDS = ("plain", "damaged", "bug", "loss")
+
+
+@pytest.fixture
+def batch(tmp_path: Path) -> list[Job]:
+    """Four drives that have been worked on, two of which failed, and one that is planned."""
+    jobs = made_jobs(tmp_path, WORDS)
+    write_plan(tmp_path / "runs", [*(job.name for job in jobs), "later"], "all")
+    run_many(jobs, letters, in_turn)
+    return jobs
+
+
+def states(folder: Path) -> dict[str, str]:
+    return {one.run.name: one.state.value for one in drives_of_folder(folder)}
+
+
+def test_every_planned_drive_is_in_one_state(batch: list[Job], tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+
+    assert states(folder) == {
+        "drive0": "done",
+        "drive1": "failed",
+        "drive2": "failed",
+        "drive3": "done",
+        "later": "waiting",
+    }
+    found = crosscue.batch_status(folder)
+    assert [found.count(state) for state in DriveState] == [2, 0, 2, 0, 1]
+    # Four drives ended a moment ago, and nobody works on the last.
+    assert found.pace.per_hour > 4.0
+    assert math.isnan(found.pace.left_s)
+
+
+def test_a_failure_leaves_its_log_in_the_run_folder(batch: list[Job], tmp_path: Path) -> None:
+    text = (batch[2].run / FAILURE).read_text()
+
+    assert "error     ZeroDivisionError: a bug; a bug in crosscue" in text
+    assert "Traceback" in text
+    assert str(error_of(batch[1].run)).endswith("cut; copy it again")
+    assert f"{batch[2].run / FAILURE}" in repr(crosscue.batch_status(tmp_path / "runs"))
+
+    Path(batch[2].logs[0]).write_text("healed")
+    run_many(batch, letters, in_turn)
+    assert not (batch[2].run / FAILURE).exists()
+    assert states(tmp_path / "runs")["drive2"] == "done"
+
+
+def test_a_worker_that_is_gone_leaves_a_stale_drive(
+    batch: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "runs"
+    later = folder / "later"
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True
+    )
+    pid, host, started = signature().split(" ", 2)
+    dead = f"{int(gone.stdout)} {host} {started}"
+    elsewhere = f"{pid} another-machine {started}"
+
+    for worker, state in ((signature(), "running"), (dead, "stale"), (elsewhere, "running")):
+        write_entry(later, {"inputs": None, "worker": worker})
+        assert states(folder)["later"] == state
+    assert pace_of(drives_of_folder(folder), folder).left_s > 0.0
+
+    monkeypatch.setattr(status, "STALE_S", 60.0)
+    os.utime(entry_path(later), (1.0e9, 1.0e9))
+    assert states(folder)["later"] == "stale"
+    assert run(["status", str(folder), "-q"]) == 3
+
+
+def test_drives_without_a_run_are_merged_as_failures_whatever_the_order(
+    batch: list[Job], tmp_path: Path
+) -> None:
+    other = tmp_path / "other" / "runs"
+    write_plan(other, ["drive0", "drive1", "drive9"], "1/2")
+    folders = [tmp_path / "runs", other]
+
+    runs, failures = gathered(folders)
+
+    assert set(runs) == {"drive0", "drive3"}
+    assert set(failures) == {"drive1", "drive2", "drive9", "later"}
+    assert "cut; copy it again" in failures["drive1"]
+    assert failures["later"] == "no run yet (waiting); replay again"
+    assert gathered(folders[::-1])[1] == failures
+
+
+def test_where_no_batch_is_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UnreadableRunError, match="no batch of drives; give the folder"):
+        drives_of_folder(tmp_path)
+    with pytest.raises(crosscue.UsageError, match="each named once"):
+        crosscue.batch_status(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("torn", ["", "[]", '{"drives": 3}', "{"])
+def test_a_torn_plan_hides_no_drive_that_was_begun(
+    batch: list[Job], tmp_path: Path, torn: str
+) -> None:
+    folder = tmp_path / "runs"
+    (folder / ".drives" / "plans" / "all.json").write_text(torn)
+
+    assert len(states(folder)) == len(batch)
+    assert json.loads((folder / ".drives" / "drive0.json").read_text())["exit_status"] == 0
