@@ -177,8 +177,7 @@ FOLDERS: Final = {
     ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"),
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
     ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
-    ("merge", "RUNS"), ("query", "RUNS"),
-    ("merge", "RUNS"), ("status", "RUNS"),
+    ("merge", "RUNS"), ("query", "RUNS"), ("status", "RUNS"),
 }  # fmt: skip
 """An empty folder in their place lacks a file, which is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {

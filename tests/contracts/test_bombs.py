@@ -58,7 +58,7 @@ REPORTS_THE_RUN = {"score", "score detector", "fit detector"}
 """They read single pictures or none, and report what was dropped as the run does."""
 OPENS_NONE: dict[str, str] = {
     "compare": "tables", "query": "tables", "merge": "tables",
-    "compare": "tables", "merge": "tables", "status": "the journal",
+    "status": "the journal",
     "fit ranges": "tables", "fit messages": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
     "train mask-rcnn": "pictures", "train frames": "nothing", "truth schema": "nothing",
