@@ -23,7 +23,7 @@ from crosscue.datasets.simulated.sensor_blocks import BUS, GYRO, MAGNETOMETER, s
 from crosscue.detectors import rle
 from crosscue.detectors.base import Choice, Detections, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.eval.pipeline.reestimate import estimate_run
+from crosscue.eval.pipeline.replay import estimate_run
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.replay.base import EVERYTHING, Block, Images, Ledger, Messages, Topic
 from crosscue.replay.logs.opening import open_log

@@ -32,7 +32,7 @@ from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
 from crosscue.detectors.base import Choice
 from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.eval.pipeline.reestimate import estimate_run
+from crosscue.eval.pipeline.replay import estimate_run
 from crosscue.eval.recording import save
 from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.eval.runs.stored_images import camera_of, read_pictures

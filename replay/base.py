@@ -139,7 +139,9 @@ __all__ = [
     "installed",
     "json_tree",
     "losses_heard",
+    "name_of",
     "one_line",
+    "origin",
     "read_at_most",
     "report_missing",
     "sha256_of",
@@ -234,6 +236,26 @@ class Log(Protocol):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None: ...
+
+
+@runtime_checkable
+class HasUrl(Protocol):
+    """A log that was opened by a URL; asking for its path may fetch all of it."""
+
+    @property
+    def url(self) -> str:
+        """As it was given."""
+        ...
+
+
+def origin(log: Log) -> Path | str:
+    """Where a log comes from: a path or a URL."""
+    return log.url if isinstance(log, HasUrl) else log.path
+
+
+def name_of(log: Log) -> str:
+    """What a log is called in accounts: its URL, else its path."""
+    return str(origin(log))
 
 
 @runtime_checkable

@@ -25,9 +25,8 @@ from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
 from crosscue.replay.base import OutputError, json_tree, strict_json, write_text
 
 from .annotations import LabelledSet
-from .calibration import fitted, judged
 from .loop import Schedule, Training
-from .measure import rates_by_score, raw_detections
+from .measure import fitted, judged, rates_by_score, raw_detections
 from .operating_point import Judged
 from .reproducible import decides_bits, reproducible
 from .samples import Sampler, Window

@@ -36,6 +36,7 @@ from crosscue.replay.base import (
     Selection,
     Table,
     Topic,
+    name_of,
     versions,
     visible,
 )
@@ -47,7 +48,6 @@ from crosscue.replay.mobileye.can.admit import all_ids
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
-from crosscue.replay.remote.logs import name_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle

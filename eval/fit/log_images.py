@@ -23,7 +23,7 @@ from crosscue.replay.base import (
     warn_of,
 )
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.readers.images.names import picture_names
+from crosscue.replay.readers.images.folder import picture_names
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.stamp_watch import StampWatch

@@ -12,8 +12,7 @@ from crosscue.eval.interface.show import listing
 from crosscue.eval.vehicle.check import Checked, Shown, check
 from crosscue.eval.vehicle.check_page import check_output, write_check
 from crosscue.eval.vehicle.mounting import estimate_mounting
-from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
-from crosscue.replay.remote.logs import name_of
+from crosscue.replay.base import EmptyResultError, OutputError, UsageError, name_of, write_text
 from crosscue.replay.vehicle.drafting.camera import Measured, Mounting, camera_of
 from crosscue.replay.vehicle.drafting.text import Examined, draft, examine
 from crosscue.replay.vehicle.vehicle import Vehicle, parse, vehicle_given

@@ -17,9 +17,9 @@ from crosscue.replay.base import (
     SchemaError,
     Selection,
     VehicleError,
+    name_of,
 )
-from crosscue.replay.remote.logs import name_of
-from crosscue.replay.signals.kinds import Plan, Signal
+from crosscue.replay.signals.plan import Plan, Signal
 
 TOPICS_SHOWN: Final = 12
 ROLES: Final[Mapping[Signal, str]] = {

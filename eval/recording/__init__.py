@@ -22,7 +22,7 @@ from crosscue.replay.base import Floats, write_whole
 if TYPE_CHECKING:
     import rerun as rr
 
-    from .drive_time import DriveTime
+    from .columns import DriveTime
 
 __all__ = ["save"]
 
@@ -47,7 +47,7 @@ def save(
     """
     import rerun as rr
 
-    from .drive_time import time_of
+    from .columns import time_of
     from .layout import Shown, blueprint
     from .scene_rows import longest_m, scene_rows
 

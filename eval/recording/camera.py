@@ -12,7 +12,7 @@ from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded
 from crosscue.replay.base import Block, Images, LogError
 
-from .drive_time import DriveTime
+from .columns import DriveTime
 
 PASSED_THROUGH: Final = ("jpeg", "png")
 """Codings that the viewer decodes itself."""

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-
-from .drive_time import DriveTime
 
 Colour: TypeAlias = tuple[int, int, int]
 
@@ -118,3 +116,31 @@ def packed(colours: Sequence[Colour]) -> NDArray[np.uint32]:
     """As Rerun keeps colours: red first, opaque."""
     rgb = np.asarray(colours, np.uint32).reshape(-1, 3)
     return (rgb @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 0xFF).astype(np.uint32)
+
+
+TIMELINE: Final = "drive"
+"""Not ``log_time``: under that name the viewer keeps the wall clock of the logging itself."""
+YEAR_2000_NS: Final = 946_684_800_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class DriveTime:
+    """How a drive's times are shown.
+
+    Attributes:
+        is_date: As dates; else as durations, for logs on a clock that begins with the machine.
+    """
+
+    is_date: bool
+
+    def column(self, t_ns: NDArray[np.int64] | Sequence[int]) -> list[rr.TimeColumn]:
+        """The index of ``send_columns`` for rows at these times."""
+        times = np.asarray(t_ns, np.int64)
+        if self.is_date:
+            return [rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))]
+        return [rr.TimeColumn(TIMELINE, duration=times.astype("timedelta64[ns]"))]
+
+
+def time_of(first_ns: int) -> DriveTime:
+    """For a drive that begins then."""
+    return DriveTime(first_ns > YEAR_2000_NS)

@@ -10,7 +10,7 @@ import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from .drive_time import TIMELINE
+from .columns import TIMELINE
 from .series import BELIEF, CUES, POSE, RANGE
 
 FAR_M: Final = 110.0

@@ -29,8 +29,7 @@ from crosscue.detectors.cues.road import road_fractions
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .columns import Colour, Shapes, arrows, boxes, labelled_strips, strips
-from .drive_time import DriveTime
+from .columns import Colour, DriveTime, Shapes, arrows, boxes, labelled_strips, strips
 
 FRAMES_HELD: Final = 256
 CAR: Final = (80, 170, 255)

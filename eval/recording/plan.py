@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 
 from .colours import ELLIPSE, END, ESTIMATE, LANDMARK, START, TRUTH
-from .columns import Shapes, strips_above
-from .drive_time import DriveTime
+from .columns import DriveTime, Shapes, strips_above
 from .scene_rows import SceneRows
 
 PATH_POINTS: Final = 20_000

@@ -18,8 +18,7 @@ from crosscue.replay.vehicle.fusion import NOT_FEATURES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, QUIET, START, TRUTH, of_feature
-from .columns import Colour
-from .drive_time import DriveTime
+from .columns import Colour, DriveTime
 from .scene_rows import SceneRows
 
 BELIEF: Final = ("plots", "belief")

@@ -6,9 +6,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.limits import MIB
-
-PIECE_BYTES: Final = MIB
+PIECE_BYTES: Final = 1 << 20
 
 
 def read_at_most(path: Path, max_bytes: int) -> bytes | None:

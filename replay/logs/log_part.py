@@ -6,8 +6,8 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 
-from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError
-from crosscue.replay.remote.logs import RangedLog, name_of
+from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError, name_of
+from crosscue.replay.remote.logs import RangedLog
 
 
 def part_of(

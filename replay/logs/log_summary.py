@@ -24,6 +24,7 @@ from crosscue.replay.base import (
     Selection,
     Topic,
     TopicAccount,
+    name_of,
     report_missing,
 )
 from crosscue.replay.clocks.findings import (
@@ -34,7 +35,6 @@ from crosscue.replay.clocks.findings import (
     instant_text,
 )
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
-from crosscue.replay.remote.logs import name_of
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
 

@@ -8,7 +8,15 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from crosscue.replay.base import DEFAULT_LIMITS, Ledger, Limits, Log, LogError, MissingTopicError
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    Ledger,
+    Limits,
+    Log,
+    LogError,
+    MissingTopicError,
+    name_of,
+)
 from crosscue.replay.formats import FORMATS, format_of, known_formats
 
 
@@ -69,8 +77,6 @@ def unless_damaged(logs: Sequence[Log]) -> Iterator[None]:
     try:
         yield
     except MissingTopicError as error:
-        from crosscue.replay.remote.logs import name_of
-
         for log in logs:
             ledger = Ledger(name_of(log))
             for _ in log.read(ledger):

@@ -11,9 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, CanFrames, Ledger, Log, Selection, Table, Topic, UsageError
+from crosscue.replay.base import (
+    Block,
+    CanFrames,
+    Ledger,
+    Log,
+    Selection,
+    Table,
+    Topic,
+    UsageError,
+    name_of,
+)
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.remote.logs import name_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -390,16 +390,6 @@ class RangedLog:
         return self._whole
 
 
-def origin(log: Log) -> Path | str:
-    """Where a log comes from: a path or a URL."""
-    return log.url if isinstance(log, RemoteLog | RangedLog) else log.path
-
-
-def name_of(log: Log) -> str:
-    """What a log is called in accounts: its URL, else its path."""
-    return str(origin(log))
-
-
 def open_remote(
     url: str, opener: Callable[[Path], Log], limits: Limits, store: Store | None = None
 ) -> RemoteLog | RangedLog:

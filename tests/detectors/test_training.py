@@ -18,8 +18,8 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts, load_checkpoint, save_checkpoint
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
-from crosscue.detectors.training.calibration import fitted, judged
 from crosscue.detectors.training.loop import Schedule, Training
+from crosscue.detectors.training.measure import fitted, judged
 from crosscue.detectors.training.operating_point import Judged
 from crosscue.detectors.training.samples import Sampler, Window, read_picture
 from crosscue.detectors.training.scores import average_precisions

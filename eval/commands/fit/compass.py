@@ -13,10 +13,10 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.terminal import (
     add_log_arguments,
     add_vehicle_output,
+    open_part,
     print_result,
 )
 

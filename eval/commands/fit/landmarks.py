@@ -17,11 +17,11 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.terminal import (
     add_part_arguments,
     add_vehicle_output,
     metres,
+    open_part,
     print_result,
 )
 

@@ -15,8 +15,12 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.terminal import add_part_arguments, metres, print_result
+from crosscue.eval.commands.shared.terminal import (
+    add_part_arguments,
+    metres,
+    open_part,
+    print_result,
+)
 from crosscue.replay.base import UsageError
 
 

@@ -22,8 +22,12 @@ import sys
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.terminal import add_part_arguments, print_json, progress_line
+from crosscue.eval.commands.shared.terminal import (
+    add_part_arguments,
+    open_part,
+    print_json,
+    progress_line,
+)
 from crosscue.replay.safe_text import terminal_width, wrapped
 
 SHOWN = 20

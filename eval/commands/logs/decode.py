@@ -10,8 +10,12 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.terminal import add_log_arguments, print_result, progress_line
+from crosscue.eval.commands.shared.terminal import (
+    add_log_arguments,
+    open_part,
+    print_result,
+    progress_line,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -15,11 +15,11 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.terminal import (
     Done,
     add_part_arguments,
     limits_of,
+    open_part,
     print_json,
     with_progress,
 )

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
-from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.terminal import (
     DriveLine,
     add_log_arguments,
     is_shown,
+    open_part,
     print_result,
 )
 from crosscue.replay.errors import UsageError

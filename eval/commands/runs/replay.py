@@ -22,7 +22,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
-from crosscue.eval.commands.shared.drive_part import open_part
 from crosscue.eval.commands.shared.terminal import (
     DriveLine,
     DrivesLine,
@@ -30,6 +29,7 @@ from crosscue.eval.commands.shared.terminal import (
     add_part_arguments,
     is_shown,
     limits_of,
+    open_part,
     print_result,
 )
 from crosscue.replay.errors import UsageError

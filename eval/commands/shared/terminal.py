@@ -10,11 +10,13 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self, TypeVar
 
+import crosscue
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,
@@ -87,6 +89,17 @@ def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
 def limits_of(args: argparse.Namespace) -> Limits:
     """The limits that a log is read with."""
     return replace(DEFAULT_LIMITS, chunk_bytes=args.max_chunk)
+
+
+@contextmanager
+def open_part(args: argparse.Namespace, logs: Sequence[Path | str]) -> Iterator[crosscue.Log]:
+    """The drive, open, of which only the part is read that ``add_part_arguments`` asks for."""
+    from crosscue.replay.logs.log_part import part_in_words
+    from crosscue.replay.logs.opening import unless_damaged
+
+    with crosscue.open(*logs, limits=limits_of(args)) as log, unless_damaged(log.logs):
+        part = part_in_words(log.logs, args.start, args.end, args.topics)
+        yield replace(log, selection=part)
 
 
 def _mebibytes(text: str) -> int:

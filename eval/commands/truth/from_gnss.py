@@ -13,8 +13,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.drive_part import open_part
-from crosscue.eval.commands.shared.terminal import add_log_arguments, print_json
+from crosscue.eval.commands.shared.terminal import add_log_arguments, open_part, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

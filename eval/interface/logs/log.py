@@ -33,6 +33,7 @@ from crosscue.replay.base import (
     Topic,
     TopicAccount,
     UsageError,
+    name_of,
     warn_of,
 )
 from crosscue.replay.base import Log as OneLog
@@ -43,7 +44,6 @@ from crosscue.replay.logs.log_part import part_of
 from crosscue.replay.logs.opening import open_log as open_one
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.logs.topic_part import columns_of
-from crosscue.replay.remote.logs import name_of
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -23,7 +23,7 @@ from crosscue.eval.batch.shards import read_shard
 from crosscue.eval.interface.logs.log import open as open_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import FAILURE, create
-from crosscue.eval.runs.input import files_named_in
+from crosscue.eval.runs.logs import files_named_in
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, versions, visible
 from crosscue.replay.logs.log_part import part_in_words
 from crosscue.replay.logs.opening import unless_damaged

@@ -157,7 +157,7 @@ def estimate_run(
         RunError: The run is damaged, or its log is gone.
         OutputError: The new folder exists.
     """
-    from crosscue.eval.pipeline.reestimate import estimate_run as estimate_in
+    from crosscue.eval.pipeline.replay import estimate_run as estimate_in
 
     folder = run_given(run).folder
     settings = _settings_again(

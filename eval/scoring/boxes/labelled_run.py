@@ -24,7 +24,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import reopened
 from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
 from crosscue.replay.base import EmptyResultError, Int64s, SchemaError, UsageError
-from crosscue.replay.readers.images.names import picture_names
+from crosscue.replay.readers.images.folder import picture_names
 
 from .matching import NOBODY, Boxes
 

@@ -6,16 +6,18 @@ Which files are time files and how they are read: ``time_file``; how pictures ge
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
 from crosscue.replay.base import (
+    DEFAULT_LIMITS,
     EVERYTHING,
     Block,
     Closing,
     Ledger,
     Limits,
+    Log,
     LogFormatError,
     Selection,
     Topic,
@@ -87,3 +89,17 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     if time_file.parent == path:
         pictures.touched.add(time_file, 0, time_file.stat().st_size)
     return ImageFolder(path, pictures, limits)
+
+
+def picture_names(log: Log) -> Mapping[str, int]:
+    """From file name to time, for a folder of pictures."""
+    if log.format != "images":
+        return {}
+    time_file = find_time_file(log.path)
+    assert time_file is not None
+    files = pair(list_files(log.path, IMAGE_SUFFIXES), read_time_file(time_file, DEFAULT_LIMITS))
+    return {
+        path.name: t_ns
+        for path, t_ns in zip(files.paths, files.t_ns.tolist(), strict=True)
+        if t_ns >= 0
+    }

@@ -18,8 +18,7 @@ from crosscue.replay.files.checksum import crc32
 from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, run_of, table_of
 from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
-from crosscue.replay.readers.mcap.damage.find import find_bytes
-from crosscue.replay.readers.mcap.damage.repair import proved_head
+from crosscue.replay.readers.mcap.damage.find import find_bytes, proved_head
 
 from .bytes import PIECE, ByteFile
 from .channels import Declarations, TopicBook

@@ -18,8 +18,7 @@ import numpy as np
 
 from crosscue.replay.base import Bytes, Limits
 from crosscue.replay.readers.mcap.chunks.rows import Rows, opcodes, rows_by_scan
-from crosscue.replay.readers.mcap.damage.find import find_chunk
-from crosscue.replay.readers.mcap.damage.repair import REPAIRED, is_doubtful, proved_head
+from crosscue.replay.readers.mcap.damage.find import REPAIRED, find_chunk, is_doubtful, proved_head
 from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync, is_exact
 
 from .bytes import ByteFile

@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
-from crosscue.replay.base import Ledger, Log, Selection, Table, warn_of
+from crosscue.replay.base import Ledger, Log, Selection, Table, name_of, warn_of
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.remote.logs import name_of
 from crosscue.replay.vehicle.roles import Role, role_of
 
 

@@ -17,10 +17,10 @@ from crosscue.replay.base import (
     Log,
     Selection,
     Table,
+    name_of,
     warn_of,
 )
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.remote.logs import name_of
 from crosscue.replay.vehicle.roles import Role, role_of
 
 from .candidates import Candidate, Kind, candidates

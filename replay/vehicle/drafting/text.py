@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import EmptyResultError, Log
-from crosscue.replay.remote.logs import name_of
+from crosscue.replay.base import EmptyResultError, Log, name_of
 from crosscue.replay.vehicle.roles import Role, role_of
 
 from .agreement import Verdict

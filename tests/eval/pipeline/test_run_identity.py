@@ -14,7 +14,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.runs.input import identity_in
+from crosscue.eval.runs.logs import identity_in
 from crosscue.eval.runs.manifest import FORMAT_VERSION
 from support.trees import tree
 

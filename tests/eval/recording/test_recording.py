@@ -18,7 +18,7 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
 from crosscue.eval.recording import save
 from crosscue.eval.recording.camera import shown
-from crosscue.eval.recording.drive_time import time_of
+from crosscue.eval.recording.columns import time_of
 from crosscue.eval.recording.layout import Shown, blueprint
 from crosscue.eval.recording.marks import outline, road_lines
 from crosscue.eval.recording.notes import inert
