@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.mobileye.geometry import evaluate
-from crosscue.replay.signals.plan import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.mobileye_cues import Past
 

@@ -11,7 +11,8 @@ from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
 from crosscue.localization.fit.compass import CompassFit, fit_compass
 from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError
-from crosscue.replay.signals.plan import Signal, plan
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_signals import read_signals

@@ -17,7 +17,8 @@ from crosscue.localization.odometry import integrate
 from crosscue.localization.start_pose import START_S, start_pose
 from crosscue.replay.base import Log, MissingTopicError, Selection, UsageError, VehicleError
 from crosscue.replay.logs.log_part import first_ns
-from crosscue.replay.signals.plan import Signal, plan
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.pose import GnssUse, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 

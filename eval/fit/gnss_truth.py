@@ -13,7 +13,8 @@ from crosscue.datasets.truth.truth import Mounting, Origin, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.localization.compass import course_at
 from crosscue.replay.base import EmptyResultError, Floats, Int64s, Log, Selection, name_of
-from crosscue.replay.signals.plan import Samples, Signal, plan
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_signals import read_signals

@@ -8,7 +8,7 @@ import numpy as np
 
 from crosscue.replay.base import Ledger, Log, Selection, name_of, warn_of
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.plan import Plan, Samples, Signal
+from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.vehicle import Vehicle
 

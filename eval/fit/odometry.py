@@ -19,7 +19,8 @@ from crosscue.localization.fit.known_drive import KnownDrive, whitened
 from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit, fit_odometry
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.replay.base import EmptyResultError, Floats, Log, Selection, VehicleError, name_of
-from crosscue.replay.signals.plan import Samples, Signal, plan
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle
 

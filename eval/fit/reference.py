@@ -13,7 +13,7 @@ from crosscue.datasets.truth.tum import heading_rad
 from crosscue.eval.scoring.pose.score import load_truth, mounting_of
 from crosscue.localization.fixes import Fixes
 from crosscue.replay.base import EmptyResultError, Floats, Int64s
-from crosscue.replay.signals.plan import Samples
+from crosscue.replay.signals.kinds import Samples
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 GeodeticOrigin: TypeAlias = tuple[float, float, float]

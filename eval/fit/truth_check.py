@@ -23,6 +23,7 @@ from crosscue.datasets.truth.annotations import (
 )
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.cvat import read_cvat
+from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
@@ -41,7 +42,6 @@ from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
 
 from .log_images import LogSpan, log_pictures, log_span
 
-OBJECTS: Final = "objects.json"
 SLACK_NS: Final = 1_000_000_000
 """Truth may begin or end so far outside its log: clocks and last pictures differ a little."""
 
@@ -320,7 +320,7 @@ def _imported(
             "log_sha256": truth.log_sha256,
         }
         truth = before.model_copy(update=kept)
-    objects = output.parent / OBJECTS
+    objects = output.parent / OBJECTS_FILE
     write_text(objects, strict_json(coco_tree(annotations, placed, cues)) + "\n")
     write_text(output, strict_json(truth.model_dump(mode="json")) + "\n")
     there: dict[str, int] = {}
@@ -354,5 +354,5 @@ def _truth(
         source=f"annotations in {source.name}",
         cues=cue_truths(annotations, placed, cues),
         own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*CUES})),
-        objects=OBJECTS,
+        objects=OBJECTS_FILE,
     )

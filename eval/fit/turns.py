@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from crosscue.localization.odometry import TurnKind, TurnSignal, WheelSpeeds
-from crosscue.replay.signals.plan import Samples, Signal
+from crosscue.replay.signals.kinds import Samples, Signal
 
 
 def wheel_speeds(samples: Samples) -> WheelSpeeds:

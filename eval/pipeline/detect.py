@@ -55,7 +55,8 @@ from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Block, Int64s, Ledger, Log, Selection, VehicleError, versions
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.plan import Plan, Source, camera_of
+from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.intrinsics import check_center, doubts
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -9,7 +9,8 @@ import numpy as np
 from crosscue.eval.runs.folder import RunFolder, TimeSegments
 from crosscue.replay.base import Log, Selection, Topic, UsageError, VehicleError
 from crosscue.replay.signals.extractor import Extractor, probe_clocks, wheels_only
-from crosscue.replay.signals.plan import Plan, Signal, plan, with_pictures
+from crosscue.replay.signals.kinds import Plan, Signal
+from crosscue.replay.signals.plan import plan, with_pictures
 from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -19,7 +19,7 @@ from crosscue.replay.base import (
     VehicleError,
     name_of,
 )
-from crosscue.replay.signals.plan import Plan, Signal
+from crosscue.replay.signals.kinds import Plan, Signal
 
 TOPICS_SHOWN: Final = 12
 ROLES: Final[Mapping[Signal, str]] = {

@@ -46,7 +46,8 @@ from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.plan import Plan, Signal, camera_of, plan, with_pictures
+from crosscue.replay.signals.kinds import Plan, Signal
+from crosscue.replay.signals.plan import camera_of, plan, with_pictures
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.time.segments import (
     LogClock,

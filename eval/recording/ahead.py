@@ -17,7 +17,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.mobileye.geometry import evaluate
-from crosscue.replay.signals.plan import LANE_COLUMNS, OBSTACLE_COLUMNS
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, ESTIMATE, FAINT, LANE, QUIET, START, TRUTH, VEHICLE

@@ -26,7 +26,7 @@ from crosscue.replay.base import (
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.plan import Plan, Source
+from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -24,7 +24,8 @@ from crosscue.replay.base import (
     warn_of,
 )
 from crosscue.replay.signals.extractor import Extractor, pictures_of
-from crosscue.replay.signals.plan import Plan, Samples, Signal, camera_of, plan
+from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.plan import camera_of, plan
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.drafting.agreement import (
     DEGREE,

@@ -11,7 +11,7 @@ from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.ros.reader import RosMobileye
-from crosscue.replay.signals.plan import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples, Signal
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples, Signal
 from crosscue.replay.vehicle.vehicle import Mobileye
 
 from .settings import MobileyeSettings

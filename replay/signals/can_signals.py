@@ -16,7 +16,7 @@ from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .converters import SPEED_UNITS, angle_samples, column_of, wheel_samples
-from .plan import MOBILEYE_SIGNALS, Samples, Signal
+from .kinds import MOBILEYE_SIGNALS, Samples, Signal
 
 
 class CanSignals:

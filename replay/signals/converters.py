@@ -11,7 +11,7 @@ import numpy as np
 from crosscue.replay.base import Block, Floats, Int64s, Ledger, Table, VehicleError
 from crosscue.replay.vehicle.vehicle import AngleSignal
 
-from .plan import Samples, Signal
+from .kinds import Samples, Signal
 
 SPEED_UNITS: Final[Mapping[str, float]] = {
     "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kph": 1 / 3.6, "kmh": 1 / 3.6, "kmph": 1 / 3.6,

@@ -17,7 +17,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .converters import FROM_TABLE
-from .plan import MOBILEYE_SIGNALS, Plan, Samples, Signal, Source
+from .kinds import MOBILEYE_SIGNALS, Plan, Samples, Signal, Source
 
 if TYPE_CHECKING:
     from crosscue.replay.decode.packets import PacketDecoder

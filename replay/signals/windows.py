@@ -14,7 +14,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from crosscue.replay.base import Block, Ledger, Readable, Selection
-from crosscue.replay.signals.plan import Plan, Samples, Signal
+from crosscue.replay.signals.kinds import Plan, Samples, Signal
 
 WIDTH_NS: Final = 1_000_000_000
 HORIZON_NS: Final = 60_000_000_000

@@ -16,7 +16,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from crosscue.replay.base import Block, Ledger, Log, Selection
-from crosscue.replay.signals.plan import Plan, Samples, Signal, Source
+from crosscue.replay.signals.kinds import Plan, Samples, Signal, Source
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .segments import BEGINNING, Cause, Epoch, LogClock, Marks, Segment, Timeline

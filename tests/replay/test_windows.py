@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import EVERYTHING, Block, Ledger, Topic, VehicleError
 from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.plan import Signal, plan
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.signals.windows import HORIZON_NS, Window, windows
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block

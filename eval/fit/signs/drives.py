@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.detectors.images import Encoded, encoded
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.eval.fit.signs.labels import Boxes, Labelled, coco_boxes
-from crosscue.eval.fit.truth_check import OBJECTS
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EVERYTHING,
@@ -40,7 +40,7 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[La
     drives = drives_of([str(folder)])
     if len(drives.drives) != 1 or len(drives.drives[0].logs) != 1:
         raise AnnotationError(f"{folder}: holds not one log; give the folder of one drive")
-    return _pictures(drives.drives[0], _boxes(folder / OBJECTS), limits)
+    return _pictures(drives.drives[0], _boxes(folder / OBJECTS_FILE), limits)
 
 
 def _boxes(path: Path) -> dict[int, Boxes]:

@@ -37,7 +37,7 @@ from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import TRAFFIC_LIGHT, Vehicle
 
-from .sign_ranges import MEASURED, Usable, source_of, usable
+from .usable import MEASURED, Usable, source_of, usable
 
 CLEARLY: Final = 2.0
 """Standard deviations of the difference of two ranges."""

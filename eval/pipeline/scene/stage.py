@@ -34,7 +34,7 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .outcome import ApproachSummary, SceneOutcome
-from .sign_ranges import MEASURED
+from .usable import MEASURED
 
 if TYPE_CHECKING:
     import pyarrow as pa

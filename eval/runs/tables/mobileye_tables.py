@@ -17,7 +17,7 @@ import numpy as np
 from crosscue.detectors.cues.far_side import MobileyeState, end_of, past_counts, state_at
 from crosscue.fusion.evidence import PastCues
 from crosscue.fusion.intersection_range import RangeBelief, Reference
-from crosscue.replay.signals.plan import (
+from crosscue.replay.signals.kinds import (
     LANE_COLUMNS,
     MOBILEYE_SIGNALS,
     OBSTACLE_COLUMNS,

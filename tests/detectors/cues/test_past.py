@@ -25,7 +25,8 @@ from crosscue.detectors.cues.far_side import (
 from crosscue.replay.base import Block, Floats, Ledger, Selection, Topic, VehicleError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.plan import MOBILEYE_SIGNALS, Samples, Signal, plan
+from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.signals.windows import Window, windows
 from crosscue.replay.vehicle.mobileye_cues import Past
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse

@@ -8,7 +8,8 @@ import pytest
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import NO_CURVE
 from crosscue.eval.pipeline.scene.motion_ranges import ONE_GROUP, ONLY_AWAY, MotionRanges
-from crosscue.eval.pipeline.scene.sign_ranges import CUT, SignRanges, source_of
+from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
+from crosscue.eval.pipeline.scene.usable import CUT, source_of
 from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.factor_graph import graph_of

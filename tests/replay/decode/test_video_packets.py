@@ -15,7 +15,7 @@ from crosscue.replay.base import Block, Images, Ledger, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.plan import Plan, Source
+from crosscue.replay.signals.kinds import Plan, Source
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.videos import SIZE_PX, number_of, video
 

@@ -10,7 +10,8 @@ import pytest
 
 from crosscue.replay.base import DATA, EVERYTHING, Block, CanFrames, Ledger, Table, Topic
 from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.plan import Signal, plan
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.drafting.camera import Mounting
 from crosscue.replay.vehicle.drafting.observed import observe
 from crosscue.replay.vehicle.drafting.text import draft, examine
