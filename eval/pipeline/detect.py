@@ -187,6 +187,7 @@ def detect_into(
         notices = (
             *gaps_text(timeline.segments),
             *_simulated_only(choices, logs),
+            *_without_cues(named, vehicle),
             *_without_thresholds(named, vehicle),
             *tables.notices,
         )
@@ -250,6 +251,19 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
         "choose a model with crosscue model list"
         for choice in choices
         if knows_simulated_only(choice)
+    ]
+
+
+def _without_cues(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
+    """Detectors of objects of which none is counted by a cue."""
+    counted = {label for labels in vehicle.cue_labels().values() for label in labels}
+    labels = {one.name: reportable(one.detector) for one in named}
+    return [
+        f"warning: {name}: no cue counts any of its {len(some)} labels ({', '.join(some[:3])}"
+        f"{', ...' if len(some) > 3 else ''}); "
+        "state what its classes mean under [labels] in its card"
+        for name, some in labels.items()
+        if some and counted.isdisjoint(some)
     ]
 
 

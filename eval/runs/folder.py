@@ -223,6 +223,26 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
     return RunFolder(path)
 
 
+@contextmanager
+def created(path: Path, *, overwrite: bool) -> Iterator[RunFolder]:
+    """As ``create``; a folder that was not there before goes again if it stays empty.
+
+    Raises:
+        RunError: As ``create``.
+        OutputError: As ``create``.
+    """
+    is_new = not path.exists()
+    run = create(path, overwrite=overwrite)
+    try:
+        yield run
+    except BaseException:
+        if is_new:
+            # Not where a run cut short has left files.
+            with suppress(OSError):
+                path.rmdir()
+        raise
+
+
 def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
     """Delete an earlier run's files; the lock stays. Call it while holding the lock.
 

@@ -36,6 +36,8 @@ def explain(error: ValidationError, text: str | None, where: str, root: type[Bas
         return f"{place}: no such key; {_suggestion(keys, root)}{more}"
     if first["type"] == "missing":
         return f"{place}: missing; add it{more}"
+    if not keys:
+        return f"{where}: {first['msg'].removeprefix('Value error, ')}{more}"
     given = repr(first["input"])
     if len(given) > GIVEN_CHARACTERS:
         given = f"{given[:GIVEN_CHARACTERS]}..."

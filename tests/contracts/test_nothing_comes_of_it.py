@@ -55,5 +55,5 @@ def test_nothing_comes_of_it(
     assert captured.out == ""
     assert captured.err.startswith("crosscue: ")
     assert captured.err.count("\n") == 1
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not list(tmp_path.iterdir())
     assert not (names["run"] / "score").exists()

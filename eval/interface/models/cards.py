@@ -22,6 +22,7 @@ from crosscue.replay.base import (
     Bytes,
     LogError,
     UsageError,
+    VehicleError,
     write_bytes,
     write_text,
 )
@@ -230,6 +231,12 @@ def _try(place: Path, written: Draft) -> None:
     try:
         build(card=str(trial))
         trial.replace(place)
+    except VehicleError as error:
+        said = str(error).removeprefix(f"{trial}: ").removesuffix("; correct the card")
+        raise VehicleError(
+            f"{place}: not written, the network does not run with it: {said}; choose another "
+            "--kind or --size, or export the network again"
+        ) from None
     finally:
         trial.unlink(missing_ok=True)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.interface.runs.run import Run, run_given
-from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.runs.folder import RunFolder, created
 from crosscue.replay.base import OutputError, UsageError
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
@@ -85,7 +85,7 @@ def replay_drive(
         if landmarks is not None:
             matcher = matcher_for(settings)
             database = stack.enter_context(open_for(Path(landmarks), matcher))
-        folder = create(Path(output), overwrite=overwrite or resume)
+        folder = stack.enter_context(created(Path(output), overwrite=overwrite or resume))
         outcome = replay_into(
             drive.logs,
             settings,
@@ -119,17 +119,17 @@ def detect_drive(
         choices = choices_for(settings, detectors)
         if not choices:
             raise UsageError(f"--detectors: none named; there are: {', '.join(known({}))}")
-        folder = create(Path(output), overwrite=overwrite)
-        outcome = detect_into(
-            drive.logs,
-            settings,
-            folder,
-            drive.selection,
-            choices,
-            None if cache is None else Path(cache),
-            draw,
-            on_frames,
-        )
+        with created(Path(output), overwrite=overwrite) as folder:
+            outcome = detect_into(
+                drive.logs,
+                settings,
+                folder,
+                drive.selection,
+                choices,
+                None if cache is None else Path(cache),
+                draw,
+                on_frames,
+            )
     return Run(folder, outcome)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crosscue.eval.interface.logs.log import Log, opened
-from crosscue.eval.runs.folder import create
+from crosscue.eval.runs.folder import created
 from crosscue.replay.base import RunError, visible
 
 from .make import vehicle_of
@@ -79,8 +79,8 @@ def decode(
 
     with opened(log) as drive:
         settings = vehicle_of(drive, vehicle)
-        folder = create(Path(output), overwrite=overwrite)
-        return decode_tables(drive.logs, settings, folder, drive.selection, on_rows)
+        with created(Path(output), overwrite=overwrite) as folder:
+            return decode_tables(drive.logs, settings, folder, drive.selection, on_rows)
 
 
 def merge(
@@ -105,5 +105,6 @@ def merge(
     runs, failures = gathered(places)
     if not runs:
         raise RunError(f"{places[0]}: no finished run in it; replay first")
-    merged = merge_runs(runs, create(Path(output), overwrite=overwrite), failures)
+    with created(Path(output), overwrite=overwrite) as folder:
+        merged = merge_runs(runs, folder, failures)
     return MergedRuns(merged.run.path, tuple(sorted(runs)), failures, merged.rows)

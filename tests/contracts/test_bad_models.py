@@ -1,0 +1,123 @@
+"""Networks, cards and labels that do not fit: one line, and nothing is left of the run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.eval import cli
+from support.onnx_models import constant_model
+from support.pictures import picture_folder
+
+ROWS = np.array([[[4.0, 4.0, 20.0, 20.0, 0.9, 1.0]]], np.float32)
+OUTPUT = 'kind = "end-to-end"\nscore = 0.3\nclasses = {}\n'
+CAMERA = "version = 1\n[camera]\nfocal_px = 900.0\ncenter_px = [960.0, 540.0]\n"
+BAD = {
+    "nan": "net.toml: output: 1 of 1 candidates are not finite numbers; correct the card",
+    "other-shape": "net.toml: output: expected (1, N, 6)",
+    "other-classes": "class numbers 1 to 1, but 1 classes are listed; correct the card",
+    "no-classes": "net.toml: output.classes is empty; list the network's classes",
+    "other-size": "the network does not run on input 40 x 32",
+    "empty-card": "net.toml:1: version: missing; add it",
+    "other-weights": "; fetch the weights again, or write a card for these",
+    "no-weights": "net.onnx: No such file",
+    "other-camera": "outside the images of 24 x 16 pixels",
+}
+"""What is bad of a network for three pictures, and a part of the line that says so."""
+
+
+def card(folder: Path, model: bytes, classes: list[str], width_px: int = 64) -> str:
+    """A card for a network that is written beside it."""
+    (folder / "net.onnx").write_bytes(model)
+    text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
+    text += f"[input]\nwidth_px = {width_px}\nheight_px = 32\n[output]\n"
+    return text + OUTPUT.format(json.dumps(classes))
+
+
+def made_bad(folder: Path, bad: str) -> None:
+    """Write ``net.toml`` with its network, and ``car.toml``."""
+    rows = {"nan": np.full_like(ROWS, np.nan), "other-shape": ROWS[:, :, :5]}.get(bad, ROWS)
+    classes = {"other-classes": ["dog"], "no-classes": []}.get(bad, ["dog", "cat"])
+    model = constant_model((1, 3, 32, 64), {"rows": rows})
+    text = card(folder, model, classes, 40 if bad == "other-size" else 64)
+    (folder / "net.toml").write_text("" if bad == "empty-card" else text)
+    if bad == "other-weights":
+        (folder / "net.onnx").write_bytes(model + b" ")
+    if bad == "no-weights":
+        (folder / "net.onnx").unlink()
+    (folder / "car.toml").write_text(CAMERA if bad == "other-camera" else "version = 1\n")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three pictures."""
+    return picture_folder(tmp_path_factory.mktemp("log") / "front", 3, "rate_hz: 10\n")
+
+
+@pytest.mark.parametrize("command", ["replay", "detect"])
+@pytest.mark.parametrize("bad", BAD)
+def test_a_network_that_does_not_fit_stops_the_run_in_one_line(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], bad: str, command: str
+) -> None:
+    made_bad(tmp_path, bad)
+    out, net, car = tmp_path / "out", tmp_path / "net.toml", tmp_path / "car.toml"
+    argv = [command, log, "--detectors", net, "--vehicle", car, "--no-cache", "-o", out]
+
+    status = cli.run([str(one) for one in argv])
+
+    captured = capsys.readouterr()
+    assert status == 2
+    assert captured.out == ""
+    assert captured.err.startswith("crosscue: ")
+    assert captured.err.count("\n") == 1
+    assert BAD[bad] in captured.err
+    assert not out.exists()
+
+
+def test_no_card_is_left_for_a_network_without_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "names.txt").write_text("dog\ncat\n")
+    net = tmp_path / "net.onnx"
+    net.write_bytes(constant_model((1, 3, 32, 64), {"rows": np.full_like(ROWS, np.nan)}))
+    before = sorted(tmp_path.iterdir())
+
+    argv = ["model", "init", net, "--class-names", tmp_path / "names.txt", "--kind", "end-to-end"]
+    status = cli.run([str(one) for one in argv])
+
+    said = capsys.readouterr().err
+    assert status == 2
+    assert said.count("\n") == 1
+    assert "net.toml: not written, the network does not run with it: output: 1 of 1" in said
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_network_of_which_no_cue_counts_a_label_and_labels_of_other_pictures(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made_bad(tmp_path, "nothing")
+    out = tmp_path / "out"
+    argv = ["detect", log, "--detectors", tmp_path / "net.toml", "--no-cache", "-o", out]
+    assert cli.run([str(one) for one in argv]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "warning: net: no cue counts any of its 2 labels (cat, dog)" in said
+    assert "[labels] in its card" in said
+
+    box = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 9, 9]}
+    picture = {"id": 1, "file_name": "elsewhere.png", "width": 24, "height": 16}
+    coco = {"categories": [{"id": 1, "name": "dog"}], "images": [picture], "annotations": [box]}
+    labels = tmp_path / "coco.json"
+    labels.write_text(json.dumps(coco))
+    for command in ("score detector", "fit detector"):
+        argv = [*command.split(), out, "--labels", labels]
+        assert cli.run([str(one) for one in argv]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "none of its 1 images is in" in said
+    assert not (out / "score").exists()
+    shutil.rmtree(out)
