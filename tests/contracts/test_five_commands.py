@@ -1,0 +1,117 @@
+"""From a fresh export of each layout to a scored drive, by the commands of the how-to page."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from crosscue.datasets.truth.truth import CueTruth, Truth, save
+from crosscue.detectors.catalog.card import read_card
+from crosscue.eval import cli
+from support.decoder_samples import CLASSES, SAMPLES, SIZE
+from support.onnx_models import constant_model
+from support.pandaset_drive import START_S, pandaset_drive
+from support.pictures import picture
+from support.torchvision_files import network
+
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "networks.md"
+HOME = Path("datasets") / "real" / "pandaset_002"
+"""Where the page has the vehicle file and the truth of its drive."""
+FRAMES = 3
+TWO_FIT = ("yolox",)
+"""A network that answers noise as it answers pictures leaves two layouts, and the page says what
+to do then."""
+
+
+def commands() -> list[str]:
+    """The first block of the page, with a recording instead of a window."""
+    block = re.search(r"```\n(crosscue model init.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
+    assert block is not None
+    return block[1].replace("view run", "view run -o drive.rrd").splitlines()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all that the page speaks of, but the network: pictures of 24 x 16 pixels."""
+    place = tmp_path_factory.mktemp("place")
+    camera = pandaset_drive(place / "PANDASET", FRAMES) / "camera" / "front_camera"
+    (camera / "intrinsics.json").write_text('{"fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 8.0}')
+    (place / "street.jpg").write_bytes(picture(0, ".jpg"))
+    (place / "names.txt").write_text("\n".join(CLASSES))
+    (place / HOME).mkdir(parents=True)
+    (place / HOME / "vehicle.toml").write_text("version = 1\n")
+    start_ns, end_ns = round(1e9 * (START_S - 1.0)), round(1e9 * (START_S + 1.0))
+    there = CueTruth(cue="stop_sign", present=True, start_ns=start_ns, end_ns=end_ns)
+    save(Truth(version=1, start_ns=start_ns, end_ns=end_ns, cues=(there,)), place / HOME)
+    return place
+
+
+def export(path: Path, kind: str) -> None:
+    """A network of a layout that finds a stop sign in every picture."""
+    sample = SAMPLES[kind]()
+    outputs = {
+        name: values if values.dtype.kind == "i" else values.astype(np.float32)
+        for name, values in sample.outputs.items()
+    }
+    is_bytes = kind == "ssd-tensorflow"
+    shape = (1, SIZE[1], SIZE[0], 3) if is_bytes else sample.input_shape
+    model = onnx.load_model_from_string(constant_model(shape, outputs))
+    if is_bytes:
+        model.graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.UINT8
+    path.write_bytes(model.SerializeToString())
+
+
+def followed(
+    place: Path,
+    weights: str,
+    kind: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> tuple[int, int, int]:
+    """Run the page's commands for a file of weights; its stop sign cue: right, of, frames."""
+    monkeypatch.chdir(place)
+    chosen = ["--kind", kind] if kind in TWO_FIT else []
+    lines = commands()
+    assert len(lines) == 5
+    for line in lines:
+        asked = line.replace("my.onnx", weights).removeprefix("crosscue ").split()
+        more = {
+            "model init": ["--overwrite", *chosen],
+            "replay PANDASET": ["--overwrite", "--no-cache"],
+            "view run": ["--overwrite"],
+        }
+        assert cli.run([*asked, *more.get(" ".join(asked[:2]), [])]) == 0, capsys.readouterr().err
+    assert Path("drive.rrd").stat().st_size
+    metrics = json.loads(Path("run", "score", "metrics.json").read_text())
+    found = metrics["cues"]["stop_sign"]
+    right = found["precision"]
+    return int(right["right"]), int(right["of"]), int(found["scored"])
+
+
+@pytest.mark.parametrize("kind", SAMPLES)
+def test_an_export_gets_to_a_scored_drive_by_the_page(
+    place: Path, kind: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(place / "my.onnx", kind)
+
+    scored = followed(place, "my.onnx", kind, capsys, monkeypatch)
+
+    assert read_card(place / "my.toml").output.kind == kind
+    assert scored == (FRAMES, FRAMES, FRAMES)
+
+
+def test_weights_of_torchvision_get_there_by_the_same_commands(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = network("ssdlite320_mobilenet_v3_large", classes=1 + len(CLASSES)).state_dict()
+    torch.save(state, place / "my.pth")
+
+    scored = followed(place, "my.pth", "torchvision", capsys, monkeypatch)
+
+    assert scored[2] == FRAMES
