@@ -45,6 +45,7 @@ _EXPORTS: Final = {
     "estimate_run": "eval.interface.runs.make",
     "score_run": "eval.interface.runs.score",
     "compare_runs": "eval.interface.runs.compare",
+    "compare_many": "eval.interface.runs.compare",
     "catalog": "eval.catalog.query.catalog",
     "Catalog": "eval.catalog.query.catalog",
     "save_recording": "eval.interface.runs.recording",
@@ -266,6 +267,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.batch import ReplayedDrives as ReplayedDrives
     from crosscue.eval.interface.runs.batch import find_drives as find_drives
     from crosscue.eval.interface.runs.batch import replay_drives as replay_drives
+    from crosscue.eval.interface.runs.compare import compare_many as compare_many
     from crosscue.eval.interface.runs.compare import compare_runs as compare_runs
     from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
     from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector

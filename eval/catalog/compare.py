@@ -9,7 +9,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
@@ -124,6 +124,8 @@ class Comparison:
         drives: Drives in both runs, only in the first, only in the second.
         why_no_metrics: Empty where both runs were scored.
         is_whole: Nothing was dropped in either.
+        left_out: Of comparisons of many runs, by run why it takes no part.
+        is_many: Is it of many runs against many?
     """
 
     changes: tuple[Change, ...]
@@ -135,6 +137,8 @@ class Comparison:
     drives: tuple[int, int, int]
     why_no_metrics: str
     is_whole: bool = True
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    is_many: bool = False
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -150,10 +154,21 @@ class Comparison:
         """Paths of the metrics with this verdict."""
         return tuple(one.path for one in self.judged if one.verdict == verdict)
 
+    def cases(self) -> tuple[tuple[str, str], ...]:
+        """For CI: by name of what is judged, why it fails, or nothing."""
+        judged = [(one.path, _failure(one)) for one in self.judged]
+        missing = [(path, "no longer scored") for path in self.no_longer_scored]
+        tables = [(one.name, one.what) for one in self.tables] if self.why_no_metrics else []
+        return (*judged, *missing, *tables)
+
+    def markdown(self) -> str:
+        """A short table of what is better, worse and undecided, for a pull request."""
+        return "\n".join(_markdown_lines(self))
+
     def as_dict(self) -> dict[str, object]:
         """What ``crosscue compare --json`` prints."""
         tree = asdict(self)
-        del tree["is_whole"]
+        del tree["is_whole"], tree["is_many"]
         return tree | {"worse": self.worse, "better": self.of("better")}
 
     def __repr__(self) -> str:
@@ -203,8 +218,8 @@ def compare_runs(
     tables = [found for name in names if (found := _compare_table(name, first, second)) is not None]
     scores = [_metrics_of(run) for run in (first, second)]
     same = len(names) - len(tables)
-    is_whole = _is_whole_run(first) and _is_whole_run(second)
-    parts = [_parts_of(run) for run in (first, second)]
+    is_whole = is_whole_run(first) and is_whole_run(second)
+    parts = [parts_of(run) for run in (first, second)]
     before, after = parts
     if None in scores or before is None or after is None:
         bare = [
@@ -214,7 +229,7 @@ def compare_runs(
         ]
         why = f"not scored, or by an earlier version: {', '.join(bare)}"
         return Comparison(changes, tuple(tables), (), (), (), same, (0, 0, 0), why, is_whole)
-    judged = compare_drives(before, after, lambda path, value: _allowed(path, value, tolerances))
+    judged = compare_drives(before, after, lambda path, value: allowed_by(path, value, tolerances))
     known = {one.metric for one in after}
     missing = {one.metric: None for one in before if one.rows and one.metric not in known}
     logs = [{one.log for one in part} for part in (before, after)]
@@ -225,12 +240,13 @@ def compare_runs(
     )
 
 
-def _allowed(path: str, before: float, tolerances: Sequence[Tolerance]) -> float:
+def allowed_by(path: str, before: float, tolerances: Sequence[Tolerance]) -> float:
+    """How much worse a metric may be: the last tolerance whose pattern fits counts."""
     fitting = (one for one in reversed(tolerances) if fnmatch.fnmatchcase(path, one.pattern))
     return next(fitting, NONE).allowed(before)
 
 
-def _parts_of(run: RunFolder) -> list[DriveMetric] | None:
+def parts_of(run: RunFolder) -> list[DriveMetric] | None:
     """What each drive adds to the metrics; None where the run was not scored."""
     folder = run if _is_pooled(run.path) else RunFolder(run.file(FOLDER))
     if not folder.file(f"{BY_DRIVE}.parquet").exists():
@@ -247,7 +263,7 @@ def open_scored(path: Path) -> RunFolder:
     return RunFolder(path) if _is_pooled(path) else open_run(path)
 
 
-def _is_whole_run(run: RunFolder) -> bool:
+def is_whole_run(run: RunFolder) -> bool:
     """Was nothing dropped in the run, or in any of those that were scored together?"""
     if not _is_pooled(run.path):
         return run.manifest().account.is_whole
@@ -384,6 +400,12 @@ def _lines(found: Comparison) -> Iterator[str]:
     for metric in _first_of(found.metrics, "metrics"):
         yield metric if isinstance(metric, str) else _metric_line(metric)
     same = len(found.judged) - len(differing)
+    if found.is_many:
+        yield f"equal      {same} judged metrics; different: {len(differing)}"
+        for name, why in found.left_out.items():
+            yield f"left out   {visible(name)}: {visible(why)}"
+        yield from _verdict_lines(found, len(differing))
+        return
     yield (
         f"equal      {found.tables_same} tables, {same} judged metrics; "
         f"different: {len(found.changes)} settings, {len(found.tables)} tables, "
@@ -396,15 +418,70 @@ def _lines(found: Comparison) -> Iterator[str]:
     yield from _verdict_lines(found, len(differing))
 
 
+def _failure(one: PairedMetric) -> str:
+    if one.verdict != "worse":
+        return ""
+    return (
+        f"{_value(one.before)} -> {_value(one.after)}, 95 % {one.low:+.3g} to {one.high:+.3g} "
+        f"over {one.drives} drives"
+    )
+
+
+def _markdown_lines(found: Comparison) -> Iterator[str]:
+    both, only_first, only_second = found.drives
+    counts = [len(found.worse), len(found.of("better"))]
+    differing = [one for one in found.judged if one.before != one.after]
+    undecided = [one for one in differing if one.verdict == "undecided"]
+    yield (
+        f"**{counts[0]} worse, {counts[1]} better, {len(undecided)} undecided**, "
+        f"{len(found.judged) - len(differing)} equal, over {both} drives"
+    )
+    notes = [
+        f"{only_first} drives only before, {only_second} only after"
+        if only_first or only_second
+        else "",
+        f"{len(found.left_out)} runs left out" if found.left_out else "",
+        f"{visible(found.why_no_metrics)}; {len(found.tables)} tables differ"
+        if found.why_no_metrics
+        else "",
+    ]
+    yield from (f"\n{note}." for note in notes if note)
+    shown = sorted(differing, key=lambda one: (ORDER.index(one.verdict), one.p, one.path))
+    if shown or found.no_longer_scored:
+        yield "\n| metric | before | after | difference (95 %) | drives | verdict |"
+        yield "|---|---|---|---|---|---|"
+    for path in found.no_longer_scored:
+        yield f"| {_cell(path)} | | | | | **worse**: no longer scored |"
+    kept = max(MAX_LINES, sum(counts))
+    for one in shown[:kept]:
+        ends = "too few drives"
+        if not math.isnan(one.low):
+            ends = f"{one.low:+.3g} to {one.high:+.3g}"
+        verdict = "**worse**" if one.verdict == "worse" else one.verdict
+        more = f"; {one.more_drives:,} more drives would decide" if one.more_drives else ""
+        yield (
+            f"| {_cell(one.path)} | {one.before:.4g} | {one.after:.4g} | "
+            f"{one.after - one.before:+.3g} ({ends}) | {one.drives} | {verdict}{more} |"
+        )
+    if len(shown) > kept:
+        yield f"\n{len(shown) - kept} more are undecided."
+
+
+def _cell(text: str) -> str:
+    """Text that can drive neither a terminal nor a table."""
+    return f"`{visible(text).replace('|', '/').replace('`', '')}`"
+
+
 def _verdict_lines(found: Comparison, differing: int) -> Iterator[str]:
     both, only_first, only_second = found.drives
     left_out = f"; {only_first} only in the first, {only_second} only in the second"
-    yield f"drives     {both} in both runs" + (left_out if only_first or only_second else "")
+    where = "on both sides" if found.is_many else "in both runs"
+    yield f"drives     {both} {where}" + (left_out if only_first or only_second else "")
     if differing and both < MIN_DRIVES:
         yield f"           too few to judge: below {MIN_DRIVES} drives every metric is undecided"
     elif differing:
         yield (
-            f"           equal runs get a verdict other than undecided in at most "
+            f"           a metric that did not change gets a verdict in at most "
             f"{100 * FALSE_ALARMS:.0f} % of comparisons, over all metrics"
         )
     worse, better = len(found.worse), len(found.of("better"))
@@ -441,7 +518,8 @@ def _judged_lines(one: PairedMetric) -> Iterator[str]:
     seen = "" if not math.isfinite(one.could_see) else f"; could have seen {one.could_see:.3g}"
     allowed = f"; allowed {one.allowed:.3g}" if one.allowed else ""
     drives = f"{one.drives} drive" + ("s" if one.drives != 1 else "")
-    yield f"{'':11}{one.after - one.before:+.3g} ({ends}) over {drives}{seen}{allowed}"
+    more = f"; {one.more_drives:,} more would decide" if one.more_drives else ""
+    yield f"{'':11}{one.after - one.before:+.3g} ({ends}) over {drives}{seen}{more}{allowed}"
 
 
 def _metric_line(one: MetricChange) -> str:

@@ -2,10 +2,16 @@
 
 If both runs are equally good, which of a drive's two results came from which run is arbitrary.
 Swapping them at random, drive by drive, shows how far metrics then differ by chance (a permutation
-test; Good, *Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3). The largest
-difference over all metrics counts, in units of its own spread (Westfall, Young, *Resampling-Based
-Multiple Testing*, 1993), so that equal runs get one or more verdicts in at most 5 % of comparisons,
-however many metrics there are and however they depend on each other.
+test; Good, *Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3).
+
+Many cues under many conditions are many chances for a false alarm. They are corrected by Holm's
+procedure (*Scandinavian Journal of Statistics* 6, 1979) with the swaps' own joint distribution in
+place of Bonferroni's bound (Westfall, Young, *Resampling-Based Multiple Testing*, 1993, algorithm
+4.1): from the metric that differs most, in units of its own spread, each is judged by the largest
+difference over those that remain. So a metric that did not change is called better or worse in at
+most 5 % of comparisons, however many there are, however they depend on each other, and whatever
+else did change. Benjamini and Hochberg's procedure decides more, but lets 5 % of its verdicts be
+false, which a gate that fails for a single one cannot use.
 """
 
 from __future__ import annotations
@@ -22,11 +28,13 @@ from crosscue.eval.scoring.by_drive import Direction, DriveMetric, Kind, directi
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 
 FALSE_ALARMS: Final = 0.05
-"""Comparisons of equal runs in which any verdict falls, at most."""
+"""Comparisons in which any metric that did not change gets a verdict, at most."""
 MIN_DRIVES: Final = 6
 """Of five, swapping can make a difference no rarer than 2 in 32: nothing is ever decided."""
 POWER_QUANTILE: Final = 0.841621
 """A difference as large as the smallest that could be seen is seen in 80 % of comparisons."""
+MAX_DRIVES: Final = 1_000_000
+"""Beyond, the number of drives that would decide is not worth printing."""
 EXACT_DRIVES: Final = 12
 SWAPS: Final = 1 << EXACT_DRIVES
 SEED: Final = 0
@@ -47,9 +55,12 @@ class PairedMetric:
         drives: Of which at least one run has rows.
         low: Lower end of the 95 % interval of after minus before, by drive; NaN below four drives.
         high: Its upper end.
-        p: How often chance makes some metric differ so much in equal runs.
+        p: How often chance makes this metric, or one that differs less, differ so much.
         could_see: The smallest difference that would be seen in 80 % of comparisons; infinite below
             six drives.
+        more_drives: How many more drives, as varied as these, would decide in 80 % of comparisons
+            whether a difference as large as this one is real; 0 where it is decided or zero,
+            None where nobody can know.
         allowed: How much worse it may be.
         verdict: Of the second run.
     """
@@ -63,6 +74,7 @@ class PairedMetric:
     high: float
     p: float
     could_see: float
+    more_drives: int | None
     allowed: float
     verdict: Verdict
 
@@ -92,41 +104,66 @@ def compare_drives(
     kinds: dict[str, Kind] = {one.metric: one.kind for one in (*first, *second)}
     known = {one.metric for one in first} & {one.metric for one in second}
     paths = [path for path in kinds if path in known]
-    sums = {path: _sums(path, logs, first, second) for path in paths}
+    found = _sums(logs, first, second)
+    sums = {path: found[path] for path in paths if path in found}
     sums = {path: one for path, one in sums.items() if one.rows.any() and one.other_rows.any()}
     swaps = _swaps(len(logs))
     spread = {path: _swapped(kinds[path], one, swaps) for path, one in sums.items()}
     units = {path: float(np.sqrt(np.mean(one**2))) for path, one in spread.items()}
     differing = [path for path in sums if units[path] > 0.0]
-    largest = np.max([np.abs(spread[p]) / units[p] for p in differing] or [np.zeros(len(swaps))], 0)
-    critical = _critical(largest)
+    scaled = np.array([np.abs(spread[path]) / units[path] for path in differing])
+    p, critical = step_down(scaled.reshape(len(differing), len(swaps)))
+    p_of = dict(zip(differing, map(float, p), strict=True))
     return tuple(
-        _judged(path, kinds[path], sums[path], units[path], largest, critical, allowed_of)
+        _judged(path, kinds[path], sums[path], p_of.get(path, 1.0), critical, allowed_of)
         for path in sums
     )
 
 
+def step_down(
+    statistics: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Corrected p values, and what a statistic must exceed to count among all of them.
+
+    Args:
+        statistics: Shape (M, S), of M metrics, each in units of its own spread: as observed in the
+            first column, as chance makes them in all.
+
+    Returns:
+        Shape (M,); and infinity where too few swaps exist for any verdict.
+    """
+    metrics = len(statistics)
+    if not metrics:
+        return np.ones(0), math.inf
+    order = np.argsort(-statistics[:, 0], kind="stable")
+    ordered = statistics[order]
+    # Of each metric and all that differ less.
+    largest = np.maximum.accumulate(ordered[::-1], axis=0)[::-1]
+    corrected = np.empty(metrics)
+    is_reached = largest >= ordered[:, :1] - ROUNDING
+    corrected[order] = np.maximum.accumulate(is_reached.mean(axis=1))
+    return corrected, _critical(largest[0])
+
+
 def _sums(
-    path: str, logs: Sequence[str], first: Sequence[DriveMetric], second: Sequence[DriveMetric]
-) -> _Sums:
+    logs: Sequence[str], first: Sequence[DriveMetric], second: Sequence[DriveMetric]
+) -> dict[str, _Sums]:
+    """By metric, what each drive adds in both runs."""
     place = {log: i for i, log in enumerate(logs)}
-    columns = []
-    for parts in (first, second):
-        total, rows = np.zeros(len(logs)), np.zeros(len(logs))
+    columns: dict[str, NDArray[np.float64]] = {}
+    for side, parts in enumerate((first, second)):
         for one in parts:
-            if one.metric == path and one.log in place:
-                total[place[one.log]] += one.total
-                rows[place[one.log]] += one.rows
-        columns += [total, rows]
-    return _Sums(*columns)
+            if one.log in place:
+                found = columns.setdefault(one.metric, np.zeros((4, len(logs))))
+                found[2 * side : 2 * side + 2, place[one.log]] += one.total, one.rows
+    return {path: _Sums(*found) for path, found in columns.items()}
 
 
 def _swaps(drives: int) -> NDArray[np.float64]:
     """Shape (S, G): 1 where a drive's results are swapped; the first row swaps none."""
     if drives <= EXACT_DRIVES:
-        return np.array(
-            [[float(row >> i & 1) for i in range(drives)] for row in range(1 << drives)]
-        ).reshape(1 << drives, drives)
+        rows = np.arange(1 << drives)[:, None]
+        return (rows >> np.arange(drives) & 1).astype(np.float64)
     drawn = np.random.default_rng(SEED).integers(0, 2, (SWAPS, drives)).astype(np.float64)
     drawn[0] = 0.0
     return drawn
@@ -164,8 +201,7 @@ def _judged(
     path: str,
     kind: Kind,
     sums: _Sums,
-    unit: float,
-    largest: NDArray[np.float64],
+    p: float,
     critical: float,
     allowed_of: Callable[[str, float], float],
 ) -> PairedMetric:
@@ -178,7 +214,6 @@ def _judged(
     difference = after - before
     sd, drives = _jackknife(kind, sums)
     half = _t(drives - 1, 0.95) * sd if drives >= MIN_CLUSTERS else math.nan
-    p = float(np.mean(largest >= abs(difference) / unit - ROUNDING)) if unit else 1.0
     allowed = allowed_of(path, before)
     sign = 1.0 if better == "higher" else -1.0
     verdict: Verdict = "undecided"
@@ -188,6 +223,8 @@ def _judged(
         elif abs(difference) - half > allowed:
             verdict = "worse"
     could_see = (critical + POWER_QUANTILE) * sd if sd else math.nan
+    could_see = could_see if drives >= MIN_DRIVES else math.inf
+    is_open = verdict == "undecided" and difference != 0.0
     return PairedMetric(
         path=path,
         before=before,
@@ -197,10 +234,19 @@ def _judged(
         low=difference - half,
         high=difference + half,
         p=p,
-        could_see=could_see if drives >= MIN_DRIVES else math.inf,
+        could_see=could_see,
+        more_drives=_more_drives(could_see, difference, drives) if is_open else 0,
         allowed=allowed,
         verdict=verdict,
     )
+
+
+def _more_drives(could_see: float, difference: float, drives: int) -> int | None:
+    """What can be seen shrinks with the root of the number of drives."""
+    if not math.isfinite(could_see):
+        return None
+    enough = drives * (could_see / difference) ** 2
+    return max(math.ceil(enough) - drives, 1) if enough < MAX_DRIVES else None
 
 
 def _jackknife(kind: Kind, sums: _Sums) -> tuple[float, int]:

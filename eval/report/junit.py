@@ -1,4 +1,4 @@
-"""Gate results as JUnit XML, which CI systems show as tests."""
+"""Gates and comparisons as JUnit XML, which CI systems show as tests."""
 
 from __future__ import annotations
 
@@ -26,21 +26,24 @@ def write_junit(path: Path, results: Sequence[GateResult], suite: str) -> None:
 
 def junit_text(results: Sequence[GateResult], suite: str) -> str:
     """The file's text; characters that XML cannot hold are shown, not kept."""
-    failed = sum(bool(one.failure) for one in results)
-    counts = {"tests": str(len(results)), "failures": str(failed), "errors": "0", "skipped": "0"}
+    return cases_text([(one.gate.text(), one.failure) for one in results], suite, "gate")
+
+
+def cases_text(cases: Sequence[tuple[str, str]], suite: str, kind: str) -> str:
+    """The same of cases of a kind, each with its name and why it fails, if it does."""
+    failed = sum(bool(failure) for _, failure in cases)
+    counts = {"tests": str(len(cases)), "failures": str(failed), "errors": "0", "skipped": "0"}
     root = ET.Element("testsuites", counts)
     parent = ET.SubElement(root, "testsuite", {"name": fit_for_xml(suite), **counts, "time": "0"})
-    for one in results:
+    for name, why in cases:
         case = ET.SubElement(
             parent,
             "testcase",
-            {"classname": "crosscue.gate", "name": fit_for_xml(one.gate.text()), "time": "0"},
+            {"classname": f"crosscue.{kind}", "name": fit_for_xml(name), "time": "0"},
         )
-        if one.failure:
-            failure = ET.SubElement(
-                case, "failure", {"type": "gate", "message": fit_for_xml(one.failure)}
-            )
-            failure.text = fit_for_xml(f"{one.gate.text()}: {one.failure}")
+        if why:
+            failure = ET.SubElement(case, "failure", {"type": kind, "message": fit_for_xml(why)})
+            failure.text = fit_for_xml(f"{name}: {why}")
     ET.indent(root)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ET.tostring(root, "unicode") + "\n"
 

@@ -27,7 +27,6 @@ BETTER: Final[Mapping[str, Direction]] = {
 """By the last part of a metric's path; metrics of other names are shown but not judged."""
 PARTS: Final = (
     "by_distance",
-    "by_condition",
     "by_control",
     "by_intersection",
     "by_drive",
@@ -81,10 +80,24 @@ def parts_of(log: str, tree: Mapping[str, Any], pose: PoseScore | None) -> Itera
         yield _part(log, "pose.lost", MetricValue(float(pose.lost_at_m is not None)), {})
 
 
+COUNTED_BY: Final = {
+    "detected": "approaches",
+    "full": "approaches",
+    "detected_m": "detected",
+    "full_m": "full",
+}
+"""Under a condition: the count beside a metric that says how many approaches it stands on."""
+
+
 def _part(
     log: str, path: str, value: MetricValue, values: Mapping[str, MetricValue]
 ) -> DriveMetric:
     outer, _, name = path.rpartition(".")
+    if "by_condition" in path.split(".") and name in COUNTED_BY:
+        rows = int(values[f"{outer}.{COUNTED_BY[name]}"].value)
+        is_mean = name.endswith("_m")
+        total = (rows * value.value if is_mean else value.value) if rows else 0.0
+        return DriveMetric(log, path, "mean", total, rows)
     if math.isnan(value.value):
         return DriveMetric(log, path, "rms" if name == "rmse_m" else "mean", 0.0, 0)
     if name == "rmse_m":

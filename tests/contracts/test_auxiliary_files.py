@@ -165,7 +165,7 @@ NAMED_IN_THE_VEHICLE_FILE: Final[dict[str, str]] = {
     "info": "{log} --vehicle {strange}",
 }
 """Commands that read the DBC files of a vehicle file."""
-WRITTEN: Final = {"--output", "--cache", "--figure", "--sheet"}
+WRITTEN: Final = {"--output", "--junit", "--cache", "--figure", "--sheet"}
 """Options whose file is made if it is missing."""
 NO_FILES: Final = {"LAYOUT", "SQL"}
 """Arguments that are no files."""

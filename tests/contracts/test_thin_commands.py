@@ -22,7 +22,7 @@ CALLS: Final = {
     "merge": ("merge",),
     "query": ("catalog",),
     "status": ("batch_status",),
-    "compare": ("compare_runs",),
+    "compare": ("compare_runs", "compare_many"),
     "vehicle init": ("draft_vehicle",),
     "vehicle check": ("check_vehicle",),
     "truth": ("write_truth",),

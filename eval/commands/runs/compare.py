@@ -1,17 +1,23 @@
-"""What changed between two runs: versions, settings, tables, metrics.
+"""What changed between two runs, or between many runs and many: better, worse or undecided.
 
-Each metric is better, worse or undecided, by the drives that both runs have (six or more). Two runs
-that differ by chance only are all undecided in at least 95 % of comparisons. Each line shows the
-95 % interval of the difference, and how large a difference these drives would have shown.
+Each metric is judged drive by drive, over the drives that both have (six or more). A metric that
+did not change gets a verdict in at most 5 % of comparisons, over all cues and conditions together.
+Each line shows the 95 % interval of the difference, how large a difference these drives would have
+shown, and how many more would decide.
 
-Exit status 1 when a metric is worse by more than its tolerance (default: 0) or no longer scored. A
-tolerance is a number in the metric's unit, a fraction of the first run's value (2%), or either for
-the metrics of a pattern; the last that fits counts. Runs that were not scored: exit status 1 when a
-table differs. Folders that crosscue score -o wrote for several runs can be compared as well.
+With --runs and --against, queries on the catalog of a folder select the runs to judge and those to
+compare them with, one of each drive.
+
+Exit status 1 when a metric is worse by more than its tolerance (default: 0) or no longer scored,
+never for noise. A tolerance is a number in the metric's unit, a fraction of the first value (2%),
+or either for the metrics of a pattern; the last that fits counts. Two runs that were not scored:
+exit status 1 when a table differs. Folders that crosscue score -o wrote for several runs can be
+compared as well.
 
 examples:
   crosscue compare runs/before runs/after
   crosscue compare runs/before runs/after --tolerance 1% 'cues.*.precision=0.02'
+  crosscue compare runs --runs "tags['model'] = 'new'" --against "tags['model'] = 'old'" --markdown
 """
 
 from __future__ import annotations
@@ -21,12 +27,19 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import print_result
+from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("first", type=Path, metavar="RUN_A", help="reference run")
-    parser.add_argument("second", type=Path, metavar="RUN_B", help="run to compare with it")
+    parser.add_argument(
+        "first", type=Path, metavar="RUN_A", help="reference run; with --runs, a folder of runs"
+    )
+    parser.add_argument(
+        "second", nargs="?", type=Path, metavar="RUN_B", help="run to compare with it"
+    )
+    parser.add_argument("--runs", metavar="QUERY", help="the runs to judge, of the folder RUN_A")
+    parser.add_argument("--against", metavar="QUERY", help="the runs to compare them with")
     parser.add_argument(
         "--tolerance",
         nargs="+",
@@ -34,11 +47,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="T",
         help="allowed deterioration of metrics: 0.01, 2%% or PATTERN=0.01",
     )
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.add_argument(
+        "--junit", type=Path, metavar="XML", help="write a test case for each judged metric"
+    )
+    shown = parser.add_mutually_exclusive_group()
+    shown.add_argument(
+        "--markdown", action="store_true", help="print a short table, for a pull request"
+    )
+    shown.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, report, and return 1 when the second run is worse, 3 when either has drops."""
-    found = crosscue.compare_runs(args.first, args.second, args.tolerance)
-    print_result(found, args)
+    """Compare, report, and return 1 when a metric is worse, 3 when either side has drops."""
+    found = _compared(args)
+    if args.markdown and not args.quiet:
+        print(found.markdown())
+    else:
+        print_result(found, args)
     return 0 if found.is_passed and found.is_whole else 3 if found.is_passed else 1
+
+
+def _compared(args: argparse.Namespace) -> crosscue.Comparison:
+    queries = [args.runs, args.against]
+    if queries == [None, None]:
+        if args.second is None:
+            raise UsageError("compare: expected two runs, or --runs and --against")
+        return crosscue.compare_runs(args.first, args.second, args.tolerance, args.junit)
+    if None in queries or args.second is not None:
+        raise UsageError("compare: expected one folder with both --runs and --against")
+    return crosscue.compare_many(args.runs, args.against, args.first, args.tolerance, args.junit)

@@ -1,16 +1,22 @@
-"""Two runs compared."""
+"""Two runs compared, or many against many."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from crosscue.eval.catalog import compare
+from crosscue.eval.catalog import compare, many_runs
+from crosscue.eval.catalog.query.catalog import select_runs
 from crosscue.eval.interface.runs.run import Run
+from crosscue.eval.report.junit import cases_text
+from crosscue.replay.base import UsageError, write_text
 
 
 def compare_runs(
-    first: Run | Path | str, second: Run | Path | str, tolerances: Sequence[str] = ()
+    first: Run | Path | str,
+    second: Run | Path | str,
+    tolerances: Sequence[str] = (),
+    junit: Path | str | None = None,
 ) -> compare.Comparison:
     """What changed from one run to another: settings, tables, metrics, and what is worse.
 
@@ -18,8 +24,53 @@ def compare_runs(
         first: The run to compare with.
         second: The run to judge.
         tolerances: How much worse metrics may be: ``0.01``, ``2%`` or ``PATTERN=0.01``.
+        junit: File for a test case of each judged metric, which fails where that is worse.
     """
     allowed = [compare.read_tolerance(text) for text in tolerances]
     paths = [one.path if isinstance(one, Run) else Path(one) for one in (first, second)]
     before, after = (compare.open_scored(path) for path in paths)
-    return compare.compare_runs(before, after, allowed)
+    return _reported(compare.compare_runs(before, after, allowed), junit)
+
+
+def compare_many(
+    runs: str | Sequence[Run | Path | str],
+    against: str | Sequence[Run | Path | str],
+    folder: Path | str | None = None,
+    tolerances: Sequence[str] = (),
+    junit: Path | str | None = None,
+) -> compare.Comparison:
+    """Whether many runs are better or worse than others of the same drives, or neither is decided.
+
+    Runs are paired by the identity of their drive. What a verdict means is in the how-to page
+    on comparing fleets.
+
+    Args:
+        runs: The runs to judge: their folders, or with ``folder`` a query that selects them.
+        against: The runs to compare with, likewise.
+        folder: The folder of all runs, whose catalog the queries ask.
+        tolerances: As of ``compare_runs``.
+        junit: As of ``compare_runs``.
+
+    Raises:
+        UsageError: A query without ``folder``, or that is wrong; two runs of one drive on a side.
+        RunError: A side has no scored run.
+    """
+    allowed = [compare.read_tolerance(text) for text in tolerances]
+    after, before = (_selected(one, folder) for one in (runs, against))
+    return _reported(many_runs.compare_many(before, after, allowed), junit)
+
+
+def _reported(found: compare.Comparison, junit: Path | str | None) -> compare.Comparison:
+    if junit is not None:
+        write_text(Path(junit), cases_text(found.cases(), "compare", "comparison"))
+    return found
+
+
+def _selected(
+    runs: str | Sequence[Run | Path | str], folder: Path | str | None
+) -> tuple[Path, ...]:
+    if not isinstance(runs, str):
+        return tuple(one.path if isinstance(one, Run) else Path(one) for one in runs)
+    if folder is None:
+        raise UsageError(f"{runs!r}: a query needs the folder of the runs; give folder")
+    return select_runs(folder, runs)

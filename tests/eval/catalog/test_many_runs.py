@@ -1,0 +1,136 @@
+"""Many runs against many: paired by drive, whatever their folders are called."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pyarrow.parquet as pq
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.eval.catalog.many_runs import compare_many
+from crosscue.eval.runs.folder import create, write_manifest
+from crosscue.eval.scoring.by_drive import DriveMetric, table_of
+from support.manifests import estimated
+
+RECALL = "cues.stop_sign.recall"
+DUSK = "cues.stop_sign.by_condition.dusk.recall"
+
+
+def scored_runs(folder: Path, right: Sequence[int], first: int = 0) -> list[Path]:
+    """A run of each drive, so many of 20 signs found, and half of them at dusk."""
+    found = []
+    for number, count in enumerate(right, first):
+        run = create(folder / f"{folder.name}-{number}", overwrite=False)
+        write_manifest(run, estimated())
+        (run.path / "score").mkdir()
+        parts = [
+            DriveMetric(f"drive {number}", RECALL, "mean", float(count), 20),
+            DriveMetric(f"drive {number}", DUSK, "mean", float(count // 2), 10),
+        ]
+        pq.write_table(table_of(iter(parts)), run.path / "score" / "by_drive.parquet")
+        found.append(run.path)
+    return found
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight drives, replayed before and after a change that costs every drive some signs."""
+    folder = tmp_path_factory.mktemp("fleet")
+    scored_runs(folder / "before", [18, 19, 20, 18, 19, 20, 18, 19])
+    scored_runs(folder / "after", [12, 14, 13, 11, 14, 15, 12, 13])
+    return folder
+
+
+QUERIES = ("--runs", "run like 'after/%'", "--against", "run like 'before/%'")
+
+
+def test_queries_select_what_is_compared(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    junit = tmp_path / "junit.xml"
+
+    assert cli.run(["compare", str(fleet), *QUERIES, "--json", "--junit", str(junit)]) == 1
+
+    found = json.loads(capsys.readouterr().out)
+    assert found["worse"] == [RECALL, DUSK]
+    assert found["drives"] == [8, 0, 0]
+    root = ET.fromstring(junit.read_text())
+    assert (root.get("tests"), root.get("failures")) == ("2", "2")
+    turned = [QUERIES[0], QUERIES[3], QUERIES[2], QUERIES[1]]
+    assert cli.run(["compare", str(fleet), *turned, "-q"]) == 0
+
+
+def test_a_table_for_a_pull_request(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["compare", str(fleet), *QUERIES, "--markdown", "--tolerance", "0.9"]) == 0
+
+    text = capsys.readouterr().out
+    assert "**0 worse, 0 better, 2 undecided**, 0 equal, over 8 drives" in text
+    assert cli.run(["compare", str(fleet), *QUERIES, "--markdown"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert "**2 worse, 0 better, 0 undecided**" in lines[0]
+    assert any(line.startswith(f"| `{RECALL}` | 0.9437 | 0.65 |") for line in lines)
+    assert all(line.count("|") == 7 for line in lines if line.startswith("|"))
+
+
+def test_the_order_of_runs_and_their_names_change_nothing(fleet: Path) -> None:
+    before, after = (sorted((fleet / side).iterdir()) for side in ("before", "after"))
+
+    found = crosscue.compare_many(after, before)
+
+    assert found.judged == crosscue.compare_many(after[::-1], before[3:] + before[:3]).judged
+    assert found.is_many
+    assert found.worse == (RECALL, DUSK)
+
+
+def test_drives_of_one_side_and_runs_without_a_score_are_reported(
+    tmp_path: Path, fleet: Path
+) -> None:
+    before = sorted((fleet / "before").iterdir())
+    after = scored_runs(tmp_path / "after", [19] * 7, first=4)
+    bare = create(tmp_path / "bare", overwrite=False)
+    write_manifest(bare, estimated())
+
+    found = compare_many(before, [*after, bare.path, tmp_path / "gone"])
+
+    assert found.drives == (4, 4, 3)
+    assert [why.partition(";")[0] for why in found.left_out.values()] == [
+        "not scored, or by an earlier version",
+        f"{tmp_path / 'gone'}: no manifest.json: not a run folder, or its run was cut short",
+    ]
+    assert not found.is_whole
+    assert found.is_passed
+
+
+def test_two_runs_of_one_drive_on_a_side_are_refused(tmp_path: Path, fleet: Path) -> None:
+    before = sorted((fleet / "before").iterdir())
+    twice = scored_runs(tmp_path / "twice", [5])
+
+    with pytest.raises(crosscue.UsageError, match="are runs of one drive; narrow the query"):
+        compare_many([*before, *twice], before)
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "what"),
+    [
+        (("--runs", "true"), 2, "expected one folder with both --runs and --against"),
+        (("other", *QUERIES), 2, "expected one folder with both"),
+        ((), 2, "expected two runs, or --runs and --against"),
+        (("--runs", "nam = 'a'", "--against", "true"), 2, "name"),
+        (("--runs", "false", "--against", "true"), 2, "runs of one drive"),
+        (("--runs", "false", "--against", "run like 'before/%'"), 4, "selects no run"),
+    ],
+)
+def test_wrong_queries_are_one_line(
+    fleet: Path,
+    words: tuple[str, ...],
+    status: int,
+    what: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.run(["compare", str(fleet), *words]) == status
+    said = capsys.readouterr().err
+    assert what in said
+    assert said.count("\n") == 1
