@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,7 +12,8 @@ from crosscue.replay.base import UnreadableRunError, UsageError
 
 from . import database, parts
 from .columns import INDEXED, OWN, VIEWS
-from .index import Index, open_index
+from .index import Index, Runs, open_index
+from .local import LocalRuns
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,9 +28,9 @@ class Catalog:
     It knows the runs that were there then; their own tables are read when a query names them.
     """
 
-    def __init__(self, folder: Path, index: Index) -> None:
+    def __init__(self, places: Runs, index: Index) -> None:
         """Use ``catalog`` instead."""
-        self.folder: Final = folder
+        self._places: Final = places
         self._index: Final = index
         self._unreadable: Final[dict[str, str]] = {}
 
@@ -38,9 +40,14 @@ class Catalog:
         return {**self._index.left_out, **self._unreadable}
 
     @property
+    def notice(self) -> str:
+        """Why the index could not be saved; empty if it was."""
+        return self._index.notice
+
+    @property
     def runs(self) -> tuple[Path, ...]:
         """Folders of all runs, sorted."""
-        return tuple(self.folder / run for run in sorted(self._index.files))
+        return tuple(Path(self._places.place(run, "")) for run in sorted(self._listed("run")))
 
     def query(self, sql: str) -> pa.Table:
         """The rows that a query selects; ``schema`` lists what can be asked for.
@@ -81,13 +88,14 @@ class Catalog:
                 "select run, or give a condition on runs"
             )
         named = dict.fromkeys(found["run"].to_pylist())
-        strange = [run for run in named if run not in self._index.files]
+        there = {*self._listed("run")}
+        strange = [run for run in named if run not in there]
         if strange:
             raise UsageError(
-                f"query: column run holds {strange[0]!r}, which is no run of {self.folder}; "
+                f"query: column run holds {strange[0]!r}, which is no run of {self._places.name}; "
                 "select the column run of a table"
             )
-        return tuple(self.folder / run for run in named)
+        return tuple(Path(self._places.place(run, "")) for run in named)
 
     def schema(self) -> pa.Table:
         """Every table and column: table, column, type and meaning."""
@@ -104,34 +112,39 @@ class Catalog:
         columns = zip(*listed, strict=True)
         return pa.table({name: list(column) for name, column in zip(head, columns, strict=True)})
 
-    @property
+    def _listed(self, column: str) -> list[Any]:
+        """A column of the table ``runs``."""
+        import pyarrow.dataset as ds
+
+        runs = self._index.tables["runs"]
+        table = runs.to_table(columns=[column]) if isinstance(runs, ds.Dataset) else runs
+        return list(table[column].to_pylist())
+
+    @cached_property
     def _names(self) -> set[str]:
-        files = {name for names in self._index.files.values() for name in names}
+        files = {name for names in self._listed("tables") for name in names}
         return {*INDEXED, *OWN, *parts.tables_of(files)}
 
     def _content(self, table: str) -> dict[str, Any]:
         """A table by its name, and what a view of that name is made of."""
-        import pyarrow.fs
-
         if table in INDEXED:
             return {table: self._index.tables[table]}
         file = parts.file_of(table)
         places = {
-            run: str(self.folder / run / file)
-            for run, files in self._index.files.items()
+            run: self._places.place(run, file)
+            for run, files in zip(self._listed("run"), self._listed("tables"), strict=True)
             if file in files
         }
-        found = parts.Parts(table, places, pyarrow.fs.LocalFileSystem())
+        found = parts.Parts(table, places, self._places.filesystem)
         self._unreadable.update(found.left_out)
         if table not in VIEWS:
             return {table: found.dataset}
-        return {
-            f"{table}_of_runs": found.dataset,
-            table: VIEWS[table].format(table=f"{table}_of_runs"),
-        }
+        base = f"{table}_of_runs"
+        return {base: found.dataset, table: VIEWS[table].format(table=base)}
 
     def __repr__(self) -> str:
-        return f"{self.folder}: {len(self._index.files)} runs, {len(self.left_out)} left out"
+        counts = f"{len(self._listed('run'))} runs, {len(self.left_out)} left out"
+        return f"{self._places.name}: {counts}; tables: {', '.join(sorted(self._names))}"
 
 
 def catalog(folder: Path | str) -> Catalog:
@@ -146,10 +159,8 @@ def catalog(folder: Path | str) -> Catalog:
     path = Path(folder)
     if not path.is_dir():
         raise UnreadableRunError(f"{path}: no folder; give a folder of runs")
-    index = open_index(str(path))
-    if not index.files and not index.left_out:
-        raise UnreadableRunError(f"{path}: neither a run folder nor a folder of some; replay first")
-    return Catalog(path, index)
+    places = LocalRuns(path)
+    return Catalog(places, open_index(places))
 
 
 def select_runs(folder: Path | str, query: str) -> tuple[Path, ...]:

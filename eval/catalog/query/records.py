@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime, timedelta
+from functools import lru_cache
 from typing import Any, Final, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -19,11 +22,16 @@ from crosscue.eval.runs.folder import (
     SceneSummary,
     TimeSegments,
 )
-from crosscue.replay.base import strict_json
+from crosscue.eval.runs.tags import TAGS, parse_tags
+from crosscue.replay.base import one_line, strict_json
 from crosscue.replay.files.identity import identity_of_all
+
+from .local import Found
 
 Row: TypeAlias = dict[str, Any]
 M = TypeVar("M", bound=BaseModel)
+JUDGED: Final = "score/approaches.parquet"
+_EPOCH: Final = datetime(1970, 1, 1)
 NOT_A_RUN: Final = frozenset({"merged", "decode"})
 """Stages of folders that hold no run of their own."""
 
@@ -79,29 +87,26 @@ class RunRows:
     approaches: list[Row] = field(default_factory=list)
     dropped: list[Row] = field(default_factory=list)
 
+    def table(self, name: str) -> list[Row]:
+        """Its rows of one table."""
+        return {"runs": [self.run], "approaches": self.approaches, "dropped": self.dropped}[name]
+
 
 def rows_of(
-    run: str,
-    name: str,
-    manifest: bytes,
-    made_ns: int,
-    files: Sequence[str],
-    tags: dict[str, str],
-    judged: Callable[[], list[Row]],
+    found: Found, name: str, manifest: bytes, files: Sequence[str], read: Callable[[str], bytes]
 ) -> RunRows | None:
     """The rows of one run; None for a folder that was merged of runs, or holds a decoded log.
 
     Args:
-        run: Its path in the catalog.
+        found: The run.
         name: Of its folder.
         manifest: Content of ``manifest.json``.
-        made_ns: When that was written.
-        files: Parquet files, from the run's folder.
-        tags: See ``crosscue tag``.
-        judged: Reads the rows of its approaches in its score.
+        files: Of its tables, of its score's, and of its tags, from its folder.
+        read: Reads one of them.
 
     Raises:
-        ValueError: The manifest is damaged or of another version.
+        ValueError: The manifest or the tags are damaged or of another version.
+        OSError: A file cannot be read.
     """
     head = _read(_Head, manifest)
     if head.format_version != FORMAT_VERSION:
@@ -111,52 +116,77 @@ def rows_of(
         )
     if head.stage in NOT_A_RUN:
         return None
-    found = _read(_Manifest, manifest)
-    detect = found.detect
-    if found.stage == "detect":
-        detect = _read(_Detect, manifest)
-    results = judged() if "score/approaches.parquet" in files else []
-    approaches = _approaches(run, found, results, tags)
-    dropped = _dropped(run, found.account)
-    lines = [one for _, _, one in found.account.lines()]
-    segments = found.time.segments
-    identity = identity_of_all([log.identity for log in found.logs]) if found.logs else None
-    row: Row = {
-        "run": run,
+    said = _read(_Manifest, manifest)
+    detect = _read(_Detect, manifest) if said.stage == "detect" else said.detect
+    tags = parse_tags(read(TAGS)) if TAGS in files else {}
+    results = _results(read(JUDGED)) if JUDGED in files else []
+    run = found.run
+    return RunRows(
+        _run_row(found, name, said, detect, files, tags, results),
+        _approaches(run, said, results, tags),
+        _dropped(run, said.account),
+    )
+
+
+def _results(content: bytes) -> list[Row]:
+    """Of the approaches in the truth, as ``approaches.parquet`` of a score has them."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        columns = pq.read_table(pa.BufferReader(content), page_checksum_verification=True)
+        return list(columns.to_pylist())
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{JUDGED}: damaged ({one_line(error)}); score the run again") from None
+
+
+def _run_row(
+    found: Found,
+    name: str,
+    said: _Manifest,
+    detect: _Detect | None,
+    files: Sequence[str],
+    tags: Mapping[str, str],
+    results: Sequence[Row],
+) -> Row:
+    lines = [one for _, _, one in said.account.lines()]
+    segments = said.time.segments
+    identity = identity_of_all([log.identity for log in said.logs]) if said.logs else None
+    return {
+        "run": found.run,
         "name": name,
-        "outcome": "whole" if found.account.is_whole else "losses",
-        "exit_status": 0 if found.account.is_whole else 3,
-        "stage": found.stage,
+        "outcome": "whole" if said.account.is_whole else "losses",
+        "exit_status": 0 if said.account.is_whole else 3,
+        "stage": said.stage,
         "identity": None if identity is None else identity.digest,
-        "logs": [log.name for log in found.logs],
-        "is_simulated": any(log.is_simulated for log in found.logs),
-        "vehicle": found.settings.get("name"),
-        "crosscue": found.versions.get("crosscue"),
-        "crosscue_commit": found.versions.get("crosscue commit"),
+        "logs": [log.name for log in said.logs],
+        "is_simulated": any(log.is_simulated for log in said.logs),
+        "vehicle": said.settings.get("name"),
+        "crosscue": said.versions.get("crosscue"),
+        "crosscue_commit": said.versions.get("crosscue commit"),
         "models": [
             {"name": one["name"], "identity": one["identity"]}
             for one in (() if detect is None else detect.detectors)
         ],
-        "settings": strict_json(found.settings),
-        "settings_sha256": _settings_sha256(found, detect),
+        "settings": sys.intern(json.dumps(said.settings, sort_keys=True)),
+        "settings_sha256": _settings_sha256(_made_with(said, detect)),
         "tags": list(tags.items()),
         "conditions": sorted({tag for one in results for tag in one["conditions"]}),
         "start_ns": segments[0].start_ns if segments else None,
         "end_ns": segments[-1].end_ns if segments else None,
-        "made_at": datetime.fromtimestamp(made_ns / 1e9, UTC).replace(tzinfo=None),
-        "seconds": found.timings.seconds,
-        "travelled_m": None if found.pose is None else found.pose.travelled_m,
+        "made_at": _EPOCH + timedelta(microseconds=found.made_ns // 1000),
+        "seconds": said.timings.seconds,
+        "travelled_m": None if said.pose is None else said.pose.travelled_m,
         "frames": None if detect is None else detect.counts.frames,
-        "approaches": 0 if found.scene is None else len(found.scene.approaches),
+        "approaches": 0 if said.scene is None else len(said.scene.approaches),
         "is_scored": "score/by_drive.parquet" in files,
         "rows_in": sum(one.entered for one in lines),
         "rows_used": sum(one.used for one in lines),
         "rows_skipped": sum(n for one in lines for n in one.skipped.values()),
         "rows_dropped": sum(n for one in lines for n in one.dropped.values()),
-        "notices": list(found.notices),
-        "tables": list(files),
+        "notices": list(said.notices),
+        "tables": [file for file in files if file != TAGS],
     }
-    return RunRows(row, approaches, dropped)
 
 
 def _read(model: type[M], content: bytes) -> M:
@@ -171,16 +201,22 @@ def _read(model: type[M], content: bytes) -> M:
         ) from None
 
 
-def _settings_sha256(found: _Manifest, detect: _Detect | None) -> str:
-    """As in the manifest of merged runs: of settings, detectors and the part of the logs."""
+def _made_with(said: _Manifest, detect: _Detect | None) -> str:
     detectors = None if detect is None else list(detect.detectors)
-    made_with = [found.settings, detectors, found.selection]
-    return hashlib.sha256(strict_json(made_with).encode()).hexdigest()
+    return json.dumps([said.settings, detectors, said.selection], sort_keys=True)
 
 
-def _approaches(run: str, found: _Manifest, results: list[Row], tags: dict[str, str]) -> list[Row]:
+@lru_cache(maxsize=256)
+def _settings_sha256(made_with: str) -> str:
+    """As in the manifest of merged runs: of settings, detectors and the part of the logs."""
+    return hashlib.sha256(strict_json(json.loads(made_with)).encode()).hexdigest()
+
+
+def _approaches(
+    run: str, said: _Manifest, results: Sequence[Row], tags: Mapping[str, str]
+) -> list[Row]:
     """Those of the run, each with its result where it was scored; then those it has none for."""
-    own = () if found.scene is None else found.scene.approaches
+    own = () if said.scene is None else said.scene.approaches
     by_number = {one["approach"]: one for one in results if one["approach"] is not None}
     shared = {"run": run, "tags": list(tags.items())}
     seen = [

@@ -1,0 +1,148 @@
+"""Runs below a folder of this machine, and what shows that one has changed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+from crosscue.eval.runs.folder import INPUT, MANIFEST
+from crosscue.eval.runs.tags import TAGS
+from crosscue.replay.base import UnreadableRunError
+
+if TYPE_CHECKING:
+    import pyarrow.fs
+
+DEPTH: Final = 6
+"""Of folders below the catalog's."""
+SCORED: Final = "metrics.json"
+SCORE: Final = "score"
+
+Stamp: TypeAlias = tuple[int, int, int, int]
+CUT_SHORT: Final[Stamp] = (0, 0, 0, 0)
+
+
+class Found(NamedTuple):
+    """A run folder.
+
+    Attributes:
+        run: Its path from the folder that was searched, with slashes; ``.`` for that itself.
+        stamp: Another one shows that something has changed; ``CUT_SHORT`` without a manifest.
+        made_ns: When the manifest was written, as time since 1970.
+    """
+
+    run: str
+    stamp: Stamp
+    made_ns: int
+
+
+class LocalRuns:
+    """The runs below a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Look at nothing yet."""
+        self.folder: Final = folder
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return str(self.folder)
+
+    @property
+    def home(self) -> Path | None:
+        """The folder, for an index; None where that is read-only."""
+        return self.folder if os.access(self.folder, os.W_OK) else None
+
+    def find(self) -> Iterator[Found]:
+        """Every run folder, whole or cut short, or the folder alone if it is one.
+
+        Raises:
+            UnreadableRunError: A folder cannot be listed.
+        """
+        itself = _found(str(self.folder), ".")
+        if itself is not None:
+            yield itself
+        else:
+            yield from _below(str(self.folder), "", DEPTH)
+
+    def files(self, run: str) -> list[str]:
+        """Names of a run's tables, those of its score after them, and of its tags.
+
+        Raises:
+            OSError: It cannot be listed.
+        """
+        folder = self.folder / run
+        names = sorted(os.listdir(folder))  # noqa: PTH208 (there may be 100,000)
+        tables = [name for name in names if name.endswith(".parquet") or name == TAGS]
+        if SCORE in names and (folder / SCORE).is_dir():
+            scored = sorted(os.listdir(folder / SCORE))  # noqa: PTH208
+            tables += [f"{SCORE}/{name}" for name in scored if name.endswith(".parquet")]
+        return tables
+
+    def read(self, run: str, file: str) -> bytes:
+        """The content of one of its files.
+
+        Raises:
+            OSError: It cannot be read.
+        """
+        return (self.folder / run / file).read_bytes()
+
+    def place(self, run: str, file: str) -> str:
+        """Where a file lies in ``filesystem``."""
+        return str(self.folder / run / file)
+
+    @property
+    def filesystem(self) -> pyarrow.fs.FileSystem:
+        """For Arrow."""
+        import pyarrow.fs
+
+        return pyarrow.fs.LocalFileSystem()
+
+
+def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
+    try:
+        with os.scandir(folder) as listed:
+            entries = [entry for entry in listed if not entry.name.startswith(".")]
+    except OSError as error:
+        raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
+    if prefix and is_cut_short({entry.name for entry in entries}):
+        yield Found(prefix[:-1], CUT_SHORT, 0)
+        return
+    for entry in sorted(entries, key=lambda entry: entry.name):
+        if not entry.is_dir():
+            continue
+        found = _found(entry.path, prefix + entry.name)
+        if found is not None:
+            yield found
+        elif depth > 1 and not entry.is_symlink():
+            yield from _below(entry.path, f"{prefix}{entry.name}/", depth - 1)
+
+
+def _found(folder: str, run: str) -> Found | None:
+    try:
+        manifest = os.stat(f"{folder}/{MANIFEST}")  # noqa: PTH116 (there may be 100,000)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
+    made_ns = manifest.st_mtime_ns
+    # A file that was replaced shows in the time of its folder.
+    stamp = (made_ns, manifest.st_size, _time(folder), _time(f"{folder}/{SCORE}"))
+    return Found(run, stamp, made_ns)
+
+
+def _time(path: str) -> int:
+    try:
+        return os.stat(path).st_mtime_ns  # noqa: PTH116
+    except OSError:
+        return 0
+
+
+def is_cut_short(names: set[str]) -> bool:
+    """Does a folder without a manifest hold what a run writes before it?
+
+    A folder of pooled scores has tables, too.
+    """
+    has_tables = any(name.endswith(".parquet") for name in names)
+    return INPUT in names or (has_tables and SCORED not in names)

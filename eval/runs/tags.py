@@ -1,0 +1,90 @@
+"""Tags of a run: words that its users set on it, such as ``weather=rain``.
+
+They lie in a file of their own, so that what a run is made of and what it found stay the same bytes
+whatever it is called.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+from pydantic import StringConstraints, ValidationError
+
+from crosscue.replay.base import UnreadableRunError, UsageError, strict_json, write_text
+
+from .record import Record
+
+TAGS: Final = "tags.json"
+KEY: Final = r"[A-Za-z_][A-Za-z0-9_.-]{0,63}"
+MAX_VALUE: Final = 1000
+MAX_BYTES: Final = 1 << 20
+
+
+class _Tags(Record):
+    format_version: Literal[1] = 1
+    tags: dict[
+        Annotated[str, StringConstraints(pattern=rf"^{KEY}$")],
+        Annotated[str, StringConstraints(max_length=MAX_VALUE)],
+    ]
+
+
+def parse_tags(content: bytes) -> dict[str, str]:
+    """From the content of ``tags.json``.
+
+    Raises:
+        ValueError: It is something else; one line.
+    """
+    try:
+        return dict(sorted(_Tags.model_validate_json(content).tags.items()))
+    except ValidationError as error:
+        why = error.errors(include_url=False)[0]["msg"].lower()
+        raise ValueError(f"{TAGS}: unreadable ({why}); delete it and tag the run again") from None
+
+
+def read_tags(run: Path) -> dict[str, str]:
+    """The tags of a run folder; none without a file of them.
+
+    Raises:
+        UnreadableRunError: They cannot be read.
+    """
+    path = run / TAGS
+    try:
+        return parse_tags(path.read_bytes())
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise UnreadableRunError(f"{path}: {error.strerror}; check its mode") from None
+    except ValueError as error:
+        raise UnreadableRunError(f"{run}: {error}") from None
+
+
+def write_tags(run: Path, tags: Mapping[str, str]) -> None:
+    """Replace the tags of a run folder; without any, its file goes.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    if tags:
+        content = _Tags(tags=dict(sorted(tags.items())))
+        write_text(run / TAGS, strict_json(content.as_json()) + "\n")
+    else:
+        (run / TAGS).unlink(missing_ok=True)
+
+
+def read_assignment(text: str) -> tuple[str, str]:
+    """``weather=rain`` as key and value.
+
+    Raises:
+        UsageError: Something else.
+    """
+    key, equals, value = text.partition("=")
+    is_fine = re.fullmatch(KEY, key) is not None and 0 < len(value) <= MAX_VALUE
+    if not (equals and is_fine and value.isprintable()):
+        raise UsageError(
+            f"{text}: expected KEY=VALUE, the key of letters, digits, '_', '.' and '-', "
+            "such as weather=rain"
+        )
+    return key, value
