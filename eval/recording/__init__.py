@@ -6,7 +6,8 @@ stored. ``save`` is all there is to call.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,10 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.eval.runs.folder import DriveManifest, RunFolder
+from crosscue.eval.runs.moments import part_of
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Floats, write_whole
+from crosscue.replay.base import Block, Floats, write_whole
+
+from .part import WHOLE, Part
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -32,6 +36,7 @@ def save(
     path: Path,
     truth: TruthTrack | None = None,
     true_ranges: TrueRanges | None = None,
+    part: Part = WHOLE,
 ) -> None:
     """Write the recording of a run, whole or not at all; what the run lacks is left out.
 
@@ -40,8 +45,10 @@ def save(
         path: Where to.
         truth: The true track, drawn into the map.
         true_ranges: Drawn beside the estimated ones.
+        part: What of the run, and which views.
 
     Raises:
+        UsageError: The run has nothing for any of the views.
         RunError: The run's tables are damaged, or the log with its pictures is not found.
         OutputError: It cannot be written.
     """
@@ -51,19 +58,23 @@ def save(
     from .layout import Shown, blueprint
     from .scene_rows import longest_m, scene_rows
 
+    if not part.is_whole:
+        run = part_of(run, part.start_ns, part.end_ns)
+    truth, true_ranges = _within(part, truth, true_ranges)
     pose = _pose(run)
     scene = scene_rows(run)
-    camera = camera_of(run)
+    camera = camera_of(run) if part.shows("cameras") else None
     has_scene = any(part is not None for part in (scene.cues, scene.ranges, scene.belief))
     topic = None if camera is None else camera.topic.name
-    shown = Shown(topic, pose, truth is not None, has_scene, longest_m(scene))
+    shown = Shown(topic, pose, truth is not None, has_scene, longest_m(scene), part)
+    layout = blueprint(shown)
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
 
     def write(partial: Path) -> None:
         recording = rr.RecordingStream("crosscue", recording_id=str(run.path.resolve().name))
-        recording.save(partial, default_blueprint=blueprint(shown))
-        _log_all(recording, time, run, pose, truth, true_ranges, camera)
+        recording.save(partial, default_blueprint=layout)
+        _log_all(recording, time, run, pose, truth, true_ranges, camera, part)
         recording.flush()
         recording.disconnect()
 
@@ -78,6 +89,7 @@ def _log_all(
     truth: TruthTrack | None,
     true_ranges: TrueRanges | None,
     stored: StoredCamera | None,
+    part: Part,
 ) -> None:
     from . import ahead, camera, plan, series
     from .notes import notes
@@ -87,24 +99,64 @@ def _log_all(
     vehicle = manifest.settings
     scene = scene_rows(run)
     more: list[str] = []
-    if pose is not None:
+    if pose is not None and part.shows("map"):
         plan.log_pose(recording, time, pose)
         plan.log_landmarks(recording, pose, run.table("pose")["landmark"].to_pylist())
         plan.log_intersection(recording, time, pose, scene)
+    if pose is not None and part.shows("pose"):
         series.log_pose_series(recording, time, pose)
-    if truth is not None:
+    if truth is not None and part.shows("map"):
         plan.log_truth(recording, time, truth)
     if len(scene.frames_ns):
-        ahead.log_ahead(recording, time, run, vehicle, scene, true_ranges)
-        series.log_belief(recording, time, scene, vehicle)
-        series.log_ranges(recording, time, scene, true_ranges)
-        series.log_cues(recording, time, scene)
-        _log_marks(recording, time, run, manifest)
+        if part.shows("ahead"):
+            ahead.log_ahead(recording, time, run, vehicle, scene, true_ranges)
+        if part.shows("belief"):
+            series.log_belief(recording, time, scene, vehicle)
+        if part.shows("ranges"):
+            series.log_ranges(recording, time, scene, true_ranges)
+        if part.shows("cues"):
+            series.log_cues(recording, time, scene)
+        if part.shows("cameras"):
+            _log_marks(recording, time, run, manifest)
     if stored is not None:
-        left_out = camera.log_pictures(recording, partial(read_pictures, stored), time)
+        pictures = partial(_read_part, stored, part)
+        left_out = camera.log_pictures(recording, pictures, time)
         if left_out:
             more.append(f"{stored.topic.name}: {left_out} pictures that cannot be decoded")
     recording.log("notes", notes(run, more), static=True)
+
+
+def _within(
+    part: Part, truth: TruthTrack | None, ranges: TrueRanges | None
+) -> tuple[TruthTrack | None, TrueRanges | None]:
+    """The truth in the part's time."""
+    if part.is_whole:
+        return truth, ranges
+    if truth is not None:
+        rows = (truth.t_ns >= part.start_ns) & (truth.t_ns <= part.end_ns)
+        truth = replace(truth, t_ns=truth.t_ns[rows], x_m=truth.x_m[rows], y_m=truth.y_m[rows])
+    if ranges is not None:
+        rows = (ranges.t_ns >= part.start_ns) & (ranges.t_ns <= part.end_ns)
+        ranges = replace(
+            ranges,
+            t_ns=ranges.t_ns[rows],
+            approach=ranges.approach[rows],
+            start_m=ranges.start_m[rows],
+            end_m=ranges.end_m[rows],
+        )
+    return truth, ranges
+
+
+def _read_part(stored: StoredCamera, part: Part, on_pictures: Callable[[Block], None]) -> None:
+    """Every picture of the part's time."""
+
+    def inside(block: Block) -> None:
+        rows = (block.log_ns >= part.start_ns) & (block.log_ns <= part.end_ns)
+        if rows.any():
+            on_pictures(block if rows.all() else block.take(rows))
+
+    span_ns = None if part.is_whole else (part.start_ns, part.end_ns)
+    read_pictures(stored, inside, span_ns)
 
 
 def _log_marks(

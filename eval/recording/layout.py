@@ -9,13 +9,19 @@ from typing import Final
 import numpy as np
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from rerun.blueprint.components import AbsoluteTimeRange
+
+from crosscue.replay.errors import UsageError
 
 from .columns import TIMELINE
+from .part import VIEWS, WHOLE, Part
 from .series import BELIEF, CUES, POSE, RANGE
 
 FAR_M: Final = 110.0
 BEHIND_M: Final = 12.0
 ASIDE_M: Final = 24.0
+MARKED_NS: Final = 100_000_000
+"""On either side of the moment that is marked on the time line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +34,7 @@ class Shown:
         has_truth: The true track is drawn.
         has_scene: There are ranges, beliefs or cues.
         longest_m: The largest range, with its band.
+        part: What of the run is recorded, and in which views.
     """
 
     camera: str | None
@@ -35,54 +42,109 @@ class Shown:
     has_truth: bool
     has_scene: bool
     longest_m: float = FAR_M
+    part: Part = WHOLE
 
 
 def blueprint(shown: Shown) -> rrb.Blueprint:
-    """The layout: a scene's, or a pose's alone."""
+    """The layout: a scene's, a pose's alone, or the views that were asked for.
+
+    Raises:
+        UsageError: The run has nothing for any of these.
+    """
+    whole = _scene(shown) if shown.has_scene else _pose_alone(shown)
     return rrb.Blueprint(
-        _scene(shown) if shown.has_scene else _pose_alone(shown),
-        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="playing", loop_mode="all"),
+        _only(shown) if shown.part.only else whole,
+        _time_panel(shown.part.moment_ns),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
 
 
-def _scene(shown: Shown) -> rrb.Container:
-    cues = rrb.StateTimelineView(
+def _time_panel(moment_ns: int | None) -> rrb.TimePanel:
+    """Plays from the beginning: no blueprint of Rerun 0.41 says where the cursor stands."""
+    marked = None
+    if moment_ns is not None:
+        marked = AbsoluteTimeRange(min=moment_ns - MARKED_NS, max=moment_ns + MARKED_NS)
+    return rrb.TimePanel(
+        timeline=TIMELINE,
+        state="collapsed",
+        play_state="playing",
+        loop_mode="all",
+        time_selection=marked,
+    )
+
+
+def _only(shown: Shown) -> rrb.Container:
+    """The views that were asked for and that the run has something for, side by side."""
+    there: dict[str, rrb.View | rrb.Container] = {"notes": _notes()}
+    if shown.camera is not None:
+        there["cameras"] = _camera(shown.camera)
+    if shown.has_scene:
+        there |= {
+            "ahead": _ahead(),
+            "belief": _belief(),
+            "ranges": _ranges(shown.longest_m),
+            "cues": _cues(),
+        }
+    if shown.pose is not None:
+        there |= {"map": _plan(shown, shown.pose), "pose": rrb.Vertical(*_pose_series())}
+    views = [there[name] for name in VIEWS if name in there and shown.part.shows(name)]
+    if not views:
+        raise UsageError(
+            f"--only {','.join(sorted(shown.part.only))}: the run has nothing to show there; "
+            f"it has {','.join(name for name in VIEWS if name in there)}"
+        )
+    return rrb.Grid(*views)
+
+
+def _cues() -> rrb.View:
+    return rrb.StateTimelineView(
         origin="/".join(CUES),
         name="Cues: filled while found",
         time_view=rrb.TimeAxis(view_range=_whole()),
     )
-    left: list[rrb.View] = [cues]
-    if shown.camera is not None:
-        left.insert(0, _camera(shown.camera))
-    ahead = rrb.Spatial2DView(
+
+
+def _ahead() -> rrb.View:
+    return rrb.Spatial2DView(
         origin="ahead",
         name="Ahead of the car (m)",
         visual_bounds=rrb.VisualBounds2D(x_range=[-ASIDE_M, ASIDE_M], y_range=[-FAR_M, BEHIND_M]),
     )
-    belief = rrb.TimeSeriesView(
+
+
+def _belief() -> rrb.View:
+    return rrb.TimeSeriesView(
         origin="/".join(BELIEF),
         name="Probability: is it there?",
         axis_x=rrb.TimeAxis(view_range=_whole()),
         axis_y=rrb.ScalarAxis(range=(-0.03, 1.03)),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),
     )
-    ranges = rrb.TimeSeriesView(
+
+
+def _ranges(longest_m: float) -> rrb.View:
+    return rrb.TimeSeriesView(
         origin="/".join(RANGE),
         name="Range (m): start red, end yellow, 2-sigma bands thin, truth green",
         axis_x=rrb.TimeAxis(view_range=_whole()),
         # A legend of eight lines would cover them.
-        axis_y=rrb.ScalarAxis(range=(0.0, shown.longest_m)),
+        axis_y=rrb.ScalarAxis(range=(0.0, longest_m)),
         plot_legend=rrb.PlotLegend(visible=False),
     )
+
+
+def _scene(shown: Shown) -> rrb.Container:
+    left: list[rrb.View] = [_cues()]
+    if shown.camera is not None:
+        left.insert(0, _camera(shown.camera))
     tabs: list[rrb.View] = [_notes()]
     if shown.pose is not None:
         tabs = [_plan(shown, shown.pose), *_pose_series(), *tabs]
     return rrb.Horizontal(
         rrb.Vertical(*left, row_shares=[5, 4][-len(left) :]),
-        ahead,
-        rrb.Vertical(belief, ranges, rrb.Tabs(*tabs), row_shares=[2, 2, 2]),
+        _ahead(),
+        rrb.Vertical(_belief(), _ranges(shown.longest_m), rrb.Tabs(*tabs), row_shares=[2, 2, 2]),
         column_shares=[10, 4, 7],
     )
 

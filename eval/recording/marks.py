@@ -26,6 +26,7 @@ from crosscue.detectors.cues.cars import (
 )
 from crosscue.detectors.cues.observed import RoadShares
 from crosscue.detectors.cues.road import road_fractions
+from crosscue.detectors.outlines import borders, outline
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -165,17 +166,6 @@ def _report_text(found: Detections) -> Iterator[tuple[NDArray[np.float64], str, 
         yield found.boxes_px[row], f"{label} {score:.2f}", row
 
 
-def outline(
-    mask: bytes, size_px: tuple[int, int], box_px: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
-    """Closed strips of shape (N, 2) around a mask, to a pixel; none for an empty mask."""
-    if not mask:
-        return []
-    x0, y0 = (int(v) for v in np.maximum(np.floor(box_px[:2]) - 1, 0))
-    x1, y1 = (int(v) for v in np.ceil(box_px[2:]) + 1)
-    return _borders(rle.decode(mask, size_px)[y0:y1, x0:x1], (x0, y0))
-
-
 def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
     """Outline of the road and a line along every few rows of it, in the picture's pixels."""
     width, height = road.mask_size_px
@@ -186,18 +176,7 @@ def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
     # Runs begin and end in turn along a row, so each two neighbours of a row are one run's ends.
     rows, columns = np.nonzero(np.diff(padded, axis=1))
     hatch = np.stack([columns, HATCH_ROWS * rows + 0.5], axis=1).reshape(-1, 2, 2)
-    return [line * scale for line in (*_borders(is_road, (0, 0)), *hatch)]
-
-
-def _borders(mask: NDArray[np.bool_], corner_px: tuple[int, int]) -> list[NDArray[np.float64]]:
-    """Closed strips around the parts of a mask whose top-left pixel is ``corner_px``."""
-    import cv2
-
-    inside = np.ascontiguousarray(mask).view(np.uint8)
-    found, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    rounded = [cv2.approxPolyDP(line, 1.0, closed=True)[:, 0, :] for line in found]
-    corner = np.array(corner_px, np.float64) + 0.5
-    return [corner + np.vstack([line, line[:1]]) for line in rounded if len(line) > 2]
+    return [line * scale for line in (*borders(is_road, (0, 0)), *hatch)]
 
 
 def log_styles(recording: rr.RecordingStream) -> None:

@@ -1,14 +1,21 @@
-"""Moments of a run as people write them: seconds from its first frame, or nanoseconds."""
+"""Moments of a run as people write them, and a run as if it had lasted only some time."""
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Final
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 from crosscue.replay.base import UnreadableRunError, UsageError
 
-from .tables.parquet import TableFolder
+from .folder import RunFolder, TableFolder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+__all__ = ["TableFolder", "approach_spans", "moment_ns", "part_of", "seconds_into", "span_ns"]
 
 TABLES: Final = ("frames", "pose")
 """The first that has rows begins the run."""
@@ -57,6 +64,64 @@ def moment_ns(run: TableFolder, text: str) -> int:
     return t_ns
 
 
+def approach_spans(run: TableFolder) -> dict[int, tuple[int, int]]:
+    """First and last time of each approach of a run, by its number.
+
+    Raises:
+        RunError: The table is damaged.
+    """
+    if not run.file("belief.parquet").exists():
+        return {}
+    table = run.table("belief", ["t_ns", "approach"])
+    grouped = table.group_by("approach").aggregate([("t_ns", "min"), ("t_ns", "max")])
+    rows = [row for row in grouped.to_pylist() if row["approach"] is not None]
+    rows.sort(key=lambda row: row["approach"])
+    return {row["approach"]: (row["t_ns_min"], row["t_ns_max"]) for row in rows}
+
+
 def seconds_into(first_ns: int, t_ns: int) -> float:
     """A moment as it is written behind ``--at``, to a millisecond."""
     return round((t_ns - first_ns) * 1e-9, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class PartOfRun(RunFolder):
+    """A run whose tables have only the rows of some time.
+
+    Attributes:
+        start_ns: First moment.
+        end_ns: Last moment.
+    """
+
+    start_ns: int = 0
+    end_ns: int = 2**63 - 1
+
+    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
+        """Rows of ``NAME.parquet`` in that time."""
+        whole = RunFolder.table(self, name, _with_time(columns))
+        inside = whole.filter(self._is_inside(whole)) if "t_ns" in whole.column_names else whole
+        return inside if columns is None else inside.select(columns)
+
+    def batches(
+        self, name: str, columns: list[str] | None = None, rows: int = 16_384
+    ) -> Iterator[pa.RecordBatch]:
+        """The same, a batch at a time."""
+        for batch in RunFolder.batches(self, name, _with_time(columns), rows):
+            inside = batch.filter(self._is_inside(batch)) if "t_ns" in batch.schema.names else batch
+            yield inside if columns is None else inside.select(columns)
+
+    def _is_inside(self, rows: pa.Table | pa.RecordBatch) -> pa.Array:
+        import pyarrow.compute as pc
+
+        times = rows["t_ns"]
+        return pc.and_(pc.greater_equal(times, self.start_ns), pc.less_equal(times, self.end_ns))
+
+
+def _with_time(columns: list[str] | None) -> list[str] | None:
+    """Each table of a run has its time; who leaves it out still gets the rows of that time."""
+    return columns if columns is None else list(dict.fromkeys([*columns, "t_ns"]))
+
+
+def part_of(run: RunFolder, start_ns: int, end_ns: int) -> RunFolder:
+    """The run with the rows of its tables from one moment to another, both included."""
+    return PartOfRun(run.path, run.logs, run.without_images, run.limits, run.home, start_ns, end_ns)

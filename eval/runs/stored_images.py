@@ -109,19 +109,21 @@ def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
         assert isinstance(block.rows, Images)
         found.extend(encoded(block.rows, int(i)) for i in np.flatnonzero(block.log_ns == t_ns))
 
-    read_pictures(camera, keep, around_ns=t_ns)
+    read_pictures(camera, keep, (t_ns, t_ns))
     return found[0] if found else None
 
 
 def read_pictures(
-    camera: StoredCamera, on_pictures: Callable[[Block], None], around_ns: int | None = None
+    camera: StoredCamera,
+    on_pictures: Callable[[Block], None],
+    span_ns: tuple[int, int] | None = None,
 ) -> None:
     """Give every block of pictures to ``on_pictures``, and warn of what was dropped.
 
     Args:
         camera: Where they lie.
         on_pictures: Reported of blocks of ``Images`` with times as in the run's tables.
-        around_ns: Only those about this time.
+        span_ns: Those of this time, and some before and behind it; None for all.
 
     Raises:
         LogError: The log cannot be opened.
@@ -138,8 +140,8 @@ def read_pictures(
     )
     selection = camera.selection
     # Rows are told apart by counting where stamps alone do not do.
-    if around_ns is not None and camera.topic.name not in camera.time.topics:
-        begin, end = around_ns - AROUND_NS, around_ns + AROUND_NS
+    if span_ns is not None and camera.topic.name not in camera.time.topics:
+        begin, end = span_ns[0] - AROUND_NS, span_ns[1] + AROUND_NS
         selection = Selection(selection.topics, begin, end)
     with open_log(camera.log, camera.limits) as log:
         for block in TimedLog(log, camera.time).read(ledger, selection):

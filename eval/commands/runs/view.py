@@ -1,7 +1,14 @@
 """A run in Rerun: open its viewer, or write the recording.
 
+--at records 6 s around a moment: the viewer plays from 2 s before it, and the moment is marked on
+the time line. (A recording cannot say where Rerun's cursor begins, so it begins there.) --approach
+records one approach, --only some of the views: cameras, ahead, belief, ranges, cues, map, pose,
+notes. What is left out of a view is not in the recording.
+
 examples:
   crosscue view runs/drive                    open Rerun's viewer
+  crosscue view runs/drive --at 12.3          at 12.3 s from the first frame
+  crosscue view runs/drive --approach 1 --only cameras,belief
   crosscue view runs/drive -o drive.rrd       write the recording, open nothing
   crosscue view runs/drive --web              serve the viewer to a browser on this machine
 """
@@ -36,6 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument(
         "--web", action="store_true", help="serve the viewer on 127.0.0.1 for a browser"
     )
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument(
+        "--at", metavar="T", help="seconds from the run's first frame, or a time (17...ns)"
+    )
+    part.add_argument(
+        "--approach", type=int, metavar="N", help="number of an approach in belief.parquet"
+    )
+    parser.add_argument(
+        "--only", default="", metavar="VIEWS", help="views to show, such as cameras,belief"
+    )
     add_logs_arguments(parser)
     parser.add_argument(
         "--truth",
@@ -55,7 +72,14 @@ def run(args: argparse.Namespace) -> int:
     made = crosscue.open_run(
         args.run, args.logs, without_images=args.without_images, limits=limits_of(args)
     )
-    path = crosscue.save_recording(made, args.output, args.truth)
+    path = crosscue.save_recording(
+        made,
+        args.output,
+        args.truth,
+        at=args.at,
+        approach=args.approach,
+        only=[name for name in args.only.split(",") if name],
+    )
     if args.output is not None:
         if args.json:
             print_json({"recording": str(path)})

@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.interface.runs.run import Run, run_given
+from crosscue.eval.runs.moments import TableFolder, approach_spans, moment_ns
 from crosscue.replay.base import UsageError
+
+if TYPE_CHECKING:
+    from crosscue.eval.recording.part import Part
+
+
+BEFORE_NS: Final = 2_000_000_000
+BEHIND_NS: Final = 4_000_000_000
+"""So much around a moment is recorded."""
 
 
 def save_recording(
-    run: Run | Path | str, output: Path | str | None = None, truth: Path | str | None = None
+    run: Run | Path | str,
+    output: Path | str | None = None,
+    truth: Path | str | None = None,
+    *,
+    at: float | str | None = None,
+    approach: int | None = None,
+    only: Sequence[str] = (),
 ) -> Path:
     """Write a run as a Rerun recording.
 
@@ -17,12 +34,17 @@ def save_recording(
         run: A finished run.
         output: Name that ends in ``.rrd``; ``drive.rrd`` in the run, if left out.
         truth: Draw the true track and ranges, too.
+        at: Record only from 2 s before this moment to 4 s behind it, and mark it: seconds from the
+            run's first frame, or nanoseconds as ``17...ns``.
+        approach: Record only this approach, by its number in ``belief.parquet``.
+        only: Record only some of ``cameras``, ``ahead``, ``belief``, ``ranges``, ``cues``, ``map``,
+            ``pose``, ``notes``; all if empty.
 
     Returns:
         The recording; ``rerun PATH`` opens it.
 
     Raises:
-        UsageError: Another suffix.
+        UsageError: Another suffix; a moment, approach or view that the run does not have.
         RunError: The log with the pictures is gone.
     """
     from crosscue.eval.recording import save
@@ -33,11 +55,33 @@ def save_recording(
     path = folder.file("drive.rrd") if output is None else Path(output)
     if path.suffix != ".rrd":
         raise UsageError(f"{path}: expected a name that ends in .rrd")
+    part = _part(folder, at, approach, only)
     track = ranges = None
     if truth is not None:
         known = load_truth(Path(truth), str(folder.path))
         ranges = known.ranges
         if known.truth.pose is not None and folder.file("pose.parquet").exists():
             track = truth_track(Path(truth), folder)
-    save(folder, path, track, ranges)
+    save(folder, path, track, ranges, part)
     return path
+
+
+def _part(
+    run: TableFolder, at: float | str | None, approach: int | None, only: Sequence[str]
+) -> Part:
+    """What to record."""
+    from crosscue.eval.recording.part import Part
+
+    views = frozenset(only)
+    if at is not None and approach is not None:
+        raise UsageError("--at, --approach: expected one of them")
+    if at is not None:
+        t_ns = moment_ns(run, at if isinstance(at, str) else repr(float(at)))
+        return Part(t_ns - BEFORE_NS, t_ns + BEHIND_NS, t_ns, views)
+    if approach is not None:
+        spans = approach_spans(run)
+        if approach not in spans:
+            there = ", ".join(map(str, spans)) or "none"
+            raise UsageError(f"--approach {approach}: {run.path} has no such one; it has: {there}")
+        return Part(*spans[approach], None, views)
+    return Part(only=views)

@@ -15,12 +15,13 @@ from rerun.chunk import RrdReader
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.images import Encoded
+from crosscue.detectors.outlines import outline
 from crosscue.eval import cli
 from crosscue.eval.recording import save
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.columns import time_of
 from crosscue.eval.recording.layout import Shown, blueprint
-from crosscue.eval.recording.marks import outline, road_lines
+from crosscue.eval.recording.marks import road_lines
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.scoring.pose.truth_track import TruthTrack

@@ -1,0 +1,107 @@
+"""A recording of a part of a run holds that part, whole, and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.moments import part_of
+from crosscue.replay.base import UsageError
+from support.scene_run import scene_run
+from support.scoring import at
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return scene_run(tmp_path_factory.mktemp("part"))
+
+
+def entities(path: Path) -> set[str]:
+    return {chunk.entity_path.split("/")[1] for chunk in RrdReader(path).stream()}
+
+
+def test_tables_of_a_part_have_its_rows_whatever_columns_are_asked_for(run: RunFolder) -> None:
+    part = part_of(run, at(10), at(19))
+
+    assert part.table("frames")["t_ns"].to_pylist() == [at(frame) for frame in range(10, 20)]
+    assert part.table("frames", ["frame"]).column_names == ["frame"]
+    assert sum(len(batch) for batch in part.batches("detections", ["label"])) == 2 * 10
+
+
+def test_a_moment_opens_two_seconds_before_it_with_all_that_was_there(
+    run: RunFolder, tmp_path: Path
+) -> None:
+    path = crosscue.save_recording(run.path, tmp_path / "at.rrd", at=3.0)
+
+    times: set[int] = set()
+    for chunk in RrdReader(path).stream():
+        if not chunk.is_static and chunk.entity_path == "/camera/picture":
+            column = chunk.to_record_batch().column("drive")
+            times.update(column.cast("int64").to_pylist())
+    # The run ends before 4 s behind the moment.
+    assert times == {at(frame) for frame in range(10, 50)}
+
+
+def test_the_same_moment_in_nanoseconds_is_the_same_recording_in_time(
+    run: RunFolder, tmp_path: Path
+) -> None:
+    rows = [
+        sum(
+            chunk.num_rows
+            for chunk in RrdReader(
+                crosscue.save_recording(run.path, tmp_path / name, at=moment)
+            ).stream()
+        )
+        for name, moment in (("a.rrd", 3.0), ("b.rrd", f"{at(30)}ns"))
+    ]
+
+    assert rows[0] == rows[1]
+
+
+def test_views_that_were_not_asked_for_are_not_in_the_file(run: RunFolder, tmp_path: Path) -> None:
+    path = crosscue.save_recording(run.path, tmp_path / "only.rrd", only=("belief", "cues"))
+
+    assert {"plots", "cues"} <= entities(path)
+    assert not {"camera", "ahead", "plan"} & entities(path)
+
+
+def test_an_approach_is_recorded_from_its_first_step_to_its_last(
+    run: RunFolder, tmp_path: Path
+) -> None:
+    crosscue.save_recording(run.path, tmp_path / "approach.rrd", approach=7, only=("belief",))
+    with pytest.raises(UsageError, match="it has: 7"):
+        crosscue.save_recording(run.path, tmp_path / "none.rrd", approach=8)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        ("--at 99", "lasts from 0 to 4.9"),
+        ("--at noon", "expected seconds"),
+        ("--at nan", "expected seconds"),
+        ("--at 1 --approach 7", "not allowed"),
+        ("--only sky", "expected some of cameras"),
+    ],
+)
+def test_what_the_run_does_not_have_is_one_line_of_wrong_usage(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, named: str
+) -> None:
+    output = tmp_path / "x.rrd"
+
+    assert cli.run(["view", str(run.path), "-o", str(output), *flags.split()]) == 2
+    printed = capsys.readouterr()
+    assert named in printed.err
+    assert printed.err.count("\n") == 1
+    assert not output.exists()
+
+
+def test_views_of_what_the_run_lacks_are_refused_with_those_it_has(tmp_path: Path) -> None:
+    bare = scene_run(tmp_path, without=frozenset({"pose"}))
+
+    with pytest.raises(UsageError, match="it has ahead,belief"):
+        crosscue.save_recording(bare.path, tmp_path / "x.rrd", only=("map",))
