@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 import numpy as np
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
-from crosscue.eval.scoring.by_drive import DriveMetric, direction
-from crosscue.eval.scoring.files import BY_DRIVE, FOLDER, METRICS
+from crosscue.eval.scoring.by_drive import BY_DRIVE, FOLDER, METRICS, DriveMetric, direction
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.replay.base import (
     MIB,

@@ -7,11 +7,14 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from .metric_values import MetricValue, metric_values
-from .pose.score import PoseScore
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+FOLDER: Final = "score"
+"""Of a score, in a run or in a study."""
+METRICS: Final = "metrics.json"
+BY_DRIVE: Final = "by_drive"
 Direction = Literal["higher", "lower"]
 Kind = Literal["mean", "rms", "sum"]
 BETTER: Final[Mapping[str, Direction]] = {
@@ -61,23 +64,25 @@ def direction(path: str) -> Direction | None:
     return None if set(parts) & set(PARTS) else BETTER.get(parts[-1])
 
 
-def parts_of(log: str, tree: Mapping[str, Any], pose: PoseScore | None) -> Iterator[DriveMetric]:
+def parts_of(
+    log: str, tree: Mapping[str, Any], pose_rmse_m: float | None, is_lost: bool
+) -> Iterator[DriveMetric]:
     """What one drive adds to every judged metric.
 
     Args:
         log: Identity of its log.
         tree: Its own scores as ``as_metrics`` returns them.
-        pose: None where it was not scored.
+        pose_rmse_m: Absolute pose error; None where the pose was not scored.
+        is_lost: The pose was lost.
     """
     sections = {name: tree[name] or {} for name in ("cues", "approaches", "belief", "range")}
     values = metric_values(sections, parts=False)
     for path, value in values.items():
         if direction(path) is not None:
             yield _part(log, path, value, values)
-    if pose is not None:
-        rmse_m = pose.ape["none"].translation_m.rmse
-        yield _part(log, "pose.ape_rmse_m", MetricValue(rmse_m, of=1), {})
-        yield _part(log, "pose.lost", MetricValue(float(pose.lost_at_m is not None)), {})
+    if pose_rmse_m is not None:
+        yield _part(log, "pose.ape_rmse_m", MetricValue(pose_rmse_m, of=1), {})
+        yield _part(log, "pose.lost", MetricValue(float(is_lost)), {})
 
 
 COUNTED_BY: Final = {

@@ -12,7 +12,9 @@ import numpy as np
 
 from crosscue.replay.base import strict_json, write_text, write_whole
 
-from .by_drive import DriveMetric, parts_of, table_of
+from .by_drive import BY_DRIVE, DriveMetric, parts_of, table_of
+from .by_drive import FOLDER as FOLDER
+from .by_drive import METRICS as METRICS
 from .drives import DriveJudged, as_metrics, score
 from .runs import RunScored
 from .truth import FEATURES
@@ -20,12 +22,8 @@ from .truth import FEATURES
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FOLDER: Final = "score"
-"""In a run, or in a study."""
-METRICS: Final = "metrics.json"
 CURVES: Final = "curves"
 CUE_FRAMES: Final = "cue_frames"
-BY_DRIVE: Final = "by_drive"
 
 
 def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> None:
@@ -44,7 +42,9 @@ def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str
 
 def _parts(one: RunScored) -> Iterator[DriveMetric]:
     logs = "+".join(sorted(log.identity.digest for log in one.run.drive_manifest().logs))
-    return parts_of(logs, as_metrics(score([one.judged])), one.pose)
+    rmse_m = None if one.pose is None else one.pose.ape["none"].translation_m.rmse
+    is_lost = one.pose is not None and one.pose.lost_at_m is not None
+    return parts_of(logs, as_metrics(score([one.judged])), rmse_m, is_lost)
 
 
 def _writer(table: pa.Table) -> Any:
