@@ -146,6 +146,8 @@ _EXPORTS: Final = {
     "FittedLandmarks": "eval.interface.fits.landmarks",
     "fit_messages": "eval.interface.fits.messages",
     "FittedMessages": "eval.interface.fits.messages",
+    "fit_temporal": "eval.interface.fits.temporal",
+    "FittedTemporal": "eval.interface.fits.temporal",
     "fit_ranges": "eval.interface.fits.ranges",
     "FittedRanges": "eval.interface.fits.ranges",
     "run_field_study": "eval.interface.studies.town",
@@ -231,6 +233,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.fits.odometry import fit_odometry as fit_odometry
     from crosscue.eval.interface.fits.ranges import FittedRanges as FittedRanges
     from crosscue.eval.interface.fits.ranges import fit_ranges as fit_ranges
+    from crosscue.eval.interface.fits.temporal import FittedTemporal as FittedTemporal
+    from crosscue.eval.interface.fits.temporal import fit_temporal as fit_temporal
     from crosscue.eval.interface.landmarks import AddedLandmarks as AddedLandmarks
     from crosscue.eval.interface.landmarks import LandmarkList as LandmarkList
     from crosscue.eval.interface.landmarks import LandmarkMatches as LandmarkMatches

@@ -60,6 +60,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "fit ranges": ("fit.ranges", "fit the curve from heights in pixels to ranges"),
     "fit detector": ("fit.detector", "fit a detector's thresholds and calibration to labels"),
     "fit messages": ("fit.messages", "fit the reliability of each cue to annotated drives"),
+    "fit temporal": ("fit.temporal", "fit the belief over time to annotated drives"),
     "fit landmarks": ("fit.landmarks", "fit the match threshold to a required false-match rate"),
     "landmarks add": ("landmarks.add", "add images with positions to a landmark database"),
     "landmarks list": ("landmarks.list", "list the contents of a landmark database"),

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 from crosscue.fusion.situation import Situation
@@ -50,6 +50,7 @@ from .range_track import (
     measure,
     predict_without_odometry,
 )
+from .temporal import TemporalFilter, TemporalSpeaker, hear, ranges_to_start, temporal_model
 
 TURN_FADES_M: Final = 25.0
 """A turn counts less and less over this way, so that bends of a road do not add up to one."""
@@ -95,10 +96,16 @@ def no_past_cues(best: RangeBelief | None, reference: Reference | None) -> Mappi
 
 
 class _Moved(NamedTuple):
-    """Since the evidence before: way gone, forwards or back, and time."""
+    """Since the evidence before: way gone, forwards or back, and time.
+
+    Attributes:
+        advanced_m: The way, negative in reverse.
+    """
 
     way_m: float
     time_s: float
+    advanced_m: float
+    advanced_var_m2: float
 
 
 @dataclass(slots=True)
@@ -129,11 +136,13 @@ class Approaches:
         self._fusion = fusion
         self._filter = range_filter
         self._new_speaker = speakers_of(graph, fusion)
+        self._over_drive = _over_drive(graph, fusion)
         self._first = tuple(cue.name for cue in graph.cues if cue.speaks_first)
         self._persistence = Persistence(graph) if fusion.kind == "persistent" else None
         self._open: _Open | None = None
         self._last_ns: int | None = None
         self._rest_m = 0.0
+        self._since_range_m = math.inf
 
     def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
         """Take the next evidence; one that is not later than the last changes nothing."""
@@ -143,6 +152,7 @@ class Approaches:
         if self._open is not None:
             self._go_on(self._open, evidence, moved.way_m)
         self._rest_m = max(0.0, self._rest_m - moved.way_m)
+        self._since_range_m += moved.way_m
         signs = self._sane(evidence.signs)
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
         heard = self._heard(evidence.counts, evidence.is_new_picture)
@@ -153,6 +163,8 @@ class Approaches:
             self._begin()
         if self._open is None:
             self._count_silent(heard.silent)
+            if self._over_drive is not None:
+                hear(self._over_drive, self._situation(evidence, heard.counts, moved))
             return Step(evidence.t_ns, None, evidence.counts, not_believed=heard.silent)
         if ranged or speaks:
             self._open.since_evidence_m = 0.0
@@ -164,8 +176,10 @@ class Approaches:
             self._close("a gap in time")
         if self._persistence is not None:
             self._persistence.restart()
+        self._over_drive = _over_drive(self._graph, self._fusion)
         self._last_ns = None
         self._rest_m = 0.0
+        self._since_range_m = math.inf
 
     def finish(self) -> None:
         """Say that the drive is over; an approach still open is counted as such."""
@@ -191,10 +205,13 @@ class Approaches:
         self._last_ns = evidence.t_ns
         passed_s = 0.0 if last_ns is None else (evidence.t_ns - last_ns) * 1e-9
         if evidence.travelled_m is not None and _has_way(evidence):
-            return _Moved(abs(evidence.travelled_m), passed_s)
+            way_m, var_m2 = evidence.travelled_m, evidence.travelled_var_m2
+            return _Moved(abs(way_m), passed_s, way_m, var_m2)
         if last_ns is not None:
             self.counts["odometry missing"] += 1
-        return _Moved(self._filter.unseen_mps * passed_s, passed_s)
+        way_m = self._filter.unseen_mps * passed_s
+        # Nobody knows how far: half of the way that is reckoned with, give or take that half.
+        return _Moved(way_m, passed_s, 0.5 * way_m, 0.25 * way_m * way_m)
 
     def _go_on(self, at_hand: _Open, evidence: FrameEvidence, moved_m: float) -> None:
         """Carry the approach over the way since the evidence before, and close it if it is over."""
@@ -237,7 +254,12 @@ class Approaches:
     def _begin(self) -> None:
         self.counts["approaches opened"] += 1
         number = self.counts["approaches opened"]
-        self._open = _Open(number, begin(self._graph), self._new_speaker())
+        speaker = (
+            self._new_speaker()
+            if self._over_drive is None
+            else TemporalSpeaker(self._graph, self._over_drive)
+        )
+        self._open = _Open(number, begin(self._graph), speaker)
 
     def _close(self, why: str) -> None:
         is_real = self._open is not None and self._open.belief.is_established
@@ -286,17 +308,16 @@ class Approaches:
         may_dissent = is_near and at_hand.since_dissent_m >= self._fusion.dissent_every_m
         if may_dissent:
             at_hand.since_dissent_m = 0.0
+        ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
+        taken = {row.reference for row in ranges if row.measured_m is not None}
+        ranged = {reference: one for reference, one in ranged.items() if reference in taken}
         messages = at_hand.speaker(
-            Situation(
-                heard.counts,
-                at_hand.belief.is_established,
-                is_near,
-                may_dissent,
-                evidence.objects,
-                evidence.is_new_picture,
-                moved.way_m,
-                moved.time_s,
-                None if best is None else best.mean_m,
+            replace(
+                self._situation(evidence, heard.counts, moved, self._to_start(ranged)),
+                is_established=at_hand.belief.is_established,
+                is_near=is_near,
+                may_dissent=may_dissent,
+                range_m=None if best is None else best.mean_m,
             )
         )
         silent = heard.silent
@@ -305,13 +326,44 @@ class Approaches:
         self._count_silent(silent)
         was_established = at_hand.belief.is_established
         belief = multiply(at_hand.belief, messages)
-        at_hand.belief = belief = establish(belief, self._graph, self._fusion.established)
+        withdrawn = None if self._over_drive is None else self._fusion.withdrawn
+        belief = establish(belief, self._graph, self._fusion.established, withdrawn)
+        at_hand.belief = belief
         if belief.is_established and not was_established:
             self.counts["approaches established"] += 1
         now = probabilities(belief, self._graph)
         return Step(
             evidence.t_ns, at_hand.number, counts, ranges, now, belief.is_established, silent
         )
+
+    def _situation(
+        self,
+        evidence: FrameEvidence,
+        counts: Mapping[str, int],
+        moved: _Moved,
+        ranges: tuple[tuple[float, float], ...] = (),
+    ) -> Situation:
+        """What a frame says outside any approach."""
+        return Situation(
+            counts,
+            is_established=False,
+            objects=evidence.objects,
+            is_new_picture=evidence.is_new_picture,
+            moved_m=moved.way_m,
+            passed_s=moved.time_s,
+            advanced_m=moved.advanced_m,
+            advanced_var_m2=moved.advanced_var_m2,
+            ranges=ranges,
+        )
+
+    def _to_start(
+        self, ranged: Mapping[Reference, tuple[float, float]]
+    ) -> tuple[tuple[float, float], ...]:
+        """Measured ranges to the start; one that resembles the frame's before has more variance."""
+        if self._over_drive is None or not ranged:
+            return ()
+        since_m, self._since_range_m = self._since_range_m, 0.0
+        return ranges_to_start(ranged, since_m, self._filter.fade_m, self._fusion.length_m)
 
     def _measured(
         self,
@@ -397,6 +449,19 @@ def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Refere
     return None, None
 
 
+def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
+    """The belief that goes on from one approach to the next, where there is one.
+
+    Raises:
+        ValueError: ``temporal`` without what was learned; no vehicle file can say that.
+    """
+    if fusion.kind != "temporal":
+        return None
+    if fusion.temporal is None:
+        raise ValueError("fusion.temporal: expected what crosscue fit temporal wrote, got None")
+    return TemporalFilter(temporal_model(graph, fusion.temporal))
+
+
 def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
     """Makes the speaker of each approach.
 
@@ -405,7 +470,7 @@ def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
     """
     if fusion.kind == "persistent":
         return lambda: PersistentSpeaker(graph, fusion.dissent)
-    if fusion.kind in ("source", None):
+    if fusion.kind in ("source", "temporal", None):
         speaker = source_speaker(graph, fusion.dissent)
         return lambda: speaker
     if fusion.calibrated is None:

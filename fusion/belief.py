@@ -33,11 +33,21 @@ def multiply(belief: Belief, messages: Sequence[float]) -> Belief:
     return Belief(sums, belief.is_established)
 
 
-def establish(belief: Belief, graph: FactorGraph, threshold: float) -> Belief:
-    """The belief, established if a feature that establishes presence exceeds ``threshold``."""
-    if belief.is_established:
+def establish(
+    belief: Belief, graph: FactorGraph, threshold: float, withdrawn: float | None = None
+) -> Belief:
+    """The belief, established if a feature that establishes presence exceeds ``threshold``.
+
+    Args:
+        belief: Before.
+        graph: Says which features establish presence.
+        threshold: Probability.
+        withdrawn: Presence is withdrawn once none of them is more probable than this; never, where
+            left out.
+    """
+    if belief.is_established and withdrawn is None:
         return belief
-    limit = log_odds(threshold)
+    limit = log_odds(withdrawn if belief.is_established and withdrawn is not None else threshold)
     is_now = any(
         feature.establishes and odds > limit
         for feature, odds in zip(graph.features, belief.log_odds, strict=True)

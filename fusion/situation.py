@@ -20,6 +20,9 @@ class Situation:
         moved_m: Way gone since the frame before, forwards or back.
         passed_s: Time since then.
         range_m: To the intersection, as far as known.
+        advanced_m: As ``moved_m``, but negative in reverse.
+        advanced_var_m2: Its variance.
+        ranges: To the start of the intersection as measured in this frame, with their variances.
     """
 
     counts: Mapping[str, int]
@@ -31,3 +34,6 @@ class Situation:
     moved_m: float = 0.0
     passed_s: float = 0.0
     range_m: float | None = None
+    advanced_m: float = 0.0
+    advanced_var_m2: float = 0.0
+    ranges: tuple[tuple[float, float], ...] = ()

@@ -6,10 +6,10 @@ Written a second at a time: memory holds that second's pictures, however long th
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Block,
+    ImageCoding,
     Images,
     Int64s,
     Ledger,
@@ -83,6 +84,24 @@ class SceneFiles:
     seconds: float
 
 
+class Imager(NamedTuple):
+    """What a drive's camera records.
+
+    Attributes:
+        name: Of what, for ``simulated.json``; empty for photographs.
+        pictures: Times and pictures of a run, one after another.
+        encode: From a picture to its bytes.
+        coding: Of these.
+        is_painted: The pictures show the ground's colours.
+    """
+
+    name: str
+    pictures: Callable[[World, SceneSettings], Iterator[tuple[int, Picture]]]
+    encode: Callable[[Picture, PictureSettings], bytes]
+    coding: ImageCoding
+    is_painted: bool = True
+
+
 def pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
     """Times and pictures of a run, one after another; nothing is written."""
     renderer = Renderer(world, settings.camera, settings.picture)
@@ -97,18 +116,45 @@ def picture_times(world: World, settings: SceneSettings) -> Int64s:
     return np.arange(int(motion.t_ns[0]), int(motion.t_ns[-1]), step, dtype=np.int64)
 
 
-def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = False) -> SceneFiles:
+def jpeg(picture: Picture, quality: int) -> bytes:
+    """A picture as JPEG."""
+    import cv2
+
+    bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
+    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+
+
+def _photograph(picture: Picture, settings: PictureSettings) -> bytes:
+    return jpeg(picture, settings.jpeg_quality)
+
+
+PHOTOGRAPHS: Final = Imager("", pictures, _photograph, "jpeg")
+
+
+def write_scene(
+    folder: Path,
+    settings: SceneSettings,
+    *,
+    overwrite: bool = False,
+    imager: Imager = PHOTOGRAPHS,
+) -> SceneFiles:
     """Simulate a run and write its files into ``folder``.
+
+    Args:
+        folder: Where to.
+        settings: The run.
+        overwrite: Replace the same drive.
+        imager: What its camera records.
 
     Raises:
         OutputError: A file is there already, or cannot be written.
         UsageError: Another drive is there, which ``overwrite`` would destroy.
     """
     if overwrite:
-        refuse_other_drive(folder, settings)
-    layout, conditions, world = world_of(settings)
+        refuse_other_drive(folder, settings, imager)
+    layout, conditions, world = world_of(settings, is_painted=imager.is_painted)
     log = folder / "drive.mcap"
-    record = _Record(layout, conditions, world, settings)
+    record = _Record(layout, conditions, world, settings, imager)
     with LogWriter(log, Ledger(str(log)), overwrite=overwrite) as writer:
         for topic in TOPICS:
             writer.add_topic(topic)
@@ -116,7 +162,7 @@ def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = Fals
             writer.write(block)
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
     write_text(folder / "vehicle.toml", record.vehicle_text())
-    write_text(folder / MADE_OF, strict_json(made_of([], asdict(settings))) + "\n")
+    write_text(folder / MADE_OF, strict_json(made_of([], _settings_of(settings, imager))) + "\n")
     return SceneFiles(
         log,
         folder / "vehicle.toml",
@@ -126,7 +172,11 @@ def write_scene(folder: Path, settings: SceneSettings, *, overwrite: bool = Fals
     )
 
 
-def refuse_other_drive(folder: Path, settings: SceneSettings) -> None:
+def _settings_of(settings: SceneSettings, imager: Imager) -> dict[str, Any]:
+    return asdict(settings) | ({"imager": imager.name} if imager.name else {})
+
+
+def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = PHOTOGRAPHS) -> None:
     """Let a drive be replaced by itself only.
 
     Raises:
@@ -139,15 +189,21 @@ def refuse_other_drive(folder: Path, settings: SceneSettings) -> None:
         there = json_tree(read_at_most(folder / MADE_OF, DEFAULT_LIMITS.record_bytes) or b"")
     except (OSError, ValueError):
         there = None
-    refuse_another(folder, "--overwrite", there, made_of([], asdict(settings)))
+    refuse_another(folder, "--overwrite", there, made_of([], _settings_of(settings, imager)))
 
 
 class _Record:
     """Gathers the truth of a run while its log is made."""
 
     def __init__(
-        self, layout: Layout, conditions: Conditions, world: World, settings: SceneSettings
+        self,
+        layout: Layout,
+        conditions: Conditions,
+        world: World,
+        settings: SceneSettings,
+        imager: Imager,
     ) -> None:
+        self._imager = imager
         self.layout, self.conditions = layout, conditions
         self.world, self.settings = world, settings
         self.objects = Objects()
@@ -170,7 +226,7 @@ class _Record:
         batch: list[tuple[int, Picture]] = []
         until = START_NS
         late = np.random.default_rng([self.conditions.seed, 10])
-        for t_ns, picture in pictures(self.world, self.settings):
+        for t_ns, picture in self._imager.pictures(self.world, self.settings):
             self._note(t_ns, picture)
             batch.append((t_ns, picture))
             until = self._until(batch)
@@ -200,7 +256,8 @@ class _Record:
             if len(part):
                 yield part
         log_ns = times + 9_000_000 + np.rint(late.exponential(2e6, len(times))).astype(np.int64)
-        yield _images(times, log_ns, [picture for _, picture in batch], self.settings.picture)
+        coded = [self._imager.encode(picture, self.settings.picture) for _, picture in batch]
+        yield _images(times, log_ns, coded, self._imager.coding)
         yield _calibration(times, log_ns, self.settings.camera)
         yield device.frames(times, [picture for _, picture in batch], MOBILEYE_BUS)
 
@@ -277,22 +334,11 @@ def _in_map(motion: TrueMotion, heading_rad: float) -> TrueMotion:
     )
 
 
-def jpeg(picture: Picture, quality: int) -> bytes:
-    """A picture as JPEG."""
-    import cv2
-
-    bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
-    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
-
-
-def _images(
-    times: Int64s, log_ns: Int64s, batch: list[Picture], settings: PictureSettings
-) -> Block:
-    coded = [jpeg(picture, settings.jpeg_quality) for picture in batch]
+def _images(times: Int64s, log_ns: Int64s, coded: list[bytes], coding: ImageCoding) -> Block:
     stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
     start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
     buffer = np.frombuffer(b"".join(coded), np.uint8)
-    images = Images(Messages(buffer, start, stop), ("jpeg",) * len(batch))
+    images = Images(Messages(buffer, start, stop), (coding,) * len(coded))
     return Block(IMAGES, np.maximum.accumulate(log_ns), images, header_ns=times)
 
 

@@ -65,8 +65,10 @@ def camera_of_width(width_px: int) -> Camera:
     return Camera(width_px=width_px, height_px=width_px * 9 // 16)
 
 
-def world_of(settings: SceneSettings) -> tuple[Layout, Conditions, World]:
-    """The world that a run happens in."""
+def world_of(
+    settings: SceneSettings, *, is_painted: bool = True
+) -> tuple[Layout, Conditions, World]:
+    """The world that a run happens in; ``is_painted`` as ``build`` takes it."""
     layout = layout_named(settings.layout)
     conditions = conditions_of(layout, settings.run, settings.seed)
-    return layout, conditions, build(layout, conditions)
+    return layout, conditions, build(layout, conditions, is_painted=is_painted)

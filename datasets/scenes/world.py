@@ -14,6 +14,7 @@ from crosscue.datasets.scenes.rendering.ground import (
     Patch,
     cast_shadows,
     paint,
+    unpainted,
     with_levels,
 )
 from crosscue.datasets.scenes.rendering.lighting import Daylight, daylight
@@ -110,6 +111,7 @@ class World:
         scenery: What is not labelled, with the fixed things.
         things: What is labelled.
         atlas: Textures.
+        patches: Paved ground beside the road: driveways and lots.
     """
 
     layout: Layout
@@ -120,6 +122,7 @@ class World:
     scenery: Mesh
     things: tuple[Thing, ...]
     atlas: Atlas
+    patches: tuple[Patch, ...] = ()
 
 
 @dataclass(slots=True)
@@ -207,8 +210,14 @@ class _Site:
             self.shadows.solids.append((foot, 1.0))
 
 
-def build(layout: Layout, conditions: Conditions) -> World:
-    """The world of a run; the same from the same layout and conditions."""
+def build(layout: Layout, conditions: Conditions, *, is_painted: bool = True) -> World:
+    """The world of a run; the same from the same layout and conditions.
+
+    Args:
+        layout: The intersection.
+        conditions: The run.
+        is_painted: Paint the ground, which takes longer than all else; without, it has no colours.
+    """
     fixed = np.random.default_rng([layout.seed, 1])
     varied = np.random.default_rng([conditions.seed, 2])
     light = daylight(conditions, varied)
@@ -221,16 +230,22 @@ def build(layout: Layout, conditions: Conditions) -> World:
     _control(site, drive)
     _parked(site, varied)
     _traffic(site, conditions, drive, varied)
-    painted, road = paint(layout, site.patches, np.random.default_rng([layout.seed, 3]))
+    scenery = joined([*site.parts, *(t.mesh for t in site.things if t.is_fixed)])
+    ground = _painted(site, light) if is_painted else unpainted(layout)
+    things, patches = tuple(site.things), tuple(site.patches)
+    return World(layout, conditions, drive, light, ground, scenery, things, site.atlas, patches)
+
+
+def _painted(site: _Site, light: Daylight) -> Ground:
+    rng = np.random.default_rng([site.layout.seed, 3])
+    painted, road = paint(site.layout, site.patches, rng)
     cast_shadows(
         painted,
         site.shadows.outlines(light.to_sun),
         site.shadows.blobs(light.to_sun),
         light.in_shadow,
     )
-    scenery = joined([*site.parts, *(t.mesh for t in site.things if t.is_fixed)])
-    ground = with_levels(painted, road)
-    return World(layout, conditions, drive, light, ground, scenery, tuple(site.things), site.atlas)
+    return with_levels(painted, road)
 
 
 def _lot(site: _Site, fixed: Generator, varied: Generator) -> None:

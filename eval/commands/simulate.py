@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "layouts",
         nargs="*",
         metavar="LAYOUT",
-        help="layouts: A to H, or L0, L1, ... and M0, M1, ...",
+        help="layouts: A to H, or L0, L1, M0, M1 and so on",
     )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder per drive"

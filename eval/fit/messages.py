@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.replay.base import Floats, Int64s, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 COVERED: Final = 0.9
 """Of the time between two frames, at least so much must have odometry."""
@@ -81,7 +84,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
         )
     way_m = _ways(run, t_ns, vehicle)
     near = _near(run, t_ns, vehicle)
-    counts = _counts(run, t_ns)
+    counts = counts_at(run.table("cues", ["t_ns", "cue", "count"]), t_ns)
     for one in np.unique(number).tolist():
         rows = np.flatnonzero(number == one)
         kept, features, place, what = _meant(t_ns[rows], truth)
@@ -155,8 +158,8 @@ def _near(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> np.typing.NDArray[n
     return np.asarray(best <= vehicle.fusion.dissent_within_m)
 
 
-def _counts(run: RunFolder, t_ns: Int64s) -> dict[str, Int64s]:
-    table = run.table("cues", ["t_ns", "cue", "count"])
+def counts_at(table: pa.Table, t_ns: Int64s) -> dict[str, Int64s]:
+    """From each cue of a table ``cues`` to how many at sorted times, or ``NOT_LOOKED``."""
     at, count = _whole(table["t_ns"]), _whole(table["count"])
     cue = np.array(table["cue"].to_pylist(), np.str_)
     out: dict[str, Int64s] = {}

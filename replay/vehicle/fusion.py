@@ -20,6 +20,7 @@ from pydantic_core import PydanticCustomError
 
 from .cue_table import CUES
 from .section import NotNegative, Positive, Section
+from .temporal import Temporal
 
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
@@ -168,13 +169,16 @@ class Calibrated(Section):
 class Fusion(Section):
     """Belief over the features of an intersection (eq. 18)."""
 
-    kind: Literal["source", "calibrated", "persistent"] | None = None
+    kind: Literal["source", "calibrated", "persistent", "temporal"] | None = None
     """``source`` multiplies every message in (eq. 18); ``calibrated`` takes learned ratios,
     discounted; ``persistent`` believes the published messages only of what is seen in several
-    frames, near enough, and discounts frames that resemble each other. Left out: ``source`` in a
-    simulated car's file, ``persistent`` in every other."""
+    frames, near enough, and discounts frames that resemble each other; ``temporal`` filters a
+    learned hidden Markov model along the drive. Left out: ``source`` in a simulated car's file,
+    ``persistent`` in every other."""
     established: Probability = 0.9
     """Presence is established once a feature that establishes it is more probable than this."""
+    withdrawn: Probability = 0.5
+    """With ``kind = "temporal"`` it is withdrawn once none of them is more probable than this."""
     dissent: Probability = 0.49
     """What a cue that dissents sends near the intersection when it is not detected."""
     dissent_within_m: NotNegative = 20.0
@@ -205,6 +209,7 @@ class Fusion(Section):
     )
 
     calibrated: Calibrated | None = None
+    temporal: Temporal | None = None
 
     @field_validator("features", mode="before")
     @classmethod
@@ -280,6 +285,27 @@ class Fusion(Section):
         if self.kind == "calibrated" and self.calibrated is None:
             raise _refused(
                 "kind calibrated needs [fusion.calibrated]; make it with: crosscue fit messages"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _has_learned_chains(self) -> Self:
+        for one in () if self.temporal is None else self.temporal.chains:
+            if one.cue not in self.cues:
+                raise _refused(f"temporal: no cue {one.cue!r}{_near(one.cue, self.cues)}")
+            for name in (*one.there, *one.missing):
+                if name not in self.features:
+                    raise _refused(f"temporal: no feature {name!r}{_near(name, self.features)}")
+        if self.kind != "temporal":
+            return self
+        if self.temporal is None:
+            raise _refused(
+                "kind temporal needs [fusion.temporal]; make it with: crosscue fit temporal"
+            )
+        if self.withdrawn >= self.established:
+            raise _refused(
+                f"withdrawn {self.withdrawn:g}, established {self.established:g}: "
+                "expected withdrawn to be smaller"
             )
         return self
 

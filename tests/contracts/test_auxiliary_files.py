@@ -98,6 +98,8 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("fit ranges", "--truth"): ("--cue stop_sign --truth {gone}", INPUT),
     ("fit ranges", "--runs"): ("--cue stop_sign --truth {truth} --runs {gone}", INPUT),
     ("fit ranges", "--test"): ("{pairs_m} --cue stop_sign --test {gone}", INPUT),
+    ("fit temporal", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
+    ("fit temporal", "--truth"): ("{run} --truth {gone} -o {out}.toml", INPUT),
     ("fit messages", "--truth"): ("{run} --truth {gone} -o {out}.toml", INPUT),
     ("fit landmarks", "--pairs"): ("--pairs {gone}", INPUT),
     ("fit landmarks", "--database"): (

@@ -59,7 +59,7 @@ REPORTS_THE_RUN = {"score", "score detector", "fit detector"}
 OPENS_NONE: dict[str, str] = {
     "compare": "tables", "query": "tables", "merge": "tables",
     "status": "the journal",
-    "fit ranges": "tables", "fit messages": "tables",
+    "fit ranges": "tables", "fit messages": "tables", "fit temporal": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
     "train mask-rcnn": "pictures", "train frames": "nothing", "truth schema": "nothing",
     "run schema": "nothing",

@@ -61,6 +61,7 @@ CALLS: Final = {
     "fit odometry": ("fit_odometry",),
     "fit landmarks": ("fit_landmarks",),
     "fit messages": ("fit_messages",),
+    "fit temporal": ("fit_temporal",),
     "fit ranges": ("fit_ranges",),
     "fit signs": ("fit_signs",),
     "study range": (

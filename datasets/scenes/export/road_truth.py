@@ -20,10 +20,17 @@ SKY_UP = -0.002
 def road_seen(
     road: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
 ) -> NDArray[np.bool_]:
-    """Road pixels, shape (H, W).
+    """Road pixels, shape (H, W): as ``ground_seen`` of ``Ground.road``, 0 or 1."""
+    return np.asarray(ground_seen(road, depth, samples, view) > 0)
+
+
+def ground_seen(
+    codes: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
+) -> NDArray[np.uint8]:
+    """What each pixel shows of a map of the ground, shape (H, W); 0 where an object hides it.
 
     Args:
-        road: The ground's map of road, 0 or 1, as ``Ground.road``.
+        codes: The map, of the size of ``Ground.road``.
         depth: The samples' buffer of 1/z, 0 where no object is; (H * samples, W * samples).
         samples: Samples a pixel, across and down.
         view: The camera.
@@ -43,14 +50,15 @@ def road_seen(
         ]
     )
     flat = cv2.warpPerspective(
-        road,
+        codes,
         onto,
         (wide, high),
         flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
     free = (depth == 0.0).reshape(high, samples, wide, samples).sum(axis=(1, 3), dtype=np.uint8)
-    seen: NDArray[np.bool_] = (flat > 0) & _falls(ray, wide, high) & (2 * free > samples**2)
+    is_ground = _falls(ray, wide, high) & (2 * free > samples**2)
+    seen: NDArray[np.uint8] = np.asarray(flat, np.uint8) * is_ground
     return seen
 
 

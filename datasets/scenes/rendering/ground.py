@@ -305,6 +305,12 @@ def with_levels(painted: Map, road: NDArray[np.bool_]) -> Ground:
     return Ground(np.concatenate(parts), np.array(levels, np.int64), road)
 
 
+def unpainted(layout: Layout) -> Ground:
+    """The map of road alone, without any colour."""
+    nothing = np.zeros((1, 4), np.uint8)
+    return Ground(nothing, np.zeros((1, 3), np.int64), road_mask(layout) > 0)
+
+
 def cast_shadows(
     painted: Map, outlines: Sequence[Floats], blobs: Sequence[Floats], remains: float
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.export.road_truth import road_seen
+from crosscue.datasets.scenes.export.road_truth import ground_seen, road_seen
 from crosscue.datasets.scenes.world import Thing, World
 
 from .camera import Camera, View, view_at
@@ -118,6 +118,32 @@ class Renderer:
 
     def picture(self, t_s: float, number: int = 0, *, with_road: bool = False) -> Picture:
         """The camera's picture at a time; ``number`` seeds its noise."""
+        view = self._drawn(t_s)
+        rgb, owner = self._composed(view, t_s)
+        self._finish(rgb, view, number)
+        road = None
+        if with_road:
+            on_map = self.world.ground.road.view(np.uint8)
+            road = road_seen(on_map, self._depth, self.settings.samples, view)
+        return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
+
+    def owners(self, t_s: float, codes: NDArray[np.uint8]) -> tuple[Picture, NDArray[np.uint8]]:
+        """A picture without colours, and what of a map of the ground its pixels show.
+
+        For a camera with one sample a pixel and a world that need not be painted.
+
+        Args:
+            t_s: From the start of the drive.
+            codes: As ``ground_seen`` takes them.
+        """
+        view = self._drawn(t_s)
+        owner = self._owner.copy()
+        black = np.zeros((*owner.shape, 3), np.uint8)
+        ground = ground_seen(codes, self._depth, self.settings.samples, view)
+        return Picture(t_s, black, view, owner, self._seen(owner, view, t_s)), ground
+
+    def _drawn(self, t_s: float) -> View:
+        """Everything that stands or drives, in the buffers."""
         view = view_at(self.camera, self.world.approach, t_s)
         self._depth.fill(0.0)
         self._owner.fill(-1)
@@ -127,13 +153,7 @@ class Renderer:
                 lit = later if later is not None and mesh is thing.later else tint
                 self._draw(mesh, lit, thing.shift(t_s), view)
         self._draw(*self._scenery, np.zeros(3), view)
-        rgb, owner = self._composed(view, t_s)
-        self._finish(rgb, view, number)
-        road = None
-        if with_road:
-            on_map = self.world.ground.road.view(np.uint8)
-            road = road_seen(on_map, self._depth, self.settings.samples, view)
-        return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
+        return view
 
     def _lens(self, scale: float) -> tuple[float, float, float]:
         cx, cy = self.camera.centre_px

@@ -237,9 +237,9 @@ class _Scene:
     def _is_new(self, seen: Seen) -> bool:
         """False where a camera repeats a picture, which shows as detections equal to the last bit.
 
-        Only beliefs that count persistence ask.
+        Only beliefs that depend on successive frames ask.
         """
-        if self.vehicle.fusion.kind != "persistent":
+        if self.vehicle.fusion.kind not in ("persistent", "temporal"):
             return True
         before, self._before = self._before, seen
         return before is None or not _is_repeated(before, seen)

@@ -1,0 +1,104 @@
+"""The belief over time, learned from annotated drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.eval.fit.messages import graph_of_runs
+from crosscue.eval.fit.temporal import annotated_drives, section_of
+from crosscue.eval.interface.runs.run import Run
+from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.truth import load
+from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
+from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
+from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedTemporal:
+    """Chains of cues along a drive; printed as the vehicle file's section.
+
+    Attributes:
+        fitted: All that was learned.
+        runs: How many runs were read.
+        path: Where the section was written to; None where it was not.
+    """
+
+    fitted: TemporalFit
+    runs: int
+    path: Path | None
+
+    @property
+    def section(self) -> str:
+        """The vehicle file's section ``[fusion.temporal]``."""
+        return section_of(self.fitted)
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue fit temporal --json`` prints."""
+        return {
+            "runs": self.runs,
+            "drives": self.fitted.drives,
+            "places": self.fitted.places,
+            "steps": self.fitted.steps,
+            "log_scores": {str(key): value for key, value in self.fitted.log_scores.items()},
+            "temporal": self.fitted.temporal.model_dump(mode="json"),
+        }
+
+    def __repr__(self) -> str:
+        end = self.section if self.path is None else f"written to {self.path}"
+        scores = ", ".join(f"{key:g}: {value:.3f}" for key, value in self.fitted.log_scores.items())
+        return (
+            f"{self.runs} runs, {self.fitted.drives} drives at {self.fitted.places} places, "
+            f"{self.fitted.steps} steps\n"
+            f"exponent {self.fitted.temporal.exponent:g}; log scores of other places by "
+            f"exponent: {scores or 'too few places'}\n\n{end}"
+        )
+
+
+def fit_temporal(
+    runs: Sequence[Run | Path | str],
+    truth: Sequence[Path | str],
+    output: Path | str | None = None,
+    *,
+    overwrite: bool = False,
+    on_runs: Callable[[int, int], None] = lambda done, of: None,
+) -> FittedTemporal:
+    """Learn the belief over time, for ``fusion.kind = "temporal"``.
+
+    Args:
+        runs: Finished runs.
+        truth: The truth of each, in the same order.
+        output: TOML file for the section; it is only returned, if left out.
+        overwrite: Replace a file that is there.
+        on_runs: Called with the number of runs that are read, and of how many.
+
+    Raises:
+        UsageError: Not a truth for each run, or runs of different cues.
+        EmptyResultError: Nothing can be learned.
+        OutputError: The file exists, or cannot be written.
+    """
+    if len(runs) != len(truth):
+        raise UsageError(
+            f"fit temporal: {len(runs)} runs, {len(truth)} truth files; give one for each, in the "
+            "same order"
+        )
+    path = None if output is None else Path(output)
+    if path is not None and path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    folders = [one.folder if isinstance(one, Run) else open_run(Path(one)) for one in runs]
+    graph, vehicle = graph_of_runs(folders)
+    drives: list[AnnotatedDrive] = []
+    for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
+        drives += annotated_drives(folder, load(Path(known), str(folder.path)), vehicle)
+        on_runs(done, len(folders))
+    try:
+        fitted = fit_drives(drives, graph)
+    except ValueError as error:
+        raise EmptyResultError(
+            f"fit temporal: nothing can be learned of {len(drives)} drives: {error}; give more"
+        ) from None
+    if path is not None:
+        write_text(path, section_of(fitted))
+    return FittedTemporal(fitted, len(folders), path)

@@ -1,0 +1,344 @@
+"""From annotated drives to what ``fusion.kind = "temporal"`` needs, by counting.
+
+* A cue's *chain*: how often it is positive after a positive step, after a negative one, and at all,
+  in each state that it depends on: no intersection ahead, or which of its features are there, by
+  distance. Counts are pulled towards those of all distances, these towards those of all states, and
+  these towards one half, each as if by ``PULL_STEPS`` more steps, so that a state that was never
+  seen says what others say.
+* *Ways*: how often which roads lead on from an intersection, each place counting once, with half a
+  place more for each.
+* *Stray* ranges: more than ``STRAY_SD`` standard deviations off, one more of two added.
+* The *exponent*: the one of ``EXPONENTS`` with the best log score where one half of the places is
+  judged by chains counted on the other half, and the other way round.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.fusion.factor_graph import CueNode, FactorGraph
+from crosscue.fusion.temporal import (
+    PRESENCE,
+    MeasuredRange,
+    TemporalFilter,
+    TemporalModel,
+    temporal_model,
+)
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.vehicle.temporal import CueChain, Temporal
+
+from .annotated_approach import NOT_LOOKED
+
+EDGES_M: Final = (0.0, 10.0, 20.0, 35.0, 50.0, 80.0)
+PULL_STEPS: Final = 20.0
+"""About as many as a drive has: one more place that says what others say."""
+STRAY_SD: Final = 3.0
+EXPONENTS: Final = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
+LEAST: Final = 0.002
+"""No probability is learned nearer to 0 or 1: what was never seen can happen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnnotatedDrive:
+    """N frames of a drive and what is true of them.
+
+    Attributes:
+        advanced_m: Shape (N,): way since the frame before, negative in reverse; 0 in the first.
+        advanced_var_m2: Shape (N,): its variance.
+        passed_s: Shape (N,): time since then.
+        start_m: Shape (N,): true distance to the intersection ahead, NaN where none is.
+        counts: From cue to shape (N,): how many, or ``NOT_LOOKED``.
+        ranges: N times the ranges to the start that were measured.
+        features: What is true of the intersection, or of a road without one.
+        place: Which layout or crossroads.
+    """
+
+    advanced_m: Floats
+    advanced_var_m2: Floats
+    passed_s: Floats
+    start_m: Floats
+    counts: Mapping[str, Int64s]
+    ranges: tuple[tuple[MeasuredRange, ...], ...]
+    features: Mapping[str, bool]
+    place: str
+
+
+class State(NamedTuple):
+    """What a cue's chain depends on; ``bin`` is None for all distances."""
+
+    there: tuple[str, ...]
+    missing: tuple[str, ...]
+    bin: int | None
+
+    @property
+    def is_ahead(self) -> bool:
+        """Is there an intersection?"""
+        return bool(self.there or self.missing)
+
+
+NOWHERE: Final = State((), (), None)
+Tally = Counter[tuple[State, str, bool]]
+"""From a state, what was before (``first``, ``stays``, ``appears``), and whether it is positive."""
+
+
+class TemporalFit(NamedTuple):
+    """What was learned.
+
+    Attributes:
+        temporal: For the vehicle file.
+        drives: Learned from.
+        places: That they were at.
+        steps: Heard in all.
+        log_scores: From exponent to the log score by which it was chosen.
+    """
+
+    temporal: Temporal
+    drives: int
+    places: int
+    steps: int
+    log_scores: Mapping[float, float]
+
+
+def fit_temporal(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> TemporalFit:
+    """Learn chains, ways, stray ranges and the exponent.
+
+    Raises:
+        ValueError: Not at least two places, one with an intersection.
+    """
+    places = sorted({one.place for one in drives})
+    if len(places) < 2 or not any(one.features.get(PRESENCE) for one in drives):
+        raise ValueError("expected drives at two places or more, one with an intersection")
+    whole = _counted(drives, graph)
+    halves = ([d for d in drives if places.index(d.place) % 2 == k] for k in (0, 1))
+    scores = _exponent_scores(list(halves), graph)
+    best = max(scores, key=lambda exponent: (-scores[exponent], exponent)) if scores else 1.0
+    steps = sum(int(_steps(one, whole).sum()) for one in drives)
+    chosen = whole.model_copy(update={"exponent": best})
+    return TemporalFit(chosen, len(drives), len(places), steps, scores)
+
+
+def _exponent_scores(
+    halves: Sequence[Sequence[AnnotatedDrive]], graph: FactorGraph
+) -> dict[float, float]:
+    if not all(any(one.features.get(PRESENCE) for one in half) for half in halves):
+        return {}
+    learned = [_counted(half, graph) for half in halves]
+    return {
+        exponent: float(
+            np.mean(
+                [
+                    log_loss(one, graph, model)
+                    for half, other in ((0, 1), (1, 0))
+                    for model in [_with(learned[other], exponent, graph)]
+                    for one in halves[half]
+                ]
+            )
+        )
+        for exponent in EXPONENTS
+    }
+
+
+def _with(learned: Temporal, exponent: float, graph: FactorGraph) -> TemporalModel:
+    return temporal_model(graph, learned.model_copy(update={"exponent": exponent}))
+
+
+def log_loss(drive: AnnotatedDrive, graph: FactorGraph, model: TemporalModel) -> float:
+    """Mean over frames and known features of -ln(probability of what is so)."""
+    beliefs = filtered(drive, model)
+    losses = [
+        -np.log(beliefs[:, column] if drive.features[name] else 1.0 - beliefs[:, column])
+        for column, name in enumerate(graph.feature_names)
+        if name in drive.features
+    ]
+    return float(np.mean(losses))
+
+
+def filtered(drive: AnnotatedDrive, model: TemporalModel) -> Floats:
+    """Probabilities after each frame, shape (N, features)."""
+    belief = TemporalFilter(model)
+    out = []
+    for i, counts in enumerate(_frames(drive)):
+        belief.hear(
+            counts,
+            drive.ranges[i],
+            float(drive.advanced_m[i]),
+            float(drive.advanced_var_m2[i]),
+            float(drive.passed_s[i]),
+        )
+        out.append(belief.probabilities())
+    return np.array(out).reshape(len(drive.start_m), len(model.has_feature))
+
+
+def _frames(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
+    columns = {name: column.tolist() for name, column in drive.counts.items()}
+    for i in range(len(drive.start_m)):
+        yield {name: column[i] for name, column in columns.items() if column[i] != NOT_LOOKED}
+
+
+def _steps(drive: AnnotatedDrive, about: Temporal) -> np.typing.NDArray[np.bool_]:
+    """Frames in which the filter hears cues."""
+    is_step = np.zeros(len(drive.start_m), np.bool_)
+    since_m = since_s = np.inf
+    for i in range(len(is_step)):
+        since_m += abs(drive.advanced_m[i])
+        since_s += drive.passed_s[i]
+        if since_m >= about.step_m or since_s >= about.step_s:
+            is_step[i], since_m, since_s = True, 0.0, 0.0
+    return is_step
+
+
+def _counted(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> Temporal:
+    ahead = {one.place: bool(one.features.get(PRESENCE)) for one in drives}
+    empty = Temporal(
+        ahead=round((sum(ahead.values()) + 1.0) / (len(ahead) + 2.0), 4),
+        ways=_ways(drives, graph),
+        edges_m=EDGES_M,
+        chains=(),
+        stray=_stray(drives),
+    )
+    steps = [_steps(one, empty) for one in drives]
+    chains = tuple(
+        chain
+        for cue in graph.cues
+        for chain in _chains(cue, graph, _tally(cue, graph, drives, steps))
+    )
+    return empty.model_copy(update={"chains": chains})
+
+
+def _ways(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> dict[str, float]:
+    others = [name for name in graph.feature_names if name != PRESENCE]
+    by_place = {
+        one.place: "+".join(name for name in others if one.features.get(name)) or "none"
+        for one in drives
+        if one.features.get(PRESENCE) and all(name in one.features for name in others)
+    }
+    names = (
+        "+".join(name for name, is_there in zip(others, way, strict=True) if is_there) or "none"
+        for way in product((True, False), repeat=len(others))
+    )
+    seen = Counter(by_place.values())
+    weights = {name: seen[name] + 0.5 for name in names}
+    total = sum(weights.values())
+    return {name: round(weight / total, 4) for name, weight in weights.items()}
+
+
+def _stray(drives: Sequence[AnnotatedDrive]) -> float:
+    far = total = 0
+    for drive in drives:
+        for start_m, ranges in zip(drive.start_m.tolist(), drive.ranges, strict=True):
+            if np.isfinite(start_m):
+                total += len(ranges)
+                far += sum(
+                    abs(one.range_m - start_m) > STRAY_SD * one.var_m2**0.5 for one in ranges
+                )
+    return round((far + 1.0) / (total + 2.0), 4)
+
+
+def _tally(
+    cue: CueNode,
+    graph: FactorGraph,
+    drives: Sequence[AnnotatedDrive],
+    steps: Sequence[np.typing.NDArray[np.bool_]],
+) -> Tally:
+    tally: Tally = Counter()
+    features = _features_of(cue, graph)
+    for drive, is_step in zip(drives, steps, strict=True):
+        count = drive.counts.get(cue.name)
+        if count is None:
+            continue
+        at = np.searchsorted(EDGES_M[1:-1], drive.start_m, side="right").tolist()
+        is_ahead = (np.isfinite(drive.start_m) & (drive.start_m < EDGES_M[-1])).tolist()
+        before: bool | None = None
+        for i in np.flatnonzero(is_step).tolist():
+            now = int(count[i])
+            if now == NOT_LOOKED:
+                before = None
+                continue
+            state = _state(drive, features, at[i]) if is_ahead[i] else NOWHERE
+            # How a chain begins is learned from all its steps: few are first ones.
+            tally[state, "first", now > 0] += 1
+            if before is not None:
+                tally[state, "stays" if before else "appears", now > 0] += 1
+            before = now > 0
+    return tally
+
+
+def _features_of(cue: CueNode, graph: FactorGraph) -> tuple[str, ...]:
+    """Features besides presence that a cue speaks of, in the graph's order."""
+    mine = {edge.feature for edge in graph.edges if edge.cue == cue.name}
+    return tuple(name for name in graph.feature_names if name in mine and name != PRESENCE)
+
+
+def _state(drive: AnnotatedDrive, features: tuple[str, ...], at: int) -> State:
+    there = tuple(name for name in features if drive.features.get(name))
+    missing = tuple(name for name in features if drive.features.get(name) is False)
+    return State((PRESENCE, *there), missing, at)
+
+
+def _chains(cue: CueNode, graph: FactorGraph, tally: Tally) -> Iterator[CueChain]:
+    """One for no intersection and one for each combination of the cue's features."""
+    if not tally:
+        return
+    features = _features_of(cue, graph)
+    usual = {what: _rate(tally, what, 0.5) for what in ("first", "stays", "appears")}
+    nowhere = {
+        what: (_rate(_in(tally, NOWHERE), what, usual[what]),)
+        for what in ("first", "stays", "appears")
+    }
+    yield CueChain(
+        cue=cue.name,
+        first=nowhere["first"],
+        stays=nowhere["stays"],
+        appears=nowhere["appears"],
+    )
+    for is_there in product((True, False), repeat=len(features)):
+        there = (
+            PRESENCE,
+            *(name for name, there in zip(features, is_there, strict=True) if there),
+        )
+        missing = tuple(name for name, there in zip(features, is_there, strict=True) if not there)
+        state = State(there, missing, None)
+        by_distance = {
+            what: tuple(
+                _rate(
+                    _in(tally, state._replace(bin=number)),
+                    what,
+                    _rate(_in(tally, state), what, usual[what]),
+                )
+                for number in range(len(EDGES_M) - 1)
+            )
+            for what in ("first", "stays", "appears")
+        }
+        yield CueChain(
+            cue=cue.name,
+            there=there,
+            missing=missing,
+            first=by_distance["first"],
+            stays=by_distance["stays"],
+            appears=by_distance["appears"],
+        )
+
+
+def _in(tally: Tally, state: State) -> Tally:
+    """Counts of one state, or of all its distances."""
+    return Counter(
+        {
+            key: count
+            for key, count in tally.items()
+            if key[0] == state
+            or (state.bin is None and state.is_ahead and key[0]._replace(bin=None) == state)
+        }
+    )
+
+
+def _rate(tally: Tally, what: str, usual: float) -> float:
+    hits = sum(count for (_, when, now), count in tally.items() if when == what and now)
+    of = sum(count for (_, when, _), count in tally.items() if when == what)
+    rate = (hits + PULL_STEPS * usual) / (of + PULL_STEPS)
+    return round(min(max(rate, LEAST), 1.0 - LEAST), 4)

@@ -1,0 +1,58 @@
+"""What is drawn into a label image is what the detectors read from it."""
+
+import numpy as np
+import pytest
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, Frame, RoadMask
+from crosscue.detectors.label_images import CLASSES, LabelledObject, label_image, objects, road
+
+SIZE_PX = (40, 30)
+
+
+def frame(image: np.ndarray) -> Frame:
+    return Frame(7, "camera", np.ascontiguousarray(image[..., ::-1]), SIZE_PX)
+
+
+def found(*drawn: LabelledObject) -> Detections:
+    (one,) = objects()([frame(label_image(np.zeros((30, 40), np.bool_), drawn))])
+    assert isinstance(one, Detections)
+    return one
+
+
+@pytest.mark.parametrize("label", CLASSES)
+def test_an_object_comes_back_with_its_box_mask_and_score(label: str) -> None:
+    mask = np.array([[True, False], [True, True], [True, True]])
+
+    back = found(LabelledObject(label, 0.8, (10, 5), mask))
+
+    assert back.labels == (label,)
+    assert back.scores[0] == pytest.approx(0.8, abs=1 / 255)
+    np.testing.assert_array_equal(back.boxes_px, [[10, 5, 12, 8]])
+    np.testing.assert_array_equal(rle.decode(back.masks[0], SIZE_PX)[5:8, 10:12], mask)
+
+
+def test_an_object_out_of_the_image_is_cut_and_one_behind_another_hidden() -> None:
+    whole = np.ones((6, 6), np.bool_)
+
+    back = found(
+        LabelledObject("car", 0.9, (0, 0), whole),
+        LabelledObject("stop sign", 0.9, (-2, -2), np.ones((10, 10), np.bool_)),
+    )
+
+    assert back.labels == ("stop sign",)
+    np.testing.assert_array_equal(back.boxes_px, [[0, 0, 8, 8]])
+
+
+def test_road_is_read_beside_objects() -> None:
+    is_road = np.zeros((30, 40), np.bool_)
+    is_road[20:] = True
+
+    (back,) = road()([frame(label_image(is_road, []))])
+
+    assert isinstance(back, RoadMask)
+    np.testing.assert_array_equal(rle.decode(back.mask, back.mask_size_px), is_road)
+
+
+def test_a_black_image_holds_nothing() -> None:
+    assert len(found()) == 0

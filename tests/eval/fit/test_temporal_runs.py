@@ -1,0 +1,80 @@
+"""The fit of the belief over time from run folders and truth files, up to the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from crosscue.eval.cli import run as crosscue
+from crosscue.eval.fit.temporal import annotated_drives
+from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.truth import load
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from support.fusion_runs import made_up_drive, write_empty_truth, write_run, write_truth
+
+Drives = tuple[list[Path], list[Path]]
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
+    """Run folders and truth files: with a road to the left, without, and at no intersection."""
+    folder = tmp_path_factory.mktemp("drives")
+    rng = np.random.default_rng(4)
+    runs, truths = [], []
+    for i in range(9):
+        left, is_empty = i % 3 == 0, i % 3 == 2
+        evidence = made_up_drive(rng, left=left, signed=not is_empty)
+        run = write_run(folder / f"run{i}", evidence).path
+        frames = pa.table({"t_ns": [one.t_ns for one in evidence]})
+        pq.write_table(frames, run / "frames.parquet", write_page_checksum=True)
+        runs.append(run)
+        truth = folder / f"truth{i}"
+        truths.append(write_empty_truth(truth) if is_empty else write_truth(truth, left=left))
+    return runs, truths
+
+
+def test_a_drive_is_divided_at_the_intersection_and_keeps_what_is_true(drives: Drives) -> None:
+    before, *after = annotated_drives(
+        open_run(drives[0][0]), load(drives[1][0], "a"), Vehicle(version=1)
+    )
+
+    assert before.features == {"intersection": True, "left": True, "right": True, "straight": True}
+    assert before.advanced_m[0] == 0.0
+    assert before.counts["stop_sign"].max() == 1
+    assert not any(one.features["intersection"] for one in after)
+
+
+def test_where_no_intersection_is_ahead_nothing_is_there(drives: Drives) -> None:
+    (one,) = annotated_drives(open_run(drives[0][2]), load(drives[1][2], "c"), Vehicle(version=1))
+
+    assert one.features == {"intersection": False, "left": False, "right": False}
+    assert np.isnan(one.start_m).all()
+
+
+def test_the_command_writes_a_section_that_a_vehicle_file_takes(
+    drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, truths = drives
+    section = tmp_path / "temporal.toml"
+    command = ["fit", "temporal", *map(str, runs), "--truth", *map(str, truths)]
+
+    assert crosscue([*command, "-o", str(section), "--json"]) == 0
+
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["runs"] == 9
+    text = "version = 1\n[fusion]\nkind = 'temporal'\n" + section.read_text()
+    learned = parse(text, "car.toml").fusion.temporal
+    assert learned is not None
+    assert learned.model_dump(mode="json") == reported["temporal"]
+
+
+def test_one_place_is_too_few(drives: Drives, capsys: pytest.CaptureFixture[str]) -> None:
+    status = crosscue(["fit", "temporal", str(drives[0][0]), "--truth", str(drives[1][0])])
+
+    assert status == 1
+    assert "two places or more" in capsys.readouterr().err
