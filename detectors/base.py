@@ -9,6 +9,8 @@ from typing import Any, Final, Protocol, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from . import rle
+
 MIN_SCORE: Final = 0.5
 """A detection is a cue above this score, where neither vehicle file nor detector says more."""
 
@@ -111,6 +113,14 @@ class Detections:
         """Height of each box, shape (N,)."""
         return np.asarray(self.boxes_px[:, 3] - self.boxes_px[:, 1])
 
+    def mask(self, i: int) -> NDArray[np.bool_]:
+        """Pixels of one detection in the picture, shape (height, width).
+
+        Raises:
+            ValueError: It has no mask, or not one of this picture.
+        """
+        return rle.decode(self.masks[i], self.size_px)
+
     def of(self, label: str) -> Self:
         """The detections with this label, in the same order."""
         return self.taken(np.array([one == label for one in self.labels], np.bool_))
@@ -170,6 +180,14 @@ class RoadMask:
     size_px: tuple[int, int]
     mask: bytes
     mask_size_px: tuple[int, int]
+
+    def pixels(self) -> NDArray[np.bool_]:
+        """Which of the mask's pixels are road, shape (height, width).
+
+        Raises:
+            ValueError: The mask is not one.
+        """
+        return rle.decode(self.mask, self.mask_size_px)
 
 
 Found: TypeAlias = Detections | RoadMask

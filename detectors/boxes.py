@@ -7,13 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 _BLOCK: Final = 128
 """So many boxes are compared with all others at a time; a table of all pairs could be large."""
 
 
-def overlaps(box: Floats, others: Floats) -> Floats:
+def overlaps(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Intersection over union of one box with each of N others, shape (N,)."""
     low = np.maximum(box[:2], others[:, :2])
     high = np.minimum(box[2:], others[:, 2:])
@@ -23,8 +21,12 @@ def overlaps(box: Floats, others: Floats) -> Floats:
 
 
 def best_of(
-    boxes: Floats, scores: Floats, groups: Int64s, min_score: float, max_overlap: float
-) -> Int64s:
+    boxes: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    groups: NDArray[np.int64],
+    min_score: float,
+    max_overlap: float,
+) -> NDArray[np.int64]:
     """Which boxes stay: good enough, and no better one of their group over them; best first.
 
     Args:
@@ -50,7 +52,11 @@ def best_of(
 
 
 def _rivals(
-    boxes: Floats, groups: Int64s, some: Int64s, others: Int64s, max_overlap: float
+    boxes: NDArray[np.float64],
+    groups: NDArray[np.int64],
+    some: NDArray[np.int64],
+    others: NDArray[np.int64],
+    max_overlap: float,
 ) -> NDArray[np.bool_]:
     """Which of the others are of each one's group and overlap it more, shape (some, others)."""
     mine, theirs = boxes[some, None], boxes[others]

@@ -98,7 +98,12 @@ def size_of(picture: Encoded) -> tuple[int, int]:
     return size
 
 
-def decode(picture: Encoded, view: View, depth_bits: int = 16) -> tuple[Bytes, tuple[int, int]]:
+WHOLE: Final = View()
+
+
+def decode(
+    picture: Encoded, view: View = WHOLE, depth_bits: int = 16
+) -> tuple[Bytes, tuple[int, int]]:
     """The pixels a view asks for, and the width and height of the whole picture.
 
     Args:

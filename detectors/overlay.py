@@ -12,8 +12,7 @@ import numpy as np
 from crosscue.detectors.cues.observed import FrameCues
 from crosscue.replay.base import Bytes, write_bytes
 
-from . import rle
-from .base import Detections, Found, RoadMask, View
+from .base import Detections, Found, RoadMask
 from .images import decode
 from .runner import FrameResult
 
@@ -55,7 +54,7 @@ class Drawer:
                 return
         import cv2
 
-        pixels, _ = decode(result.picture, View())
+        pixels, _ = decode(result.picture)
         _, encoded = cv2.imencode(".jpg", draw(pixels, result, cues))
         path = self.folder / f"{result.t_ns}.jpg"
         write_bytes(path, encoded.tobytes())
@@ -118,7 +117,7 @@ def _fitting(text: str, width_px: int, scale: float) -> float:
 def _tint(canvas: Bytes, road: RoadMask) -> None:
     import cv2
 
-    mask = rle.decode(road.mask, road.mask_size_px).astype(np.uint8)
+    mask = road.pixels().astype(np.uint8)
     size = (canvas.shape[1], canvas.shape[0])
     is_road = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
     canvas[is_road] = canvas[is_road] // 2 + np.array(BLUE, np.uint8) // 2

@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.replay.vehicle.vehicle import CueSpec, Polygon, Regions, Vehicle
 
@@ -48,7 +47,7 @@ def road_fractions(road: RoadMask, regions: Regions) -> RoadShares:
         ValueError: The mask is not one.
     """
     width, height = road.mask_size_px
-    is_road = rle.decode(road.mask, road.mask_size_px)
+    is_road = road.pixels()
     shares = []
     for polygon in (regions.left, regions.straight, regions.right):
         inside = region_mask(polygon, (height, width))

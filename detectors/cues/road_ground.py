@@ -24,7 +24,6 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 
@@ -50,7 +49,7 @@ def ground_fractions(
     """
     if place is None or camera.focal_px is None:
         return NOT_SEEN
-    is_road = rle.decode(road.mask, road.mask_size_px)
+    is_road = road.pixels()
     fractions = [
         _fraction(is_road, road, camera, regions, one, margin_m, place.sd_m)
         for one, margin_m in rectangles(regions, place)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
-
-from crosscue.replay.columns import Floats
 
 from .base import (
     BoxOutput,
@@ -46,7 +45,7 @@ class YoloxOutput(BoxOutput):
         # Most cells are empty. No class score is above 1, so objectness alone rules those out.
         is_able = ~(np.asarray(rows[0, :, 4], np.float64) < self.score)
         able = rows[0, is_able]
-        table: Floats = np.asarray(able[:, :5], np.float64)
+        table: NDArray[np.float64] = np.asarray(able[:, :5], np.float64)
         corner, stride = (cell[is_able] for cell in cells(size_px, self.strides))
         center = (table[:, :2] + corner) * stride
         # A width of e^20 cells is wider than any picture; more would overflow.

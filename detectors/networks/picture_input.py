@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
 from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.decoders.base import Array, Size
-from crosscue.replay.columns import Bytes, Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class Placement:
     offset: tuple[float, float]
     size_px: Size
 
-    def to_picture(self, boxes_px: Floats) -> Floats:
+    def to_picture(self, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Boxes (N, 4) in input pixels as boxes in the picture's."""
         return np.asarray((boxes_px - np.tile(self.offset, 2)) / np.tile(self.scale, 2), np.float64)
 
@@ -59,7 +59,7 @@ def place(picture: Size, want: Input) -> Placement:
     return Placement(scale, (float(spare[0] // 2), float(spare[1] // 2)), whole)
 
 
-def prepared(pixels: Bytes, want: Input) -> tuple[Array, Placement]:
+def prepared(pixels: NDArray[np.uint8], want: Input) -> tuple[Array, Placement]:
     """A picture (H, W, 3) as a network's input with its batch axis, and where it lies there."""
     height, width = pixels.shape[:2]
     placement = place((width, height), want)
@@ -70,7 +70,7 @@ def prepared(pixels: Bytes, want: Input) -> tuple[Array, Placement]:
     return _numbers(fitted, want, (left, top), placement.size_px)[None], placement
 
 
-def _fitted(pixels: Bytes, want: Input, placement: Placement) -> Bytes:
+def _fitted(pixels: NDArray[np.uint8], want: Input, placement: Placement) -> NDArray[np.uint8]:
     """The picture at the size that it has in the input."""
     import cv2
 
@@ -84,7 +84,7 @@ def _fitted(pixels: Bytes, want: Input, placement: Placement) -> Bytes:
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-def _numbers(pixels: Bytes, want: Input, corner: Size, size_px: Size) -> Array:
+def _numbers(pixels: NDArray[np.uint8], want: Input, corner: Size, size_px: Size) -> Array:
     """Pixels in the network's order, type and scale, the pad's value around them.
 
     Args:

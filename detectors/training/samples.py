@@ -13,7 +13,6 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.mask_rcnn.network import MEAN, SPREAD, Plan
 from crosscue.replay.base import Bytes, Floats, LogError, SchemaError
@@ -75,7 +74,7 @@ def read_picture(picture: LabelledPicture) -> Bytes:
         SchemaError: Of another size than annotated.
     """
     try:
-        pixels, size = decode(read_file(picture.path), View())
+        pixels, size = decode(read_file(picture.path))
     except OSError as error:
         raise LogError(f"{picture.path}: {error.strerror}; check the file") from None
     except LogError as error:

@@ -12,10 +12,9 @@ from crosscue.localization.compass import course_at
 from crosscue.localization.fit.compass import CompassFit, fit_compass
 from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError
 from crosscue.replay.signals.kinds import Signal
-from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_signals import read_signals
+from .log_signals import plan_of, read_signals
 
 
 def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
@@ -25,7 +24,7 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
         EmptyResultError: No magnetometer.
         VehicleError: Too few readings with a reference.
     """
-    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    planned = plan_of(logs, vehicle)
     magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
     if magnetometer is None:
         raise EmptyResultError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")

@@ -18,11 +18,10 @@ from crosscue.localization.start_pose import START_S, start_pose
 from crosscue.replay.base import Log, MissingTopicError, Selection, UsageError, VehicleError
 from crosscue.replay.logs.log_part import first_ns
 from crosscue.replay.signals.kinds import Signal
-from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.pose import GnssUse, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_signals import read_signals
+from .log_signals import plan_of, read_signals
 from .reference import GeodeticOrigin, Reference, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 
@@ -131,7 +130,7 @@ def _laid(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, truth: Path | None
 ) -> dict[str, object] | None:
     """The first seconds' odometry laid onto known positions; None where that shows no heading."""
-    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    planned = plan_of(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
     if wheels is None or (truth is None and gnss is None):

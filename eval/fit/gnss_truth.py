@@ -14,10 +14,9 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.localization.compass import course_at
 from crosscue.replay.base import EmptyResultError, Floats, Int64s, Log, Selection, name_of
 from crosscue.replay.signals.kinds import Samples, Signal
-from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_signals import read_signals
+from .log_signals import plan_of, read_signals
 
 POSE_FILE: Final = "gnss.tum"
 HELD_S: Final = 60.0
@@ -36,7 +35,7 @@ def write_gnss_truth(
         EmptyResultError: No GNSS position, or none with a heading.
         OutputError: It cannot be written.
     """
-    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    planned = plan_of(logs, vehicle)
     source = planned.source_of(Signal.POSITION)
     if source is None:
         raise EmptyResultError(f"no GNSS in the log: {planned.missing[Signal.POSITION]}")

@@ -9,8 +9,18 @@ import numpy as np
 from crosscue.replay.base import Ledger, Log, Selection, name_of, warn_of
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.vehicle import Vehicle
+
+
+def plan_of(logs: Sequence[Log], vehicle: Vehicle) -> Plan:
+    """Which topics of a drive's logs carry which signals.
+
+    Raises:
+        VehicleError: A topic that the vehicle file names is not there, or several could be meant.
+    """
+    return plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
 
 
 def read_signals(

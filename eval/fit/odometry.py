@@ -20,11 +20,10 @@ from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit, fit_odome
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.replay.base import EmptyResultError, Floats, Log, Selection, VehicleError, name_of
 from crosscue.replay.signals.kinds import Samples, Signal
-from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_signals import read_signals
+from .log_signals import plan_of, read_signals
 from .reference import Reference, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 
@@ -130,7 +129,7 @@ def fit(
         VehicleError: The drive is too short.
         SchemaError: The truth file does not fit, or holds no pose.
     """
-    planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    planned = plan_of(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
     if truth is None and gnss is None:
         raise EmptyResultError(

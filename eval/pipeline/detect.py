@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.detectors import rle
 from crosscue.detectors.base import (
     MIN_SCORE,
     Choice,
@@ -477,7 +476,7 @@ def _height_px(found: Detections, i: int) -> float:
     """Rows that the mask spans, or the box's height where there is no mask."""
     if not found.masks[i]:
         return float(found.boxes_px[i, 3] - found.boxes_px[i, 1])
-    rows = np.flatnonzero(rle.decode(found.masks[i], found.size_px).any(axis=1))
+    rows = np.flatnonzero(found.mask(i).any(axis=1))
     return float(rows[-1] - rows[0] + 1) if len(rows) else 0.0
 
 

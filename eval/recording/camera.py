@@ -8,7 +8,6 @@ from typing import Final
 
 import rerun as rr
 
-from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded
 from crosscue.replay.base import Block, Images, LogError
 
@@ -81,7 +80,7 @@ def shown(picture: Encoded) -> bytes | None:
     import cv2
 
     try:
-        pixels, _ = decode(picture, View())
+        pixels, _ = decode(picture)
     except LogError:
         return None
     ok, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

@@ -170,7 +170,7 @@ def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
     """Outline of the road and a line along every few rows of it, in the picture's pixels."""
     width, height = road.mask_size_px
     scale = np.array(road.size_px, np.float64) / (width, height)
-    is_road = rle.decode(road.mask, road.mask_size_px)
+    is_road = road.pixels()
     padded = np.zeros((-(-height // HATCH_ROWS), width + 2), np.int8)
     padded[:, 1:-1] = is_road[::HATCH_ROWS]
     # Runs begin and end in turn along a row, so each two neighbours of a row are one run's ends.

@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+AMBIGUOUS: Final = "log time comes twice"
+"""Why rows of either side of a set-back are not scored."""
 NONE: Final = -1
 """Stands for a null approach."""
 

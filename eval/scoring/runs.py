@@ -22,7 +22,6 @@ from crosscue.eval.runs.folder import (
     summed,
 )
 from crosscue.eval.runs.logs import place_of
-from crosscue.eval.runs.tables.log_time import AMBIGUOUS
 from crosscue.replay.base import (
     RunError,
     SchemaError,
@@ -32,7 +31,7 @@ from crosscue.replay.remote.logs import is_remote
 
 from . import intervals
 from . import truth as score_truth
-from .columns import RunTables
+from .columns import AMBIGUOUS, RunTables
 from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
 from .pose import score as score_pose
 from .pose.score import PoseScore, ScoredPoses

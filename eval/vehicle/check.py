@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, encoded
 from crosscue.replay.base import (
     Bytes,
@@ -338,7 +337,7 @@ def _picture(
                 return shown
             if shown is None or middle_ns is not None:
                 try:
-                    pixels, _ = decode(encoded(rows, row), View(), depth)
+                    pixels, _ = decode(encoded(rows, row), depth_bits=depth)
                 except LogFormatError:
                     continue
                 shown = Shown(topic.name, t_ns, pixels)

@@ -17,8 +17,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
-
 from .periods import PeriodSketch
 
 LOOK_AHEAD: Final = 128
@@ -56,16 +54,16 @@ class OrderWatch:
         self.late_stretches = 0
         self.worst_late_ns = 0
         self.periods = PeriodSketch()
-        self._undecided: Int64s = np.zeros(0, dtype=np.int64)
-        self._undecided_log: Int64s = np.zeros(0, dtype=np.int64)
+        self._undecided: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._undecided_log: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._before_ns: int | None = None
         self._high_ns: int | None = None
         self._in_stretch = False
         self._rows_since_reset = LOOK_AHEAD
-        self._sorted: Int64s = np.zeros(0, dtype=np.int64)
+        self._sorted: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._emitted_ns: int | None = None
 
-    def add(self, stamps_ns: Int64s, log_ns: Int64s) -> None:
+    def add(self, stamps_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
         """Take in the next rows: their stamps and log times, shape (N,) each."""
         if not len(stamps_ns):
             return
@@ -84,7 +82,7 @@ class OrderWatch:
         self._decide(self._undecided, self._undecided_log, len(self._undecided))
         self._emit_periods(hold=0)
 
-    def _decide(self, rows: Int64s, log: Int64s, n: int) -> None:
+    def _decide(self, rows: NDArray[np.int64], log: NDArray[np.int64], n: int) -> None:
         """Judge the first ``n`` of ``rows``, looking ahead into the rest, which are kept."""
         self._undecided, self._undecided_log = rows[n:].copy(), log[n:].copy()
         if not n:
@@ -100,7 +98,7 @@ class OrderWatch:
             start = stop
         self._era(rows[start:n])
 
-    def _reset_rows(self, steps: Int64s, n: int) -> Iterator[int]:
+    def _reset_rows(self, steps: NDArray[np.int64], n: int) -> Iterator[int]:
         """Rows below ``n`` at which the clock was set back."""
         back = np.flatnonzero(steps[:n] < 0)
         if len(back):
@@ -123,7 +121,7 @@ class OrderWatch:
         self._high_ns = None
         self._in_stretch = False
 
-    def _era(self, stamps: Int64s) -> None:
+    def _era(self, stamps: NDArray[np.int64]) -> None:
         """Rows between two resets, or a part of them."""
         if not len(stamps):
             return
@@ -157,7 +155,7 @@ class OrderWatch:
             self._emitted_ns = int(ready[-1])
 
 
-def forward_max(values: Int64s, width: int) -> Int64s:
+def forward_max(values: NDArray[np.int64], width: int) -> NDArray[np.int64]:
     """The largest of each value and the ``width - 1`` after it, in linear time.
 
     Running maxima from both ends of stretches ``width`` long meet in every window (M. van Herk,
@@ -172,7 +170,7 @@ def forward_max(values: Int64s, width: int) -> Int64s:
     return largest
 
 
-def forward_min(values: Int64s, width: int) -> Int64s:
+def forward_min(values: NDArray[np.int64], width: int) -> NDArray[np.int64]:
     """The smallest of each value and the ``width - 1`` after it."""
     # The complement turns order around without overflow.
     return ~forward_max(~values, width)

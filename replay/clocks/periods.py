@@ -7,8 +7,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 BINS_PER_OCTAVE: Final = 32
 _BINS: Final = 2 + 63 * BINS_PER_OCTAVE
 LONGEST_KEPT: Final = 1024
@@ -23,13 +21,13 @@ class PeriodSketch:
 
     def __init__(self) -> None:
         self.count = 0
-        self._counts: Int64s = np.zeros(_BINS, dtype=np.int64)
-        self._sums: Floats = np.zeros(_BINS)
-        self._long_ns: Int64s = np.zeros(0, dtype=np.int64)
-        self._long_at_ns: Int64s = np.zeros(0, dtype=np.int64)
+        self._counts: NDArray[np.int64] = np.zeros(_BINS, dtype=np.int64)
+        self._sums: NDArray[np.float64] = np.zeros(_BINS)
+        self._long_ns: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._long_at_ns: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._floor_ns = -1
 
-    def add(self, steps_ns: Int64s, at_ns: Int64s) -> None:
+    def add(self, steps_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> None:
         """Take in steps.
 
         Args:
@@ -71,7 +69,7 @@ class PeriodSketch:
         longest = int(self._long_ns.max())
         return longest, int(self._long_at_ns[self._long_ns == longest].min())
 
-    def _keep_longest(self, steps_ns: Int64s, at_ns: Int64s) -> None:
+    def _keep_longest(self, steps_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> None:
         longer = steps_ns > self._floor_ns
         if not longer.any():
             return
@@ -84,7 +82,7 @@ class PeriodSketch:
         self._long_ns, self._long_at_ns = long_ns, long_at_ns
 
 
-def _bin_of(steps_ns: Int64s) -> NDArray[np.intp]:
+def _bin_of(steps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     """Bin 0 holds steps of 0; bin k holds those from 2 ** ((k - 1) / BINS_PER_OCTAVE) ns on."""
     octaves = np.log2(np.maximum(steps_ns, 1).astype(np.float64))
     return np.where(steps_ns == 0, 0, 1 + (octaves * BINS_PER_OCTAVE).astype(np.intp))

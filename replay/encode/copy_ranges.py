@@ -7,8 +7,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
-
 FEW_LENGTHS: Final = 32
 """Copies of as many different lengths are made length by length; of more, one by one."""
 LARGE: Final = 4096
@@ -16,7 +14,11 @@ LARGE: Final = 4096
 
 
 def copy_ranges(
-    target: Bytes, target_start: Int64s, source: Bytes, source_start: Int64s, length: Int64s
+    target: NDArray[np.uint8],
+    target_start: NDArray[np.int64],
+    source: NDArray[np.uint8],
+    source_start: NDArray[np.int64],
+    length: NDArray[np.int64],
 ) -> None:
     """Copy N ranges of bytes; ranges of one length together, where there are few lengths."""
     if not len(length):
@@ -38,7 +40,7 @@ def copy_ranges(
         to_view[target_start[rows_]] = of_view[source_start[rows_]]
 
 
-def _windows(buffer: Bytes, width: int) -> NDArray[np.void]:
+def _windows(buffer: NDArray[np.uint8], width: int) -> NDArray[np.void]:
     """Every stretch of ``width`` bytes of a buffer, as one view of it."""
     view: NDArray[np.void] = np.ndarray(
         (len(buffer) - width + 1,), f"V{width}", buffer.data, strides=(1,)

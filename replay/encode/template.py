@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes
 from crosscue.replay.decode.ros.plan import Items, Plan, Run, Text
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
@@ -93,7 +92,7 @@ def filled(
     size: int,
     values: Mapping[str, NDArray[np.generic]],
     items: Mapping[str, NDArray[np.generic]] | None = None,
-) -> Bytes:
+) -> NDArray[np.uint8]:
     """``size`` messages with their numbers, shape (size, bytes of one).
 
     Args:
@@ -115,12 +114,12 @@ def filled(
     return rows
 
 
-def _put(rows: Bytes, at: int, column: NDArray[np.generic], code: str) -> None:
+def _put(rows: NDArray[np.uint8], at: int, column: NDArray[np.generic], code: str) -> None:
     raw = np.ascontiguousarray(column.astype(code)).view(np.uint8).reshape(len(rows), -1)
     rows[:, at : at + raw.shape[1]] = raw
 
 
-def _put_time(rows: Bytes, at: int, t_ns: NDArray[np.generic]) -> None:
+def _put_time(rows: NDArray[np.uint8], at: int, t_ns: NDArray[np.generic]) -> None:
     seconds, rest = np.divmod(t_ns.astype(np.int64), 1_000_000_000)
     _put(rows, at, seconds, "<i4")
     _put(rows, at + 4, rest, "<u4")

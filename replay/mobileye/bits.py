@@ -10,24 +10,24 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
-
 Words: TypeAlias = NDArray[np.uint64]
 """Shape (N,): payloads."""
 
 
-def words_of(payloads: Bytes) -> Words:
+def words_of(payloads: NDArray[np.uint8]) -> Words:
     """The first 8 bytes of each row of ``payloads``, shape (N, W), as words."""
     first = np.ascontiguousarray(payloads[:, :8])
     return first.view("<u8").ravel().astype(np.uint64, copy=False)
 
 
-def payloads_of(words: Words) -> Bytes:
+def payloads_of(words: Words) -> NDArray[np.uint8]:
     """The words as bytes, shape (N, 8)."""
     return words.astype("<u8").view(np.uint8).reshape(-1, 8)
 
 
-def extract(words: Words, start: int, bits: int, is_signed: bool, is_big_endian: bool) -> Int64s:
+def extract(
+    words: Words, start: int, bits: int, is_signed: bool, is_big_endian: bool
+) -> NDArray[np.int64]:
     """Bits ``start`` to ``start + bits - 1`` of each word.
 
     Big-endian numbers must fill whole bytes: ``start`` is then the first bit of the first byte.
@@ -43,7 +43,7 @@ def extract(words: Words, start: int, bits: int, is_signed: bool, is_big_endian:
     return (raised >> np.uint64(drop)).view(np.int64)
 
 
-def place(raw: Int64s, start: int, bits: int, is_big_endian: bool) -> Words:
+def place(raw: NDArray[np.int64], start: int, bits: int, is_big_endian: bool) -> Words:
     """Words that hold the low ``bits`` bits of ``raw`` at ``start``, and nothing else."""
     low = raw.view(np.uint64) & np.uint64((1 << bits) - 1)
     if is_big_endian:

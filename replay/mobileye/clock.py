@@ -22,8 +22,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
-
 MS: Final = 1_000_000
 WRAP_NS: Final = 256 * MS
 
@@ -56,11 +54,13 @@ class Unwrapped(NamedTuple):
         notices: Plain sentences.
     """
 
-    image_ns: Int64s
+    image_ns: NDArray[np.int64]
     notices: tuple[str, ...]
 
 
-def unwrap(counter_ms: NDArray[np.integer], log_ns: Int64s, min_latency_ns: int = 0) -> Unwrapped:
+def unwrap(
+    counter_ms: NDArray[np.integer], log_ns: NDArray[np.int64], min_latency_ns: int = 0
+) -> Unwrapped:
     """When the image of each status frame was grabbed, on the log's clock.
 
     Args:
@@ -86,7 +86,7 @@ class CounterClock:
         self._watched = 0
         self._noticed: dict[str, tuple[int, int]] = {}
 
-    def feed(self, counter_ms: NDArray[np.integer], log_ns: Int64s) -> Int64s:
+    def feed(self, counter_ms: NDArray[np.integer], log_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Image times of the next frames, shape (N,)."""
         pairs = zip(counter_ms.tolist(), log_ns.tolist(), strict=True)
         return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._min_ns

@@ -14,8 +14,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 from .bits import Words, extract, place
 from .layout import VARIANTS, Column, Columns, Field, Message, Variant
 
@@ -26,7 +24,7 @@ _SNAP: Final = 0.05
 """A value given this close to a step of the raw number, in steps, is that step (float32 fields)."""
 
 
-def values_of(message: Message, words: Words, variant: Variant) -> dict[str, Floats]:
+def values_of(message: Message, words: Words, variant: Variant) -> dict[str, NDArray[np.float64]]:
     """Values on the wire, NaN where missing, of every field.
 
     Args:
@@ -34,7 +32,7 @@ def values_of(message: Message, words: Words, variant: Variant) -> dict[str, Flo
         words: Shape (N,).
         variant: Shape (N,); unknown leaves the fields missing that depend on it.
     """
-    values: dict[str, Floats] = {}
+    values: dict[str, NDArray[np.float64]] = {}
     for f in message.fields:
         raw = extract(words, f.start, f.bits, f.signed, f.order == "big")
         value = from_raw(f, raw)
@@ -46,7 +44,7 @@ def values_of(message: Message, words: Words, variant: Variant) -> dict[str, Flo
     return values
 
 
-def from_raw(f: Field, raw: Int64s) -> Floats:
+def from_raw(f: Field, raw: NDArray[np.int64]) -> NDArray[np.float64]:
     """(raw - zero) * scale / per, NaN for the codes that mean missing."""
     value = raw.astype(np.float64)
     if f.zero:
@@ -60,7 +58,7 @@ def from_raw(f: Field, raw: Int64s) -> Floats:
     return value
 
 
-def from_given(f: Field, given: Floats) -> Floats:
+def from_given(f: Field, given: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values that another program took off the wire, back on the table's steps and codes."""
     steps = given * f.per / f.scale + f.zero
     whole = np.rint(steps)
@@ -69,7 +67,7 @@ def from_given(f: Field, given: Floats) -> Floats:
     return np.where(is_near, from_raw(f, raw), given)
 
 
-def blank_dependent(message: Message, values: dict[str, Floats]) -> None:
+def blank_dependent(message: Message, values: dict[str, NDArray[np.float64]]) -> None:
     """Make missing what hangs on another field that is missing or 0."""
     for f in message.fields:
         if f.missing_with and f.missing_with in values:
@@ -78,7 +76,7 @@ def blank_dependent(message: Message, values: dict[str, Floats]) -> None:
             values[f.name] = np.where(values[f.needs] == 0, np.nan, values[f.name])
 
 
-def columns_of(message: Message, values: Mapping[str, Floats]) -> Columns:
+def columns_of(message: Message, values: Mapping[str, NDArray[np.float64]]) -> Columns:
     """SI, left-positive, each column in its type."""
     columns: Columns = {}
     for f in {f.name: f for f in message.fields}.values():
@@ -101,7 +99,7 @@ def dtype_of(message: Message, name: str) -> np.dtype[np.generic]:
     return np.dtype(np.int8 if any(f.may_be_missing for f in same) else np.bool_)
 
 
-def _whole(value: Floats, dtype: np.dtype[np.generic]) -> Column:
+def _whole(value: NDArray[np.float64], dtype: np.dtype[np.generic]) -> Column:
     if dtype == np.bool_:
         flags: Column = value != 0
         return flags
@@ -130,7 +128,9 @@ def words_from(
     return words
 
 
-def _raw_from(f: Field, column: Column | None, here: NDArray[np.bool_], topic: str) -> Int64s:
+def _raw_from(
+    f: Field, column: Column | None, here: NDArray[np.bool_], topic: str
+) -> NDArray[np.int64]:
     stand_in = f.missing[0] if f.missing else f.default
     if column is None:
         return np.full(len(here), stand_in, dtype=np.int64)
@@ -153,18 +153,18 @@ def _raw_from(f: Field, column: Column | None, here: NDArray[np.bool_], topic: s
     return np.where(is_missing | np.isnan(nearest), stand_in, nearest).astype(np.int64)
 
 
-def _inside(steps: Floats, lowest: int, highest: int) -> NDArray[np.bool_]:
+def _inside(steps: NDArray[np.float64], lowest: int, highest: int) -> NDArray[np.bool_]:
     return (steps >= lowest - 0.5 - 1e-6) & (steps <= highest + 0.5 + 1e-6)
 
 
-def _beside_missing(f: Field, nearest: Floats) -> Floats:
+def _beside_missing(f: Field, nearest: NDArray[np.float64]) -> NDArray[np.float64]:
     """A value on a code that means missing moves to the step before it."""
     for code in f.missing:
         nearest = np.where(nearest == code, code - 1 if code > 0 else code + 1, nearest)
     return nearest
 
 
-def _on_wire(f: Field, column: Column) -> tuple[Floats, NDArray[np.bool_]]:
+def _on_wire(f: Field, column: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """A column in the wire's unit and sign, and where it is missing."""
     value = column.astype(np.float64)
     if f.kind != "real":

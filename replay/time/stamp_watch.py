@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-
-from crosscue.replay.columns import Int64s
+from numpy.typing import NDArray
 
 MIN_SET_BACK_NS: Final = 100_000_000
 STRAY_NS: Final = 1_000_000_000
@@ -63,7 +62,7 @@ class StampWatch:
         self.strays: list[tuple[int, int]] = []
         """Half-open ranges of rows."""
         self.eras: list[Era] = []
-        self._held: Int64s = np.empty(0, np.int64)
+        self._held: NDArray[np.int64] = np.empty(0, np.int64)
         self._decided = 0
         self._before_ns: int | None = None
         self._step_ns = 0
@@ -73,7 +72,7 @@ class StampWatch:
         """Of how many rows all is known."""
         return self._decided
 
-    def add(self, stamps_ns: Int64s) -> None:
+    def add(self, stamps_ns: NDArray[np.int64]) -> None:
         """Take in the next rows, shape (N,)."""
         self.rows += len(stamps_ns)
         self._held = np.concatenate([self._held, stamps_ns])
@@ -106,7 +105,7 @@ class StampWatch:
         self._held = rows[done:].copy()
         self._decided += done
 
-    def _accept(self, rows: Int64s) -> None:
+    def _accept(self, rows: NDArray[np.int64]) -> None:
         """Rows that belong to the era at hand."""
         if not len(rows):
             return
@@ -117,7 +116,7 @@ class StampWatch:
         self._step_ns = abs(int(rows[-1]) - int(before or rows[-1]))
         self._before_ns = int(rows[-1])
 
-    def _judge(self, rows: Int64s, jump: int) -> int:
+    def _judge(self, rows: NDArray[np.int64], jump: int) -> int:
         """Say what the step before row ``jump`` is; where to go on."""
         before_ns = self._before_ns
         assert before_ns is not None
@@ -135,7 +134,7 @@ class StampWatch:
         self._accept(rows[jump : jump + 1])
         return jump + 1
 
-    def _stray_until(self, rows: Int64s, jump: int, before_ns: int) -> int | None:
+    def _stray_until(self, rows: NDArray[np.int64], jump: int, before_ns: int) -> int | None:
         """The row after a stray that begins at ``jump``, or None where none does."""
         reach_ns = max(STRAY_NS, 5 * self._step_ns // 2)
         ahead = rows[jump : jump + MAX_STRAY_ROWS + 1]
@@ -149,7 +148,7 @@ class StampWatch:
         return jump + length if is_far else None
 
 
-def _goes_on(rows: Int64s, jump: int, before_ns: int, step_ns: int) -> bool:
+def _goes_on(rows: NDArray[np.int64], jump: int, before_ns: int, step_ns: int) -> bool:
     """Do the stamps go on from row ``jump``, without a leap back to where they were?"""
     ahead = rows[jump : jump + LOOK_AHEAD]
     if len(ahead) <= ROWS_TO_BELIEVE:

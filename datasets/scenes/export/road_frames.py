@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
-from crosscue.replay.columns import Bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,8 +21,8 @@ class RoadFrames:
         road: Shape (N, H, W), uint8: 0 to 255, the fraction of the pixel that is road.
     """
 
-    pixels: Bytes
-    road: Bytes
+    pixels: NDArray[np.uint8]
+    road: NDArray[np.uint8]
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -68,7 +68,7 @@ def rendered(
         yield frames_of(settings, count, size_px)
 
 
-def shrunk(picture: Bytes, size_px: tuple[int, int]) -> Bytes:
+def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """At another size, each pixel the mean of those it covers."""
     import cv2
 

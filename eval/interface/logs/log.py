@@ -385,10 +385,9 @@ class CameraFrame:
             LogFormatError: Damaged, cut short, or of a coding that is not decoded.
             LogTooLargeError: More pixels than are decoded.
         """
-        from crosscue.detectors.base import View
         from crosscue.detectors.images import Encoded, decode
 
-        pixels, _ = decode(Encoded(self.coding, memoryview(self.encoded), self.layout), View())
+        pixels, _ = decode(Encoded(self.coding, memoryview(self.encoded), self.layout))
         return pixels[:, :, ::-1]
 
     def __repr__(self) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.datasets.truth.box_labels import class_names_given
-from crosscue.detectors.base import Detections, Detector, Frame, View
+from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.draft import Draft, draft
 from crosscue.detectors.catalog.places import card_named
@@ -248,7 +248,7 @@ def _pixels_of(picture: Path) -> tuple[Bytes, tuple[int, int]]:
         LogError: It cannot be read or decoded.
     """
     try:
-        return decode(read_file(picture), View())
+        return decode(read_file(picture))
     except OSError as error:
         raise LogError(f"{picture}: {error.strerror}; give a JPEG, PNG or WebP file") from None
     except LogError as error:

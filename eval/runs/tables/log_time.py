@@ -22,8 +22,6 @@ from crosscue.replay.time.segments import Cause, Timeline
 if TYPE_CHECKING:
     import pyarrow as pa
 
-AMBIGUOUS: Final = "log time comes twice"
-"""Why rows of either side of a set-back are not scored."""
 LABELS: Final = frozenset({"segment", "log_t_ns"})
 """Columns that every table has besides its own."""
 

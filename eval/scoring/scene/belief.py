@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.log_time import AMBIGUOUS
-from crosscue.eval.scoring.columns import NONE, RunTables
+from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
 from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature

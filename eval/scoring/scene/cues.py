@@ -23,8 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.log_time import AMBIGUOUS
-from crosscue.eval.scoring.columns import NONE, CueRows, RunTables
+from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, CueRows, RunTables
 from crosscue.eval.scoring.intervals import Proportion, share
 from crosscue.eval.scoring.pooling import (
     BINS_M,

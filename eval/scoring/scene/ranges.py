@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.log_time import AMBIGUOUS
-from crosscue.eval.scoring.columns import RunTables
+from crosscue.eval.scoring.columns import AMBIGUOUS, RunTables
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.pooling import (
     BINS_M,

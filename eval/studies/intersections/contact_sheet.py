@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.base import Found, RoadMask, View
+from crosscue.detectors.base import Found, RoadMask
 from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import decode
 from crosscue.detectors.overlay import draw, write_label
@@ -95,7 +95,7 @@ def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes 
     picture = picture_at(camera, t_ns)
     if picture is None:
         return None
-    pixels, _ = decode(picture, View())
+    pixels, _ = decode(picture)
     result = FrameResult(t_ns, frame.size_px, picture, tuple(found))
     return draw(pixels, result, FrameCues(_cues_at(run, t_ns), None), ENLARGE)
 

@@ -9,7 +9,6 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.decode.ros.plan import Plan, Value
 from crosscue.replay.decode.ros.walk import Bools, Found, Rows, gather
 
@@ -36,7 +35,7 @@ class Fields(Protocol):
         ...
 
     @property
-    def buffer(self) -> Bytes:
+    def buffer(self) -> NDArray[np.uint8]:
         """All bytes, which places count in."""
         ...
 
@@ -53,7 +52,7 @@ class Fields(Protocol):
         """Strings at ``path``."""
         ...
 
-    def items(self, path: str) -> tuple[Int64s, Int64s]:
+    def items(self, path: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First byte and number of items of the sequence at ``path``, each of shape (M,)."""
         ...
 
@@ -79,7 +78,7 @@ class WalkedFields:
     """
 
     plan: Plan
-    buffer: Bytes
+    buffer: NDArray[np.uint8]
     parts: tuple[Part, ...]
     order: Rows | None
     seen: dict[str, NDArray[np.generic]] = field(default_factory=dict)
@@ -97,7 +96,7 @@ class WalkedFields:
             self.seen[path] = self._joined(lambda part: _numbers(part, value, is_cdr=is_cdr))
         return self.seen[path]
 
-    def text_ranges(self, path: str) -> tuple[Int64s, Int64s]:
+    def text_ranges(self, path: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First byte and length of the string at ``path``, each of shape (M,)."""
         first = self._joined(lambda part: part.found.texts[path][0][part.rows])
         length = self._joined(lambda part: part.found.texts[path][1][part.rows])
@@ -115,7 +114,7 @@ class WalkedFields:
             out.append(text)
         return tuple(out)
 
-    def items(self, path: str) -> tuple[Int64s, Int64s]:
+    def items(self, path: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """First byte and number of items of the sequence at ``path``, each of shape (M,)."""
         first = self._joined(lambda part: part.found.sequences[path][0][part.rows])
         count = self._joined(lambda part: part.found.sequences[path][1][part.rows])
@@ -181,7 +180,9 @@ def _numbers(part: Part, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
     return got if found.little else got.astype(value.code)
 
 
-def _nanoseconds(found: Found, place: Int64s, code: str, *, is_cdr: bool) -> Int64s:
+def _nanoseconds(
+    found: Found, place: NDArray[np.int64], code: str, *, is_cdr: bool
+) -> NDArray[np.int64]:
     """ROS 1 seconds are unsigned, ROS 2 seconds signed; only ROS 1 durations have signed rests."""
     seconds = "i4" if is_cdr or code == "duration" else "u4"
     rest = "i4" if not is_cdr and code == "duration" else "u4"

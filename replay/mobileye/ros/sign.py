@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats
 from crosscue.replay.mobileye.settings import LaneSign
 
 VOTES_WANTED: Final = 50
@@ -25,7 +25,7 @@ class LaneSignVotes:
         self._right = self._left = 0
         self._was_set = sign != "auto"
 
-    def add(self, side: int, c0_m: Floats, quality: Floats) -> None:
+    def add(self, side: int, c0_m: NDArray[np.float64], quality: NDArray[np.float64]) -> None:
         """Lanes of one side (1 left, -1 right), as the messages have them."""
         clear = c0_m[(quality >= USABLE_QUALITY) & (np.abs(c0_m) > CLEAR_OF_MIDDLE_M)]
         left = int((clear * side > 0).sum())

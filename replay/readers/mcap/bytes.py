@@ -10,8 +10,8 @@ from threading import Event, Lock
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes
 from crosscue.replay.files.checksum import crc32
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
@@ -36,9 +36,9 @@ class Buffers:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._owned: list[Bytes] = []
+        self._owned: list[NDArray[np.uint8]] = []
 
-    def take(self, size: int) -> Bytes:
+    def take(self, size: int) -> NDArray[np.uint8]:
         """An array of shape (size,) with any content; safe from any thread."""
         with self._lock:
             best: int | None = None
@@ -85,7 +85,7 @@ class ByteFile:
             self._window_at, begin = at, 0
         return memoryview(self._window)[begin:]
 
-    def read(self, at: int, size: int) -> Bytes:
+    def read(self, at: int, size: int) -> NDArray[np.uint8]:
         """Up to ``size`` bytes at ``at``, as an array of its own, shape (size,) or less at the end.
 
         Raises:
@@ -93,7 +93,7 @@ class ByteFile:
         """
         return self.read_into(at, self.buffers.take(max(0, min(size, self.size - at))))
 
-    def read_into(self, at: int, array: Bytes) -> Bytes:
+    def read_into(self, at: int, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The bytes at ``at``, written into ``array``; fewer than it has at the end.
 
         Raises:
@@ -157,7 +157,7 @@ class RangedByteFile(ByteFile):
         """What is at hand from ``at`` on: at least ``least`` bytes, less only at the end."""
         return self._ranged.at_least(at, least)
 
-    def read_into(self, at: int, array: Bytes) -> Bytes:
+    def read_into(self, at: int, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The bytes at ``at``, written into ``array``; fewer than it has at the end."""
         found = self._ranged.at_least(at, len(array))[: len(array)]
         array[: len(found)] = np.frombuffer(found, dtype=np.uint8)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes
-
 from .blocks import VIRTUAL, VIRTUAL_MASTER, Channel, Conversion
 
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
@@ -33,7 +31,7 @@ def is_plain(channel: Channel) -> bool:
 class Words:
     """Records as 64-bit words: what several channels take their bits from is loaded once."""
 
-    def __init__(self, records: Bytes, first: int = 0) -> None:
+    def __init__(self, records: NDArray[np.uint8], first: int = 0) -> None:
         """Nothing is loaded yet.
 
         Args:
@@ -149,7 +147,9 @@ def is_applied(conversion: Conversion) -> bool:
     return conversion.type in (0, 1, 2, 4, 5, 6)
 
 
-def invalid(channel: Channel, records: Bytes, value_bytes: int) -> NDArray[np.bool_] | None:
+def invalid(
+    channel: Channel, records: NDArray[np.uint8], value_bytes: int
+) -> NDArray[np.bool_] | None:
     """Which values the recorder marked as invalid; None for none."""
     if channel.flags & ALL_INVALID:
         return np.ones(len(records), np.bool_)

@@ -17,7 +17,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 
@@ -300,9 +299,9 @@ class Entries:
         log_ns: Shape (N,), int64.
     """
 
-    offset: Int64s
-    conn: Int64s
-    log_ns: Int64s
+    offset: NDArray[np.int64]
+    conn: NDArray[np.int64]
+    log_ns: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -315,7 +314,7 @@ class Entries:
 _FEW_NUMBERS: Final = 65_536
 
 
-def tally(conn: Int64s) -> dict[int, int]:
+def tally(conn: NDArray[np.int64]) -> dict[int, int]:
     """How often each connection number occurs; real ones are small, damaged ones need not be."""
     if len(conn) and conn.max() < _FEW_NUMBERS:
         counts = np.bincount(conn)

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 from .series import WINDOW_S, Grid, Series, Track
 
@@ -53,8 +52,8 @@ class Turning:
     """
 
     name: str
-    turned_rad: Floats
-    off_radps: Floats
+    turned_rad: NDArray[np.float64]
+    off_radps: NDArray[np.float64]
     has_scale: bool = True
 
 
@@ -217,7 +216,7 @@ def _bias(series: Series, speed: Series, grid: Grid) -> float | None:
 
 
 def _judged(
-    found: Verdict, turned: Floats, references: Sequence[Turning], bias_radps: float
+    found: Verdict, turned: NDArray[np.float64], references: Sequence[Turning], bias_radps: float
 ) -> Verdict:
     facts, wrong = [*found.facts], [*found.wrong]
     agrees, error, sign, is_judged = 0, math.inf, 1, False
@@ -261,7 +260,7 @@ def _judged(
     return Verdict(tuple(facts), tuple(wrong), agrees, error, sign, is_judged)
 
 
-def _correlation(mine: Floats, other: Floats) -> float:
+def _correlation(mine: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     if float(np.std(mine)) == 0.0 or float(np.std(other)) == 0.0:
         return 0.0
     return float(np.corrcoef(mine, other)[0, 1])

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-
-from crosscue.replay.base import Floats
+from numpy.typing import NDArray
 
 from .agreement import (
     Turning,
@@ -183,7 +182,7 @@ def _reference_speed(seen: Observed, grid: Grid) -> Series | None:
         return None
     at_grid = np.stack([np.abs(one.at(grid)) for one in others])
     known = np.isfinite(at_grid).sum(axis=0) >= 3
-    median: Floats = np.full(len(grid.t_ns), np.nan)
+    median: NDArray[np.float64] = np.full(len(grid.t_ns), np.nan)
     if known.any():
         median[known] = np.nanmedian(at_grid[:, known], axis=0)
     return Series.of(f"the median of {len(others)} speeds", grid.t_ns, median)

@@ -11,7 +11,8 @@ import pytest
 from crosscue.eval.interface.runs.score import ScoreWork
 from crosscue.eval.report.summary import pose_summary, summary
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.log_time import AMBIGUOUS, ambiguous
+from crosscue.eval.runs.tables.log_time import ambiguous
+from crosscue.eval.scoring.columns import AMBIGUOUS
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.runs import scores_of
 from support.gap_drive import Clock, replayed, write_drive

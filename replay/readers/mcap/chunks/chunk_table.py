@@ -14,7 +14,6 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.records import CHUNK_FIXED, PREFIX, BrokenRecordError, ChunkIndex
 
 SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
@@ -44,18 +43,18 @@ class ChunkTable(Mapping[int, ChunkIndex]):
         channel: Shape (M,), uint16: channels that have a message index, chunk by chunk.
     """
 
-    at: Int64s
-    length: Int64s
-    index_length: Int64s
+    at: NDArray[np.int64]
+    length: NDArray[np.int64]
+    index_length: NDArray[np.int64]
     start: NDArray[np.uint64]
     end: NDArray[np.uint64]
     sizes: NDArray[np.uint64]
     compression: NDArray[np.bytes_]
-    edges: Int64s
+    edges: NDArray[np.int64]
     channel: NDArray[np.uint16]
 
     @property
-    def after(self) -> Int64s:
+    def after(self) -> NDArray[np.int64]:
         """Shape (N,): where whatever follows a chunk and its message indexes begins."""
         return self.at + self.length + self.index_length
 
@@ -213,12 +212,14 @@ def _sorted(table: ChunkTable, sane: NDArray[np.bool_]) -> ChunkTable:
     return table.take(np.array([rows[place] for place in sorted(rows)], dtype=np.intp))
 
 
-def _gathered(view: Bytes, at: Int64s, size: int) -> Bytes:
+def _gathered(view: NDArray[np.uint8], at: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
     """Shape (N, size): the bytes from each place on."""
     return np.take(view, at[:, None] + np.arange(size))
 
 
-def _names(view: Bytes, at: Int64s, size: Int64s) -> NDArray[np.bytes_]:
+def _names(
+    view: NDArray[np.uint8], at: NDArray[np.int64], size: NDArray[np.int64]
+) -> NDArray[np.bytes_]:
     """The compression names; shorter ones are filled with zeros, which the dtype leaves out."""
     padded = np.zeros((len(at), _LONGEST_NAME), dtype=np.uint8)
     for width in np.unique(size).tolist():
@@ -227,6 +228,6 @@ def _names(view: Bytes, at: Int64s, size: Int64s) -> NDArray[np.bytes_]:
     return padded.view(f"S{_LONGEST_NAME}")[:, 0]
 
 
-def _need(size: Int64s, wanted: Int64s | int) -> None:
+def _need(size: NDArray[np.int64], wanted: NDArray[np.int64] | int) -> None:
     if (size < wanted).any():
         raise BrokenRecordError("a chunk index is shorter than its fields")

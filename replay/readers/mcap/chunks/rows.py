@@ -16,7 +16,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.chunks.scan import Scan, scan_of
 from crosscue.replay.readers.mcap.records import (
     ATTACHMENT,
@@ -76,9 +75,9 @@ class Rows:
             channel numbers and where their messages are. If empty, all are in stored order.
     """
 
-    buffer: Bytes
-    offset: Int64s
-    stop: Int64s
+    buffer: NDArray[np.uint8]
+    offset: NDArray[np.int64]
+    stop: NDArray[np.int64]
     channel: NDArray[np.uint16]
     sequence: NDArray[np.uint32]
     log: NDArray[np.uint64]
@@ -121,7 +120,7 @@ NEVER_IN_A_CHUNK: Final = opcodes(
 )
 
 
-def rows_by_index(buffer: Bytes, indexes: Sequence[MessageIndex]) -> Rows | None:
+def rows_by_index(buffer: NDArray[np.uint8], indexes: Sequence[MessageIndex]) -> Rows | None:
     """The messages of a chunk, found through its message indexes; None if these are not true."""
     filled = [index for index in indexes if len(index.entries)]
     if not filled:
@@ -162,7 +161,9 @@ def rows_by_index(buffer: Bytes, indexes: Sequence[MessageIndex]) -> Rows | None
     return replace(rows, groups=groups) if groups else rows.take(np.argsort(offset, kind="stable"))
 
 
-def _groups(offset: Int64s, filled: Sequence[MessageIndex]) -> tuple[tuple[int, slice], ...]:
+def _groups(
+    offset: NDArray[np.int64], filled: Sequence[MessageIndex]
+) -> tuple[tuple[int, slice], ...]:
     """The messages of each channel; empty if some channel's are not in stored order."""
     edges = [0, *accumulate(len(index.entries) for index in filled)]
     inner = edges[1:-1]
@@ -177,7 +178,7 @@ def _groups(offset: Int64s, filled: Sequence[MessageIndex]) -> tuple[tuple[int, 
 
 
 def _between_messages(
-    buffer: Bytes, offset: Int64s, stop: Int64s
+    buffer: NDArray[np.uint8], offset: NDArray[np.int64], stop: NDArray[np.int64]
 ) -> tuple[list[Definition], int] | None:
     """Definitions and number of other records, if with the messages they cover the buffer.
 
@@ -205,7 +206,7 @@ def _between_messages(
     return definitions, ignored
 
 
-def join(whole: Bytes, parts: Sequence[tuple[Rows, int]]) -> Rows:
+def join(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
     """Messages of consecutive chunks as those of one.
 
     Args:
@@ -240,7 +241,7 @@ def join(whole: Bytes, parts: Sequence[tuple[Rows, int]]) -> Rows:
     )
 
 
-def rows_by_scan(buffer: Bytes, stop_at: NDArray[np.bool_], most: int) -> Rows:
+def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], most: int) -> Rows:
     """The messages of a stretch up to where it cannot be followed any further (``Rows.end``).
 
     Args:
@@ -277,7 +278,7 @@ def rows_by_scan(buffer: Bytes, stop_at: NDArray[np.bool_], most: int) -> Rows:
     )
 
 
-def _definitions(buffer: Bytes, scan: Scan, end: int) -> tuple[list[Definition], int]:
+def _definitions(buffer: NDArray[np.uint8], scan: Scan, end: int) -> tuple[list[Definition], int]:
     begins, ends = scan.offset, np.append(scan.offset, scan.end)[1:]
     wanted = ((scan.opcode == SCHEMA) | (scan.opcode == CHANNEL)) & (begins < end)
     at = np.flatnonzero(wanted)
@@ -293,7 +294,7 @@ def _definitions(buffer: Bytes, scan: Scan, end: int) -> tuple[list[Definition],
     return definitions, int((begins < end).sum()) - messages - len(definitions)
 
 
-def _others(buffer: Bytes, begin: int, end: int) -> tuple[list[Definition], int] | None:
+def _others(buffer: NDArray[np.uint8], begin: int, end: int) -> tuple[list[Definition], int] | None:
     """What lies between two indexed messages; None if a message is there or it does not fit."""
     view, at, ignored = buffer.data, begin, 0
     found: list[Definition] = []

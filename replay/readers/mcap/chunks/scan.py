@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.records import PREFIX
 
 
@@ -27,12 +26,12 @@ class Scan:
             begins that is not whole, has operation code 0, is one to stop at, or is one too many.
     """
 
-    offset: Int64s
+    offset: NDArray[np.int64]
     opcode: NDArray[np.uint8]
     end: int
 
 
-def scan_of(buffer: Bytes, stop_at: NDArray[np.bool_], most: int) -> Scan:
+def scan_of(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], most: int) -> Scan:
     """The records of ``buffer`` from its beginning.
 
     Args:

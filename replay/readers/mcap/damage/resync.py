@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.chunks.rows import Definition, Rows
 from crosscue.replay.readers.mcap.records import (
@@ -205,7 +204,7 @@ class Resync:
         raw = bytes(self._file.peek(at, PREFIX.size))
         return raw == PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
-    def _candidates(self, window: Bytes, most: int) -> list[int]:
+    def _candidates(self, window: NDArray[np.uint8], most: int) -> list[int]:
         """Offsets, below ``most``, at which a message, schema or channel may begin."""
         at = _kinds(window, most, SCHEMA, MESSAGE)
         is_message = window[at] == MESSAGE
@@ -214,11 +213,11 @@ class Resync:
         offsets: list[int] = found.tolist()
         return offsets
 
-    def _messages(self, window: Bytes, at: Int64s) -> Int64s:
+    def _messages(self, window: NDArray[np.uint8], at: NDArray[np.int64]) -> NDArray[np.int64]:
         if not len(at):
             return at
         head = heads_at(window, at)
-        kept: Int64s = at[(head.size >= MESSAGE_FIXED) & self.plausible.messages(head)]
+        kept: NDArray[np.int64] = at[(head.size >= MESSAGE_FIXED) & self.plausible.messages(head)]
         return kept
 
     def _after(self, at: int) -> int | None:
@@ -259,10 +258,10 @@ class Resync:
         return head.compression in COMPRESSIONS and length == head.body_at + head.body_size
 
 
-def _kinds(window: Bytes, most: int, first: int, last: int) -> Int64s:
+def _kinds(window: NDArray[np.uint8], most: int, first: int, last: int) -> NDArray[np.int64]:
     """Offsets, below ``most``, of records of one of these kinds that may have a sane length."""
     heads = window[: max(min(most, len(window) - MESSAGE_HEAD.itemsize + 1), 0)]
-    at: Int64s = np.flatnonzero((heads >= first) & (heads <= last)).astype(np.int64)
+    at: NDArray[np.int64] = np.flatnonzero((heads >= first) & (heads <= last)).astype(np.int64)
     for byte in (6, 7, 8):  # no record has a length of 2^40 bytes
         at = at[window[at + byte] == 0]
     return at
