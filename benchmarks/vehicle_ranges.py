@@ -92,17 +92,19 @@ def main() -> None:
     settings = open_run(run).drive_manifest().settings.camera
     pairs = list(_pairs(run, folder))
     for height_m in [float(text) for text in sys.argv[3:]] or [settings.z_m]:
-        camera = GroundCamera(settings.focal_px or 0.0, (settings.center_px or (0, 0))[1], height_m)
+        focal_px, center_y_px = settings.focal_px or 0.0, (settings.center_px or (0, 0))[1]
+        camera = GroundCamera(focal_px, height_m)
         print(f"camera {height_m} m above the ground")
         for near_m, far_m in pairwise(EDGES_M):
             inside = [(row, true_m) for row, true_m in pairs if near_m <= true_m < far_m]
             by: dict[str, list[tuple[OneRange, float]]] = {"ground": [], "size": [], "both": []}
             for row, true_m in inside:
                 height_px, size = row["height_px"], VEHICLES[row["label"]]
-                ground = ground_range(row["y1"], height_px, camera)
+                slope = (row["y1"] - center_y_px) / focal_px
+                ground = ground_range(slope, height_px, camera)
                 by["ground"] += [] if ground is None else [(ground, true_m)]
                 by["size"].append((size_range(height_px, camera.focal_px, size), true_m))
-                by["both"].append((vehicle_range(row["y1"], height_px, camera, size), true_m))
+                by["both"].append((vehicle_range(slope, height_px, camera, size), true_m))
             texts = "  ".join(f"{name}: {_report_text(some)}" for name, some in by.items())
             print(f"  {near_m:3.0f} to {far_m:3.0f} m  {texts}")
 

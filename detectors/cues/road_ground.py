@@ -4,7 +4,7 @@ The source's regions are fixed in the picture (eq. 13), so a wide road of the eg
 its own lanes far ahead, lie in the region for "right". Here a region is a rectangle on the ground,
 anchored to the intersection as believed: aside the middle half between its start and its end,
 further off than the ego vehicle's own road is wide; straight, the lane beyond its end. It
-is projected with the camera's height, pitch and intrinsics; the ground is level.
+is projected with the camera's mounting and intrinsics; the ground is level.
 
 A region is **not seen**, which says nothing for or against a road,
 
@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import RoadMask
+from crosscue.detectors.ranging.ground_plane import GroundPlane
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 
 from .observed import NOT_SEEN, Place, RoadShares
@@ -80,37 +82,22 @@ def outlines(
     """
     if place is None or camera.focal_px is None or camera.z_m <= 0.0:
         return None, None, None
-    return tuple(
-        None if one[0] - camera.x_m < NEAREST_M else project(_corners(one), camera, size_px)
-        for one, _ in rectangles(regions, place)
-    )
+    ground = GroundPlane.of(camera, size_px)
+    found = [_outline(one, ground) for one, _ in rectangles(regions, place)]
+    return tuple(found)
+
+
+def _outline(one: Rectangle, ground: GroundPlane) -> Floats | None:
+    """Corners in the picture; None where one of them lies beside or behind the camera."""
+    if one[0] - ground.position_m[0] < NEAREST_M:
+        return None
+    corners = ground.project(_corners(one))
+    return None if np.isnan(corners).any() else corners
 
 
 def _corners(one: Rectangle) -> NDArray[np.float64]:
     first, last, rightmost, leftmost = one
     return np.array([(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)])
-
-
-def project(
-    points_m: NDArray[np.float64], camera: Camera, size_px: tuple[int, int]
-) -> NDArray[np.float64]:
-    """Points on level ground in the picture.
-
-    Args:
-        points_m: Shape (N, 2): ahead of the rear axle and to the left; ahead of the camera.
-        camera: Its place, height, pitch and intrinsics.
-        size_px: Width and height of the picture.
-
-    Returns:
-        Shape (N, 2): x and y, pixels.
-    """
-    focal_px = camera.focal_px or math.nan
-    center_x, center_y = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
-    ahead, left = points_m[:, 0] - camera.x_m, points_m[:, 1] - camera.y_m
-    cos, sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
-    depth = ahead * cos + camera.z_m * sin
-    below = camera.z_m * cos - ahead * sin
-    return np.stack([center_x - focal_px * left / depth, center_y + focal_px * below / depth], 1)
 
 
 def _fraction(
@@ -124,13 +111,14 @@ def _fraction(
 ) -> float:
     """Fraction of road pixels in one rectangle; NaN where it is not seen."""
     away_m = one[0] - camera.x_m
-    if away_m < NEAREST_M or camera.z_m <= 0.0:
+    corners = _outline(one, GroundPlane.of(camera, road.size_px))
+    if corners is None or camera.z_m <= 0.0:
         return math.nan
     doubt_m = math.hypot(place_sd_m, away_m**2 * camera.pitch_sd_rad / camera.z_m)
     if doubt_m > margin_m:
         return math.nan
     scale = np.array(road.mask_size_px) / np.array(road.size_px)
-    polygon = project(_corners(one), camera, road.size_px) * scale
+    polygon = corners * scale
     if polygon[:2, 1].mean() - polygon[2:, 1].mean() < regions.min_rows:
         return math.nan
     inside = _inside(polygon, is_road.shape)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+from .ground_plane import GroundPlane
 from .height_to_range import range_of
 from .standard_sizes import VEHICLES, size_of
 from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
@@ -76,11 +77,10 @@ def _by_size(
         return size_range(height_px, focal_px, size_of("stop_sign"))
     if label not in VEHICLES:
         return None
-    center_px = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
-    over_ground = GroundCamera(
-        focal_px, center_px[1], camera.z_m, camera.pitch_rad, camera.pitch_sd_rad
-    )
-    return vehicle_range(y1, height_px, over_ground, VEHICLES[label])
+    foot = np.array([[0.5 * (x0 + x1), y1]])
+    ((ahead, _, up),) = GroundPlane.of(camera, size_px).rays(foot).tolist()
+    over_ground = GroundCamera(focal_px, camera.z_m, camera.pitch_sd_rad)
+    return vehicle_range(-up / ahead, height_px, over_ground, VEHICLES[label])
 
 
 def _is_cut(box_px: NDArray[np.float64], size_px: tuple[int, int]) -> bool:

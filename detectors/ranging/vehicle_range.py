@@ -33,16 +33,12 @@ class GroundCamera:
 
     Attributes:
         focal_px: Focal length.
-        center_y_px: Row of the optical axis.
         height_m: Above the ground.
-        pitch_rad: How far the axis points below the horizon.
-        pitch_sd_rad: How far that is off in a frame.
+        pitch_sd_rad: How far its pitch is off in a frame.
     """
 
     focal_px: float
-    center_y_px: float
     height_m: float
-    pitch_rad: float = 0.0
     pitch_sd_rad: float = 0.005
 
 
@@ -65,40 +61,41 @@ def size_range(height_px: float, focal_px: float, size: SizePrior) -> OneRange:
     return OneRange(mean_m, mean_m * math.hypot(size.spread, _edge_px(height_px) / height_px))
 
 
-def ground_range(bottom_px: float, height_px: float, camera: GroundCamera) -> OneRange | None:
+def ground_range(slope: float, height_px: float, camera: GroundCamera) -> OneRange | None:
     """Range of what stands on the ground at a box's lower edge.
 
     Args:
-        bottom_px: Row of the edge.
+        slope: Of the ray through the edge: so far down, as seen from the camera, for each metre
+            ahead of the car.
         height_px: Of the box.
         camera: Over level ground.
 
     Returns:
         None at or near the horizon, where the edge says nothing.
     """
-    below_rad = math.atan((bottom_px - camera.center_y_px) / camera.focal_px) + camera.pitch_rad
+    below_rad = math.atan(slope)
     angle_sd = math.hypot(camera.pitch_sd_rad, _edge_px(height_px) / camera.focal_px)
     if not MIN_SIGMAS * angle_sd < below_rad < 0.5 * math.pi or camera.height_m <= 0.0:
         return None
-    mean_m = camera.height_m / math.tan(below_rad)
+    mean_m = camera.height_m / slope
     slope_m = mean_m**2 / camera.height_m + camera.height_m
     spoiled_m = math.hypot(slope_m * angle_sd, CAMERA_HEIGHT_SD * mean_m, OVERHANG_M)
     return OneRange(mean_m, spoiled_m)
 
 
 def vehicle_range(
-    bottom_px: float, height_px: float, camera: GroundCamera, size: SizePrior
+    slope: float, height_px: float, camera: GroundCamera, size: SizePrior
 ) -> OneRange:
     """Range of a vehicle by ground and size.
 
     Args:
-        bottom_px: Row of its box's lower edge.
+        slope: Of the ray through its box's lower edge, as for ``ground_range``.
         height_px: Of its box, positive.
         camera: Over level ground.
         size: Of vehicles.
     """
     by_size = size_range(height_px, camera.focal_px, size)
-    by_ground = ground_range(bottom_px, height_px, camera)
+    by_ground = ground_range(slope, height_px, camera)
     if by_ground is None:
         return by_size
     weights = [(one.mean_m / one.sd_m) ** 2 for one in (by_size, by_ground)]

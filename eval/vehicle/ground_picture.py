@@ -6,7 +6,6 @@ known here: they are drawn for one assumed ahead.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Final
 
@@ -15,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.cues.observed import Place
-from crosscue.detectors.cues.road_ground import project, rectangles
+from crosscue.detectors.cues.road_ground import rectangles
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 AHEAD_M: Final = (5, 10, 15, 20, 30, 50, 80)
@@ -25,14 +25,6 @@ NEAREST_M: Final = 0.5
 ASSUMED: Final = Place(30.0, 50.0, 0.0)
 """From the rear axle to the start and the end of the intersection that regions are drawn for."""
 YELLOW, WHITE, GREEN, BLACK = (0, 230, 255), (255, 255, 255), (80, 230, 80), (0, 0, 0)
-
-
-def horizon_px(camera: Camera, size_px: tuple[int, int]) -> float | None:
-    """Height of the horizon in the picture; None without a focal length."""
-    if camera.focal_px is None:
-        return None
-    center = camera.center_px[1] if camera.center_px is not None else 0.5 * size_px[1]
-    return center - camera.focal_px * math.tan(camera.pitch_rad)
 
 
 def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8]:
@@ -46,13 +38,17 @@ def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8
     size_px = (pixels.shape[1], pixels.shape[0])
     scale = max(size_px[0] / 1280, 0.5)
     camera = vehicle.camera
-    y = horizon_px(camera, size_px)
-    if y is not None:
-        _line(canvas, np.array([[0.0, y], [float(size_px[0]), y]]), YELLOW, scale)
-        _write(canvas, "horizon", (8.0, y - 6.0), YELLOW, scale)
-    if y is not None and camera.z_m > 0.0:
+    ground = GroundPlane.of(camera, size_px)
+    if camera.focal_px is not None:
+        sides = np.array([0.0, float(size_px[0])])
+        y = ground.horizon_px(sides)
+        _line(canvas, np.column_stack([sides, y]), YELLOW, scale)
+        _write(canvas, "horizon", (8.0, float(y[0]) - 6.0), YELLOW, scale)
+    if camera.focal_px is not None and camera.z_m > 0.0:
         for line, text in _grid(camera):
-            points = project(line, camera, size_px)
+            points = ground.project(line)
+            if np.isnan(points).any():
+                continue
             _line(canvas, points, WHITE, 0.6 * scale)
             x, below = points[0].tolist()
             if text and below < size_px[1]:
@@ -90,7 +86,9 @@ def _regions(
         first, last, rightmost, leftmost = one
         corners = [(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)]
         if first - camera.x_m > NEAREST_M:
-            yield name, project(np.array(corners), camera, size_px)
+            outline = GroundPlane.of(camera, size_px).project(np.array(corners))
+            if not np.isnan(outline).any():
+                yield name, outline
 
 
 def _line(

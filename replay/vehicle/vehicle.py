@@ -137,13 +137,12 @@ class Camera(Section):
     focal_px: Positive | None = None
     center_px: tuple[Finite, Finite] | None = None
     roll_rad: Finite = 0.0
-    """How far it is turned about its axis: its right side down is positive. Recorded only: ranges
-    and regions on the road take a level camera that looks straight ahead."""
+    """How far it is turned about its axis: its right side down is positive."""
     pitch_rad: Finite = 0.0
     """How far its axis points below the horizon."""
     yaw_rad: Finite = 0.0
     """How far its axis points to the left; ``crosscue fit odometry`` finds it where the truth is
-    the camera's track. Scoring applies it; ranges and regions on the road do not."""
+    the camera's track."""
     pitch_sd_rad: NotNegative = 0.01
     """How far that is off in a frame: a car pitches by some half a degree as it brakes."""
     depth_bits: Annotated[int, Field(ge=8, le=16)] = 16

@@ -35,7 +35,7 @@ class Observation(NamedTuple):
     Attributes:
         t_s: Time.
         pose: Of the camera: x, y, heading in the plane of the road.
-        edges_rad: Bearings of its left and right end, to the right of the camera's axis.
+        edges_rad: Bearings of its left and right end, to the right of straight ahead.
         distance_m: From its height.
         error: Standard deviation of the distance as a fraction, from the box alone.
         long: Length over height.

@@ -25,6 +25,7 @@ from crosscue.detectors.cues.tracked.motion import (
     motion_of,
     place_of_end,
 )
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import Motion, iou
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
@@ -149,16 +150,22 @@ class CarTracks:
         focal_px = self._camera.focal_px or 0.0
         if is_cut or y1 <= y0 or x1 <= x0 or focal_px <= 0.0:
             return None
-        distance_m = focal_px * CAR_HEIGHT_M / (y1 - y0)
+        ends = np.array([[x0, 0.5 * (y0 + y1)], [x1, 0.5 * (y0 + y1)]])
+        rays = GroundPlane.of(self._camera, found.size_px).rays(ends)
+        if rays[:, 0].min() <= 0.0:
+            return None
+        depth_m = focal_px * CAR_HEIGHT_M / (y1 - y0)
+        distance_m = depth_m * float(rays[:, 0].mean())
         if distance_m > max(self._settings.within_m, self._settings.past_within_m):
             return None
-        center = (self._camera.center_px or (0.5 * width, 0.0))[0]
-        edges = math.atan2(x0 - center, focal_px), math.atan2(x1 - center, focal_px)
+        left, right = np.arctan2(-rays[:, 1], rays[:, 0]).tolist()
         error = BOX_PX / (y1 - y0) + (HIDDEN_FRACTION if is_hidden else BOX_FRACTION)
         mask = found.masks[i]
         nose = 0 if not mask else nose_of(rle.column_heights_px(mask, found.size_px))
         long = (x1 - x0) / (y1 - y0)
-        return Observation(self._t_s, self._pose, edges, distance_m, error, long, nose, is_hidden)
+        return Observation(
+            self._t_s, self._pose, (left, right), distance_m, error, long, nose, is_hidden
+        )
 
     def _assign(self, cars: Sequence[tuple[NDArray[np.float64], Observation]]) -> list[_Track]:
         """Cars that are where they were on their way to first; new cars begin a track.

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import (
     Facing,
     Motion,
@@ -136,7 +137,7 @@ class MotionRanges:
 
     def _chain(self, cue: str, size_px: tuple[int, int]) -> _Chain:
         camera = self.vehicle.camera
-        center_px = camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1])
+        center_px = GroundPlane.of(camera, size_px).ahead_px()
         scale_sd = self.vehicle.odometry.scale_sd
         tracks = ObjectTracks(cue, camera.focal_px or 0.0, center_px, scale_sd)
         tracks.counts = self.counts

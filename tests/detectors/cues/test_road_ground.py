@@ -15,8 +15,9 @@ from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Place, RoadShares, Seen
-from crosscue.detectors.cues.road_ground import ground_fractions, project
+from crosscue.detectors.cues.road_ground import ground_fractions, outlines
 from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Regions, Vehicle, parse
 
@@ -69,10 +70,24 @@ def test_a_point_on_the_ground_is_projected_where_the_camera_sees_it(
 ) -> None:
     level = CAMERA.model_copy(update={"pitch_rad": 0.0})
 
-    ((x, y),) = project(np.array([[ahead_m + level.x_m, left_m]]), level, SIZE).tolist()
+    ((x, y),) = (
+        GroundPlane.of(level, SIZE).project(np.array([[ahead_m + level.x_m, left_m]])).tolist()
+    )
 
     assert x == pytest.approx(640.0 - 900.0 * left_m / ahead_m)
     assert y == pytest.approx(340.0 + 900.0 * 1.5 / ahead_m)
+
+
+def test_a_turned_camera_has_its_regions_at_the_same_places_on_the_ground() -> None:
+    turns = {"yaw_rad": 0.1, "pitch_rad": 0.05, "roll_rad": -0.08}
+    found = []
+    for camera in (CAMERA, CAMERA.model_copy(update=turns)):
+        ground = GroundPlane.of(camera, SIZE)
+        shown = outlines(camera, GROUND, at(16.0), SIZE)
+        found.append([ground.unproject(one) for one in shown if one is not None])
+
+    assert len(found[0]) == 3
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
 
 
 @settings(max_examples=60, deadline=None)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.ranging.detection_range import detection_range
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.standard_sizes import VEHICLES, SizePrior
 from crosscue.detectors.ranging.vehicle_range import (
     CAMERA_HEIGHT_SD,
@@ -19,7 +20,8 @@ from crosscue.detectors.ranging.vehicle_range import (
 )
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 
-CAMERA = GroundCamera(focal_px=1500.0, center_y_px=540.0, height_m=1.5)
+CAMERA = GroundCamera(focal_px=1500.0, height_m=1.5)
+CENTER_Y_PX = 540.0
 CAR = VEHICLES["car"]
 SIZE = (1920, 1080)
 
@@ -27,15 +29,17 @@ SIZE = (1920, 1080)
 def edge_px(range_m: float, camera: GroundCamera = CAMERA, pitch_rad: float = 0.0) -> float:
     """Row where a point of level ground appears."""
     angle = math.atan(camera.height_m / range_m) - pitch_rad
-    return camera.center_y_px + camera.focal_px * math.tan(angle)
+    return CENTER_Y_PX + camera.focal_px * math.tan(angle)
 
 
-@pytest.mark.parametrize("pitch_rad", [-0.03, 0.0, 0.08])
+def slope(bottom_px: float) -> float:
+    """Of the ray through a row of a level camera."""
+    return (bottom_px - CENTER_Y_PX) / CAMERA.focal_px
+
+
 @pytest.mark.parametrize("range_m", [4.0, 17.0, 40.0])
-def test_a_point_of_level_ground_has_its_range_exactly(range_m: float, pitch_rad: float) -> None:
-    tilted = GroundCamera(1500.0, 540.0, 1.5, pitch_rad)
-
-    found = ground_range(edge_px(range_m, pitch_rad=pitch_rad), 60.0, tilted)
+def test_a_point_of_level_ground_has_its_range_exactly(range_m: float) -> None:
+    found = ground_range(slope(edge_px(range_m)), 60.0, CAMERA)
 
     assert found is not None
     assert found.mean_m == pytest.approx(range_m, rel=1e-9)
@@ -43,17 +47,17 @@ def test_a_point_of_level_ground_has_its_range_exactly(range_m: float, pitch_rad
 
 def test_an_edge_at_the_horizon_says_nothing_and_size_alone_speaks() -> None:
     for bottom_px in (500.0, 540.0, 545.0):
-        assert ground_range(bottom_px, 20.0, CAMERA) is None
-        assert vehicle_range(bottom_px, 20.0, CAMERA, CAR) == size_range(20.0, 1500.0, CAR)
+        assert ground_range(slope(bottom_px), 20.0, CAMERA) is None
+        assert vehicle_range(slope(bottom_px), 20.0, CAMERA, CAR) == size_range(20.0, 1500.0, CAR)
 
 
 def test_near_the_ground_decides_and_far_away_the_size() -> None:
     tall = SizePrior(1.65, 0.15)
     for range_m, nearer in ((8.0, "ground"), (60.0, "size")):
         height_px = 1500.0 * 2.0 / range_m
-        both = vehicle_range(edge_px(range_m), height_px, CAMERA, tall)
+        both = vehicle_range(slope(edge_px(range_m)), height_px, CAMERA, tall)
         by_size = size_range(height_px, 1500.0, tall)
-        by_ground = ground_range(edge_px(range_m), height_px, CAMERA)
+        by_ground = ground_range(slope(edge_px(range_m)), height_px, CAMERA)
         assert by_ground is not None
         to_ground = abs(math.log(both.mean_m / by_ground.mean_m))
         to_size = abs(math.log(both.mean_m / by_size.mean_m))
@@ -71,9 +75,9 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(range_m: float) -> Non
         edge_sd = math.hypot(EDGE_PX, EDGE_FRACTION * true_px)
         tilt, raised = 0.005 * rng.normal(), 1.0 + CAMERA_HEIGHT_SD * rng.normal()
         stands_m = range_m + OVERHANG_M * rng.normal()
-        camera = GroundCamera(1500.0, 540.0, 1.5 * raised)
+        camera = GroundCamera(1500.0, 1.5 * raised)
         bottom_px = edge_px(stands_m, camera, tilt) + edge_sd * rng.normal()
-        found = vehicle_range(bottom_px, true_px + edge_sd * rng.normal(), CAMERA, CAR)
+        found = vehicle_range(slope(bottom_px), true_px + edge_sd * rng.normal(), CAMERA, CAR)
         inside += abs(found.mean_m - range_m) < 1.96 * found.sd_m
 
     assert 0.92 <= inside / 2000 <= 0.985
@@ -132,6 +136,18 @@ def test_the_camera_s_own_pitch_is_taken_into_account() -> None:
     assert loose is not None
     assert found[1].mean_m == pytest.approx(found[0].mean_m)
     assert loose.sd_m > found[0].sd_m
+
+
+@pytest.mark.parametrize(("yaw", "roll"), [(0.1, 0.0), (0.0, 0.05), (-0.1, 0.03)])
+def test_a_turned_camera_sees_the_same_range(yaw: float, roll: float) -> None:
+    found = []
+    for turns in ("", f"yaw_rad = {yaw}\nroll_rad = {roll}\n"):
+        car = vehicle(FOCAL + turns)
+        ((x, y),) = GroundPlane.of(car.camera, SIZE).project(np.array([[13.5, 2.0]]))
+        found.append(detection_range(car, "bus", np.array([x - 9, y - 9, x + 9, y]), 380.0, SIZE))
+
+    assert found[0] is not None
+    assert found[0] == pytest.approx(found[1])
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import crosscue
-from crosscue.detectors.cues.road_ground import project
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, check
-from crosscue.eval.vehicle.ground_picture import draw_ground, horizon_px
+from crosscue.eval.vehicle.ground_picture import draw_ground
 from crosscue.replay.base import EVERYTHING, Block, Table, Topic
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block
@@ -68,9 +68,10 @@ def test_the_horizon_is_where_a_level_road_ends() -> None:
     camera = Camera(focal_px=800.0, center_px=(320.0, 200.0), pitch_rad=0.05, z_m=1.4)
     size_px = (640, 400)
 
-    far = project(np.array([[1e7, 0.0]]), camera, size_px)
+    ground = GroundPlane.of(camera, size_px)
+    ((x, y),) = ground.project(np.array([[1e7, 0.0]]))
 
-    assert horizon_px(camera, size_px) == pytest.approx(far[0, 1], abs=1e-3)
+    assert ground.horizon_px(np.array([x]))[0] == pytest.approx(y, abs=1e-3)
 
 
 def test_a_picture_shows_the_horizon_unless_nobody_knows_where_it_is() -> None:

@@ -1,0 +1,151 @@
+"""A pinhole camera, mounted at any angle, over level ground: metres to pixels and back.
+
+Axes of the car and of the camera's body are forward, left, up (ISO 8855). The body is turned from
+the car by yaw about up, then pitch about left, then roll about forward, as the vehicle file has
+them: yaw to the left, pitch down and roll to the right are positive. Points on the ground are
+stated from the rear axle, ahead and to the left.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from crosscue.replay.columns import Floats
+
+
+class Mounted(Protocol):
+    """What ``[camera]`` of a vehicle file says, as ``crosscue.replay.vehicle.vehicle.Camera``."""
+
+    @property
+    def focal_px(self) -> float | None:
+        """Focal length."""
+        ...
+
+    @property
+    def center_px(self) -> tuple[float, float] | None:
+        """Where the optical axis meets the picture."""
+        ...
+
+    @property
+    def x_m(self) -> float:
+        """Ahead of the rear axle."""
+        ...
+
+    @property
+    def y_m(self) -> float:
+        """To its left."""
+        ...
+
+    @property
+    def z_m(self) -> float:
+        """Above the ground."""
+        ...
+
+    @property
+    def yaw_rad(self) -> float:
+        """To the left."""
+        ...
+
+    @property
+    def pitch_rad(self) -> float:
+        """Down."""
+        ...
+
+    @property
+    def roll_rad(self) -> float:
+        """To the right."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundPlane:
+    """Where a camera sees the ground.
+
+    Attributes:
+        focal_px: Focal length.
+        center_px: Where the optical axis meets the picture.
+        position_m: Of the camera: ahead of the rear axle, to its left, above the ground.
+        to_car: Shape (3, 3): rotation from the camera's forward, left, up to the car's.
+    """
+
+    focal_px: float
+    center_px: tuple[float, float]
+    position_m: tuple[float, float, float]
+    to_car: Floats
+
+    @classmethod
+    def of(cls, camera: Mounted, size_px: tuple[int, int]) -> GroundPlane:
+        """The camera of a vehicle file, which has a focal length.
+
+        Args:
+            camera: Its section.
+            size_px: Width and height of the picture; its middle is the center where none is stated.
+        """
+        return cls(
+            camera.focal_px or math.nan,
+            camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]),
+            (camera.x_m, camera.y_m, camera.z_m),
+            turned(camera.yaw_rad, camera.pitch_rad, camera.roll_rad),
+        )
+
+    def rays(self, points_px: Floats) -> Floats:
+        """Directions in the car's axes, shape (N, 3), of unit depth along the optical axis.
+
+        Args:
+            points_px: Shape (N, 2): x and y.
+        """
+        right_down = (points_px - np.array(self.center_px)) / self.focal_px
+        body = np.column_stack([np.ones(len(right_down)), -right_down])
+        return np.asarray(body @ self.to_car.T, np.float64)
+
+    def seen_at(self, directions: Floats) -> Floats:
+        """Where directions in the car's axes, shape (N, 3), lie in the picture, shape (N, 2).
+
+        NaN for what lies beside or behind the camera.
+        """
+        forward, left, up = (directions @ self.to_car).T
+        forward = np.where(forward > 0.0, forward, np.nan)
+        center_x, center_y = self.center_px
+        x = center_x - self.focal_px * left / forward
+        return np.stack([x, center_y - self.focal_px * up / forward], axis=1)
+
+    def project(self, ground_m: Floats) -> Floats:
+        """Points on the ground, shape (N, 2), in the picture; NaN beside or behind the camera."""
+        x_m, y_m, z_m = self.position_m
+        away_m = ground_m - np.array([x_m, y_m])
+        return self.seen_at(np.column_stack([away_m, np.full(len(away_m), -z_m)]))
+
+    def unproject(self, points_px: Floats) -> Floats:
+        """Points of the picture, shape (N, 2), on the ground; NaN at and above the horizon."""
+        x_m, y_m, z_m = self.position_m
+        rays = self.rays(points_px)
+        below = np.where(rays[:, 2] < 0.0, -rays[:, 2], np.nan)
+        return np.asarray(rays[:, :2] * (z_m / below)[:, None] + np.array([x_m, y_m]), np.float64)
+
+    def ahead_px(self) -> tuple[float, float]:
+        """What does not move in the picture as the car goes straight ahead."""
+        ((x, y),) = self.seen_at(np.array([[1.0, 0.0, 0.0]])).tolist()
+        return x, y
+
+    def horizon_px(self, x_px: Floats) -> Floats:
+        """Height of the horizon in the columns ``x_px``, shape (N,)."""
+        forward, left, up = self.to_car[2]
+        to_left = (self.center_px[0] - x_px) / self.focal_px
+        return np.asarray(
+            self.center_px[1] + self.focal_px * (forward + left * to_left) / up, np.float64
+        )
+
+
+def turned(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Floats:
+    """From the axes of a camera's body to the car's, shape (3, 3)."""
+    (cy, sy), (cp, sp), (cr, sr) = (
+        (math.cos(angle), math.sin(angle)) for angle in (yaw_rad, pitch_rad, roll_rad)
+    )
+    about_up = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_left = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_forward = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return np.asarray(about_up @ about_left @ about_forward, np.float64)
