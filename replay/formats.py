@@ -91,6 +91,12 @@ FORMATS: Final[dict[str, Format]] = {
         "crosscue.datasets.adapters.kitti_odometry:open_sequence",
         "KITTI odometry sequence",
     ),
+    "phone-drive": Format(
+        (),
+        ("*_phone.csv",),
+        "crosscue.datasets.adapters.phone_drive:open_drive",
+        "smartphone driving data set (folder)",
+    ),
     "nuscenes": Format(
         (".nuscenes",),
         ("v1.0-*/scene.json",),

@@ -40,11 +40,10 @@ from crosscue.replay.base import (
     read_at_most,
 )
 from crosscue.replay.decode.coding import IMAGE_SUFFIXES
+from crosscue.replay.readers.held_rows import HeldRows
 from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched
-
-from .held_rows import HeldRows
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB

@@ -16,6 +16,7 @@ from support.kitti_drive import raw_drive
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.nuscenes_drive import nuscenes_drive
 from support.pandaset_drive import pandaset_drive
+from support.phone_drive import phone_drive
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_bag, write_folder
 from support.videos import video
@@ -87,6 +88,7 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "comma2k19": lambda folder: _comma2k19(folder / "segment"),
     "kitti-raw": lambda folder: raw_drive(folder / "drive"),
     "kitti-odometry": kitti_odometry_drive,
+    "phone-drive": lambda folder: phone_drive(folder / "drive"),
     "nuscenes": lambda folder: nuscenes_drive(folder / "root"),
     "pandaset": lambda folder: pandaset_drive(folder / "002"),
     "video": _video,

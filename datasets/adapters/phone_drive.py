@@ -1,0 +1,263 @@
+"""A car's CAN values and a phone on its dashboard, as the smartphone driving data set records them.
+
+A folder holds ``NAME_car.csv`` (speed, steering, engine and position at 10 Hz) and
+``NAME_phone.csv`` (compass, gyro, gravity at 10 Hz, GNSS once a second), both stamped by wall
+clocks without a zone; log times are those clocks', read as UTC. A line of the phone's file is a row
+of several topics, so a damaged line is lost from each of them.
+"""
+
+from __future__ import annotations
+
+import csv
+import heapq
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.base import (
+    EVERYTHING,
+    MIB,
+    Block,
+    Closing,
+    Floats,
+    Int64s,
+    Ledger,
+    Limits,
+    LogFormatError,
+    Selection,
+    Table,
+    Topic,
+    read_at_most,
+)
+from crosscue.replay.readers.held_rows import HeldRows, Loss
+
+MAX_FILE_BYTES: Final = 256 * MIB
+MILE_H_MPS: Final = 0.44704
+MICROTESLA: Final = 1e-6
+QUARTER_HOUR_S: Final = 900.0
+"""Zones differ from UTC by whole ones."""
+DAMAGED: Final = "a line that cannot be understood"
+GRAVITY: Final = tuple(f"motionGravity{axis}(G)" for axis in "XYZ")
+GYRO: Final = tuple(f"gyroRotation{axis}(rad/s)" for axis in "XYZ")
+FIELD: Final = tuple(f"locationHeading{axis}(µT)" for axis in "XYZ")
+FIX_TIME: Final = "locationTimestamp_since1970(s)"
+
+Values = Mapping[str, Floats]
+
+
+def _speed(of: Values) -> dict[str, Floats]:
+    return {"speed_mps": of["Speed (MPH)"] * MILE_H_MPS}
+
+
+def _engine(of: Values) -> dict[str, Floats]:
+    return {
+        "steering_deg": of["Steering Angle"],
+        "throttle_percent": of["Throttle Position"],
+        "engine_rpm": of["Engine RPM"],
+    }
+
+
+def _car_position(of: Values) -> dict[str, Floats]:
+    latitude, longitude = "Latitude / Y Position (Degrees)", "Longitude / X Position (Degrees)"
+    return {"latitude_deg": of[latitude], "longitude_deg": of[longitude]}
+
+
+def _yaw_rate(of: Values) -> dict[str, Floats]:
+    """About the vertical, which the phone's own gravity vector shows; it points down."""
+    down = np.column_stack([of[name] for name in GRAVITY])
+    rate = np.column_stack([of[name] for name in GYRO])
+    return {"yaw_rate_radps": -(rate * down).sum(axis=1) / np.linalg.norm(down, axis=1)}
+
+
+def _field(of: Values) -> dict[str, Floats]:
+    return {f"mag_{axis}_t": of[name] * MICROTESLA for axis, name in zip("xyz", FIELD, strict=True)}
+
+
+def _fix(of: Values) -> dict[str, Floats]:
+    course = np.deg2rad(90.0 - of["locationCourse(°)"])
+    return {
+        "latitude_deg": of["locationLatitude(WGS84)"],
+        "longitude_deg": of["locationLongitude(WGS84)"],
+        "altitude_m": of["locationAltitude(m)"],
+        "position_sd_m": of["locationHorizontalAccuracy(m)"],
+        "speed_mps": of["locationSpeed(m/s)"],
+        "course_rad": np.arctan2(np.sin(course), np.cos(course)),
+    }
+
+
+class _Stream(NamedTuple):
+    """A topic: its type, the columns it is made of, and how."""
+
+    type_name: str
+    fields: tuple[str, ...]
+    to_columns: Callable[[Values], dict[str, Floats]]
+
+
+CAR: Final[dict[str, _Stream]] = {
+    "car/speed": _Stream("crosscue/WheelSpeeds", ("Speed (MPH)",), _speed),
+    "car/engine": _Stream(
+        "crosscue/Table", ("Steering Angle", "Throttle Position", "Engine RPM"), _engine
+    ),
+    "car/position": _Stream(
+        "crosscue/Table",
+        ("Latitude / Y Position (Degrees)", "Longitude / X Position (Degrees)"),
+        _car_position,
+    ),
+}
+PHONE: Final[dict[str, _Stream]] = {
+    "phone/gyro": _Stream("sensor_msgs/msg/Imu", (*GYRO, *GRAVITY), _yaw_rate),
+    "phone/magnetometer": _Stream("sensor_msgs/msg/MagneticField", FIELD, _field),
+}
+FIX: Final = _Stream(
+    "sensor_msgs/msg/NavSatFix",
+    (
+        FIX_TIME,
+        "locationLatitude(WGS84)",
+        "locationLongitude(WGS84)",
+        "locationAltitude(m)",
+        "locationHorizontalAccuracy(m)",
+        "locationSpeed(m/s)",
+        "locationCourse(°)",
+    ),
+    _fix,
+)
+
+
+class Drive(Closing):
+    """One folder as a ``Log``."""
+
+    format: Final = "phone-drive"
+
+    def __init__(self, path: Path, rows: Sequence[HeldRows]) -> None:
+        """Put a drive together."""
+        self.path: Final = path
+        self._rows: Final = tuple(rows)
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The car's, then the phone's."""
+        return tuple(rows.topic for rows in self._rows)
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All streams, in order of each one's first time; see ``Log.read``."""
+        ledger.integrity = "not checkable: lines carry no checksum, so a missing line cannot be seen"
+        streams = [rows.read(ledger, selection) for rows in self._rows]
+        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Damaged lines; see ``KnowsItsEnd``."""
+        for rows in self._rows:
+            rows.report_missing(ledger)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class _Lines(NamedTuple):
+    """A file's lines that have a time, and what is damaged."""
+
+    t_ns: Int64s
+    fields: list[dict[str, str]]
+    losses: tuple[Loss, ...]
+
+
+def open_drive(path: Path, limits: Limits) -> Drive:
+    """Read both files of a folder.
+
+    Raises:
+        LogFormatError: A file is missing or too large, there are two of a kind, or columns lack.
+    """
+    rows: list[HeldRows] = []
+    for kind, streams in (("car", CAR), ("phone", PHONE)):
+        files = sorted(path.glob(f"*_{kind}.csv"))
+        if len(files) != 1:
+            names = ", ".join(file.name for file in files) or "none"
+            raise LogFormatError(f"{path}: expected one file *_{kind}.csv, found {names}")
+        wanted = {name for one in streams.values() for name in one.fields}
+        wanted |= {*FIX.fields} if kind == "phone" else set()
+        lines = _read(files[0], wanted)
+        rows += [_held(name, one, lines) for name, one in streams.items()]
+        if kind == "phone":
+            rows.append(_fixes(lines))
+    return Drive(path, rows)
+
+
+def _read(file: Path, wanted: set[str]) -> _Lines:
+    content = read_at_most(file, MAX_FILE_BYTES)
+    if content is None:
+        raise LogFormatError(f"{file}: over {MAX_FILE_BYTES // MIB} MiB; not read")
+    lines = content.decode("utf-8", errors="replace").splitlines()
+    reader = csv.reader(lines)
+    header = next(reader, [])
+    if missing := sorted(wanted - {*header}):
+        raise LogFormatError(f"{file}: no column {missing[0]!r}; expected the published columns")
+    times: list[int] = []
+    fields: list[dict[str, str]] = []
+    losses: list[Loss] = []
+    for number, line in enumerate(reader, start=2):
+        t_ns = _wall_ns(line[0]) if len(line) == len(header) else None
+        if t_ns is None:
+            losses.append(Loss(DAMAGED, 1, f"{file.name}:{number}: {','.join(line)[:60]!r}"))
+            continue
+        times.append(t_ns)
+        fields.append(dict(zip(header, line, strict=True)))
+    order = np.argsort(np.array(times, np.int64), kind="stable")
+    return _Lines(
+        np.array(times, np.int64)[order], [fields[i] for i in order.tolist()], tuple(losses)
+    )
+
+
+def _held(name: str, stream: _Stream, lines: _Lines) -> HeldRows:
+    """A stream with a row for each line."""
+    values = {one: _numbers(lines.fields, one) for one in stream.fields}
+    good = np.isfinite(np.column_stack([*values.values()])).all(axis=1)
+    bad = int((~good).sum())
+    losses = lines.losses
+    if bad:
+        at = int(lines.t_ns[np.flatnonzero(~good)[0]])
+        losses = (*losses, Loss("a field is not a number", bad, f"first at {at} ns"))
+    t_ns = lines.t_ns[good]
+    made = stream.to_columns({one: column[good] for one, column in values.items()})
+    declared = len(t_ns) + sum(loss.rows or 0 for loss in losses)
+    topic = Topic(name, stream.type_name, "columns", declared=declared)
+    return HeldRows(topic, t_ns, Table({**made}), losses)
+
+
+def _fixes(lines: _Lines) -> HeldRows:
+    """The lines with which a new position came, at the time it is of, on the wall clock."""
+    fix_s = _numbers(lines.fields, FIX_TIME)
+    is_new = np.isfinite(fix_s) & (np.diff(fix_s, prepend=-math.inf) > 0.0)
+    rows = np.flatnonzero(is_new)
+    behind_s = lines.t_ns[rows] * 1e-9 - fix_s[rows]
+    zone_s = QUARTER_HOUR_S * round(float(np.median(behind_s)) / QUARTER_HOUR_S) if len(rows) else 0
+    picked = _Lines(
+        np.rint((fix_s[rows] + zone_s) * 1e9).astype(np.int64),
+        [lines.fields[i] for i in rows.tolist()],
+        # A damaged line may have held a new position or none.
+        tuple(loss._replace(rows=None) for loss in lines.losses),
+    )
+    return _held("phone/gnss", FIX, picked)
+
+
+def _wall_ns(text: str) -> int | None:
+    """A wall clock's time as if it were UTC; None where it is none."""
+    try:
+        at = datetime.fromisoformat(text.strip()).replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return round(at.timestamp() * 1e6) * 1000
+
+
+def _numbers(lines: Sequence[Mapping[str, str]], name: str) -> Floats:
+    return np.array([_number(line[name]) for line in lines], np.float64)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -1,0 +1,88 @@
+"""A phone on the dashboard: axes, clocks and units, and what damage costs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.replay.base import Ledger, LogFormatError, Table
+from crosscue.replay.logs.opening import open_log
+from support.phone_drive import LATE_S, START_S, YAW_RATE_RADPS, phone_drive
+
+ZONE_S = -5 * 3600
+
+
+def tables_of(path: Path) -> dict[str, tuple[np.ndarray, Table]]:
+    found = {}
+    with open_log(path) as log:
+        for block in log.read(Ledger(str(path))):
+            assert isinstance(block.rows, Table)
+            found[block.topic] = block.log_ns, block.rows
+    return found
+
+
+def test_the_yaw_rate_is_about_the_vertical_however_the_phone_lies(tmp_path: Path) -> None:
+    _, rows = tables_of(phone_drive(tmp_path / "drive"))["phone/gyro"]
+
+    np.testing.assert_allclose(rows["yaw_rate_radps"][-1], YAW_RATE_RADPS, atol=1e-8)
+    assert rows["yaw_rate_radps"][0] == 0.0
+
+
+def test_a_position_has_the_time_it_is_of_on_the_wall_clock(tmp_path: Path) -> None:
+    found = tables_of(phone_drive(tmp_path / "drive"))
+    t_ns, rows = found["phone/gnss"]
+
+    assert len(t_ns) == 6
+    assert t_ns[0] * 1e-9 == pytest.approx(START_S + ZONE_S - LATE_S)
+    assert found["car/speed"][0][0] * 1e-9 == pytest.approx(START_S + ZONE_S, abs=0.1)
+    assert rows["course_rad"][0] == pytest.approx(-math.pi / 2)
+
+
+def test_speeds_are_metres_and_fields_are_tesla(tmp_path: Path) -> None:
+    found = tables_of(phone_drive(tmp_path / "drive"))
+
+    assert found["car/speed"][1]["speed_mps"][0] == pytest.approx(20.0 * 1609.344 / 3600.0)
+    assert found["phone/magnetometer"][1]["mag_z_t"][0] == pytest.approx(40e-6)
+
+
+def test_a_damaged_line_of_the_phone_is_lost_from_each_of_its_topics(tmp_path: Path) -> None:
+    drive = phone_drive(tmp_path / "drive")
+    file = drive / "made_phone.csv"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    lines[10] = "rubbish"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    ledger = Ledger(str(drive))
+    with open_log(drive) as log:
+        rows = sum(len(block) for block in log.read(ledger))
+
+    assert rows == 3 * 60 + 2 * 59 + 6
+    assert ledger.topic("phone/gyro").dropped.total() == 1
+    assert ledger.topic("phone/magnetometer").dropped.total() == 1
+    # The line may have held a new position, or none.
+    assert ledger.topic("phone/gnss").dropped_unknown
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "says"),
+    [
+        ("car", None, "expected one file *_car.csv, found none"),
+        ("car", ("Speed (MPH)", "Speed"), "no column 'Speed (MPH)'"),
+        ("phone", ("motionGravityX", "gravity"), "no column 'motionGravityX(G)'"),
+    ],
+)
+def test_a_missing_file_or_column_is_named(
+    kind: str, change: tuple[str, str] | None, says: str, tmp_path: Path
+) -> None:
+    drive = phone_drive(tmp_path / "drive")
+    file = drive / f"made_{kind}.csv"
+    if change is None:
+        file.unlink()
+    else:
+        file.write_text(file.read_text(encoding="utf-8").replace(*change, 1), encoding="utf-8")
+
+    with pytest.raises(LogFormatError) as caught:
+        open_log(drive)
+    assert says in str(caught.value)
