@@ -144,7 +144,7 @@ class Drive(Closing):
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All streams, in order of each one's first time; see ``Log.read``."""
-        ledger.integrity = "not checkable: lines carry no checksum, so a missing line cannot be seen"
+        ledger.integrity = "not checkable: no checksums, and a missing line cannot be seen"
         streams = [rows.read(ledger, selection) for rows in self._rows]
         yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
 
