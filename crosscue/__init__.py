@@ -46,6 +46,8 @@ _EXPORTS: Final = {
     "score_run": "eval.interface.runs.score",
     "compare_runs": "eval.interface.runs.compare",
     "compare_many": "eval.interface.runs.compare",
+    "tag_runs": "eval.interface.runs.tags",
+    "TaggedRuns": "eval.interface.runs.tags",
     "catalog": "eval.catalog.query.catalog",
     "Catalog": "eval.catalog.query.catalog",
     "save_recording": "eval.interface.runs.recording",
@@ -292,6 +294,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.tables import MergedRuns as MergedRuns
     from crosscue.eval.interface.runs.tables import decode as decode
     from crosscue.eval.interface.runs.tables import merge as merge
+    from crosscue.eval.interface.runs.tags import TaggedRuns as TaggedRuns
+    from crosscue.eval.interface.runs.tags import tag_runs as tag_runs
     from crosscue.eval.interface.simulate import SimulatedDrives as SimulatedDrives
     from crosscue.eval.interface.simulate import draw_contact_sheet as draw_contact_sheet
     from crosscue.eval.interface.simulate import draw_sign as draw_sign

@@ -31,6 +31,7 @@ from crosscue.eval.runs.folder import (
     write_manifest,
 )
 from crosscue.eval.runs.tables.parquet import TableSink
+from crosscue.eval.runs.tags import read_tags
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,
@@ -172,6 +173,7 @@ def _manifest(
                 rows=one.rows,
                 seconds=one.seconds,
                 tables_sha256=_tables_hash(one.run),
+                tags=read_tags(one.run.path),
             )
             for one in drives
         ),
@@ -227,7 +229,7 @@ def gathered(
         Runs by name, and by name of a drive why there is no run of it.
 
     Raises:
-        UsageError: Two different runs have one name.
+        UsageError: Two different runs have one name, or one run has different tags.
         RunError: A run is damaged or of another version.
     """
     runs: dict[str, RunFolder] = {}
@@ -244,6 +246,11 @@ def gathered(
                 raise UsageError(
                     f"{first.path} and {path}: two different runs of one name; merging would "
                     "drop one: rename it, or replay it as the other was"
+                )
+            if read_tags(first.path) != read_tags(path):
+                raise UsageError(
+                    f"{first.path} and {path}: one run with different tags; merging would drop "
+                    "some: set the same with crosscue tag"
                 )
         merged = _merged_in(RunFolder(folder / FOLDER))
         reported = {} if merged is None else merged.failures

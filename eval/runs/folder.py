@@ -82,6 +82,7 @@ __all__ = [
     "MAX_MANIFEST_BYTES",
     "OWN_FRAME",
     "STAGED",
+    "TAGS",
     "UNATTRIBUTED",
     "Account",
     "ApproachRow",
@@ -141,6 +142,8 @@ INPUT: Final = "input.json"
 FAILURE: Final = "failure.log"
 """Why the last attempt at a run failed; a finished run takes its place."""
 MAX_MANIFEST_BYTES: Final = 256 << 20
+TAGS: Final = "tags.json"
+"""What its users call a run; it stays when the run is made again. See ``tags``."""
 STAGED: Final = ".new"
 """Folder inside a run that holds what is to replace it, until that is whole."""
 
@@ -244,7 +247,7 @@ def created(path: Path, *, overwrite: bool) -> Iterator[RunFolder]:
 
 
 def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
-    """Delete an earlier run's files; the lock stays. Call it while holding the lock.
+    """Delete an earlier run's files; the lock and its tags stay. Call it while holding the lock.
 
     The manifest goes first: a folder that has one is a whole run, even if this is cut short.
 
@@ -260,7 +263,7 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
         if content is not None:
             write_input(run, content)
         for entry in run.path.iterdir():
-            if entry.name == LOCK or (entry.name == INPUT and content is not None):
+            if entry.name in (LOCK, TAGS) or (entry.name == INPUT and content is not None):
                 continue
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry)
@@ -328,7 +331,7 @@ def _swap(run: RunFolder, new: RunFolder, keep: bool, until: Manifest | None) ->
         write_manifest(run, until)
     names = {entry.name for entry in new.path.iterdir()}
     for entry in run.path.iterdir():
-        if entry.name in (LOCK, STAGED) or (keep and entry.name not in names):
+        if entry.name in (LOCK, STAGED, TAGS) or (keep and entry.name not in names):
             continue
         if entry.is_dir() and not entry.is_symlink():
             shutil.rmtree(entry)

@@ -286,6 +286,7 @@ class MergedDrive(Record):
     """By table."""
     seconds: float
     tables_sha256: str
+    tags: dict[str, str] = Field(default_factory=dict)
 
 
 class MergedManifest(Record):

@@ -7,7 +7,7 @@ whatever it is called.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -15,12 +15,11 @@ from pydantic import StringConstraints, ValidationError
 
 from crosscue.replay.base import UnreadableRunError, UsageError, strict_json, write_text
 
+from .folder import TAGS
 from .record import Record
 
-TAGS: Final = "tags.json"
 KEY: Final = r"[A-Za-z_][A-Za-z0-9_.-]{0,63}"
 MAX_VALUE: Final = 1000
-MAX_BYTES: Final = 1 << 20
 
 
 class _Tags(Record):
@@ -74,12 +73,29 @@ def write_tags(run: Path, tags: Mapping[str, str]) -> None:
         (run / TAGS).unlink(missing_ok=True)
 
 
-def read_assignment(text: str) -> tuple[str, str]:
-    """``weather=rain`` as key and value.
+def assignments(tags: Mapping[str, str] | Sequence[str], remove: Sequence[str]) -> dict[str, str]:
+    """Tags to set, by key, checked.
+
+    Args:
+        tags: By key; or texts such as ``weather=rain``.
+        remove: Keys that are to go.
 
     Raises:
-        UsageError: Something else.
+        UsageError: No key or value, a key set twice, or set and removed.
     """
+    texts = [f"{key}={value}" for key, value in tags.items()] if isinstance(tags, Mapping) else tags
+    found: dict[str, str] = {}
+    for key, value in map(_assignment, texts):
+        if key in found or key in remove:
+            raise UsageError(f"{key}: set twice, or set and removed; name each key once")
+        found[key] = value
+    for key in remove:
+        if re.fullmatch(KEY, key) is None:
+            raise UsageError(f"{key}: no key of a tag; expected one such as weather")
+    return found
+
+
+def _assignment(text: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
     is_fine = re.fullmatch(KEY, key) is not None and 0 < len(value) <= MAX_VALUE
     if not (equals and is_fine and value.isprintable()):

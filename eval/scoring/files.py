@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 CURVES: Final = "curves"
 CUE_FRAMES: Final = "cue_frames"
+APPROACHES: Final = "approaches"
 
 
 def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str, Any]) -> None:
-    """Write ``metrics.json``, and ``curves``, ``cue_frames`` and ``by_drive`` as Parquet.
+    """Write ``metrics.json``; ``curves``, ``cue_frames``, ``approaches``, ``by_drive`` as Parquet.
 
     Raises:
         OutputError: They cannot be written.
@@ -35,7 +36,11 @@ def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str
     write_text(folder / METRICS, strict_json(metrics) + "\n")
     judged = [one.judged for one in scored]
     parts = chain.from_iterable(map(_parts, scored))
-    tables = {CURVES: curve_table(judged), CUE_FRAMES: cue_frame_table(judged)}
+    tables = {
+        CURVES: curve_table(judged),
+        CUE_FRAMES: cue_frame_table(judged),
+        APPROACHES: approach_table(judged),
+    }
     for name, table in (tables | {BY_DRIVE: table_of(parts)}).items():
         write_whole(folder / f"{name}.parquet", _writer(table))
 
@@ -79,6 +84,53 @@ def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
         parts = [c.features.get(name, missing[len(c.t_ns)]) for c in curves]
         columns[name] = _joined(parts, np.float64)
     return pa.table(columns)
+
+
+def approach_table(judged: Sequence[DriveJudged]) -> pa.Table:
+    """Every approach of the truth with its result; a distance that is not known is null.
+
+    Columns: drive, approach (number in the run), truth (id in the truth), intersection, control,
+    conditions, present, detected_m, full_m, features_m, false_features and the two reasons why not.
+    """
+    import pyarrow as pa
+
+    texts = pa.list_(pa.string())
+    schema = pa.schema(
+        {
+            "drive": pa.string(),
+            "approach": pa.int64(),
+            "truth": pa.int64(),
+            "intersection": pa.string(),
+            "control": pa.string(),
+            "conditions": texts,
+            "present": texts,
+            "detected_m": pa.float64(),
+            "full_m": pa.float64(),
+            "features_m": pa.map_(pa.string(), pa.float64()),
+            "false_features": texts,
+            "why_not_detected": pa.string(),
+            "why_not_full": pa.string(),
+        }
+    )
+    results = [
+        one for drive in judged if drive.approaches is not None for one in drive.approaches.results
+    ]
+    rows = [
+        {
+            **{name: getattr(one, name) for name in schema.names if name != "truth"},
+            "approach": one.run_approach,
+            "truth": one.approach,
+            "detected_m": _known(one.detected_m),
+            "full_m": _known(one.full_m),
+            "features_m": [(name, _known(far_m)) for name, far_m in one.features_m.items()],
+        }
+        for one in results
+    ]
+    return pa.Table.from_pylist(rows, schema)
+
+
+def _known(distance_m: float | None) -> float | None:
+    return None if distance_m is None or math.isnan(distance_m) else distance_m
 
 
 def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:

@@ -61,6 +61,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("compare", "RUN_B"): ("{run} {gone}", INPUT),
     ("merge", "RUNS"): ("{gone} -o {out}", INPUT),
     ("query", "RUNS"): ("{gone} --schema", INPUT),
+    ("tag", "RUN"): ("{gone} weather=rain", INPUT),
     ("status", "RUNS"): ("{gone}", INPUT),
     ("fit messages", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
     ("fit signs", "LABELS"): ("{gone}.csv --label stop", INPUT),

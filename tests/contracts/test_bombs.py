@@ -57,7 +57,7 @@ OPENS_LOGS: dict[str, str] = {
 REPORTS_THE_RUN = {"score", "score detector", "fit detector"}
 """They read single pictures or none, and report what was dropped as the run does."""
 OPENS_NONE: dict[str, str] = {
-    "compare": "tables", "query": "tables", "merge": "tables",
+    "compare": "tables", "query": "tables", "tag": "texts", "merge": "tables",
     "status": "the journal",
     "fit ranges": "tables", "fit messages": "tables", "fit temporal": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",

@@ -31,6 +31,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "compare": ("gone gone2", INPUT),
     "merge": ("gone -o out", INPUT),
     "query": ("gone --schema", INPUT),
+    "tag": ("gone", INPUT),
     "status": ("gone", INPUT),
     "view": ("gone -o x.rrd", INPUT),
     "failures": ("gone", INPUT),

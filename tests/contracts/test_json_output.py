@@ -36,6 +36,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "merge": ("runs -o merged", 0),
     "failures": ("runs/a --truth TRUTH -o worst.parquet", 0),
     "query": ("runs SQL", 0),
+    "tag": ("runs/a weather=rain", 0),
     "status": ("runs", 0),
     "truth check": ("TRUTH --log LOG", 0),
     "truth schema": ("", 0),

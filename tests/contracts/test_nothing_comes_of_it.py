@@ -16,7 +16,7 @@ ELSEWHERE: dict[str, str] = {
     "convert": "test_empty_result.py",
     "info": "that there is no row is its result", "landmarks list": "an empty list is its result",
     "landmarks match": "that nothing matches is its result",
-    "query": "a table without rows is its result",
+    "query": "a table without rows is its result", "tag": "sets what it is asked to set",
     "compare": "that nothing changed is its result", "view": "shows whatever a run holds",
     "seal": "seals whatever bytes there are", "train frames": "simulates", "simulate": "simulates",
     "demo": "simulates", "study drive": "simulates", "study field": "simulates",

@@ -21,6 +21,7 @@ CALLS: Final = {
     "decode": ("decode",),
     "merge": ("merge",),
     "query": ("catalog",),
+    "tag": ("tag_runs",),
     "status": ("batch_status",),
     "compare": ("compare_runs", "compare_many"),
     "vehicle init": ("draft_vehicle",),

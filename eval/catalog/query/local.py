@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from crosscue.eval.runs.folder import INPUT, MANIFEST
-from crosscue.eval.runs.tags import TAGS
+from crosscue.eval.runs.folder import INPUT, MANIFEST, TAGS
 from crosscue.replay.base import UnreadableRunError
 
 if TYPE_CHECKING:

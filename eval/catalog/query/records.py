@@ -16,13 +16,14 @@ from pydantic import BaseModel, ValidationError
 from crosscue.eval.runs.folder import (
     FORMAT_VERSION,
     MANIFEST,
+    TAGS,
     Account,
     LogRow,
     PoseSummary,
     SceneSummary,
     TimeSegments,
 )
-from crosscue.eval.runs.tags import TAGS, parse_tags
+from crosscue.eval.runs.tags import parse_tags
 from crosscue.replay.base import one_line, strict_json
 from crosscue.replay.files.identity import identity_of_all
 

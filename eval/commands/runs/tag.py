@@ -1,0 +1,42 @@
+"""Set tags of runs, remove them, or list them.
+
+A tag is a key and a value, such as weather=rain. It lies in tags.json of the run, is a column of
+crosscue query, and stays when the run is made again. Without KEY=VALUE and --remove, tags are
+listed.
+
+examples:
+  crosscue tag runs/drive-1f0e runs/drive-93aa weather=rain route=north
+  crosscue tag runs --remove route
+  crosscue tag runs
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.terminal import print_result
+from crosscue.replay.base import UsageError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument(
+        "words",
+        nargs="+",
+        metavar="RUN",
+        help="run folders, or folders of them; then KEY=VALUE for each tag to set",
+    )
+    parser.add_argument("--remove", nargs="+", default=[], metavar="KEY", help="tags to remove")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Tag and list."""
+    tags = [word for word in args.words if "=" in word and not Path(word).exists()]
+    runs = [word for word in args.words if word not in tags]
+    if not runs:
+        raise UsageError("tag: no run named; give run folders before KEY=VALUE")
+    print_result(crosscue.tag_runs(runs, tags, args.remove), args)
+    return 0

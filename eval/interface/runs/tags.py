@@ -1,0 +1,75 @@
+"""Tags of runs: words that their users set, by which a catalog finds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.runs import tags as stored
+from crosscue.eval.runs.folder import RunFolder, locked
+from crosscue.replay.base import visible
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class TaggedRuns:
+    """Runs and their tags.
+
+    Attributes:
+        tags: By run folder.
+    """
+
+    tags: Mapping[Path, Mapping[str, str]]
+
+    def as_dict(self) -> dict[str, dict[str, str]]:
+        """What ``crosscue tag --json`` prints."""
+        return {str(path): dict(tags) for path, tags in self.tags.items()}
+
+    def __repr__(self) -> str:
+        lines = (
+            f"{path}  {' '.join(f'{key}={value}' for key, value in tags.items()) or 'no tags'}"
+            for path, tags in self.tags.items()
+        )
+        return "\n".join(visible(line) for line in lines)
+
+
+def tag_runs(
+    runs: Sequence[Path | str],
+    tags: Mapping[str, str] | Sequence[str] = (),
+    remove: Sequence[str] = (),
+) -> TaggedRuns:
+    """Set and remove tags of runs; without either, read them.
+
+    They lie in ``tags.json`` of each run and stay when it is made again. Nothing else in the run
+    depends on them.
+
+    Args:
+        runs: Run folders, folders of them, patterns, or ``@lists``.
+        tags: By key the value to set; or texts such as ``weather=rain``.
+        remove: Keys whose tag goes, where a run has it.
+
+    Raises:
+        UsageError: No key or value of a tag, or one key set twice or both set and removed.
+        RunError: No run, one that cannot be read, or one that is being written.
+        OutputError: A run cannot be written.
+    """
+    new = stored.assignments(tags, remove)
+    folders = [RunFolder(path) for path in runs_of([str(run) for run in runs])]
+    for run in folders:
+        # All are checked before the first is changed.
+        run.drive_manifest()
+        stored.read_tags(run.path)
+    return TaggedRuns({run.path: _tagged(run, new, remove) for run in folders})
+
+
+def _tagged(run: RunFolder, new: Mapping[str, str], remove: Sequence[str]) -> dict[str, str]:
+    if not new and not remove:
+        return stored.read_tags(run.path)
+    with locked(run):
+        before = stored.read_tags(run.path)
+        after = {key: value for key, value in before.items() if key not in remove}
+        after = dict(sorted({**after, **new}.items()))
+        if after != before:
+            stored.write_tags(run.path, after)
+    return after

@@ -1,0 +1,68 @@
+"""Scores and the truth's conditions in a catalog."""
+
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.eval.runs.folder import RunFolder
+from support.catalog_runs import add_run, change, scene, seen
+from support.scoring import truth_folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs, one of them scored; its approach, number 7, is in the truth under rain."""
+    folder = tmp_path_factory.mktemp("fleet")
+    truth = truth_folder(folder / "truth")
+    scored = add_run(folder / "runs/scored", "scored")
+    change(scored, scene=scene(seen(7, 30.0), seen(9, None)))
+    add_run(folder / "runs/plain", "plain")
+    assert cli.run(["score", str(scored.path), "--truth", str(truth), "-q"]) == 0
+    return folder / "runs"
+
+
+def test_an_approach_has_its_conditions_and_result(runs: Path) -> None:
+    rows = crosscue.catalog(runs).query(
+        "select run, approach, truth, intersection, control, conditions, detected_m, "
+        "detected_range_m, features_m['left'] as left_m from approaches order by run, approach"
+    )
+
+    plain, scored, extra = (list(row.values()) for row in rows.to_pylist())
+    assert plain == ["plain", 7, None, None, None, None, None, 30.0, None]
+    # Three frames confirm a detection: 0.95 at frame 10, 30 m away; left at frame 20.
+    assert scored[:6] == ["scored", 7, 0, "A", "stop_sign", ["rain"]]
+    assert scored[7:] == [30.0, 20.0]
+    assert extra[:3] == ["scored", 9, None]
+
+
+def test_conditions_select_runs(runs: Path) -> None:
+    found = crosscue.catalog(runs)
+
+    assert found.select("'rain' in conditions") == (runs / "scored",)
+    assert found.select("not is_scored") == (runs / "plain",)
+
+
+def test_scores_are_those_of_the_metrics_file(runs: Path) -> None:
+    table = RunFolder(runs / "scored/score").table("by_drive").to_pylist()
+    rows = crosscue.catalog(runs).query("select metric, value from scores order by metric")
+
+    got = {row["metric"]: row["value"] for row in rows.to_pylist()}
+    assert got["cues.stop_sign.precision"] == pytest.approx(1.0)
+    for one in table:
+        if one["kind"] == "sum":
+            assert got[one["metric"]] == one["total"]
+        elif one["rows"] == 0:
+            assert got[one["metric"]] is None
+        elif one["kind"] == "rms":
+            assert got[one["metric"]] ** 2 * one["rows"] == pytest.approx(one["total"])
+
+
+def test_the_first_sight_of_a_sign_is_a_question(runs: Path) -> None:
+    rows = crosscue.catalog(runs).query(
+        "select run, max(distance_m) as first_m from cue_frames "
+        "where cue = 'stop_sign' and count > 0 group by run"
+    )
+
+    assert rows.to_pylist() == [{"run": "scored", "first_m": 30.0}]

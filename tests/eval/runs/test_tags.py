@@ -1,0 +1,138 @@
+"""Tags of runs: what users call them stays beside what they are made of."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.eval.batch.merge import gathered, merge_runs
+from crosscue.eval.runs.folder import MANIFEST, clear, create, locked, open_run, staged
+from crosscue.eval.runs.manifest import MergedManifest
+from crosscue.replay.base import RunError, UnreadableRunError, UsageError
+from support.catalog_runs import add_run, runs_below
+from support.manifests import estimated
+from support.trees import tree
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Two drives, each with two settings."""
+    return runs_below(tmp_path / "fleet")
+
+
+def test_tags_are_set_listed_and_removed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    monday, tuesday = str(runs / "a/monday"), str(runs / "a/tuesday")
+
+    assert cli.run(["tag", monday, tuesday, "weather=rain", "route=5 = north", "--json"]) == 0
+    both = {"weather": "rain", "route": "5 = north"}
+    assert json.loads(capsys.readouterr().out) == {monday: both, tuesday: both}
+
+    assert cli.run(["tag", monday, "weather=dry", "--remove", "route", "-q"]) == 0
+    capsys.readouterr()
+    assert cli.run(["tag", str(runs / "a")]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{monday}  weather=dry",
+        f"{tuesday}  route=5 = north weather=rain",
+    ]
+
+
+def test_a_run_without_its_last_tag_is_as_it_was(runs: Path) -> None:
+    before = tree(runs / "a/monday")
+
+    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
+    assert tree(runs / "a/monday") != before
+    crosscue.tag_runs([runs / "a/monday"], remove=["weather", "never_set"])
+
+    assert tree(runs / "a/monday") == before
+
+
+def test_tags_are_columns_of_runs_and_approaches(runs: Path) -> None:
+    crosscue.catalog(runs)
+    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
+
+    found = crosscue.catalog(runs)
+
+    assert found.select("tags['weather'] = 'rain'") == (runs / "a/monday",)
+    rows = found.query("select run from approaches where tags.weather = 'rain'")
+    assert rows.to_pylist() == [{"run": "a/monday"}]
+    assert len(found.select("tags['weather'] is null")) == 3
+
+
+def test_a_run_that_is_made_again_keeps_its_tags(runs: Path) -> None:
+    run = open_run(runs / "a/monday")
+    crosscue.tag_runs([run.path], {"weather": "rain"})
+    with locked(run), staged(run) as new:
+        new.file(MANIFEST).write_text(estimated().model_dump_json(by_alias=True))
+    assert crosscue.tag_runs([run.path]).tags == {run.path: {"weather": "rain"}}
+
+    clear(create(run.path, overwrite=True))
+
+    assert [path.name for path in run.path.iterdir()] == ["tags.json"]
+
+
+def test_merging_keeps_tags_and_depends_on_nothing_else_in_them(runs: Path) -> None:
+    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
+    found, failures = gathered([runs / "a"])
+    manifest = merge_runs(found, create(runs / "all", overwrite=False), failures).run.manifest()
+
+    assert isinstance(manifest, MergedManifest)
+    assert {one.name: one.tags for one in manifest.drives} == {
+        "monday": {"weather": "rain"},
+        "tuesday": {},
+    }
+
+
+def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
+    add_run(runs / "copy/monday", "monday")
+    gathered([runs / "a", runs / "copy"])
+    crosscue.tag_runs([runs / "copy/monday"], {"weather": "rain"})
+
+    with pytest.raises(UsageError, match="one run with different tags"):
+        gathered([runs / "a", runs / "copy"])
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["weather="], "weather=: expected KEY=VALUE"),
+        (["1weather=rain"], "expected KEY=VALUE"),
+        (["weather=a\nb"], "expected KEY=VALUE"),
+        (["weather=rain", "weather=dry"], "weather: set twice"),
+        (["weather=rain", "--remove", "weather"], "set twice, or set and removed"),
+        (["--remove", "a b"], "a b: no key of a tag"),
+    ],
+)
+def test_wrong_tags_change_nothing(
+    runs: Path, argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = tree(runs)
+
+    assert cli.run(["tag", str(runs / "a"), *argv]) == 2
+
+    assert said in capsys.readouterr().err
+    assert tree(runs) == before
+
+
+def test_tags_without_a_run_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["tag", "weather=rain"]) == 2
+    assert "no run named" in capsys.readouterr().err
+
+
+def test_damaged_tags_are_reported_and_not_overwritten(runs: Path) -> None:
+    path = runs / "a/monday/tags.json"
+    path.write_text('{"format_version": 1, "tags": {"weather": 3}}')
+
+    with pytest.raises(UnreadableRunError, match=r"tags\.json: unreadable"):
+        crosscue.tag_runs([runs / "a"], {"weather": "rain"})
+
+    assert "3" in path.read_text()
+    assert not (runs / "a/tuesday/tags.json").exists()
+    assert "tags.json: unreadable" in crosscue.catalog(runs).left_out["a/monday"]
+
+
+def test_a_run_that_is_being_written_is_not_tagged(runs: Path) -> None:
+    run = open_run(runs / "a/monday")
+    with locked(run), pytest.raises(RunError, match="is writing it"):
+        crosscue.tag_runs([run.path], {"weather": "rain"})
