@@ -54,6 +54,8 @@ _EXPORTS: Final = {
     "failures": "eval.interface.failures.failures",
     "Failures": "eval.interface.failures.failures",
     "Failure": "eval.failures.record",
+    "browse": "eval.interface.failures.browse",
+    "Site": "eval.interface.failures.browse",
     "load_vehicle": "eval.interface.runs.run",
     "demo": "eval.interface.demo",
     "Demo": "eval.interface.demo",
@@ -221,6 +223,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.demo import KnownDrive as KnownDrive
     from crosscue.eval.interface.demo import demo as demo
     from crosscue.eval.interface.demo import fetch_drive as fetch_drive
+    from crosscue.eval.interface.failures.browse import Site as Site
+    from crosscue.eval.interface.failures.browse import browse as browse
     from crosscue.eval.interface.failures.failures import Failures as Failures
     from crosscue.eval.interface.failures.failures import failures as failures
     from crosscue.eval.interface.fits.compass import FittedCompass as FittedCompass

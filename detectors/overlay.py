@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.cues.observed import FrameCues
 from crosscue.replay.base import Bytes, write_bytes
 
+from . import rle
 from .base import Detections, Found, RoadMask
-from .images import decode
+from .images import Encoded, decode
 from .runner import FrameResult
 
 GREEN: Final = (80, 220, 60)
 BLUE: Final = (255, 140, 0)
+AMBER: Final = (90, 190, 255)
+PALE: Final = (230, 230, 230)
 MARGIN_PX: Final = 10
 """Left and right of the cues' line."""
 
@@ -82,6 +86,55 @@ def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1
     scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
     write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
     return canvas
+
+
+def draw_frame(
+    picture: Encoded,
+    found: Sequence[Found],
+    counts: Mapping[str, int],
+    regions: Callable[[tuple[int, int]], Iterable[NDArray[np.float64]]],
+    width_px: int,
+) -> Bytes:
+    """All that was found in one picture, drawn: road, masks, boxes, regions, cues.
+
+    Args:
+        picture: Of the frame.
+        found: By each detector; empty leaves the picture bare.
+        counts: Of its cues.
+        regions: Their corners in a picture of a width and height, shape (N, 2) each; they are
+            drawn where a detector looks for road.
+        width_px: That the picture will be shown in; lines and text are drawn to be read there.
+
+    Raises:
+        LogError: It cannot be decoded.
+    """
+    pixels, _ = decode(picture)
+    size = (pixels.shape[1], pixels.shape[0])
+    enlarge = max(size[0] / width_px, 0.5)
+    if not found:
+        return np.asarray(pixels, np.uint8)
+    result = FrameResult(0, size, picture, tuple(found))
+    canvas = draw(pixels, result, FrameCues(dict(counts), None), 0.8 * enlarge)
+    for one in found:
+        if isinstance(one, Detections):
+            for box, mask in zip(one.boxes_px, one.masks, strict=True):
+                for line in rle.outline(mask, one.size_px, box):
+                    _line(canvas, line, AMBER, enlarge)
+    has_road = any(isinstance(one, RoadMask) for one in found)
+    for corners in regions(size) if has_road else ():
+        _line(canvas, np.vstack([corners, corners[:1]]), PALE, enlarge)
+    return canvas
+
+
+def _line(
+    canvas: Bytes, points: NDArray[np.float64], colour: tuple[int, int, int], enlarge: float
+) -> None:
+    import cv2
+
+    # A region may reach far beyond the picture; OpenCV needs numbers that fit.
+    far = 4.0 * max(canvas.shape[:2])
+    whole = np.rint(np.clip(points, -far, far)).astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(canvas, [whole], False, colour, max(round(enlarge), 1), cv2.LINE_AA)
 
 
 def picture_of(pixels: Bytes, found: Found) -> bytes:

@@ -50,6 +50,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "query": ("runs.query", "ask all runs below a folder with SQL"),
     "view": ("runs.view", "show a run in Rerun"),
     "failures": ("failures.find", "list what went wrong in runs, worst first, by cause"),
+    "browse": ("failures.browse", "write failures as a static site with pictures and filters"),
     "model list": ("model.list", "list the networks of the catalog"),
     "model show": ("model.show", "show what a network is, its classes and its measurements"),
     "model fetch": ("model.fetch", "fetch the weights of a network of the catalog"),

@@ -16,7 +16,6 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.drives import DriveJudged
 from crosscue.eval.scoring.scene.approaches import NEAR_M, ApproachResult
 from crosscue.eval.scoring.scene.cues import SEEN, CueFrames
 from crosscue.replay.vehicle.cue_table import CUES
@@ -83,17 +82,6 @@ class Finding:
     cause: Cause
     reported: str
     cues: tuple[CueEvidence, ...]
-
-
-def findings(drives: Sequence[DriveJudged]) -> tuple[Finding, ...]:
-    """All late, missing and invented features, drive by drive."""
-    return tuple(
-        one
-        for drive in drives
-        if drive.approaches is not None
-        for result in drive.approaches.results
-        for one in approach_findings(result, drive.cues)
-    )
 
 
 def by_cause(found: Sequence[Finding]) -> dict[str, Counter[str]]:

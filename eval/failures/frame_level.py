@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.eval.scoring.scene.approaches import NEAR_M
 from crosscue.eval.scoring.scene.cues import SEEN, CueFrames, is_wrong
 from crosscue.eval.scoring.scene.ranges import RangeJudged, sds_off
 
@@ -48,8 +49,10 @@ def missed_and_false(
     is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
     for rows in _episodes(cue.t_ns, np.flatnonzero(is_missed), cue.approach):
         why = _why_missed(cue, rows, labels, least, detected)
-        # The nearest frame: there it should have been easiest.
-        yield _failure("missed", cue.cue, why, cue, rows, int(rows[-1]), about, run)
+        # The nearest frame that is not yet at the intersection: there it should be easiest.
+        ahead = rows[~(cue.distance_m[rows] < NEAR_M)]
+        row = int(ahead[-1] if len(ahead) else rows[-1])
+        yield _failure("missed", cue.cue, why, cue, rows, row, about, run)
     for rows in _episodes(cue.t_ns, np.flatnonzero(is_wrong(cue)), cue.approach):
         sure = [_highest(detected.get(int(cue.t_ns[i]), ()), labels) for i in rows]
         row = int(rows[int(np.argmax(sure))])

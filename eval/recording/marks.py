@@ -25,7 +25,6 @@ from crosscue.detectors.cues.cars import (
 )
 from crosscue.detectors.cues.observed import RoadShares
 from crosscue.detectors.cues.road import road_fractions
-from crosscue.detectors.outlines import borders, outline
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -103,7 +102,7 @@ class Marks:
             colour = self._colour(found, row)
             is_far = box[2] - box[0] < LABELLED * found.size_px[0]
             (self.far if is_far else self.objects).add(box, colour, text)
-            for line in outline(found.masks[row], found.size_px, box):
+            for line in rle.outline(found.masks[row], found.size_px, box):
                 self.outlines.add(line, colour)
 
     def _colour(self, found: Detections, row: int) -> Colour:
@@ -175,7 +174,7 @@ def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
     # Runs begin and end in turn along a row, so each two neighbours of a row are one run's ends.
     rows, columns = np.nonzero(np.diff(padded, axis=1))
     hatch = np.stack([columns, HATCH_ROWS * rows + 0.5], axis=1).reshape(-1, 2, 2)
-    return [line * scale for line in (*borders(is_road, (0, 0)), *hatch)]
+    return [line * scale for line in (*rle.borders(is_road, (0, 0)), *hatch)]
 
 
 def log_styles(recording: rr.RecordingStream) -> None:

@@ -17,13 +17,31 @@ def render_page(
             an error, never an empty place.
         formats: Functions that the template calls.
     """
+    return page_template(template, formats)(content)
+
+
+def page_template(
+    template: str, formats: Mapping[str, Callable[..., str]]
+) -> Callable[[Mapping[str, object]], str]:
+    """A template that makes many pages.
+
+    Args:
+        template: Its file's name, with its ending.
+        formats: Functions that the template calls.
+
+    Returns:
+        From the content to the HTML, as ``render_page``.
+    """
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.globals |= formats
-    source = (
-        files("crosscue.eval.report").joinpath("templates", template).read_text(encoding="utf-8")
-    )
-    return environment.from_string(source).render(**content)
+    compiled = environment.from_string(template_text(template))
+    return lambda content: compiled.render(**content)
+
+
+def template_text(name: str) -> str:
+    """A file beside the templates, as it is."""
+    return files("crosscue.eval.report").joinpath("templates", name).read_text(encoding="utf-8")

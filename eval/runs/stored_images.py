@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -104,13 +104,27 @@ def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
         LogError: The log cannot be opened.
     """
     found: list[Encoded] = []
+    pictures_at(camera, (t_ns,), lambda _, picture: found.append(picture))
+    return found[0] if found else None
+
+
+def pictures_at(
+    camera: StoredCamera, times: Collection[int], on_picture: Callable[[int, Encoded], None]
+) -> None:
+    """Give the pictures taken at exactly these times of the run's tables to ``on_picture``.
+
+    Raises:
+        LogError: The log cannot be opened.
+    """
+    wanted = np.array(sorted(times), np.int64)
 
     def keep(block: Block) -> None:
         assert isinstance(block.rows, Images)
-        found.extend(encoded(block.rows, int(i)) for i in np.flatnonzero(block.log_ns == t_ns))
+        for i in np.flatnonzero(np.isin(block.log_ns, wanted)).tolist():
+            on_picture(int(block.log_ns[i]), encoded(block.rows, i))
 
-    read_pictures(camera, keep, (t_ns, t_ns))
-    return found[0] if found else None
+    if len(wanted):
+        read_pictures(camera, keep, (int(wanted[0]), int(wanted[-1])))
 
 
 def read_pictures(

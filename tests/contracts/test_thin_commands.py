@@ -49,6 +49,7 @@ CALLS: Final = {
         "save_recording",
     ),
     "failures": ("failures",),
+    "browse": ("browse",),
     "plugins": ("plugins",),
     "info": ("open",),
     "landmarks add": (

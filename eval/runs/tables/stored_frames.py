@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.base import Detections, Found, RoadMask
 from crosscue.detectors.cues.observed import RoadShares, Role, Seen, all_labels
 from crosscue.eval.runs.manifest import DetectorRow
 
@@ -32,6 +32,12 @@ class StoredFrame:
     seen: Seen
     size_px: tuple[int, int]
     heights_px: tuple[NDArray[np.float64], ...]
+
+    @property
+    def found(self) -> tuple[Found, ...]:
+        """What each detector found, road as far as its mask was read."""
+        road = (self.seen.road,) if isinstance(self.seen.road, RoadMask) else ()
+        return (*self.seen.objects, *self.seen.signs, *road)
 
 
 @dataclass(slots=True)

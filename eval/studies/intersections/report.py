@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.eval.batch.jobs import Done
-from crosscue.eval.failures.causes import Finding, by_cause, findings
+from crosscue.eval.failures.causes import Finding, approach_findings, by_cause
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import render_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.files import write_scores
 from crosscue.eval.scoring.intervals import TOO_FEW
-from crosscue.eval.scoring.runs import metrics_of
+from crosscue.eval.scoring.runs import RunScored, metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.replay.base import strict_json, versions, write_text
 
@@ -62,7 +62,7 @@ def write_study(
     folder = out / "score"
     metrics = metrics_of(scored.scored, scored.scores)
     write_scores(folder, scored.scored, metrics)
-    found = findings([one.judged for one in scored.scored])
+    found = _findings(scored.scored)
     tables = _tables(settings, done, scored, approaches, found)
     write_text(out / TABLES, strict_json(tables) + "\n")
     content = {
@@ -169,7 +169,7 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
             f"{_number(row['full_m']):>9}"
         )
     lines += ["", "late, missing or invented (drives):"]
-    for cause, places in by_cause(findings([one.judged for one in scored.scored])).items():
+    for cause, places in by_cause(_findings(scored.scored)).items():
         reported_places = ", ".join(f"{place} {drives}" for place, drives in places.items())
         lines.append(f"  {cause:<20} {reported_places}")
     lines += ["", f"{'cue':<20}{'precision':>10}{'95 %':>16}{'positives':>11}{'published':>11}"]
@@ -200,3 +200,14 @@ def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
 
 def _of(some: int, of: int) -> str:
     return f"{some} of {of}"
+
+
+def _findings(scored: Sequence[RunScored]) -> tuple[Finding, ...]:
+    """All late, missing and invented features, drive by drive."""
+    return tuple(
+        found
+        for one in scored
+        if one.judged.approaches is not None
+        for result in one.judged.approaches.results
+        for found in approach_findings(result, one.judged.cues)
+    )

@@ -15,7 +15,6 @@ from rerun.chunk import RrdReader
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.images import Encoded
-from crosscue.detectors.outlines import outline
 from crosscue.eval import cli
 from crosscue.eval.recording import save
 from crosscue.eval.recording.camera import shown
@@ -203,7 +202,7 @@ def test_an_outline_runs_along_the_masks_border(x: int, y: int, width: int, heig
     mask = rle.encode(np.ones((height, width), np.bool_), (x, y), (64, 48))
     box = np.array([x, y, x + width, y + height], np.float64)
 
-    (line,) = outline(mask, (64, 48), box)
+    (line,) = rle.outline(mask, (64, 48), box)
 
     assert (line[0] == line[-1]).all()
     assert line.min(axis=0).tolist() == [x + 0.5, y + 0.5]

@@ -1,0 +1,85 @@
+"""Write failures as a static site that needs no server: pictures, belief curves, filters.
+
+RUN is what crosscue failures takes, or a table that it wrote. Open index.html in a browser. Each
+failure shows its picture with boxes, masks and regions, the belief around it, and the command that
+opens Rerun there.
+
+examples:
+  crosscue browse runs -o site
+  crosscue browse worst.parquet -o site --recordings
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.terminal import print_result, progress_line
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument(
+        "runs", nargs="+", metavar="RUN", help="run folders, folders of them, or a table"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the site"
+    )
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="T.json",
+        help="truth of all runs (default: truth.json beside each run's log)",
+    )
+    parser.add_argument(
+        "--any-log",
+        action="store_true",
+        help="accept truth made for another file of the same drive, such as a converted log",
+    )
+    parser.add_argument(
+        "--logs", type=Path, metavar="DIR", help="folder that the runs' logs have moved to"
+    )
+    parser.add_argument(
+        "--top",
+        type=int,
+        metavar="N",
+        help="only N failures, of as many causes and runs as possible (default: all)",
+    )
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        default=0.9,
+        metavar="P",
+        help="a feature is believed above this probability (default: 0.9)",
+    )
+    parser.add_argument(
+        "--recordings",
+        action="store_true",
+        help="write a recording of each moment as well; megabytes each",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing site")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="number of runs in parallel"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the site; 3 when a run could not be examined."""
+    with progress_line(args, "drawing") as line:
+        made = crosscue.browse(
+            args.runs,
+            args.output,
+            truth=args.truth,
+            top=args.top,
+            threshold=args.threshold,
+            any_log=args.any_log,
+            logs=args.logs,
+            has_recordings=args.recordings,
+            overwrite=args.overwrite,
+            workers=args.workers,
+            on_runs=line.counting("runs"),
+        )
+    print_result(made, args)
+    return 0 if made.is_whole else 3

@@ -1,0 +1,121 @@
+"""Pictures of failing frames: boxes, masks, road and regions drawn, and a small copy of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.road_ground import outlines
+from crosscue.detectors.images import Encoded
+from crosscue.detectors.overlay import draw_frame
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.stored_images import camera_of, pictures_at
+from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
+from crosscue.replay.errors import CrosscueError
+
+WIDTH_PX: Final = 800
+SMALL_PX: Final = 240
+QUALITY: Final = 72
+SIDES: Final = ("left", "straight", "right")
+
+Keep = Callable[[int, bytes, bytes], None]
+"""Takes the time of a frame, its picture and the small copy, as JPEG."""
+
+
+def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
+    """Draw some frames of a run.
+
+    Args:
+        run: The run.
+        times: Of the frames, as in the run's tables.
+        keep: Called for each picture that could be read.
+
+    Returns:
+        Why a picture is missing; empty where none is.
+    """
+    wanted = frozenset(times)
+    try:
+        camera = camera_of(run)
+        if camera is None:
+            return "the run has no camera, or several"
+        found = _found(run, wanted)
+        places, cues = _places(run, wanted), _cues(run, wanted)
+
+        def on_picture(t_ns: int, picture: Encoded) -> None:
+            regions = partial(_regions, run, places.get(t_ns))
+            frame = found.get(t_ns)
+            results = () if frame is None else frame.found
+            try:
+                canvas = draw_frame(picture, results, cues.get(t_ns, {}), regions, WIDTH_PX)
+            except CrosscueError:
+                # One picture that cannot be decoded: its page says that it is missing.
+                return
+            keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))
+
+        pictures_at(camera, wanted, on_picture)
+    except CrosscueError as error:
+        return str(error)
+    return ""
+
+
+def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, StoredFrame]:
+    detected = run.drive_manifest().detected
+    if detected is None:
+        return {}
+    frames = stored_frames(run, detected.detectors, with_road_masks=True)
+    return {one.seen.t_ns: one for one in frames if one.seen.t_ns in wanted}
+
+
+def _places(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, Place]:
+    """Where the run believes the intersection at these times; regions on the ground follow it."""
+    if not run.file("range.parquet").exists():
+        return {}
+    length_m = run.drive_manifest().settings.fusion.length_m
+    ends: dict[int, dict[str, float]] = {}
+    for row in run.table("range", ["t_ns", "reference", "range_m"]).to_pylist():
+        if row["t_ns"] in wanted and row["range_m"] is not None:
+            ends.setdefault(row["t_ns"], {})[row["reference"]] = row["range_m"]
+    return {
+        t_ns: Place(
+            known.get("start", known.get("end", math.nan) - length_m),
+            known.get("end", known.get("start", math.nan) + length_m),
+            0.0,
+        )
+        for t_ns, known in ends.items()
+    }
+
+
+def _cues(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, dict[str, int]]:
+    """Positive cues at these times."""
+    found: dict[int, dict[str, int]] = {}
+    if run.file("cues.parquet").exists():
+        for row in run.table("cues", ["t_ns", "cue", "count"]).to_pylist():
+            if row["t_ns"] in wanted:
+                found.setdefault(row["t_ns"], {})[row["cue"]] = row["count"]
+    return found
+
+
+def _regions(
+    run: RunFolder, place: Place | None, size_px: tuple[int, int]
+) -> Iterable[NDArray[np.float64]]:
+    vehicle = run.drive_manifest().settings
+    if vehicle.regions.kind == "ground":
+        polygons = outlines(vehicle.camera, vehicle.regions, place, size_px)
+        return [one for one in polygons if one is not None]
+    return [np.array(getattr(vehicle.regions, side)) * size_px for side in SIDES]
+
+
+def _jpeg(pixels: NDArray[np.uint8], width_px: int) -> bytes:
+    import cv2
+
+    if pixels.shape[1] > width_px:
+        size = (width_px, max(round(pixels.shape[0] * width_px / pixels.shape[1]), 1))
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return bytes(content.tobytes())

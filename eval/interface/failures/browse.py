@@ -1,0 +1,170 @@
+"""Failures as a static site, for a person to browse."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from crosscue.eval.failures.order import ranked
+from crosscue.eval.failures.record import Failure, read_failures
+from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
+from crosscue.eval.interface.runs.recording import save_recording
+from crosscue.replay.base import EmptyResultError, OutputError, UsageError, cannot_write, visible
+from crosscue.replay.processes import in_processes
+
+from .failures import ENDINGS, Failures, failures
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Site:
+    """A static site of failures; printed as ``crosscue browse`` prints it.
+
+    Attributes:
+        index: Its first page.
+        failures: How many it shows.
+        pictures: How many frames have a picture.
+        without_picture: Failures without one.
+        reasons: Why pictures of a run are missing.
+        found: How the failures were found; None where a table named them.
+    """
+
+    index: Path
+    failures: int
+    pictures: int
+    without_picture: int
+    reasons: tuple[str, ...]
+    found: Failures | None
+
+    @property
+    def is_whole(self) -> bool:
+        """Every run could be examined."""
+        return self.found is None or not self.found.failed
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue browse --json`` prints."""
+        return {
+            "index": str(self.index),
+            "failures": self.failures,
+            "pictures": self.pictures,
+            "without_picture": self.without_picture,
+            "reasons": list(self.reasons),
+            "failed": {}
+            if self.found is None
+            else {str(path): str(error) for path, error in self.found.failed.items()},
+        }
+
+    def __repr__(self) -> str:
+        lines = [f"failures   {self.failures:,}, {self.pictures:,} pictures"]
+        if self.without_picture:
+            lines.append(f"           {self.without_picture:,} failures without a picture")
+        lines += [f"           {visible(why)}" for why in self.reasons]
+        if self.found is not None:
+            lines += [f"left out   {visible(str(error))}" for error in self.found.failed.values()]
+        lines.append(f"open       {visible(str(self.index.resolve()))}")
+        return "\n".join(lines)
+
+
+def browse(
+    runs: Sequence[Path | str] | Path | str,
+    output: Path | str,
+    *,
+    truth: Path | str | None = None,
+    top: int | None = None,
+    threshold: float = 0.9,
+    any_log: bool = False,
+    logs: Path | str | None = None,
+    has_recordings: bool = False,
+    overwrite: bool = False,
+    workers: int = 1,
+    on_runs: Callable[[int, int], None] = lambda done, of: None,
+) -> Site:
+    """Write failures as a static site: pages, pictures and charts that need no server.
+
+    Args:
+        runs: As for ``failures``; or a table that ``failures`` wrote.
+        output: Folder of the site, new or empty.
+        truth: As for ``failures``.
+        top: As for ``failures``.
+        threshold: As for ``failures``.
+        any_log: As for ``failures``.
+        logs: Where the runs' logs have moved to, if they have.
+        has_recordings: Write a recording of each moment beside its page; megabytes each.
+        overwrite: Replace an earlier site.
+        workers: How many runs are drawn side by side.
+        on_runs: Called with the number of runs that are drawn, and of how many.
+
+    Raises:
+        UsageError: A value out of range, or a table beside other runs.
+        EmptyResultError: Nothing went wrong.
+        OutputError: The folder holds something else, or cannot be written.
+    """
+    folder = Path(output)
+    _check_place(folder, overwrite)
+    chosen, found = _given(runs, truth, top, threshold, any_log, workers)
+    if not chosen:
+        raise EmptyResultError(f"{folder}: no failure to show; nothing was written")
+    entries = entries_of(chosen)
+    made = folder.with_name(f".{folder.name}.partial")
+    try:
+        shutil.rmtree(made, ignore_errors=True)
+        for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
+            (made / part).mkdir(parents=True)
+        work = RunWork(made, len(entries), None if logs is None else Path(logs), has_recordings)
+        groups, pictures, reasons = by_run(entries), frozenset[str](), []
+        for done, (written, why) in enumerate(in_processes(work, groups, workers), 1):
+            pictures |= written
+            reasons += [why] if why else []
+            on_runs(done, len(groups))
+        if has_recordings:
+            for one in entries:
+                path = made / "r" / f"{one.number:05d}.rrd"
+                save_recording(one.failure.run, path, at=f"{one.failure.t_ns}ns")
+        write_lists(made, entries, pictures)
+        shutil.rmtree(folder, ignore_errors=True)
+        made.rename(folder)
+    except OSError as error:
+        raise cannot_write(Path(error.filename or folder), error) from None
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+    bare = sum(one.picture not in pictures for one in entries)
+    return Site(
+        folder / "index.html", len(entries), len(pictures), bare, tuple(sorted(set(reasons))), found
+    )
+
+
+def _check_place(folder: Path, overwrite: bool) -> None:
+    try:
+        there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    except OSError as error:
+        raise cannot_write(folder, error) from None
+    if there and not (folder / MARKER).is_file():
+        raise OutputError(f"{folder}: holds something that is not a site; give another folder")
+    if there and not overwrite:
+        raise OutputError(f"{folder}: holds a site; give another folder or --overwrite")
+
+
+def _given(
+    runs: Sequence[Path | str] | Path | str,
+    truth: Path | str | None,
+    top: int | None,
+    threshold: float,
+    any_log: bool,
+    workers: int,
+) -> tuple[tuple[Failure, ...], Failures | None]:
+    """The failures of runs, or those of a table."""
+    given = [Path(one) for one in ([runs] if isinstance(runs, Path | str) else runs)]
+    if any(one.suffix in ENDINGS for one in given):
+        if len(given) > 1 or top is not None:
+            raise UsageError(f"{given[0]}: expected a table alone, without --top, or runs")
+        return ranked(read_failures(given[0])), None
+    found = failures(
+        [str(one) for one in given],
+        truth=truth,
+        top=top,
+        threshold=threshold,
+        any_log=any_log,
+        workers=workers,
+    )
+    return ranked(found.failures), found

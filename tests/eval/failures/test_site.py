@@ -1,0 +1,182 @@
+"""A site of failures: every failure has its page, found without the script as well as with it."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.eval.failures.record import Failure, read_failures, write_failures
+from crosscue.eval.failures.site import FACETS, PER_PAGE, entries_of, write_lists
+from crosscue.replay.base import EmptyResultError, OutputError, UsageError
+from support.scene_run import scene_run
+from support.scoring import truth_folder
+
+
+class Links(HTMLParser):
+    """Where a page leads, and what it shows."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.found: list[Path] = []
+        self.scripts = 0
+        self._folder = page.parent
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Keep what an element refers to."""
+        self.scripts += tag == "script"
+        for name, value in attrs:
+            if name in ("href", "src") and value is not None and "://" not in value:
+                self.found.append((self._folder / value).resolve())
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, crosscue.Site]:
+    folder = tmp_path_factory.mktemp("site")
+    run, truth = scene_run(folder).path, truth_folder(folder / "truth")
+    return folder, crosscue.browse(run, folder / "site", truth=truth)
+
+
+def test_every_link_leads_to_a_file_and_every_failure_has_a_page_and_a_picture(
+    made: tuple[Path, crosscue.Site],
+) -> None:
+    folder, site = made
+    pages = sorted((folder / "site").rglob("*.html"))
+
+    for page in pages:
+        assert [path for path in Links(page).found if not path.exists()] == [], page
+    assert len(list((folder / "site" / "f").iterdir())) == site.failures > 1
+    assert site.without_picture == 0
+    small, large = ({p.name for p in (folder / "site" / part).iterdir()} for part in ("t", "p"))
+    assert small == large
+
+
+def test_a_page_shows_the_belief_and_the_command_that_opens_rerun_there(
+    made: tuple[Path, crosscue.Site],
+) -> None:
+    folder, _ = made
+    page = (folder / "site" / "f" / "00001.html").read_text()
+
+    assert "<svg" in page
+    at = re.search(r"crosscue view (\S+) --at ([0-9.]+)<", page)
+    assert at is not None
+    assert Path(at[1]) == folder / "run"
+    assert crosscue.save_recording(at[1], folder / "at.rrd", at=at[2], only=("belief",)).exists()
+
+
+def test_names_from_a_log_stay_text(made: tuple[Path, crosscue.Site]) -> None:
+    folder, _ = made
+    for page in (folder / "site").rglob("*.html"):
+        assert "<img src=x" not in page.read_text()
+
+
+def failure(number: int, **changes: object) -> Failure:
+    usual: dict[str, object] = {
+        "run": f"runs/{number % 7}",
+        "kind": "missed",
+        "level": "frames",
+        "what": f"cue_{number % 5}",
+        "cause": "</script><b>",
+        "reported": "",
+        "t_ns": number,
+        "at_s": 0.1 * number,
+        "start_ns": number,
+        "end_ns": number,
+        "frames": 1,
+        "approach": None,
+        "intersection": "",
+        "conditions": ("rain", "dusk")[: number % 3],
+        "distance_m": float(number % 100),
+        "severity": 1000.0 - number,
+    }
+    return Failure(**(usual | changes))  # type: ignore[arg-type]
+
+
+def test_without_the_script_pages_reach_every_failure_by_each_facet(tmp_path: Path) -> None:
+    entries = entries_of([failure(number) for number in range(2 * PER_PAGE + 1)])
+    write_lists(tmp_path, entries, frozenset())
+
+    def listed(pages: list[Path]) -> list[str]:
+        return sorted(
+            path.name for page in pages for path in Links(page).found if path.parent.name == "f"
+        )
+
+    wanted = sorted(one.page for one in entries)
+    assert listed([tmp_path / "index.html", *tmp_path.glob("page-*.html")]) == wanted
+    for facet in FACETS:
+        pages = list((tmp_path / "by").glob(f"{facet}-*.html"))
+        assert set(listed(pages)) == set(wanted)
+        # A failure under two conditions is in the lists of both.
+        assert facet == "condition" or listed(pages) == wanted
+        assert all(Links(page).scripts == 0 for page in pages)
+
+
+def test_what_the_script_lists_is_json_that_cannot_end_its_element(tmp_path: Path) -> None:
+    write_lists(tmp_path, entries_of([failure(1)]), frozenset())
+    page = (tmp_path / "index.html").read_text()
+
+    rows = json.loads(page.partition('id="rows">')[2].partition("</script>")[0])
+    assert rows[0][2] == "</script><b>"
+    assert page.count("</script>") == 2
+
+
+def test_the_same_runs_make_the_same_bytes(made: tuple[Path, crosscue.Site]) -> None:
+    folder, _ = made
+    truth = folder / "truth"
+    crosscue.browse(folder / "run", folder / "again", truth=truth)
+
+    files = [p.relative_to(folder / "site") for p in (folder / "site").rglob("*") if p.is_file()]
+    for path in files:
+        assert (folder / "site" / path).read_bytes() == (folder / "again" / path).read_bytes()
+
+
+def test_a_table_of_failures_makes_a_site_of_those_alone(
+    made: tuple[Path, crosscue.Site], tmp_path: Path
+) -> None:
+    folder, _ = made
+    truth = folder / "truth"
+    crosscue.failures(folder / "run", truth=truth, top=2, output=tmp_path / "two.parquet")
+
+    site = crosscue.browse(tmp_path / "two.parquet", tmp_path / "two")
+    assert site.failures == 2
+    assert crosscue.browse(tmp_path / "two.parquet", tmp_path / "two", overwrite=True)
+
+
+def test_a_log_that_is_gone_leaves_pages_without_pictures_and_the_reason(tmp_path: Path) -> None:
+    run, truth = scene_run(tmp_path / "drive").path, truth_folder(tmp_path / "truth")
+    (tmp_path / "drive" / "drive.mcap").unlink()
+
+    site = crosscue.browse(run, tmp_path / "site", truth=truth)
+    assert site.pictures == 0
+    assert site.without_picture == site.failures
+    assert "drive.mcap" in site.reasons[0]
+
+
+def test_a_folder_that_is_not_a_site_is_never_replaced(
+    made: tuple[Path, crosscue.Site], tmp_path: Path
+) -> None:
+    folder, _ = made
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("keep")
+
+    with pytest.raises(OutputError, match="not a site"):
+        crosscue.browse(folder / "run", tmp_path / "mine", overwrite=True)
+    with pytest.raises(OutputError, match="holds a site"):
+        crosscue.browse(folder / "run", folder / "site")
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
+
+
+def test_nothing_wrong_writes_nothing(made: tuple[Path, crosscue.Site], tmp_path: Path) -> None:
+    write_failures([], tmp_path / "none.json")
+    assert read_failures(tmp_path / "none.json") == ()
+
+    with pytest.raises(EmptyResultError):
+        crosscue.browse(tmp_path / "none.json", tmp_path / "site")
+    with pytest.raises(UsageError):
+        crosscue.browse([tmp_path / "none.json", made[0] / "run"], tmp_path / "site")
+    assert not (tmp_path / "site").exists()
