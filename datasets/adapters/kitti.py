@@ -16,7 +16,6 @@ raw fix.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -35,7 +34,6 @@ from crosscue.replay.base import (
     NOT_ASKED_TIME,
     NOT_ASKED_TOPIC,
     Block,
-    Closing,
     Int64s,
     Ledger,
     Limits,
@@ -44,12 +42,12 @@ from crosscue.replay.base import (
     Table,
     Topic,
 )
-from crosscue.replay.decode.coding import IMAGE_SUFFIXES
-from crosscue.replay.readers.images.files import PictureFiles
+from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
 from crosscue.replay.seal.touched import Touched, open_noted
 
+from crosscue.replay.readers.held_rows import CameraDrive
 from .kitti_labels import read_labels
 from .kitti_odometry import projection
 from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
@@ -85,6 +83,24 @@ class Oxts:
     single: Path | None = None
     touched: Touched = field(default_factory=Touched, kw_only=True)
 
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The signals of the GNSS and inertial box."""
+        return tuple(
+            Topic(name, type_name, "columns", declared=self.files.declared)
+            for name, (type_name, _) in TOPICS.items()
+        )
+
+    def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+        """Every signal's rows, with their account."""
+        return _read_oxts(self, ledger, selection)
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Packets without a time, times without a packet; see ``KnowsItsEnd``."""
+        for name in TOPICS:
+            ledger.drop(name, "a packet without its time", int(np.sum(self.files.t_ns < 0)))
+            ledger.drop(name, "a time without its packet", len(self.files.missing_ns))
+
     def lines(self) -> Iterator[Line]:
         """Every packet in stored order."""
         if self.single is not None:
@@ -109,7 +125,7 @@ class Oxts:
                 number += 1
 
 
-class Drive(Closing):
+class Drive(CameraDrive):
     """One drive as a ``Log``."""
 
     format: Final = "kitti-raw"
@@ -119,52 +135,27 @@ class Drive(Closing):
         path: Path,
         cameras: Sequence[PictureFiles],
         oxts: Oxts | None,
-        unreadable: Sequence[Unreadable],
-        notices: Sequence[str],
         limits: Limits,
         touched: Touched,
+        *,
+        unreadable: Sequence[Unreadable] = (),
+        notices: Sequence[str] = (),
     ) -> None:
-        """Put a drive together; ``unreadable`` holds arguments for ``Ledger.drop``."""
-        self.path: Final = path
-        self.touched: Final = touched
-        self._cameras: Final = tuple(cameras)
-        self._oxts: Final = oxts
-        self._unreadable: Final = tuple(unreadable)
-        self._notices: Final = tuple(notices)
-        self._limits: Final = limits
-
-    @property
-    def oxts(self) -> Oxts | None:
-        """The box's packets, or None where none exists with times."""
-        return self._oxts
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Cameras, then the signals of the GNSS and inertial box."""
-        cameras = tuple(camera.topic for camera in self._cameras)
-        if self._oxts is None:
-            return cameras
-        declared = self._oxts.files.declared
-        return cameras + tuple(
-            Topic(name, type_name, "columns", declared=declared)
-            for name, (type_name, _) in TOPICS.items()
+        """Put a drive together; ``oxts`` are the packets of the GNSS and inertial box."""
+        numbers = () if oxts is None else (oxts,)
+        super().__init__(
+            path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices
         )
+        self.oxts: Final = oxts
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams side by side, in order of each block's first time; see ``Log.read``."""
-        for sentence in self._notices:
-            ledger.notice(sentence)
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
-        if self._oxts is not None:
-            streams.append(_read_oxts(self._oxts, ledger, selection))
-        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+        """As ``CameraDrive.read``; says that packets have no checksum."""
+        yield from super().read(ledger, selection)
         ledger.integrity = "; ".join(
             part
             for part in (
                 ledger.integrity if ledger.integrity != "not checked" else "",
-                "OXTS text has no checksum" if self._oxts is not None else "",
+                "OXTS text has no checksum" if self.oxts is not None else "",
             )
             if part
         )
@@ -175,27 +166,12 @@ class Drive(Closing):
         Raises:
             LogFormatError: The file is damaged.
         """
-        single = self._oxts.single if self._oxts is not None else None
+        single = self.oxts.single if self.oxts is not None else None
         if single is not None:
             file = self.path / "calib" / single.name
         else:
             file = self.path.resolve().parent / "calib_cam_to_cam.txt"
         return projection(file, str(int(camera.rpartition("_")[2])))
-
-    def report_missing(self, ledger: Ledger) -> None:
-        """Files without a time, times without a file; see ``KnowsItsEnd``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        for camera in self._cameras:
-            camera.report_missing(ledger)
-        if self._oxts is not None:
-            files = self._oxts.files
-            for name in TOPICS:
-                ledger.drop(name, "a packet without its time", int(np.sum(files.t_ns < 0)))
-                ledger.drop(name, "a time without its packet", len(files.missing_ns))
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
 
 def open_drive(path: Path, limits: Limits) -> Drive:
@@ -261,12 +237,12 @@ def _open_raw(path: Path, limits: Limits) -> Drive:
     unreadable: list[Unreadable] = []
     touched = Touched()
     for folder in sorted(path.glob("image_[0-9][0-9]")):
-        files = _timed(folder, IMAGE_SUFFIXES, folder.name, unreadable, limits, touched)
+        files = _timed(folder, list_pictures, folder.name, unreadable, limits, touched)
         if files is not None:
             topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
             cameras.append(PictureFiles(topic, files, touched))
     lost: list[Unreadable] = []
-    packets = _timed(path / "oxts", (".txt",), "oxts", lost, limits, touched)
+    packets = _timed(path / "oxts", _packet_files, "oxts", lost, limits, touched)
     unreadable += [(name, *loss[1:]) for loss in lost for name in TOPICS]
     if not cameras and packets is None:
         why = unreadable[0][3] if unreadable else "no image_0x and no oxts with files in data/"
@@ -276,16 +252,20 @@ def _open_raw(path: Path, limits: Limits) -> Drive:
         path,
         cameras,
         None if packets is None else Oxts(packets, touched=touched),
-        unreadable,
-        notices if (path / "velodyne_points").is_dir() else [],
         limits,
         touched,
+        unreadable=unreadable,
+        notices=notices if (path / "velodyne_points").is_dir() else (),
     )
+
+
+def _packet_files(folder: Path) -> list[Path]:
+    return list_files(folder, (".txt",))
 
 
 def _timed(
     folder: Path,
-    suffixes: Sequence[str],
+    listed: Callable[[Path], Sequence[Path]],
     topic: str,
     unreadable: list[Unreadable],
     limits: Limits,
@@ -293,7 +273,7 @@ def _timed(
 ) -> TimedFiles | None:
     """The files of one stream with times; else None, and why is added to ``unreadable``."""
     time_file = folder / "timestamps.txt"
-    paths = list_files(folder / "data", suffixes) if (folder / "data").is_dir() else []
+    paths = listed(folder / "data") if (folder / "data").is_dir() else []
     if not time_file.is_file():
         if paths:
             why = f"{folder.name}/timestamps.txt is missing; put it back"
@@ -322,7 +302,7 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
     name = singles[0].stem
     cameras, touched = [], Touched()
     for folder in sorted(path.glob(f"image_[0-9][0-9]/{name}")):
-        paths = list_files(folder, IMAGE_SUFFIXES)
+        paths = list_pictures(folder)
         if paths:
             topic = Topic(folder.parent.name, "crosscue/Images", "columns")
             t_ns = np.array([_frame_ns(path.stem) for path in paths], dtype=np.int64)
@@ -335,7 +315,7 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
     )
     if (period_s := _driven_period_s(oxts)) is not None:
         notice += f" (distance over speed says {period_s * 1e3:.1f} ms a frame)"
-    return Drive(path, cameras, oxts, [], [notice], limits, touched)
+    return Drive(path, cameras, oxts, limits, touched, notices=[notice])
 
 
 def _driven_period_s(oxts: Oxts) -> float | None:

@@ -15,8 +15,7 @@ x ahead (their z), y left (their -x), z up (their -y).
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -27,26 +26,21 @@ from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
-    EVERYTHING,
     MIB,
-    Block,
-    Closing,
     Floats,
     Int64s,
-    Ledger,
     Limits,
     LogFormatError,
-    Selection,
     Table,
     Topic,
     read_at_most,
 )
-from crosscue.replay.decode.coding import IMAGE_SUFFIXES
-from crosscue.replay.readers.held_rows import HeldRows, Loss
-from crosscue.replay.readers.images.files import PictureFiles
+from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file
-from crosscue.replay.readers.timed_files import TimedFiles, list_files
+from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
+
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
@@ -85,45 +79,10 @@ class Poses(NamedTuple):
         )
 
 
-class Drive(Closing):
+class Drive(CameraDrive):
     """One sequence as a ``Log``."""
 
     format: Final = "kitti-odometry"
-
-    def __init__(
-        self,
-        path: Path,
-        cameras: Sequence[PictureFiles],
-        odometry: HeldRows | None,
-        unreadable: Sequence[tuple[str, str, int | None, str]],
-        limits: Limits,
-        touched: Touched,
-    ) -> None:
-        """Put a sequence together; ``unreadable`` holds arguments for ``Ledger.drop``."""
-        self.path: Final = path
-        self.touched: Final = touched
-        self._cameras: Final = tuple(cameras)
-        self._odometry: Final = odometry
-        self._unreadable: Final = tuple(unreadable)
-        self._limits: Final = limits
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Cameras, then odometry."""
-        cameras = tuple(camera.topic for camera in self._cameras)
-        return cameras if self._odometry is None else (*cameras, self._odometry.topic)
-
-    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams side by side, in order of each block's first time; see ``Log.read``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        if (self.path / "velodyne").is_dir():
-            ledger.notice("velodyne: laser scans are not read")
-        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
-        if self._odometry is not None:
-            ledger.notice("odometry: made of the true poses; a pose estimated from it is no result")
-            streams.append(self._odometry.read(ledger, selection))
-        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
         """Focal length and optical center of a rectified camera; None where not published.
@@ -132,18 +91,6 @@ class Drive(Closing):
             LogFormatError: The file is damaged.
         """
         return projection(self.path / "calib.txt", camera.rpartition("_")[2].lstrip("0") or "0")
-
-    def report_missing(self, ledger: Ledger) -> None:
-        """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        for camera in self._cameras:
-            camera.report_missing(ledger)
-        if self._odometry is not None:
-            self._odometry.report_missing(ledger)
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
 
 def projection(file: Path, camera: str) -> tuple[float, float, float] | None:
@@ -183,7 +130,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     touched.add(times_file, 0, times_file.stat().st_size)
     cameras = []
     for folder in sorted(path.glob("image_[0-9]")):
-        paths = list_files(folder, IMAGE_SUFFIXES)
+        paths = list_pictures(folder)
         if paths:
             files = _timed(paths, times.t_ns)
             topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
@@ -200,7 +147,11 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
             odometry = HeldRows(topic, poses.t_ns, poses.odometry(), poses.losses)
         except LogFormatError as error:
             unreadable.append(("odometry", "file cannot be read", None, str(error)))
-    return Drive(path, cameras, odometry, unreadable, limits, touched)
+    notices = ["velodyne: laser scans are not read"] if (path / "velodyne").is_dir() else []
+    numbers = () if odometry is None else (odometry,)
+    if numbers:
+        notices.append("odometry: made of the true poses; a pose estimated from it is no result")
+    return Drive(path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices)
 
 
 def pose_file(path: Path) -> Path | None:

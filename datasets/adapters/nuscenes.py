@@ -16,9 +16,8 @@ of the published schema; no drive of the set was at hand when this was written.
 
 from __future__ import annotations
 
-import heapq
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -26,23 +25,18 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from crosscue.replay.base import (
-    EVERYTHING,
-    Block,
-    Closing,
     Floats,
     Int64s,
-    Ledger,
     Limits,
     LogFormatError,
-    Selection,
     Table,
     Topic,
 )
-from crosscue.replay.readers.held_rows import HeldRows, Loss
 from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
 
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
 WHEEL_RADIUS_M: Final = 0.305
@@ -184,46 +178,32 @@ def _has(row: Row, *keys: str) -> bool:
     )
 
 
-class Drive(Closing):
+class Drive(CameraDrive):
     """One scene as a ``Log``."""
 
     format: Final = "nuscenes"
 
     def __init__(
         self,
-        path: Path,
         tables: SceneTables,
+        path: Path,
         cameras: Sequence[PictureFiles],
         rows: Sequence[HeldRows],
-        unreadable: Sequence[tuple[str, str, int | None, str]],
         limits: Limits,
         touched: Touched,
+        unreadable: Sequence[tuple[str, str, int | None, str]],
     ) -> None:
-        """Put a scene together; ``unreadable`` holds arguments for ``Ledger.drop``."""
-        self.path: Final = path
-        self.touched: Final = touched
-        self._tables: Final = tables
-        self._cameras: Final = tuple(cameras)
-        self._rows: Final = tuple(rows)
-        self._unreadable: Final = tuple(unreadable)
-        self._limits: Final = limits
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Cameras, then numbers."""
-        return (
-            *(camera.topic for camera in self._cameras),
-            *(rows.topic for rows in self._rows),
+        """Put a scene together; ``tables`` know its cameras."""
+        super().__init__(
+            path,
+            cameras,
+            rows,
+            limits,
+            touched,
+            unreadable=unreadable,
+            notices=("laser and radar are not read",),
         )
-
-    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams side by side, in order of each block's first time; see ``Log.read``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        ledger.notice("laser and radar are not read")
-        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
-        streams += [rows.read(ledger, selection) for rows in self._rows]
-        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+        self._tables: Final = tables
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
         """Focal length and optical center of a camera, px.
@@ -235,18 +215,6 @@ class Drive(Closing):
         if row is None:
             return None
         return matrix_of(row, self._tables.scene)
-
-    def report_missing(self, ledger: Ledger) -> None:
-        """Files without a row, rows without a file, damaged rows; see ``KnowsItsEnd``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        for camera in self._cameras:
-            camera.report_missing(ledger)
-        for rows in self._rows:
-            rows.report_missing(ledger)
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
 
 def matrix_of(row: Row, scene: Scene) -> tuple[float, float, float]:
@@ -302,7 +270,7 @@ def open_scene(path: Path, limits: Limits) -> Drive:
         held.append(_odometry(tables))
     if not cameras and not held:
         raise LogFormatError(f"{path}: {scene.name}: no picture of a camera in sample_data.json")
-    return Drive(path, tables, cameras, held, unreadable, limits, touched)
+    return Drive(tables, path, cameras, held, limits, touched, unreadable)
 
 
 def _timed(root: Path, rows: Sequence[Row]) -> TimedFiles:

@@ -12,8 +12,7 @@ poses, so it is no wheel speed and as good as the poses are); ``gnss``.
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -24,26 +23,21 @@ from scipy.spatial.transform import Rotation
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
-    EVERYTHING,
     MIB,
-    Block,
-    Closing,
     Floats,
     Int64s,
-    Ledger,
     Limits,
     LogFormatError,
-    Selection,
     Table,
     Topic,
     json_tree,
     read_at_most,
 )
-from crosscue.replay.decode.coding import IMAGE_SUFFIXES
-from crosscue.replay.readers.held_rows import HeldRows
-from crosscue.replay.readers.images.files import PictureFiles
-from crosscue.replay.readers.timed_files import TimedFiles, list_files
+from crosscue.replay.readers.images.files import PictureFiles, list_pictures
+from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
+
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
@@ -95,45 +89,10 @@ class Poses:
         return Table({"speed_x_mps": self.speed_mps(), "yaw_rate_radps": yaw_rate})
 
 
-class Drive(Closing):
+class Drive(CameraDrive):
     """One sequence as a ``Log``."""
 
     format: Final = "pandaset"
-
-    def __init__(
-        self,
-        path: Path,
-        cameras: Sequence[PictureFiles],
-        rows: Sequence[HeldRows],
-        unreadable: Sequence[tuple[str, str, int | None, str]],
-        limits: Limits,
-        touched: Touched,
-    ) -> None:
-        """Put a sequence together; ``unreadable`` holds arguments for ``Ledger.drop``."""
-        self.path: Final = path
-        self.touched: Final = touched
-        self._cameras: Final = tuple(cameras)
-        self._rows: Final = tuple(rows)
-        self._unreadable: Final = tuple(unreadable)
-        self._limits: Final = limits
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Cameras, then numbers."""
-        return (
-            *(camera.topic for camera in self._cameras),
-            *(rows.topic for rows in self._rows),
-        )
-
-    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams side by side, in order of each block's first time; see ``Log.read``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        if (self.path / "lidar").is_dir():
-            ledger.notice("lidar: sweeps are not read")
-        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
-        streams += [rows.read(ledger, selection) for rows in self._rows]
-        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
         """Focal length and optical center of a camera, px; None where they are not published.
@@ -152,18 +111,6 @@ class Drive(Closing):
         if not (0.0 < focal < np.inf and np.isfinite([x, y]).all()):
             raise LogFormatError(f"{file}: fx {focal}, cx {x}, cy {y}: expected numbers of pixels")
         return focal, x, y
-
-    def report_missing(self, ledger: Ledger) -> None:
-        """Pictures and rows without a time, times without them; see ``KnowsItsEnd``."""
-        for loss in self._unreadable:
-            ledger.drop(*loss)
-        for camera in self._cameras:
-            camera.report_missing(ledger)
-        for rows in self._rows:
-            rows.report_missing(ledger)
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
 
 READ_ON_OPENING: Final = (
@@ -185,7 +132,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     for file in (one for pattern in READ_ON_OPENING for one in path.glob(pattern)):
         touched.add(file, 0, file.stat().st_size)
     for folder in sorted((path / "camera").iterdir()):
-        paths = list_files(folder, IMAGE_SUFFIXES) if folder.is_dir() else []
+        paths = list_pictures(folder) if folder.is_dir() else []
         if not paths:
             continue
         try:
@@ -207,7 +154,8 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     if not cameras and not rows:
         why = unreadable[0][3] if unreadable else "no camera with pictures and timestamps.json"
         raise LogFormatError(f"{path}: no stream of a PandaSet sequence can be read: {why}")
-    return Drive(path, cameras, rows, unreadable, limits, touched)
+    notices = ("lidar: sweeps are not read",) if (path / "lidar").is_dir() else ()
+    return Drive(path, cameras, rows, limits, touched, unreadable=unreadable, notices=notices)
 
 
 def read_poses(path: Path, camera: str = FRONT) -> Poses:

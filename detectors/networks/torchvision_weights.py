@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from crosscue.detectors.catalog.architectures import ARCHITECTURES, ArchitectureName
 from crosscue.detectors.catalog.card import MAX_BYTES, ModelCard
 from crosscue.detectors.decoders.base import Array
-from crosscue.detectors.devices import chosen_device, threads_of
+from crosscue.detectors.networks.devices import chosen_device, threads_of
 from crosscue.replay.errors import VehicleError, one_line
 
 from .weights import Weights

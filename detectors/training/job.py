@@ -12,7 +12,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import torch
 
-from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.networks.mask_rcnn.checkpoint import (
     Calibration,
     Checkpoint,

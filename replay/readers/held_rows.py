@@ -1,22 +1,29 @@
-"""A stream of numbers held in memory, for data sets whose drives have some thousand rows."""
+"""Drives of data sets: cameras beside streams of numbers, which are held in memory where short."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import heapq
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Final, NamedTuple, Protocol
 
 from crosscue.replay.base import (
+    EVERYTHING,
     NOT_ASKED_TIME,
     NOT_ASKED_TOPIC,
     Block,
+    Closing,
     Int64s,
     Ledger,
+    Limits,
     Selection,
     Table,
     Topic,
 )
+from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.timed_files import is_inside
+from crosscue.replay.seal.touched import Touched
 
 NO_PARTNER: Final = "a row without its time, or a time without its row"
 
@@ -45,6 +52,11 @@ class HeldRows:
     table: Table
     losses: tuple[Loss, ...] = ()
 
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The one topic."""
+        return (self.topic,)
+
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
         """The rows asked for, with their account."""
         name, n = self.topic.name, len(self.t_ns)
@@ -69,3 +81,84 @@ class HeldRows:
             ledger.drop(self.topic.name, *loss)
         missing = (self.topic.declared or 0) - len(self.t_ns) - lost
         ledger.drop(self.topic.name, NO_PARTNER, max(missing, 0))
+
+
+class Numbers(Protocol):
+    """Streams of numbers beside a drive's cameras."""
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """What they are called."""
+        ...
+
+    def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
+        """The rows asked for, with their account."""
+        ...
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """See ``KnowsItsEnd``."""
+        ...
+
+
+class CameraDrive(Closing):
+    """A drive of a data set as a ``Log``; a data set adds its ``format`` and its intrinsics."""
+
+    def __init__(
+        self,
+        path: Path,
+        cameras: Sequence[PictureFiles],
+        numbers: Sequence[Numbers],
+        limits: Limits,
+        touched: Touched,
+        *,
+        unreadable: Sequence[tuple[str, str, int | None, str]] = (),
+        notices: Sequence[str] = (),
+    ) -> None:
+        """Put a drive together.
+
+        Args:
+            path: Its folder.
+            cameras: Their pictures.
+            numbers: Beside them.
+            limits: That its files are read with.
+            touched: Which files are read, for a seal.
+            unreadable: What could not be opened, as arguments for ``Ledger.drop``.
+            notices: What is odd about it, a sentence each.
+        """
+        self.path: Final = path
+        self.touched: Final = touched
+        self._cameras: Final = tuple(cameras)
+        self._numbers: Final = tuple(numbers)
+        self._limits: Final = limits
+        self._unreadable: Final = tuple(unreadable)
+        self._notices: Final = tuple(notices)
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Cameras, then numbers."""
+        return (
+            *(camera.topic for camera in self._cameras),
+            *(topic for numbers in self._numbers for topic in numbers.topics),
+        )
+
+    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
+        """All streams side by side, in order of each block's first time; see ``Log.read``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        for sentence in self._notices:
+            ledger.notice(sentence)
+        streams = [camera.read(ledger, selection, self._limits) for camera in self._cameras]
+        streams += [numbers.read(ledger, selection) for numbers in self._numbers]
+        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Pictures and rows without a time, times without them; see ``KnowsItsEnd``."""
+        for loss in self._unreadable:
+            ledger.drop(*loss)
+        for camera in self._cameras:
+            camera.report_missing(ledger)
+        for numbers in self._numbers:
+            numbers.report_missing(ledger)
+
+    def close(self) -> None:
+        """Nothing is held open."""

@@ -25,7 +25,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.detectors import rle, weights_file
 from crosscue.detectors.base import Choice, Detections, Frame
 from crosscue.detectors.boxes import overlaps
-from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.networks.mask_rcnn.checkpoint import (
     KEY,
     Calibration,

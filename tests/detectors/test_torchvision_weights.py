@@ -21,7 +21,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.catalog.architectures import ARCHITECTURES, ArchitectureName
 from crosscue.detectors.catalog.card import read_card
-from crosscue.detectors.devices import threads_of
+from crosscue.detectors.networks.devices import threads_of
 from crosscue.detectors.networks.model_detector import build
 from crosscue.eval.cli import run
 from support.torchvision_files import NAMES, class_names, hollow, network

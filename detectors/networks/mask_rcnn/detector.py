@@ -25,7 +25,7 @@ from torch import Tensor
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
-from crosscue.detectors.devices import chosen_device, threads_of
+from crosscue.detectors.networks.devices import chosen_device, threads_of
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
 from crosscue.replay.base import Bytes, CrosscueError, Floats, VehicleError
 

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Found, Frame, RoadMask, View
-from crosscue.detectors.devices import chosen_device
+from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.settings import Settings, identity_of, settings_of
 
 from .checkpoint import RoadCheckpoint, load_road

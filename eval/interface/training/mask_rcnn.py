@@ -207,7 +207,7 @@ def measure_mask_rcnn(
     """
     if not all(1 <= count <= 2000 for count in proposals):
         raise UsageError("--proposals: expected 1 to 2000")
-    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
     from crosscue.detectors.training.annotations import read_coco
     from crosscue.detectors.training.measure import measure

@@ -140,7 +140,7 @@ def train_road(
         raise UsageError("train road: give --layouts to simulate, or --data with pictures")
     import torch
 
-    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
     from crosscue.detectors.training.reproducible import decides_bits, reproducible
     from crosscue.detectors.training.road import RoadSchedule, RoadTraining
@@ -215,7 +215,7 @@ def measure_road(
     if (data is None) == (not test_layouts):
         raise UsageError("--measure: give --test-layouts with layouts, or --data with pictures")
     from crosscue.datasets.adapters.road_folder import load_folder
-    from crosscue.detectors.devices import chosen_device
+    from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road
     from crosscue.detectors.networks.road.network import embedded_path
 

@@ -23,13 +23,18 @@ from crosscue.replay.base import (
     Selection,
     Topic,
 )
-from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
-from crosscue.replay.readers.timed_files import TimedFiles, is_inside
+from crosscue.replay.decode.coding import IMAGE_SUFFIXES, MAGIC_BYTES, coding_of
+from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files
 from crosscue.replay.seal.touched import Touched, open_noted
 
 from .damage import CHECKED, damage_of
 
 _DETAILS_TOLD: Final = 20
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """Picture files in natural order, hidden ones not."""
+    return list_files(folder, IMAGE_SUFFIXES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,13 +22,12 @@ from crosscue.replay.base import (
     Selection,
     Topic,
 )
-from crosscue.replay.decode.coding import IMAGE_SUFFIXES
 from crosscue.replay.files.time_file_names import find_time_file
 from crosscue.replay.readers.time_file import read_time_file
-from crosscue.replay.readers.timed_files import list_files, pair
+from crosscue.replay.readers.timed_files import pair
 from crosscue.replay.seal.touched import Touched
 
-from .files import PictureFiles
+from .files import PictureFiles, list_pictures
 
 
 class ImageFolder(Closing):
@@ -70,7 +69,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     Raises:
         LogFormatError: No picture, no time file, or a time file that cannot be understood.
     """
-    paths = list_files(path, IMAGE_SUFFIXES)
+    paths = list_pictures(path)
     if not paths:
         raise LogFormatError(f"{path}: no picture in it; expected .png, .jpg or .webp files")
     time_file = find_time_file(path)
@@ -97,7 +96,7 @@ def picture_names(log: Log) -> Mapping[str, int]:
         return {}
     time_file = find_time_file(log.path)
     assert time_file is not None
-    files = pair(list_files(log.path, IMAGE_SUFFIXES), read_time_file(time_file, DEFAULT_LIMITS))
+    files = pair(list_pictures(log.path), read_time_file(time_file, DEFAULT_LIMITS))
     return {
         path.name: t_ns
         for path, t_ns in zip(files.paths, files.t_ns.tolist(), strict=True)
