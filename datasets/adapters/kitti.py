@@ -42,12 +42,12 @@ from crosscue.replay.base import (
     Table,
     Topic,
 )
+from crosscue.replay.readers.held_rows import CameraDrive
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
 from crosscue.replay.seal.touched import Touched, open_noted
 
-from crosscue.replay.readers.held_rows import CameraDrive
 from .kitti_labels import read_labels
 from .kitti_odometry import projection
 from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse

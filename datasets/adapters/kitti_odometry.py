@@ -35,12 +35,11 @@ from crosscue.replay.base import (
     Topic,
     read_at_most,
 )
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
-
-from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB

@@ -32,11 +32,11 @@ from crosscue.replay.base import (
     Table,
     Topic,
 )
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
 
-from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
 WHEEL_RADIUS_M: Final = 0.305

@@ -33,11 +33,10 @@ from crosscue.replay.base import (
     json_tree,
     read_at_most,
 )
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
-
-from crosscue.replay.readers.held_rows import CameraDrive, HeldRows
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
