@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.replay.base import UnreadableRunError, UsageError
+from crosscue.replay.remote.logs import is_remote
 
 from . import database, parts
 from .columns import INDEXED, OWN, VIEWS
 from .index import Index, Runs, open_index
 from .local import LocalRuns
+from .remote import RemoteRuns
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -47,7 +49,7 @@ class Catalog:
     @property
     def runs(self) -> tuple[Path, ...]:
         """Folders of all runs, sorted."""
-        return tuple(Path(self._places.place(run, "")) for run in sorted(self._listed("run")))
+        return tuple(self._places.path(run) for run in sorted(self._listed("run")))
 
     def query(self, sql: str) -> pa.Table:
         """The rows that a query selects; ``schema`` lists what can be asked for.
@@ -62,11 +64,19 @@ class Catalog:
             UsageError: It is not one, or names a table or column that does not exist.
         """
         words = {word.lower() for word in _WORD.findall(sql)}
-        tables: dict[str, Any] = {}
-        for name in self._names:
-            if name in words:
-                tables |= self._content(name)
-        return database.select(sql, tables, self._names)
+        named = [name for name in self._names if name in words]
+        files = {name: self._parts(name) for name in named if name not in INDEXED}
+        while True:
+            tables = {name: self._index.tables[name] for name in named if name in INDEXED}
+            for name, one in files.items():
+                tables |= _views(name, one)
+                self._unreadable.update(one.left_out)
+            try:
+                return database.select(sql, tables, self._names)
+            except database.FailedError:
+                # A file whose head is sound may be damaged or gone further on.
+                if not sum(one.drop_damaged() for one in files.values()):
+                    raise
 
     def select(self, query: str) -> tuple[Path, ...]:
         """Folders of the runs that a query selects.
@@ -95,7 +105,7 @@ class Catalog:
                 f"query: column run holds {strange[0]!r}, which is no run of {self._places.name}; "
                 "select the column run of a table"
             )
-        return tuple(Path(self._places.place(run, "")) for run in named)
+        return tuple(self._places.path(run) for run in named)
 
     def schema(self) -> pa.Table:
         """Every table and column: table, column, type and meaning."""
@@ -125,49 +135,53 @@ class Catalog:
         files = {name for names in self._listed("tables") for name in names}
         return {*INDEXED, *OWN, *parts.tables_of(files)}
 
-    def _content(self, table: str) -> dict[str, Any]:
-        """A table by its name, and what a view of that name is made of."""
-        if table in INDEXED:
-            return {table: self._index.tables[table]}
+    def _parts(self, table: str) -> parts.Parts:
         file = parts.file_of(table)
         places = {
             run: self._places.place(run, file)
             for run, files in zip(self._listed("run"), self._listed("tables"), strict=True)
             if file in files
         }
-        found = parts.Parts(table, places, self._places.filesystem)
-        self._unreadable.update(found.left_out)
-        if table not in VIEWS:
-            return {table: found.dataset}
-        base = f"{table}_of_runs"
-        return {base: found.dataset, table: VIEWS[table].format(table=base)}
+        return parts.Parts(table, places, self._places.filesystem)
 
     def __repr__(self) -> str:
         counts = f"{len(self._listed('run'))} runs, {len(self.left_out)} left out"
         return f"{self._places.name}: {counts}; tables: {', '.join(sorted(self._names))}"
 
 
-def catalog(folder: Path | str) -> Catalog:
-    """Open the catalog of all runs below a folder.
+def _views(table: str, found: parts.Parts) -> dict[str, Any]:
+    """A table by its name, and what a view of that name is made of."""
+    if table not in VIEWS:
+        return {table: found.dataset}
+    base = f"{table}_of_runs"
+    return {base: found.dataset, table: VIEWS[table].format(table=base)}
+
+
+def catalog(place: Path | str) -> Catalog:
+    """Open the catalog of all runs below a folder or URL.
 
     Args:
-        folder: A folder of runs, at any depth down to six, or a single run.
+        place: A folder of runs, at any depth down to six; a single run; or a URL of fsspec's, such
+            as ``s3://bucket/runs``, of which only what a query needs is fetched.
 
     Raises:
         UnreadableRunError: It is no folder, holds no run, or cannot be listed.
     """
-    path = Path(folder)
-    if not path.is_dir():
-        raise UnreadableRunError(f"{path}: no folder; give a folder of runs")
-    places = LocalRuns(path)
+    if is_remote(place) and not str(place).startswith("file://"):
+        places: Runs = RemoteRuns(str(place))
+    else:
+        folder = Path(str(place).removeprefix("file://"))
+        if not folder.is_dir():
+            raise UnreadableRunError(f"{folder}: no folder; give a folder of runs")
+        places = LocalRuns(folder)
     return Catalog(places, open_index(places))
 
 
-def select_runs(folder: Path | str, query: str) -> tuple[Path, ...]:
+def select_runs(place: Path | str, query: str) -> tuple[Path, ...]:
     """Folders of the runs that a query selects; see ``Catalog.select``.
 
     Args:
-        folder: As for ``catalog``.
+        place: As for ``catalog``.
         query: As for ``Catalog.select``.
     """
-    return catalog(folder).select(query)
+    return catalog(place).select(query)

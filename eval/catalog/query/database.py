@@ -35,6 +35,10 @@ _QUOTED: Final = re.compile(r'"([^"]+)"')
 _SCHEMA: Final = "crosscue query --schema lists all"
 
 
+class FailedError(UsageError):
+    """A query that is right in itself failed on the rows that it met."""
+
+
 def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Table:
     """The result of one SELECT.
 
@@ -45,6 +49,7 @@ def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Tabl
 
     Raises:
         UsageError: No single SELECT, or one that names what does not exist; the nearest is named.
+        FailedError: It fails on a row, or a file cannot be read.
     """
     import duckdb
 
@@ -60,9 +65,12 @@ def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Tabl
         columns = _columns(tables.values())
         try:
             _check(database, sql)
-            return database.sql(sql).to_arrow_table()
         except duckdb.Error as error:
             raise UsageError(_message(error, sorted(known), columns)) from None
+        try:
+            return database.sql(sql).to_arrow_table()
+        except duckdb.Error as error:
+            raise FailedError(_message(error, sorted(known), columns)) from None
 
 
 def _columns(contents: Iterable[Any]) -> list[str]:

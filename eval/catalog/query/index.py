@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from crosscue.replay.base import OutputError, UnreadableRunError
+from crosscue.replay.remote.logs import is_remote
 
 from .columns import INDEXED, arrow_schema
 from .local import CUT_SHORT, Found
@@ -67,6 +68,10 @@ class Runs(Protocol):
 
     def place(self, run: str, file: str) -> str:
         """Where a file lies in ``filesystem``."""
+        ...
+
+    def path(self, run: str) -> Path:
+        """The folder of a run."""
         ...
 
 
@@ -139,7 +144,7 @@ def _path_of(runs: Runs) -> Path:
     if runs.home is not None:
         return runs.home / NAME
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    whole = runs.name if "://" in runs.name else str(Path(runs.name).resolve())
+    whole = runs.name if is_remote(runs.name) else str(Path(runs.name).resolve())
     key = hashlib.sha256(os.fsencode(whole)).hexdigest()[:32]
     return Path(base, "crosscue", "catalogs", key)
 

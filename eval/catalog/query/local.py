@@ -91,6 +91,10 @@ class LocalRuns:
         """Where a file lies in ``filesystem``."""
         return str(self.folder / run / file)
 
+    def path(self, run: str) -> Path:
+        """The folder of a run."""
+        return self.folder / run
+
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
         """For Arrow."""

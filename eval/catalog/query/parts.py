@@ -37,7 +37,6 @@ class Parts:
     """One table over many runs.
 
     Attributes:
-        dataset: Its rows.
         left_out: By run, why its file could not be read.
     """
 
@@ -55,11 +54,13 @@ class Parts:
         import pyarrow.dataset as ds
 
         self.left_out: Final[dict[str, str]] = {}
+        self._places: Final = runs
+        self._filesystem: Final = filesystem
         scan = ds.ParquetFragmentScanOptions(pre_buffer=True, page_checksum_verification=True)
-        form = ds.ParquetFileFormat(default_fragment_scan_options=scan)
+        self._form: Final = ds.ParquetFileFormat(default_fragment_scan_options=scan)
+        self._fragments: Final[dict[str, ds.Fragment]] = {}
         schema = pa.schema([("run", pa.string())])
-        fragments = []
-        for run, fragment, found in _opened(runs, filesystem, form):
+        for run, fragment, found in _opened(runs, filesystem, self._form):
             try:
                 if isinstance(found, Exception):
                     raise found
@@ -67,10 +68,32 @@ class Parts:
             except (OSError, pa.ArrowException) as error:
                 self.left_out[run] = _why(runs[run], error)
                 continue
-            fragments.append(fragment)
-        if not fragments:
-            schema = arrow_schema(OWN[table])
-        self.dataset: Final = ds.FileSystemDataset(fragments, schema, form, filesystem)
+            self._fragments[run] = fragment
+        self._schema: Final = schema if self._fragments else arrow_schema(OWN.get(table, {}))
+
+    @property
+    def dataset(self) -> ds.Dataset:
+        """The rows of all runs whose file can be read."""
+        import pyarrow.dataset as ds
+
+        fragments = list(self._fragments.values())
+        return ds.FileSystemDataset(fragments, self._schema, self._form, self._filesystem)
+
+    def drop_damaged(self) -> int:
+        """Read every file whole and leave out those that cannot be read; how many there were."""
+        import pyarrow as pa
+
+        damaged = {}
+        for run, fragment in self._fragments.items():
+            try:
+                for _ in fragment.to_batches():
+                    pass
+            except (OSError, pa.ArrowException) as error:
+                damaged[run] = _why(self._places[run], error)
+        for run in damaged:
+            del self._fragments[run]
+        self.left_out.update(damaged)
+        return len(damaged)
 
 
 def _opened(

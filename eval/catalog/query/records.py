@@ -175,7 +175,9 @@ def _run_row(
         "conditions": sorted({tag for one in results for tag in one["conditions"]}),
         "start_ns": segments[0].start_ns if segments else None,
         "end_ns": segments[-1].end_ns if segments else None,
-        "made_at": _EPOCH + timedelta(microseconds=found.made_ns // 1000),
+        "made_at": _EPOCH + timedelta(microseconds=found.made_ns // 1000)
+        if found.made_ns
+        else None,
         "seconds": said.timings.seconds,
         "travelled_m": None if said.pose is None else said.pose.travelled_m,
         "frames": None if detect is None else detect.counts.frames,

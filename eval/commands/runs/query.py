@@ -26,7 +26,7 @@ from crosscue.replay.base import UsageError, visible
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("runs", metavar="RUNS", help="folder of runs, or one run")
+    parser.add_argument("runs", metavar="RUNS", help="folder or URL of runs, or one run")
     parser.add_argument("sql", nargs="?", metavar="SQL", help="one SELECT, in quotes")
     parser.add_argument("--schema", action="store_true", help="print tables and columns instead")
     shape = parser.add_mutually_exclusive_group()

@@ -197,3 +197,19 @@ def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
         crosscue.catalog(tmp_path)
     with pytest.raises(UnreadableRunError, match="no folder; give a folder of runs"):
         crosscue.catalog(tmp_path / "gone")
+
+
+def test_damage_that_shows_only_while_reading_costs_that_file_only(tmp_path: Path) -> None:
+    for name in ("good", "torn"):
+        add_run(tmp_path / name, name)
+    path = tmp_path / "torn/belief.parquet"
+    content = bytearray(path.read_bytes())
+    content[100:160] = bytes(255 - byte for byte in content[100:160])
+    path.write_bytes(content)
+    found = crosscue.catalog(tmp_path)
+
+    rows = found.query('select run, count("left") as n, sum(t_ns) > 0 as ok from belief group by 1')
+
+    assert rows.to_pylist() == [{"run": "good", "n": 50, "ok": True}]
+    assert found.left_out.keys() == {"torn"}
+    assert "belief.parquet: damaged" in found.left_out["torn"]

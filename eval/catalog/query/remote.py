@@ -1,0 +1,176 @@
+"""Runs on an object store, found by one listing and read by ranges; protocols are fsspec's."""
+
+from __future__ import annotations
+
+import hashlib
+import posixpath
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from crosscue.eval.runs.folder import MANIFEST, TAGS
+from crosscue.replay.base import UnreadableRunError, UsageError, one_line
+
+from .local import CUT_SHORT, SCORE, Found, Stamp, is_cut_short
+
+if TYPE_CHECKING:
+    import pyarrow.fs
+
+T = TypeVar("T")
+TIMES: Final = ("LastModified", "last_modified", "mtime", "updated", "created")
+"""What stores call the time of an object; the first that is there is taken."""
+VERSIONS: Final = ("ETag", "etag", "version_id", "generation", "md5Hash", *TIMES)
+"""What shows that an object is another one."""
+
+Infos = Mapping[str, Mapping[str, Any]]
+
+
+class RemoteRuns:
+    """The runs below a URL."""
+
+    home: Final = None
+    """Nothing is written to a store: its index lies in the cache."""
+
+    def __init__(self, url: str) -> None:
+        """Find the store.
+
+        Raises:
+            UnreadableRunError: There is no such protocol.
+        """
+        url_to_fs = import_module("fsspec.core").url_to_fs
+        self.name: Final = url
+        try:
+            system, root = url_to_fs(url)
+        except (ImportError, ValueError) as error:
+            raise UnreadableRunError(f"{url}: {one_line(error)}") from None
+        self._system: Final[Any] = system
+        self._root: Final = str(root).rstrip("/")
+        self._objects: dict[str, dict[str, Mapping[str, Any]]] = {}
+
+    def find(self) -> Iterator[Found]:
+        """Every run folder, whole or cut short.
+
+        Raises:
+            UnreadableRunError: The store cannot be asked.
+        """
+        # What an earlier catalog listed is kept by some stores' libraries.
+        self._system.invalidate_cache()
+        listed = self._asked(lambda: self._system.find(self._root, detail=True))
+        self._objects = _by_folder(self._root, listed)
+        found: list[str] = []
+        for folder in sorted(self._objects, key=lambda name: [*name.split("/")]):
+            names = self._objects[folder]
+            is_inside = any(_is_below(folder, run) for run in found[-1:])
+            if is_inside or any(part.startswith(".") and part != "." for part in folder.split("/")):
+                continue
+            if MANIFEST in names:
+                found.append(folder)
+                yield Found(folder, self._stamp(folder), _time_ns(names[MANIFEST]))
+            elif folder != "." and is_cut_short({*names}):
+                found.append(folder)
+                yield Found(folder, CUT_SHORT, 0)
+
+    def files(self, run: str) -> list[str]:
+        """Names of a run's tables, those of its score after them, and of its tags."""
+        own = [name for name in self._objects[run] if name.endswith(".parquet") or name == TAGS]
+        scored = self._objects.get(_joined(run, SCORE), {})
+        return sorted(own) + [
+            f"{SCORE}/{name}" for name in sorted(scored) if name.endswith(".parquet")
+        ]
+
+    def read(self, run: str, file: str) -> bytes:
+        """The content of one of its files.
+
+        Raises:
+            OSError: It cannot be read.
+        """
+        try:
+            return bytes(self._system.cat_file(self.place(run, file)))
+        except OSError:
+            raise
+        except Exception as error:  # each store's library has errors of its own
+            raise OSError(one_line(error)) from None
+
+    def place(self, run: str, file: str) -> str:
+        """Where a file lies in ``filesystem``."""
+        return f"{self._root}/{file}" if run == "." else f"{self._root}/{run}/{file}"
+
+    def path(self, run: str) -> Path:
+        """No folder of this machine.
+
+        Raises:
+            UsageError: Always.
+        """
+        raise UsageError(
+            f"{self.name}: runs on a store have no folder here; query the column run, or copy them"
+        )
+
+    @property
+    def filesystem(self) -> pyarrow.fs.FileSystem:
+        """For Arrow: what is read of an object is what was asked for, without reading ahead."""
+        import pyarrow as pa
+        import pyarrow.fs
+
+        class Ranged(pyarrow.fs.FSSpecHandler):  # type: ignore[misc]
+            def open_input_file(self, path: str) -> pa.PythonFile:
+                return pa.PythonFile(self.fs.open(path, mode="rb", cache_type="none"), mode="r")
+
+        return pyarrow.fs.PyFileSystem(Ranged(self._system))
+
+    def _stamp(self, run: str) -> Stamp:
+        own = self._objects[run]
+        others = {name: info for name, info in own.items() if name != MANIFEST}
+        scored = self._objects.get(_joined(run, SCORE), {})
+        size = int(own[MANIFEST].get("size") or 0)
+        return (_digest({MANIFEST: own[MANIFEST]}), size, _digest(others), _digest(scored))
+
+    def _asked(self, ask: Callable[[], T]) -> T:
+        """What a store answers; each store's library has errors of its own."""
+        try:
+            return ask()
+        except FileNotFoundError:
+            raise UnreadableRunError(f"{self.name}: nothing there; check the address") from None
+        except PermissionError as error:
+            line = one_line(error)
+            raise UnreadableRunError(
+                f"{self.name}: no permission ({line}); check credentials"
+            ) from None
+        except Exception as error:
+            kind = type(error).__name__
+            raise UnreadableRunError(
+                f"{self.name}: cannot be listed ({kind}: {one_line(error)}); try again"
+            ) from None
+
+
+def _by_folder(root: str, listed: Infos) -> dict[str, dict[str, Mapping[str, Any]]]:
+    folders: dict[str, dict[str, Mapping[str, Any]]] = defaultdict(dict)
+    for address, info in listed.items():
+        folder, _, name = posixpath.relpath(address, root).rpartition("/")
+        folders[folder or "."][name] = info
+    return folders
+
+
+def _is_below(folder: str, run: str) -> bool:
+    return run == "." or folder.startswith(f"{run}/")
+
+
+def _joined(run: str, folder: str) -> str:
+    return folder if run == "." else f"{run}/{folder}"
+
+
+def _digest(objects: Infos) -> int:
+    digest = hashlib.sha256()
+    for name, info in sorted(objects.items()):
+        version = next((str(info[key]) for key in VERSIONS if info.get(key) is not None), "")
+        digest.update(f"{name}\0{info.get('size')}\0{version}\0".encode())
+    return int.from_bytes(digest.digest()[:7])
+
+
+def _time_ns(info: Mapping[str, Any]) -> int:
+    time = next((info[key] for key in TIMES if info.get(key) is not None), 0)
+    if isinstance(time, datetime):
+        return int((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * 1e9)
+    return int(time * 1e9) if isinstance(time, int | float) else 0
