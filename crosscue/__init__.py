@@ -48,6 +48,8 @@ _EXPORTS: Final = {
     "compare_many": "eval.interface.runs.compare",
     "tag_runs": "eval.interface.runs.tags",
     "TaggedRuns": "eval.interface.runs.tags",
+    "history": "eval.interface.runs.history",
+    "History": "eval.catalog.history",
     "catalog": "eval.catalog.query.catalog",
     "Catalog": "eval.catalog.query.catalog",
     "save_recording": "eval.interface.runs.recording",
@@ -210,6 +212,7 @@ if TYPE_CHECKING:
     from crosscue.eval.batch.drive_list import DriveList as DriveList
     from crosscue.eval.catalog.compare import Comparison as Comparison
     from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
+    from crosscue.eval.catalog.history import History as History
     from crosscue.eval.catalog.query.catalog import Catalog as Catalog
     from crosscue.eval.catalog.query.catalog import catalog as catalog
     from crosscue.eval.failures.record import Failure as Failure
@@ -281,6 +284,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.compare import compare_runs as compare_runs
     from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
     from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
+    from crosscue.eval.interface.runs.history import history as history
     from crosscue.eval.interface.runs.make import detect_drive as detect_drive
     from crosscue.eval.interface.runs.make import estimate_run as estimate_run
     from crosscue.eval.interface.runs.make import replay_drive as replay_drive

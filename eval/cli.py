@@ -45,6 +45,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "compare": ("runs.compare", "compare two runs, with tolerances"),
     "status": ("runs.status", "show how far batches of drives have come"),
+    "history": ("runs.history", "show metrics over versions, and where they changed"),
     "merge": ("runs.merge", "merge the runs of several batches into one folder of tables"),
     "tag": ("runs.tag", "set tags of runs, remove them, or list them"),
     "query": ("runs.query", "ask all runs below a folder with SQL"),

@@ -265,6 +265,28 @@ def _jackknife(kind: Kind, sums: _Sums) -> tuple[float, int]:
     return math.sqrt((n - 1) / n * float(((known - known.mean()) ** 2).sum())), n
 
 
+def pooled(
+    kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]
+) -> tuple[float, float, int]:
+    """A metric over drives, half its 95 % interval by leaving out each drive, and how many.
+
+    Args:
+        kind: Of the metric.
+        total: Shape (G,).
+        rows: Shape (G,); 0 for drives without the metric.
+    """
+    mine = rows > 0.0
+    total, rows, n = total[mine], rows[mine], int(mine.sum())
+    value = float(_value(kind, np.array(total.sum()), np.array(rows.sum())))
+    if n < MIN_CLUSTERS:
+        return (value if n else math.nan), math.nan, n
+    without = _value(kind, total.sum() - total, rows.sum() - rows)
+    if kind == "sum":
+        without = without * n / (n - 1)
+    sd = math.sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
+    return value, _t(n - 1, 0.95) * sd, n
+
+
 def _t(freedom: int, confidence: float) -> float:
     from scipy.special import stdtrit
 

@@ -63,6 +63,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("query", "RUNS"): ("{gone} --schema", INPUT),
     ("tag", "RUN"): ("{gone} weather=rain", INPUT),
     ("status", "RUNS"): ("{gone}", INPUT),
+    ("history", "RUNS"): ("{gone}", INPUT),
     ("fit messages", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
     ("fit signs", "LABELS"): ("{gone}.csv --label stop", INPUT),
     ("fit ranges", "TABLE"): ("{gone} --cue stop_sign", INPUT),
@@ -180,7 +181,7 @@ FOLDERS: Final = {
     ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"),
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
     ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
-    ("merge", "RUNS"), ("query", "RUNS"), ("status", "RUNS"),
+    ("merge", "RUNS"), ("query", "RUNS"), ("status", "RUNS"), ("history", "RUNS"),
 }  # fmt: skip
 """An empty folder in their place lacks a file, which is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {

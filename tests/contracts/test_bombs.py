@@ -60,6 +60,7 @@ OPENS_NONE: dict[str, str] = {
     "compare": "tables", "query": "tables", "tag": "texts", "merge": "tables",
     "status": "the journal",
     "fit ranges": "tables", "fit messages": "tables", "fit temporal": "tables",
+    "history": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
     "train mask-rcnn": "pictures", "train frames": "nothing", "truth schema": "nothing",
     "run schema": "nothing",

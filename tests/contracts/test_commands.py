@@ -33,6 +33,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "query": ("gone --schema", INPUT),
     "tag": ("gone", INPUT),
     "status": ("gone", INPUT),
+    "history": ("gone -o out.html", INPUT),
     "view": ("gone -o x.rrd", INPUT),
     "failures": ("gone", INPUT),
     "browse": ("gone -o site", INPUT),

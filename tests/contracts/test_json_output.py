@@ -39,6 +39,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "query": ("runs SQL", 0),
     "tag": ("runs/a weather=rain", 0),
     "status": ("runs", 0),
+    "history": ("runs --by version", 0),
     "truth check": ("TRUTH --log LOG", 0),
     "truth schema": ("", 0),
     "run schema": ("", 0),

@@ -20,6 +20,7 @@ CALLS: Final = {
     "seal": ("seal", "check_seal"),
     "decode": ("decode",),
     "merge": ("merge",),
+    "history": ("history",),
     "query": ("catalog",),
     "tag": ("tag_runs",),
     "status": ("batch_status",),

@@ -1,0 +1,238 @@
+"""Every metric over the versions, commits or tags that the runs of a catalog were made with."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.by_drive import DriveMetric, Kind, direction
+from crosscue.eval.scoring.change_points import (
+    FALSE_ALARMS,
+    MIN_DRIVES,
+    SHUFFLES,
+    ChangePoint,
+    Results,
+    change_points,
+)
+from crosscue.replay.base import EmptyResultError, visible
+
+from .paired import pooled
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+BY: Final[Mapping[str, str]] = {"commit": "crosscue_commit", "version": "crosscue"}
+"""From what a history may go by to the column of ``runs``; any other name is a tag's."""
+
+
+class Asked(Protocol):
+    """A catalog of runs."""
+
+    def query(self, sql: str) -> pa.Table:
+        """The rows that a query selects."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A metric under one version.
+
+    Attributes:
+        value: Pooled over its drives; NaN where none has it.
+        low: Lower end of the 95 % interval, over drives; NaN below four.
+        high: Its upper end.
+        drives: How many it stands on.
+    """
+
+    value: float
+    low: float
+    high: float
+    drives: int
+
+
+@dataclass(frozen=True, slots=True)
+class MetricHistory:
+    """A metric over all versions.
+
+    Attributes:
+        path: Its name.
+        better: Its good direction.
+        points: One for each version.
+        changes: Where it changed.
+    """
+
+    path: str
+    better: str
+    points: tuple[Point, ...]
+    changes: tuple[ChangePoint, ...]
+
+    def is_better(self, change: ChangePoint) -> bool:
+        """Is it better from this change point on, over the drives on both sides?"""
+        return (change.by > 0.0) == (self.better == "higher")
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class History:
+    """Metrics over versions; printed as ``crosscue history`` prints them.
+
+    Attributes:
+        by: What the versions are: ``commit``, ``version`` or a tag's name.
+        versions: In the order in which their first run was made.
+        drives: How many drives each has scored runs of.
+        metrics: Those that were scored, with changed ones first.
+        left_out: Why runs take no part, and how many.
+    """
+
+    by: str
+    versions: tuple[str, ...]
+    drives: tuple[int, ...]
+    metrics: tuple[MetricHistory, ...]
+    left_out: Mapping[str, int]
+
+    @property
+    def changed(self) -> tuple[MetricHistory, ...]:
+        """Metrics with a change point."""
+        return tuple(one for one in self.metrics if one.changes)
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue history --json`` prints."""
+        return asdict(self)
+
+    def __repr__(self) -> str:
+        return "\n".join(map(visible, _lines(self)))
+
+
+def _lines(found: History) -> Iterator[str]:
+    for one in found.changed:
+        for change in one.changes:
+            word = "better" if one.is_better(change) else "WORSE"
+            before, after = (one.points[change.at + i].value for i in (-1, 0))
+            yield (
+                f"{word:11}{one.path}: {before:.4g} -> {after:.4g} from {found.by} "
+                f"{found.versions[change.at]} on (p {change.p:.2g})"
+            )
+    for why, count in found.left_out.items():
+        yield f"left out   {count} runs {why}"
+    yield (
+        f"history    {len(found.metrics)} metrics over {len(found.versions)} "
+        f"{'versions' if found.by == 'version' else found.by + 's'}; {len(found.changed)} changed"
+    )
+
+
+def history_of(catalog: Asked, by: str, patterns: Sequence[str] = ()) -> History:
+    """The history of every judged metric.
+
+    Args:
+        catalog: The runs.
+        by: ``commit``, ``version``, or the name of a tag.
+        patterns: Of metrics' names; none means all.
+
+    Raises:
+        EmptyResultError: No scored run says which version it is of, or no metric fits.
+    """
+    runs = _runs(catalog, by)
+    left_out = {
+        "without a score": sum(not one["is_scored"] for one in runs),
+        f"without a {by}": sum(one["is_scored"] and one["version"] is None for one in runs),
+    }
+    usable = [one for one in runs if one["is_scored"] and one["version"] is not None]
+    if not usable:
+        raise EmptyResultError(
+            f"history: no scored run of {len(runs)} has a {by}; score them, or give another --by"
+        )
+    # The latest run of a drive under a version stands for it.
+    chosen = {(one["version"], one["identity"]): one["run"] for one in usable}
+    left_out["replaced by a later run of the same drive"] = len(usable) - len(chosen)
+    versions = list(dict.fromkeys(one["version"] for one in usable))
+    place = {run: versions.index(version) for (version, _), run in chosen.items()}
+    parts = _parts(catalog, place, patterns)
+    if not parts:
+        raise EmptyResultError(
+            f"history: no judged metric fits {', '.join(patterns) or 'any name'}; see score --json"
+        )
+    counts = [sum(at == i for at in place.values()) for i in range(len(versions))]
+    return History(
+        by,
+        tuple(versions),
+        tuple(counts),
+        _metrics(parts, len(versions)),
+        {why: count for why, count in left_out.items() if count},
+    )
+
+
+def limits() -> dict[str, object]:
+    """What a change point means, in numbers."""
+    return {
+        "shuffles": SHUFFLES,
+        "alarms": round(100.0 * FALSE_ALARMS),
+        "min_drives": MIN_DRIVES,
+    }
+
+
+def _runs(catalog: Asked, by: str) -> list[dict[str, Any]]:
+    column = BY.get(by, "tags['{}']".format(by.replace("'", "''")))
+    # The name is quoted, and a query can reach nothing but the catalog's tables.
+    sql = (
+        f"select run, coalesce(identity, run) as identity, is_scored, {column} as version "  # noqa: S608
+        "from runs order by made_at, run"
+    )
+    rows: list[dict[str, Any]] = catalog.query(sql).to_pylist()
+    return rows
+
+
+def _parts(
+    catalog: Asked, place: Mapping[str, int], patterns: Sequence[str]
+) -> dict[str, list[tuple[int, DriveMetric]]]:
+    """By metric, each drive's part with the place of its version."""
+    found: dict[str, list[tuple[int, DriveMetric]]] = {}
+    table = catalog.query(
+        "select s.run, coalesce(r.identity, r.run) as log, metric, kind, total, rows "
+        "from scores s join runs r on s.run = r.run order by metric, s.run"
+    )
+    wanted: dict[str, bool] = {}
+    for row in table.to_pylist():
+        path, run = row["metric"], row.pop("run")
+        if path not in wanted:
+            fits = not patterns or any(fnmatch.fnmatchcase(path, one) for one in patterns)
+            wanted[path] = fits and direction(path) is not None
+        if wanted[path] and run in place:
+            found.setdefault(path, []).append((place[run], DriveMetric(**row)))
+    return found
+
+
+def _metrics(
+    parts: Mapping[str, Sequence[tuple[int, DriveMetric]]], versions: int
+) -> tuple[MetricHistory, ...]:
+    logs = {log: i for i, log in enumerate(sorted({m.log for of in parts.values() for _, m in of}))}
+    sums = {}
+    for path, of in parts.items():
+        total, rows = np.zeros((len(logs), versions)), np.zeros((len(logs), versions))
+        for at, one in of:
+            total[logs[one.log], at] += one.total
+            rows[logs[one.log], at] += one.rows
+        sums[path] = (of[0][1].kind, total, rows)
+    changes = change_points({path: _results(*one) for path, one in sums.items()})
+    found = []
+    for path, (kind, total, rows) in sums.items():
+        points = tuple(_point(kind, total[:, at], rows[:, at]) for at in range(versions))
+        found.append(MetricHistory(path, str(direction(path)), points, changes[path]))
+    return tuple(sorted(found, key=lambda one: (not one.changes, one.path)))
+
+
+def _results(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> Results:
+    is_known = rows > 0.0
+    values = np.divide(total, rows, out=np.full(total.shape, math.nan), where=is_known)
+    known = is_known.sum(axis=1)
+    weights = np.divide(rows.sum(axis=1), known, out=np.zeros(len(rows)), where=known > 0)
+    return Results(total if kind == "sum" else values, weights)
+
+
+def _point(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> Point:
+    value, half, drives = pooled(kind, total, rows)
+    return Point(value, value - half, value + half, drives)

@@ -1,0 +1,202 @@
+"""Where a metric changed in a history of versions, judged drive by drive.
+
+If nothing changed, it is arbitrary which of a drive's results came from which version. Shuffling
+the results of each drive among the versions it was replayed with shows by how much chance alone
+makes the versions before some split differ from those after it: the permutation test of
+``crosscue compare``, for more than two versions. A split's difference is the mean over drives,
+weighted by their rows, in units of its own spread; the largest over all splits and metrics counts
+(Westfall, Young, *Resampling-Based Multiple Testing*, 1993). If it is larger than in 95 % of the
+shuffles, that split is a change point, and what lies before and after it is searched in the same
+manner, all such parts together (binary segmentation; Vostrikova, *Soviet Mathematics Doklady* 24,
+1981). So a history in which nothing changed shows any change point in at most 5 % of cases, and so
+does each further round of the search. At the end each change point is tested once more between its
+neighbors, and one that they explain is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+FALSE_ALARMS: Final = 0.05
+MIN_DRIVES: Final = 6
+"""With results on both sides of a split; fewer decide nothing, as in a comparison."""
+SHUFFLES: Final = 1000
+SEED: Final = 0
+ROUNDING: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Results:
+    """One metric of G drives under V versions.
+
+    Attributes:
+        values: Shape (G, V); NaN where a drive has none.
+        weights: Shape (G,): rows that a drive's values stand on.
+    """
+
+    values: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class ChangePoint:
+    """A change of one metric.
+
+    Attributes:
+        at: The first version, by its place, that differs from those before.
+        p: How often chance makes any metric differ so much at any split.
+        by: How much more it is from there on than before, up to the next change points; mean over
+            the drives on both sides.
+    """
+
+    at: int
+    p: float
+    by: float
+
+
+def change_points(results: Mapping[str, Results]) -> dict[str, tuple[ChangePoint, ...]]:
+    """The change points of every metric, in order; see the head of this file.
+
+    Args:
+        results: By metric; all with the same drives and versions.
+    """
+    found: dict[str, list[ChangePoint]] = {name: [] for name in results}
+    spans = [_Span(name, 0, one.values.shape[1]) for name, one in results.items()]
+    while spans:
+        points = list(_found_in(spans, results))
+        for span, point in points:
+            found[span.name].append(point)
+        spans = [
+            half
+            for span, point in points
+            for half in (replace(span, end=point.at), replace(span, first=point.at))
+        ]
+    return {name: _confirmed(sorted(points), results[name]) for name, points in found.items()}
+
+
+def _confirmed(points: Sequence[ChangePoint], one: Results) -> tuple[ChangePoint, ...]:
+    """Those that still stand between their neighbors: a first split may lie beside the change."""
+    edges = [0, *(point.at for point in points), one.values.shape[1]]
+    kept = []
+    for i, point in enumerate(points):
+        first, end = edges[i], edges[i + 2]
+        differences = _differences(one.values[:, first:end], one.weights)
+        if differences is None:
+            continue
+        of_split = differences[:, point.at - first - 1]
+        far = abs(of_split[0]) * (1.0 - ROUNDING)
+        if (np.abs(of_split) >= far).mean() <= FALSE_ALARMS:
+            kept.append(replace(point, by=float(of_split[0])))
+    return tuple(kept)
+
+
+@dataclass(frozen=True, slots=True)
+class _Span:
+    """Some versions of a metric, from ``first`` up to ``end``, not included."""
+
+    name: str
+    first: int
+    end: int
+
+
+def _found_in(
+    spans: Sequence[_Span], results: Mapping[str, Results]
+) -> Iterator[tuple[_Span, ChangePoint]]:
+    """The clearest split of each span where chance over all spans is ruled out."""
+    statistics = {}
+    for span in spans:
+        one = results[span.name]
+        scaled = _statistics(one.values[:, span.first : span.end], one.weights)
+        if scaled is not None:
+            statistics[span] = scaled
+    if not statistics:
+        return
+    largest = np.max([one.max(axis=1) for one in statistics.values()], axis=0)
+    for span, scaled in statistics.items():
+        split = int(scaled[0].argmax())
+        p = float((largest >= scaled[0, split] - ROUNDING).mean())
+        if p <= FALSE_ALARMS:
+            yield span, ChangePoint(span.first + split + 1, p, math.nan)
+
+
+def _statistics(
+    values: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Difference at every split, in units of its spread, for every shuffle.
+
+    Shape (S, V - 1), the first row unshuffled; None where too few drives decide, or none differs.
+    """
+    signed = _differences(values, weights)
+    if signed is None:
+        return None
+    differences = np.abs(signed)
+    spread = np.sqrt((differences**2).mean(axis=0))
+    if not (spread > ROUNDING).any():
+        return None
+    is_apart = spread > ROUNDING
+    found: NDArray[np.float64] = np.where(is_apart, differences, 0.0) / np.where(
+        is_apart, spread, 1.0
+    )
+    return found
+
+
+def _differences(
+    values: NDArray[np.float64], weights: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """After minus before at every split, for every shuffle, as above."""
+    is_known = np.isfinite(values)
+    weight = _split_weights(is_known, weights)
+    if weight is None:
+        return None
+    shuffled = _shuffled(np.where(is_known, values, 0.0), is_known)
+    found: NDArray[np.float64] = np.tensordot(shuffled, weight, axes=([1, 2], [1, 2]))
+    return found
+
+
+def _split_weights(
+    is_known: NDArray[np.bool_], weights: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """What each value adds to the difference at each split: shape (V - 1, G, V)."""
+    versions = is_known.shape[1]
+    if versions < 2:
+        return None
+    place = np.arange(versions)
+    whole = np.zeros((versions - 1, *is_known.shape))
+    for split in range(1, versions):
+        sides = [is_known & (place < split), is_known & (place >= split)]
+        counts = [side.sum(axis=1) for side in sides]
+        both = (counts[0] > 0) & (counts[1] > 0) & (weights > 0.0)
+        if both.sum() < MIN_DRIVES:
+            continue
+        fraction = np.where(both, weights, 0.0) / weights[both].sum()
+        before, after = (
+            side * (fraction / np.maximum(count, 1))[:, None]
+            for side, count in zip(sides, counts, strict=True)
+        )
+        whole[split - 1] = after - before
+    return whole if whole.any() else None
+
+
+def _shuffled(values: NDArray[np.float64], is_known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Each drive's values among the versions that it has: shape (S, G, V); the first as they are.
+
+    The same shuffles for every metric of a drive: metrics that depend on each other still do.
+    """
+    chance = np.random.default_rng(SEED)
+    keys = chance.random((SHUFFLES, *values.shape))
+    place = np.arange(values.shape[1])
+    keys[0] = place
+    # A version that a drive lacks stays where it is: its key sorts it to its own place.
+    order = np.broadcast_to(place, keys.shape).copy()
+    for drive, known in enumerate(is_known):
+        there = np.flatnonzero(known)
+        order[:, drive, there] = there[np.argsort(keys[:, drive, there], axis=1)]
+    drives = np.arange(len(values))[None, :, None]
+    found: NDArray[np.float64] = values[drives, order]
+    return found

@@ -1,0 +1,149 @@
+"""A metric over versions: what the page and the command show of it."""
+
+import json
+import math
+import os
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.eval.runs.folder import create, write_manifest
+from crosscue.eval.runs.tags import write_tags
+from crosscue.eval.scoring.by_drive import DriveMetric, table_of
+from support.manifests import estimated
+from support.scoring import log_row
+
+RECALL, BRIER = "cues.stop_sign.recall", "belief.left.brier"
+MODELS = ("m0", "m1", "m2", "m3")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight drives under four models, of which the third finds fewer signs; one has no score."""
+    folder = tmp_path_factory.mktemp("fleet")
+    chance = np.random.default_rng(2)
+    for at, model in enumerate(MODELS):
+        for drive in range(8):
+            run = create(folder / f"{9 - at}-{drive}", overwrite=False)
+            log = folder / f"drive{drive}.mcap"
+            log.write_text(f"drive {drive}")
+            write_manifest(run, estimated(logs=(log_row(log, run),)))
+            os.utime(run.path / "manifest.json", (1.7e9 + at, 1.7e9 + at))
+            write_tags(run.path, {"model": model})
+            if (model, drive) == ("m3", 7):
+                continue
+            right = 70.0 + 2.0 * drive + chance.integers(0, 3) - 15.0 * (at >= 2)
+            parts = [
+                DriveMetric(f"drive {drive}", RECALL, "mean", right, 100),
+                DriveMetric(f"drive {drive}", BRIER, "mean", 5.0 + chance.normal(), 100),
+                DriveMetric(f"drive {drive}", "cues.stop_sign.positives", "sum", 9.0, 1),
+            ]
+            (run.path / "score").mkdir()
+            pq.write_table(table_of(iter(parts)), run.path / "score" / "by_drive.parquet")
+    return folder
+
+
+class Words(HTMLParser):
+    """Text of a page, and what it would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.text = ""
+        self.loaded: list[str] = []
+
+    def handle_data(self, data: str) -> None:
+        """Keep it."""
+        self.text += f" {data.strip()}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Note what would be loaded."""
+        self.loaded += [tag] if tag in ("script", "link", "img", "iframe") else []
+
+
+def test_the_page_shows_each_metric_and_where_it_changed(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "history.html"
+
+    assert cli.run(["history", str(fleet), "--by", "model", "-o", str(page)]) == 0
+
+    said = capsys.readouterr().out
+    assert re.search(rf"WORSE +{re.escape(RECALL)}: 0\.7\d+ -> 0\.6\d+ from model m2 on", said)
+    assert "2 metrics over 4 models; 1 changed" in said
+    assert "left out   1 runs without a score" in said
+    words = Words()
+    words.feed(page.read_text())
+    assert f"{RECALL} m2 worse" in " ".join(words.text.split())
+    assert page.read_text().count("<svg") == 2
+    assert not words.loaded
+    first = page.read_bytes()
+    assert cli.run(["history", str(fleet), "--by", "model", "-o", str(page)]) == 1
+    argv = ["history", str(fleet), "--by", "model", "-o", str(page), "--overwrite", "-q"]
+    assert cli.run(argv) == 0
+    assert page.read_bytes() == first
+
+
+def test_points_have_intervals_and_drives(fleet: Path) -> None:
+    found = crosscue.history(fleet, by="model", metrics=["*.recall"])
+
+    assert found.versions == MODELS
+    assert found.drives == (8, 8, 8, 7)
+    (one,) = found.metrics
+    assert [change.at for change in one.changes] == [2]
+    assert one.changes[0].by == pytest.approx(-0.15, abs=0.02)
+    assert not one.is_better(one.changes[0])
+    for point in one.points:
+        assert point.low < point.value < point.high
+    assert one.points[3].drives == 7
+
+
+def test_one_version_has_points_and_no_change(
+    fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["history", str(fleet), "--by", "version", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+
+    assert len(found["versions"]) == 1
+    assert all(not one["changes"] for one in found["metrics"])
+    # Four runs of each drive: the latest stands for it.
+    assert found["left_out"]["replaced by a later run of the same drive"] == 31 - found["drives"][0]
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "what"),
+    [
+        (["--by", "no_such_tag"], 1, "no scored run of 32 has a no_such_tag"),
+        (["--by", "it's"], 1, "no scored run of 32 has a it's"),
+        (["--by", "model", "--metrics", "x.*"], 1, "no judged metric fits x.*"),
+    ],
+)
+def test_what_has_no_history_is_one_line(
+    fleet: Path, words: list[str], status: int, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["history", str(fleet), *words]) == status
+    said = capsys.readouterr().err
+    assert what in said
+    assert said.count("\n") == 1
+
+
+def test_names_cannot_break_out_of_the_page(fleet: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "hostile"
+    run = create(folder / "a", overwrite=False)
+    write_manifest(run, estimated())
+    write_tags(run.path, {"model": "<script>alert(1)</script>"})
+    (run.path / "score").mkdir()
+    part = DriveMetric("d", "cues.<b>.recall", "mean", 1.0, 2)
+    pq.write_table(table_of(iter([part])), run.path / "score" / "by_drive.parquet")
+
+    found = crosscue.history(folder, tmp_path / "page.html", "model")
+
+    text = (tmp_path / "page.html").read_text()
+    assert "<script" not in text
+    assert "<b>" not in text
+    assert math.isnan(found.metrics[0].points[0].low)
