@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import os
 import re
 import shlex
 from collections.abc import Iterator, Sequence
@@ -30,7 +31,7 @@ from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
 from crosscue.replay.remote.logs import is_remote, matches
 
-from .shards import Shard
+from .shards import Shard, read_shard
 
 VEHICLE: Final = "vehicle.toml"
 TRUTH: Final = "truth.json"
@@ -126,14 +127,27 @@ class _Found:
     beside: Path | None
 
 
-def drives_of(arguments: Sequence[str], *, each: bool = False) -> DriveList:
+def drives_of(
+    arguments: Sequence[str], *, each: bool = False, shard: str | None = None
+) -> DriveList:
     """The drives that LOG arguments mean; see the head of this file.
+
+    Args:
+        arguments: At least one.
+        each: Every one is a drive, or a folder of drives.
+        shard: Which part of the drives, see ``read_shard``; None for all.
 
     Raises:
         UsageError: Nothing matches, a list that cannot be read, a drive named twice, or a folder
             that may be one drive or several.
         LogError: A place that is not there or may not be looked into.
     """
+    part = None if shard is None else read_shard(shard, os.environ)
+    found = _all_of(arguments, each=each)
+    return found if part is None else found.part(part)
+
+
+def _all_of(arguments: Sequence[str], *, each: bool) -> DriveList:
     is_many = each or any(_is_plural(text) for text in arguments)
     if not is_many and len(arguments) > 1:
         return DriveList(tuple(_named([_Found(tuple(arguments), None)])), False)

@@ -34,7 +34,7 @@ from crosscue.replay.base import (
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
 
-from .journal import beating, read_entry, write_entry
+from .journal import beating, error_of, read_entry, write_entry, write_plan
 
 
 class Result(Protocol):
@@ -193,6 +193,23 @@ def run_many(
                     failed += done.error is not None
                 tell()
     return tuple(found[job.name] for job in jobs)
+
+
+def planned(
+    folder: Path, jobs: Sequence[Job], part: str, *, retry_failed: bool = False
+) -> Sequence[Job]:
+    """The jobs that a start is about to work on, written down so that others see what is left.
+
+    Args:
+        folder: Of the run folders.
+        jobs: All of them.
+        part: ``all``, or which shard they are.
+        retry_failed: Only those whose last attempt failed; what was planned stays so.
+    """
+    if retry_failed:
+        return [job for job in jobs if error_of(job.run) is not None]
+    write_plan(folder, [job.name for job in jobs], part)
+    return jobs
 
 
 def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:

@@ -20,8 +20,6 @@ from crosscue.replay.base import json_tree, strict_json, write_text
 JOURNAL: Final = ".drives"
 PLANS: Final = "plans"
 FORMAT_VERSION: Final = 2
-MERGED: Final = "merged"
-"""What the merged run is called among those that it was made of."""
 BEAT_S: Final = 10.0
 
 

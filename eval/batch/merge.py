@@ -42,8 +42,7 @@ from crosscue.replay.base import (
     strict_json,
 )
 
-from .journal import MERGED
-from .status import NO_RUN, unfinished
+from .status import MERGED, NO_RUN, unfinished
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -12,8 +12,10 @@ from typing import Final
 from crosscue.eval.runs.folder import FAILURE, MANIFEST, is_alive
 from crosscue.replay.base import UnreadableRunError
 
-from .journal import BEAT_S, MERGED, has_journal, names_in, read_entry, silent_s, started_s
+from .journal import BEAT_S, has_journal, names_in, read_entry, silent_s, started_s
 
+MERGED: Final = "merged"
+"""What the merged run is called among those that it was made of."""
 STALE_S: Final = 12.0 * BEAT_S
 """A worker of another machine that has been silent so long is taken for dead."""
 WINDOW_S: Final = 3600.0

@@ -27,7 +27,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import print_result
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,8 +70,8 @@ def _compared(args: argparse.Namespace) -> crosscue.Comparison:
     queries = [args.runs, args.against]
     if queries == [None, None]:
         if args.second is None:
-            raise UsageError("compare: expected two runs, or --runs and --against")
+            raise crosscue.UsageError("compare: expected two runs, or --runs and --against")
         return crosscue.compare_runs(args.first, args.second, args.tolerance, args.junit)
     if None in queries or args.second is not None:
-        raise UsageError("compare: expected one folder with both --runs and --against")
+        raise crosscue.UsageError("compare: expected one folder with both --runs and --against")
     return crosscue.compare_many(args.runs, args.against, args.first, args.tolerance, args.junit)

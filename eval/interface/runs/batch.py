@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +14,10 @@ from crosscue.eval.batch.jobs import (
     Progress,
     exit_status_of,
     fingerprint_of,
+    planned,
     run_many,
 )
-from crosscue.eval.batch.journal import error_of, write_plan
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
-from crosscue.eval.batch.shards import read_shard
 from crosscue.eval.interface.logs.log import open as open_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import FAILURE, create
@@ -183,9 +181,7 @@ def find_drives(*logs: Path | str, each: bool = False, shard: str | None = None)
             neither or of one drive.
         LogError: A place that is not there or may not be looked into.
     """
-    part = None if shard is None else read_shard(shard, os.environ)
-    found = drives_of([str(log) for log in logs], each=each)
-    return found if part is None else found.part(part)
+    return drives_of([str(log) for log in logs], each=each, shard=shard)
 
 
 def replay_drives(
@@ -259,11 +255,8 @@ def replay_drives(
         for one in found.drives
     ]
     shard = "" if found.shard is None else f"{found.shard} of {found.of} drives"
-    if retry_failed:
-        jobs = [job for job in jobs if error_of(job.run) is not None]
-    else:
-        write_plan(folder, [job.name for job in jobs], str(found.shard or "all"))
-    done = run_many(jobs, work, engine, overwrite=overwrite, on_progress=on_progress)
+    asked = planned(folder, jobs, str(found.shard or "all"), retry_failed=retry_failed)
+    done = run_many(asked, work, engine, overwrite=overwrite, on_progress=on_progress)
     if shard:
         return ReplayedDrives(done, None, None, shard)
     why = None
