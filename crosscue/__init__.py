@@ -129,6 +129,8 @@ _EXPORTS: Final = {
     "ImportedTruth": "eval.fit.truth_check",
     "score_runs": "eval.interface.runs.scores",
     "ScoredRuns": "eval.interface.runs.scores",
+    "open_mlflow": "eval.interface.runs.tracking",
+    "MlflowSink": "eval.interface.runs.tracking",
     "score_detector": "eval.interface.runs.detector_scores",
     "DetectorScore": "eval.interface.runs.detector_scores",
     "simulate_approaches": "eval.interface.simulate",
@@ -304,6 +306,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.runs.tables import merge as merge
     from crosscue.eval.interface.runs.tags import TaggedRuns as TaggedRuns
     from crosscue.eval.interface.runs.tags import tag_runs as tag_runs
+    from crosscue.eval.interface.runs.tracking import MlflowSink as MlflowSink
+    from crosscue.eval.interface.runs.tracking import open_mlflow as open_mlflow
     from crosscue.eval.interface.simulate import SimulatedDrives as SimulatedDrives
     from crosscue.eval.interface.simulate import draw_contact_sheet as draw_contact_sheet
     from crosscue.eval.interface.simulate import draw_sign as draw_sign

@@ -107,11 +107,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_false",
         help="write a report without figures, in a fraction of the time",
     )
+    parser.add_argument(
+        "--mlflow",
+        metavar="URI",
+        help="also log scores, tags and report to the MLflow server or store at this address",
+    )
+    parser.add_argument(
+        "--experiment",
+        default="crosscue",
+        metavar="NAME",
+        help="experiment in MLflow (default: crosscue)",
+    )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Score every run, then all together; 1 for a failed gate, 3 when anything was dropped."""
+    # Opened first: an address that is wrong is reported before anything is scored.
+    sink = None if args.mlflow is None else crosscue.open_mlflow(args.mlflow, args.experiment)
     with progress_line(args, "scoring") as line:
 
         def on_run(scored: crosscue.ScoredRun) -> None:
@@ -148,6 +161,8 @@ def run(args: argparse.Namespace) -> int:
         print_json(found.as_dict())
     elif not args.quiet:
         print(f"\n{found}" if found.is_many else found)
+    if sink is not None:
+        sink.log(found)
     if found.has_failed_gate:
         return 1
     return 0 if found.is_whole else 3

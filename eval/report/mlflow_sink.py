@@ -1,0 +1,135 @@
+"""Scores in an MLflow tracking server or store.
+
+MLflow is imported here only, with its own telemetry off. Its client alone (``mlflow-skinny``) is
+enough for a server. A folder as a store has to be allowed in MLflow 3.17, which no longer develops
+such stores (``MLFLOW_ALLOW_FILE_STORE=true``); a database needs the full ``mlflow``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.replay.base import OutputError, UsageError, one_line
+
+MAX_METRICS: Final = 1000
+"""In one request."""
+MAX_VALUE: Final = 5000
+"""Characters of a tag's value."""
+_STRANGE: Final = re.compile(r"[^\w .:/-]")
+"""What names in MLflow may not hold."""
+SWITCHED: Final = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    # Seven retries with growing pauses would hold a command for minutes.
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """What becomes one run in MLflow.
+
+    Attributes:
+        name: Of the run.
+        metrics: By name; those that are no number are left out.
+        tags: By name.
+        files: Artifacts.
+    """
+
+    name: str
+    metrics: Mapping[str, float]
+    tags: Mapping[str, str]
+    files: Sequence[Path]
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """An experiment of a store that can be reached.
+
+    Attributes:
+        uri: Of the store.
+        client: MLflow's.
+        identity: Of the experiment.
+    """
+
+    uri: str
+    client: Any
+    identity: str
+
+    def log(self, one: Tracked) -> str:
+        """Write one run; its identity in MLflow comes back.
+
+        Raises:
+            OutputError: The store refuses, or can no longer be reached.
+        """
+        from mlflow.entities import Metric, RunTag
+
+        tags = [RunTag(fit(name), value[:MAX_VALUE]) for name, value in one.tags.items()]
+        metrics = [
+            Metric(fit(name), value, 0, 0)
+            for name, value in one.metrics.items()
+            if math.isfinite(value)
+        ]
+        with _reported(self.uri):
+            run: str = self.client.create_run(self.identity, run_name=one.name).info.run_id
+            self.client.log_batch(run, tags=tags)
+            for first in range(0, len(metrics), MAX_METRICS):
+                self.client.log_batch(run, metrics=metrics[first : first + MAX_METRICS])
+            for path in one.files:
+                self.client.log_artifact(run, str(path))
+            self.client.set_terminated(run)
+        return run
+
+
+def open_experiment(uri: str, experiment: str) -> Experiment:
+    """Reach a store, and find or make the experiment in it.
+
+    Raises:
+        UsageError: MLflow is not installed.
+        OutputError: The store cannot be reached or used.
+    """
+    for name, value in SWITCHED.items():
+        os.environ.setdefault(name, value)
+    try:
+        from mlflow.tracking import MlflowClient
+    except ImportError:
+        raise UsageError(
+            "--mlflow: MLflow is not installed; pip install 'crosscue[mlflow]'"
+        ) from None
+    with _reported(uri):
+        client = MlflowClient(tracking_uri=uri)
+        found = client.get_experiment_by_name(experiment)
+        identity = client.create_experiment(experiment) if found is None else found.experiment_id
+    return Experiment(uri, client, str(identity))
+
+
+@contextmanager
+def _reported(uri: str) -> Iterator[None]:
+    from mlflow.exceptions import MlflowException
+
+    try:
+        yield
+    except ImportError as error:
+        raise UsageError(
+            f"--mlflow {uri}: this store needs the full MLflow ({one_line(error)}); "
+            "pip install mlflow"
+        ) from None
+    except (MlflowException, OSError, ValueError) as error:
+        text = one_line(error)
+        if "MLFLOW_ALLOW_FILE_STORE" in text:
+            text = "MLflow no longer opens folders unless MLFLOW_ALLOW_FILE_STORE=true is set"
+        raise OutputError(
+            f"--mlflow {uri}: {text[:300]}; the scores are in their folders; give a server's URL"
+        ) from None
+
+
+def fit(name: str) -> str:
+    """A name that MLflow takes."""
+    return _STRANGE.sub("_", name)
