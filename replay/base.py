@@ -78,7 +78,7 @@ from .ledger import (
 from .limits import DEFAULT_LIMITS, MIB, Limits
 from .losses import LossWarning, losses_heard, warn_again, with_losses
 from .safe_text import visible
-from .versions import installed, versions
+from .versions import installed, versions, versions_and_commit
 
 __all__ = [
     "BLOCK_BYTES",
@@ -148,6 +148,7 @@ __all__ = [
     "strict_json",
     "toml_tree",
     "versions",
+    "versions_and_commit",
     "visible",
     "warn_again",
     "warn_of",

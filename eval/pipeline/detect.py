@@ -51,7 +51,15 @@ from crosscue.eval.runs.folder import (
 from crosscue.eval.runs.logs import input_of, is_simulated, log_names, log_rows
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.base import Block, Int64s, Ledger, Log, Selection, VehicleError, versions
+from crosscue.replay.base import (
+    Block,
+    Int64s,
+    Ledger,
+    Log,
+    Selection,
+    VehicleError,
+    versions_and_commit,
+)
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Source
@@ -193,7 +201,7 @@ def detect_into(
         write_manifest(
             run,
             DetectManifest(
-                versions=versions(),
+                versions=versions_and_commit(),
                 logs=log_rows(logs, run),
                 selection=part_of(selection),
                 settings=vehicle,

@@ -44,7 +44,7 @@ from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions
+from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions_and_commit
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
@@ -159,7 +159,7 @@ def estimate_into(
     write_manifest(
         run,
         EstimateManifest(
-            versions=versions(),
+            versions=versions_and_commit(),
             logs=_hashed(logs, run, found) if reported is None else tuple(reported),
             selection=part_of(selection),
             settings=vehicle,

@@ -1,15 +1,53 @@
-"""Versions of installed packages, found or not."""
+"""Which crosscue it was."""
 
-from __future__ import annotations
+import subprocess
+from pathlib import Path
 
-import numpy as np
+import pytest
 
-from crosscue.replay.base import installed
-
-
-def test_a_version_is_that_of_what_is_installed() -> None:
-    assert installed("numpy") == np.__version__
+from crosscue.replay.versions import commit, versions, versions_and_commit
 
 
-def test_a_package_that_cannot_be_looked_up_is_unknown() -> None:
-    assert installed("no-such-package-of-ours") == "unknown"
+def _git(folder: Path, *words: str) -> str:
+    """What git prints; its own settings do not count."""
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main"]
+    command = ["git", *identity, *words]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository of one commit."""
+    folder = tmp_path_factory.mktemp("checkout")
+    _git(folder, "init")
+    _git(folder, "commit", "--allow-empty", "-m", "first")
+    return folder
+
+
+def test_the_commit_is_what_git_says(checkout: Path) -> None:
+    head = _git(checkout, "rev-parse", "HEAD").strip()
+
+    assert commit(checkout) == head
+    _git(checkout, "pack-refs", "--all")
+    commit.cache_clear()
+    assert commit(checkout) == head
+    _git(checkout, "worktree", "add", "-b", "other", "../worktree")
+    assert commit(checkout.parent / "worktree") == head
+    _git(checkout, "checkout", "--detach")
+    commit.cache_clear()
+    assert commit(checkout) == head
+
+
+def test_a_folder_without_a_commit_has_none(tmp_path: Path) -> None:
+    (tmp_path / ".git").mkdir()
+    (tmp_path / ".git/HEAD").write_text("nonsense")
+
+    assert commit(tmp_path) is None
+
+
+def test_a_commit_is_beside_versions_and_not_among_them() -> None:
+    beside = versions_and_commit()
+
+    assert "crosscue_commit" not in versions()
+    assert versions().items() <= beside.items()
+    assert beside.keys() - versions().keys() <= {"crosscue_commit"}

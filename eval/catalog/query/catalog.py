@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _WORD: Final = re.compile(r"\w+")
+_SEVERAL: Final = """
+select list(run) as examples from (
+  select identity, settings_sha256, min(run) as run from runs
+  where identity is not null group by identity, settings_sha256
+)
+group by identity having count(*) > 1 order by min(run)
+"""
 _OF_CONDITION: Final = "select run from runs where (\n{}\n) order by run"
 
 
@@ -42,9 +49,9 @@ class Catalog:
         return {**self._index.left_out, **self._unreadable}
 
     @property
-    def notice(self) -> str:
-        """Why the index could not be saved; empty if it was."""
-        return self._index.notice
+    def notices(self) -> tuple[str, ...]:
+        """That the index could not be saved; that drives have runs of different settings."""
+        return tuple(text for text in (self._index.notice, self._several_settings()) if text)
 
     @property
     def runs(self) -> tuple[Path, ...]:
@@ -129,6 +136,17 @@ class Catalog:
         runs = self._index.tables["runs"]
         table = runs.to_table(columns=[column]) if isinstance(runs, ds.Dataset) else runs
         return list(table[column].to_pylist())
+
+    def _several_settings(self) -> str:
+        """One line on drives that were run with several settings; empty without any."""
+        found = database.select(_SEVERAL, {"runs": self._index.tables["runs"]}, ["runs"])
+        if not found.num_rows:
+            return ""
+        first, other = sorted(found["examples"][0].as_py())[:2]
+        return (
+            f"{found.num_rows} drives have runs of different settings, as {first} and {other}: "
+            "settings_sha256 tells them apart"
+        )
 
     @cached_property
     def _names(self) -> set[str]:

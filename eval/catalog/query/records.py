@@ -164,7 +164,7 @@ def _run_row(
         "is_simulated": any(log.is_simulated for log in said.logs),
         "vehicle": said.settings.get("name"),
         "crosscue": said.versions.get("crosscue"),
-        "crosscue_commit": said.versions.get("crosscue commit"),
+        "crosscue_commit": said.versions.get("crosscue_commit"),
         "models": [
             {"name": one["name"], "identity": one["identity"]}
             for one in (() if detect is None else detect.detectors)

@@ -49,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
         print_rows(found, args)
     else:
         write_rows(found, args)
-    if catalog.notice:
-        print(f"crosscue: {visible(catalog.notice)}", file=sys.stderr)
+    for notice in () if args.quiet else catalog.notices:
+        print(f"crosscue: {visible(notice)}", file=sys.stderr)
     for name, why in sorted(catalog.left_out.items()):
         print(f"crosscue: left out: {visible(name)}: {visible(why)}", file=sys.stderr)
     return 3 if catalog.left_out else 0

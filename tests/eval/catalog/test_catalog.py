@@ -213,3 +213,13 @@ def test_damage_that_shows_only_while_reading_costs_that_file_only(tmp_path: Pat
     assert rows.to_pylist() == [{"run": "good", "n": 50, "ok": True}]
     assert found.left_out.keys() == {"torn"}
     assert "belief.parquet: damaged" in found.left_out["torn"]
+
+
+def test_drives_with_several_settings_are_noted(runs: Path) -> None:
+    [notice] = crosscue.catalog(runs).notices
+
+    assert notice == (
+        "2 drives have runs of different settings, as a/monday and b/monday: "
+        "settings_sha256 tells them apart"
+    )
+    assert crosscue.catalog(runs / "a").notices == ()

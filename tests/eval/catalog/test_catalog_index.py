@@ -150,7 +150,7 @@ def test_a_full_disk_costs_the_index_only(runs: Path, monkeypatch: pytest.Monkey
     found = crosscue.catalog(runs)
 
     assert found.query(ALL).num_rows == 4
-    assert "the disk is full" in found.notice
+    assert "the disk is full" in found.notices[0]
     assert found.left_out == {}
     assert [path.name for path in runs.iterdir() if path.is_file()] == []
 
