@@ -243,8 +243,9 @@ class Cars(Section):
     """With ``kind = "tracks"`` a car is judged once seen in so many frames."""
     max_frames: Annotated[int, Field(ge=3, le=100)] = 10
     """And by the newest so many."""
-    within_m: Positive = 60.0
-    """Cars that are further away by their height are not judged."""
+    within_m: Positive = 100.0
+    """Cars that are further away by their height are not judged; nearer ones are where their motion
+    is sure."""
     crossing_mps: Positive = 2.0
     """A car that crosses moves sideways by more; a parked one surely moves by less. One past the
     intersection comes or goes by more."""

@@ -31,8 +31,8 @@ SIGMAS: Final = 3.0
 MIN_NOSE: Final = 0.5
 """Three of four frames agree on the nose."""
 LIKELY: Final = 1.08
-"""Standard deviations; one side of a Gaussian holds 86 % within them, which is what the cue's
-precision promises."""
+"""Standard deviations; one side of a Gaussian holds 86 % within them. That is for a car at the
+limit; most that count are further past it (``PAST_PRECISION`` in the table of cues)."""
 COMES_OR_GOES: Final = 2.0
 """Standard deviations of its speed; less is asked than across, since a standing car of another
 height that is taken for a moving one is on that road, too."""
@@ -42,16 +42,21 @@ MAX_SLANT: Final = 0.5
 
 def crossing(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
     """Cars that move steadily across the ego vehicle's heading."""
-    return [
-        car
-        for car in cars
-        if car.frames >= settings.min_frames
-        and car.distance_m <= settings.within_m
-        and car.is_steady
-        and car.long > settings.length_per_height
-        and abs(car.right_mps) > max(settings.crossing_mps, SIGMAS * car.right_sd_mps)
-        and abs(car.ahead_mps) <= abs(car.right_mps) + 2.0 * car.ahead_sd_mps
-    ]
+    return [car for car in cars if not crossing_gates(car, settings)]
+
+
+def crossing_gates(car: CarMotion, settings: Cars) -> list[str]:
+    """What speaks against a car's crossing; nothing for one that does."""
+    fast_mps = max(settings.crossing_mps, SIGMAS * car.right_sd_mps)
+    gates = {
+        "seen too seldom": car.frames < settings.min_frames,
+        "too far": car.distance_m > settings.within_m,
+        "no steady motion": not car.is_steady,
+        "not seen from the side": car.long <= settings.length_per_height,
+        "not surely across": abs(car.right_mps) <= fast_mps,
+        "moves along": abs(car.ahead_mps) > abs(car.right_mps) + 2.0 * car.ahead_sd_mps,
+    }
+    return [gate for gate, is_failed in gates.items() if is_failed]
 
 
 def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:

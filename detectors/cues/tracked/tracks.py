@@ -30,9 +30,9 @@ from crosscue.detectors.ranging.object_tracks import Motion, iou
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 BOX_PX: Final = 1.0
-"""Standard deviation of a box's edge ..."""
+"""Standard deviation of a box's height ..."""
 BOX_FRACTION: Final = 0.03
-"""... and what is added of the box's height."""
+"""... and what is added, in squares, of the height itself."""
 FASTEST_MPS: Final = 25.0
 """A car that would have gone faster between two frames is another one."""
 HIDDEN_FRACTION: Final = 0.15
@@ -159,7 +159,7 @@ class CarTracks:
         if distance_m > max(self._settings.within_m, self._settings.past_within_m):
             return None
         left, right = np.arctan2(-rays[:, 1], rays[:, 0]).tolist()
-        error = BOX_PX / (y1 - y0) + (HIDDEN_FRACTION if is_hidden else BOX_FRACTION)
+        error = math.hypot(BOX_PX / (y1 - y0), HIDDEN_FRACTION if is_hidden else BOX_FRACTION)
         mask = found.masks[i]
         nose = 0 if not mask else nose_of(rle.column_heights_px(mask, found.size_px))
         long = (x1 - x0) / (y1 - y0)
@@ -255,7 +255,7 @@ def _away(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float
         return math.inf
     fastest_m = FASTEST_MPS * (one.t_s - last.t_s) + 0.5
     grown = one.distance_m / ahead_m
-    error = BOX_PX / float(box_px[3] - box_px[1]) + BOX_FRACTION
+    error = math.hypot(BOX_PX / float(box_px[3] - box_px[1]), BOX_FRACTION)
     limit = 2.0 * ERRORS * error + math.log1p(fastest_m / one.distance_m)
     if abs(math.log(grown)) > limit:
         return math.inf
