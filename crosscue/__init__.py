@@ -87,7 +87,7 @@ _EXPORTS: Final = {
     "CueSpec": "replay.vehicle.cue_spec",
     "Format": "replay.formats",
     "DataSet": "replay.formats",
-    "PluginWarning": "replay.plugins",
+    "PluginWarning": "replay.errors",
     "CrosscueError": "replay.errors",
     "UsageError": "replay.errors",
     "LogError": "replay.errors",
@@ -101,7 +101,7 @@ _EXPORTS: Final = {
     "OutputError": "replay.errors",
     "EmptyResultError": "replay.errors",
     "AccountError": "replay.errors",
-    "LossWarning": "replay.losses",
+    "LossWarning": "replay.errors",
     "convert": "eval.interface.logs.convert",
     "Converted": "eval.interface.logs.convert",
     "seal": "eval.interface.logs.seals",
@@ -359,8 +359,10 @@ if TYPE_CHECKING:
     from crosscue.replay.errors import LogError as LogError
     from crosscue.replay.errors import LogFormatError as LogFormatError
     from crosscue.replay.errors import LogTooLargeError as LogTooLargeError
+    from crosscue.replay.errors import LossWarning as LossWarning
     from crosscue.replay.errors import MissingTopicError as MissingTopicError
     from crosscue.replay.errors import OutputError as OutputError
+    from crosscue.replay.errors import PluginWarning as PluginWarning
     from crosscue.replay.errors import RunError as RunError
     from crosscue.replay.errors import SchemaError as SchemaError
     from crosscue.replay.errors import UnknownFormatError as UnknownFormatError
@@ -368,8 +370,6 @@ if TYPE_CHECKING:
     from crosscue.replay.errors import VehicleError as VehicleError
     from crosscue.replay.formats import DataSet as DataSet
     from crosscue.replay.formats import Format as Format
-    from crosscue.replay.losses import LossWarning as LossWarning
-    from crosscue.replay.plugins import PluginWarning as PluginWarning
     from crosscue.replay.vehicle.cue_spec import CueSpec as CueSpec
     from crosscue.replay.vehicle.vehicle import Vehicle as Vehicle
 

@@ -10,13 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.cues.observed import FrameCues
 from crosscue.replay.base import Bytes, write_bytes
 
 from . import rle
 from .base import Detections, Found, RoadMask
 from .images import Encoded, decode
-from .runner import FrameResult
 
 GREEN: Final = (80, 220, 60)
 BLUE: Final = (255, 140, 0)
@@ -43,8 +41,16 @@ class Drawer:
     _every: int = field(default=1)
     _written: list[Path] = field(default_factory=list)
 
-    def __call__(self, result: FrameResult, cues: FrameCues) -> None:
+    def __call__(
+        self, t_ns: int, picture: Encoded, found: Sequence[Found], counts: Mapping[str, int]
+    ) -> None:
         """Look at one frame.
+
+        Args:
+            t_ns: When it was taken.
+            picture: Decoded if it is to be written.
+            found: By each detector.
+            counts: Of its cues.
 
         Raises:
             OutputError: A picture cannot be written.
@@ -58,9 +64,9 @@ class Drawer:
                 return
         import cv2
 
-        pixels, _ = decode(result.picture)
-        _, encoded = cv2.imencode(".jpg", draw(pixels, result, cues))
-        path = self.folder / f"{result.t_ns}.jpg"
+        pixels, _ = decode(picture)
+        _, encoded = cv2.imencode(".jpg", draw(pixels, found, counts))
+        path = self.folder / f"{t_ns}.jpg"
         write_bytes(path, encoded.tobytes())
         self._written.append(path)
 
@@ -71,17 +77,19 @@ class Drawer:
         self._every *= 2
 
 
-def draw(pixels: Bytes, result: FrameResult, cues: FrameCues, enlarge: float = 1.0) -> Bytes:
+def draw(
+    pixels: Bytes, found: Sequence[Found], counts: Mapping[str, int], enlarge: float = 1.0
+) -> Bytes:
     """A copy with road tinted, boxes and labels, and the positive cues at the bottom.
 
     Args:
         pixels: Shape (H, W, 3), uint8, blue first.
-        result: What was found in it.
-        cues: And what follows.
+        found: By each detector.
+        counts: Of the cues that follow.
         enlarge: Text and lines, for a picture that will be shrunk.
     """
-    canvas = _drawn(pixels, result.found, enlarge)
-    positive = [f"{cue} {count}" for cue, count in cues.counts.items() if count]
+    canvas = _drawn(pixels, found, enlarge)
+    positive = [f"{cue} {count}" for cue, count in counts.items() if count]
     text = "  ".join(positive) or "no cue"
     scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
     write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
@@ -113,8 +121,7 @@ def draw_frame(
     enlarge = max(size[0] / width_px, 0.5)
     if not found:
         return np.asarray(pixels, np.uint8)
-    result = FrameResult(0, size, picture, tuple(found))
-    canvas = draw(pixels, result, FrameCues(dict(counts), None), 0.8 * enlarge)
+    canvas = draw(pixels, found, counts, 0.8 * enlarge)
     for one in found:
         if isinstance(one, Detections):
             for box, mask in zip(one.boxes_px, one.masks, strict=True):

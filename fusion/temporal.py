@@ -27,9 +27,9 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.fusion.situation import Situation
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
 from .factor_graph import FactorGraph, log_odds
@@ -94,8 +94,8 @@ class _Chain(NamedTuple):
     """
 
     cue: str
-    nowhere: Floats
-    ahead: Floats
+    nowhere: NDArray[np.float64]
+    ahead: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,9 +112,9 @@ class TemporalModel:
 
     settings: Temporal
     ways: tuple[tuple[str, ...], ...]
-    way_probabilities: Floats
+    way_probabilities: NDArray[np.float64]
     chains: tuple[_Chain, ...]
-    has_feature: Floats
+    has_feature: NDArray[np.float64]
 
     @property
     def cells(self) -> int:
@@ -177,8 +177,8 @@ class TemporalFilter:
     """
 
     model: TemporalModel
-    nowhere: Floats = field(init=False)
-    ahead: Floats = field(init=False)
+    nowhere: NDArray[np.float64] = field(init=False)
+    ahead: NDArray[np.float64] = field(init=False)
     _moved_m: float = 0.0
     _var_m2: float = 0.0
     _since_m: float = math.inf
@@ -193,13 +193,13 @@ class TemporalFilter:
         self.nowhere = (1.0 - settings.ahead) * spread
         self.ahead = settings.ahead * spread[:, None] * self.model.way_probabilities[None, :]
 
-    def centers_m(self) -> Floats:
+    def centers_m(self) -> NDArray[np.float64]:
         """Distance of each cell's middle from the rear axle, shape (cells,)."""
         settings = self.model.settings
         middle = (np.arange(self.model.cells) + 0.5) * settings.cell_m
         return np.asarray(middle - settings.behind_m - self._moved_m)
 
-    def probabilities(self) -> Floats:
+    def probabilities(self) -> NDArray[np.float64]:
         """Of each feature, in the graph's order, within (0, 1)."""
         mass = self.model.has_feature @ self.ahead.sum(axis=0)
         return np.asarray(np.clip(mass, FLOOR, 1.0 - FLOOR))
@@ -246,7 +246,7 @@ class TemporalFilter:
             log_ahead += at_cells[:, None]
         self._weigh(log_nowhere, log_ahead)
 
-    def _weigh(self, log_nowhere: Floats, log_ahead: Floats) -> None:
+    def _weigh(self, log_nowhere: NDArray[np.float64], log_ahead: NDArray[np.float64]) -> None:
         top = max(float(log_nowhere.max()), float(log_ahead.max()))
         self.nowhere = self.nowhere * np.exp(log_nowhere - top)
         self.ahead = self.ahead * np.exp(log_ahead - top)
@@ -254,7 +254,7 @@ class TemporalFilter:
         self.nowhere /= total
         self.ahead /= total
 
-    def _cues(self, counts: Mapping[str, int]) -> tuple[float, Floats]:
+    def _cues(self, counts: Mapping[str, int]) -> tuple[float, NDArray[np.float64]]:
         """Log likelihoods of all cues that were looked for."""
         settings = self.model.settings
         at = np.searchsorted(np.array(settings.edges_m[1:-1]), self.centers_m(), side="right")
@@ -273,7 +273,7 @@ class TemporalFilter:
         self._before = heard
         return nowhere, np.asarray(by_distance[at])
 
-    def _range(self, one: MeasuredRange) -> Floats:
+    def _range(self, one: MeasuredRange) -> NDArray[np.float64]:
         """Log likelihoods of a range, by cell."""
         settings = self.model.settings
         var_m2 = one.var_m2 + settings.cell_m**2 / 12.0
@@ -323,7 +323,7 @@ class TemporalFilter:
         self.ahead = _blurred(self.ahead, side)
 
 
-def _blurred(mass: Floats, side: float) -> Floats:
+def _blurred(mass: NDArray[np.float64], side: float) -> NDArray[np.float64]:
     """Mass with ``side`` of each cell in either neighbour; the ends keep what would leave."""
     blurred = mass * (1.0 - 2.0 * side)
     blurred[:-1] += side * mass[1:]

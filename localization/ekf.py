@@ -15,15 +15,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 from . import pose_filter
 from .angles import wrap
 from .pose_filter import HEADING, SPEED, State, arc
+
+Floats: TypeAlias = NDArray[np.float64]
 
 X: Final = 0
 Y: Final = 1

@@ -20,7 +20,9 @@ from typing import Final, Literal, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
+
 
 Bools: TypeAlias = NDArray[np.bool_]
 TurnKind: TypeAlias = Literal["yaw rate", "steering"]

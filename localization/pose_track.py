@@ -23,17 +23,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Final, NamedTuple, Protocol, Self
+from typing import Final, NamedTuple, Protocol, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-
-from crosscue.replay.columns import Floats, Int64s
 
 from .angles import wrap
 from .ekf import PoseBelief, coast, packed, unpacked
 from .odometry import Increments
 from .pose_filter import HEADING, SPEED, major_axis_m, predict, update
+
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
 
 ACCEPTED: Final = 0
 REJECTED: Final = 1

@@ -43,6 +43,7 @@ from .errors import (
     LogError,
     LogFormatError,
     LogTooLargeError,
+    LossWarning,
     MissingTopicError,
     OutputError,
     RunError,
@@ -76,7 +77,7 @@ from .ledger import (
     warn_of,
 )
 from .limits import DEFAULT_LIMITS, MIB, Limits
-from .losses import LossWarning, losses_heard, warn_again, with_losses
+from .losses import losses_heard, warn_again, with_losses
 from .safe_text import visible
 from .versions import installed, versions, versions_and_commit
 

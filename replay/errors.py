@@ -17,7 +17,8 @@
     * EmptyResultError       nothing of what was asked for is in the logs
     * AccountError           rows in are not rows used, skipped and dropped: a bug of ours
 
-A wrong argument from the caller's own code stays a ``ValueError``.
+A wrong argument from the caller's own code stays a ``ValueError``. What stops nothing is a
+warning: ``LossWarning`` for dropped rows, ``PluginWarning`` for a plug-in that does not load.
 """
 
 
@@ -111,3 +112,11 @@ def one_line(error: BaseException, most: int | None = None) -> str:
         most: Keep this many characters; None keeps all.
     """
     return " ".join(str(error).split())[:most]
+
+
+class LossWarning(UserWarning):
+    """Something of a log was dropped, in one line."""
+
+
+class PluginWarning(UserWarning):
+    """An installed plug-in does not load, so crosscue goes on without it."""

@@ -20,8 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol, TypeVar
 
-from .errors import AccountError
-from .losses import LossWarning
+from .errors import AccountError, LossWarning
 
 DETAILS_KEPT: Final = 1000
 """Single skips and losses kept with time and text; counts are exact beyond it."""

@@ -11,12 +11,10 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from .errors import LossWarning
+
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-class LossWarning(UserWarning):
-    """Something of a log was dropped, in one line."""
 
 
 def with_losses(work: Callable[[T], R], one: T) -> tuple[R, tuple[str, ...]]:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final, Literal, TypeVar
 
+from .errors import PluginWarning
+
 Kind = Literal["detector", "cue", "reader", "dataset"]
 T = TypeVar("T")
 
@@ -26,10 +28,6 @@ GROUPS: Final[dict[Kind, str]] = {
     "dataset": "crosscue.datasets",
 }
 """From what is offered to its entry point group."""
-
-
-class PluginWarning(UserWarning):
-    """An installed plug-in does not load, so crosscue goes on without it."""
 
 
 @dataclass(frozen=True, slots=True)

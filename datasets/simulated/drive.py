@@ -10,12 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
+
 
 WHEELBASE_M: Final = 2.7
 TRACK_WIDTH_M: Final = 1.55

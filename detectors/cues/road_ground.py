@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.ranging.ground_plane import GroundPlane
-from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 
 from .observed import NOT_SEEN, Place, RoadShares
@@ -87,7 +86,7 @@ def outlines(
     return tuple(found)
 
 
-def _outline(one: Rectangle, ground: GroundPlane) -> Floats | None:
+def _outline(one: Rectangle, ground: GroundPlane) -> NDArray[np.float64] | None:
     """Corners in the picture; None where one of them lies beside or behind the camera."""
     if one[0] - ground.position_m[0] < NEAREST_M:
         return None

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.settings import Proportion, Settings
-from crosscue.replay.columns import Floats, Int64s
+
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
 
 Array: TypeAlias = NDArray[np.generic]
 Outputs: TypeAlias = Mapping[str, Array]

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 
 class Mounted(Protocol):
@@ -75,7 +74,7 @@ class GroundPlane:
     focal_px: float
     center_px: tuple[float, float]
     position_m: tuple[float, float, float]
-    to_car: Floats
+    to_car: NDArray[np.float64]
 
     @classmethod
     def of(cls, camera: Mounted, size_px: tuple[int, int]) -> GroundPlane:
@@ -92,7 +91,7 @@ class GroundPlane:
             turned(camera.yaw_rad, camera.pitch_rad, camera.roll_rad),
         )
 
-    def rays(self, points_px: Floats) -> Floats:
+    def rays(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Directions in the car's axes, shape (N, 3), of unit depth along the optical axis.
 
         Args:
@@ -102,7 +101,7 @@ class GroundPlane:
         body = np.column_stack([np.ones(len(right_down)), -right_down])
         return np.asarray(body @ self.to_car.T, np.float64)
 
-    def seen_at(self, directions: Floats) -> Floats:
+    def seen_at(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where directions in the car's axes, shape (N, 3), lie in the picture, shape (N, 2).
 
         NaN for what lies beside or behind the camera.
@@ -113,13 +112,13 @@ class GroundPlane:
         x = center_x - self.focal_px * left / forward
         return np.stack([x, center_y - self.focal_px * up / forward], axis=1)
 
-    def project(self, ground_m: Floats) -> Floats:
+    def project(self, ground_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points on the ground, shape (N, 2), in the picture; NaN beside or behind the camera."""
         x_m, y_m, z_m = self.position_m
         away_m = ground_m - np.array([x_m, y_m])
         return self.seen_at(np.column_stack([away_m, np.full(len(away_m), -z_m)]))
 
-    def unproject(self, points_px: Floats) -> Floats:
+    def unproject(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points of the picture, shape (N, 2), on the ground; NaN at and above the horizon."""
         x_m, y_m, z_m = self.position_m
         rays = self.rays(points_px)
@@ -131,7 +130,7 @@ class GroundPlane:
         ((x, y),) = self.seen_at(np.array([[1.0, 0.0, 0.0]])).tolist()
         return x, y
 
-    def horizon_px(self, x_px: Floats) -> Floats:
+    def horizon_px(self, x_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Height of the horizon in the columns ``x_px``, shape (N,)."""
         forward, left, up = self.to_car[2]
         to_left = (self.center_px[0] - x_px) / self.focal_px
@@ -140,7 +139,7 @@ class GroundPlane:
         )
 
 
-def turned(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Floats:
+def turned(yaw_rad: float, pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
     """From the axes of a camera's body to the car's, shape (3, 3)."""
     (cy, sy), (cp, sp), (cr, sr) = (
         (math.cos(angle), math.sin(angle)) for angle in (yaw_rad, pitch_rad, roll_rad)

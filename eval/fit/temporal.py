@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.fit.messages import NOTHING_THERE, counts_at
@@ -21,7 +22,6 @@ from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.temporal import MeasuredRange, ranges_to_start
-from crosscue.replay.base import Floats, Int64s
 from crosscue.replay.vehicle.temporal import CueChain
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
@@ -34,9 +34,9 @@ CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 class _Moves(NamedTuple):
     """Between frames, shape (N,) each; of the first frame nothing."""
 
-    way_m: Floats
-    var_m2: Floats
-    passed_s: Floats
+    way_m: NDArray[np.float64]
+    var_m2: NDArray[np.float64]
+    passed_s: NDArray[np.float64]
 
 
 def annotated_drives(
@@ -84,7 +84,7 @@ def annotated_drives(
         )
 
 
-def _from_first(column: Floats) -> Floats:
+def _from_first(column: NDArray[np.float64]) -> NDArray[np.float64]:
     """The same, without what lies before the part."""
     out = column.copy()
     out[0] = 0.0
@@ -92,7 +92,7 @@ def _from_first(column: Floats) -> Floats:
 
 
 def _parts(
-    truth: Truth, t_ns: Int64s
+    truth: Truth, t_ns: NDArray[np.int64]
 ) -> Iterator[tuple[np.typing.NDArray[np.bool_], dict[str, bool], str]]:
     """Frames of a part, what is true there, and the intersection's name."""
     ahead = np.zeros(len(t_ns), np.bool_)
@@ -113,7 +113,7 @@ def _parts(
         yield kept, dict(NOTHING_THERE), ""
 
 
-def _moves(run: RunFolder, t_ns: Int64s) -> _Moves:
+def _moves(run: RunFolder, t_ns: NDArray[np.int64]) -> _Moves:
     odometer = odometer_of(run)
     ways = [odometer.until(now) for now in t_ns.tolist()]
     return _Moves(
@@ -124,7 +124,7 @@ def _moves(run: RunFolder, t_ns: Int64s) -> _Moves:
 
 
 def _ranges(
-    table: pa.Table, t_ns: Int64s, way_m: Floats, vehicle: Vehicle
+    table: pa.Table, t_ns: NDArray[np.int64], way_m: NDArray[np.float64], vehicle: Vehicle
 ) -> list[tuple[MeasuredRange, ...]]:
     """Of each frame, as the filter takes them."""
     measured: dict[int, dict[Reference, tuple[float, float]]] = {}

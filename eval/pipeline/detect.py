@@ -62,8 +62,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.kinds import Plan, Source
-from crosscue.replay.signals.plan import camera_of
+from crosscue.replay.signals.plan import camera_of, pictures_only
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.intrinsics import check_center, doubts
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -145,7 +144,7 @@ def detect_into(
     named = [Named(choice.name, make(choice)) for choice in choices]
     log, topic = logs[camera[0]], camera[1]
     ledger = Ledger(log_names(logs)[camera[0]])
-    planned = Plan((Source(camera[0], topic, ()),), {})
+    planned = pictures_only(camera)
     narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
     clocks = probe_clocks(log, planned, vehicle, camera[0], narrowed)
     timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
@@ -408,7 +407,7 @@ class _Tables:
                 }
             )
         self._add_cues(result.t_ns, cues)
-        self.drawer(result, cues)
+        self.drawer(result.t_ns, result.picture, result.found, cues.counts)
         for name, rows in self._held.items():
             if len(rows) > 8192:
                 self._write(name)

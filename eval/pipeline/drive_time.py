@@ -10,7 +10,7 @@ from crosscue.eval.runs.folder import RunFolder, TimeSegments
 from crosscue.replay.base import Log, Selection, Topic, UsageError, VehicleError
 from crosscue.replay.signals.extractor import Extractor, probe_clocks, wheels_only
 from crosscue.replay.signals.kinds import Plan, Signal
-from crosscue.replay.signals.plan import plan, with_pictures
+from crosscue.replay.signals.plan import pictures_only, plan, with_pictures
 from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -58,7 +58,7 @@ def camera_timeline(
     try:
         return drive_timeline(logs, vehicle, selection, camera)
     except VehicleError:
-        planned = with_pictures(Plan((), {}), camera)
+        planned = pictures_only(camera)
         selections = selections_of(logs, planned, selection)
         return scan(logs, planned, vehicle, selections, _no_wheels(planned, vehicle, len(logs)))
 

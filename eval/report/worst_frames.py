@@ -10,10 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, View
-from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.overlay import draw
-from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import camera_of, picture_at
 from crosscue.eval.scoring.runs import RunScored
@@ -144,8 +142,7 @@ def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]])
         tuple(row["label"] for row in rows),
         (b"",) * len(rows),
     )
-    cues = FrameCues({one.cue: one.count}, None)
-    canvas = draw(pixels, FrameResult(one.t_ns, size, picture, (found,)), cues)
+    canvas = draw(pixels, (found,), {one.cue: one.count})
     ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not ok:
         return one

@@ -8,13 +8,15 @@ section 6.4). Everything else by the bootstrap, its percentiles widened for few 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, wilson
 from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
-from crosscue.replay.columns import Floats
+
+Floats: TypeAlias = NDArray[np.float64]
 
 Z_95: Final = 1.959964
 REPLICATES: Final = 400

@@ -21,6 +21,7 @@ from itertools import product
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.fusion.factor_graph import CueNode, FactorGraph
 from crosscue.fusion.temporal import (
@@ -30,7 +31,6 @@ from crosscue.fusion.temporal import (
     TemporalModel,
     temporal_model,
 )
-from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
 from .annotated_approach import NOT_LOOKED
@@ -59,11 +59,11 @@ class AnnotatedDrive:
         place: Which layout or crossroads.
     """
 
-    advanced_m: Floats
-    advanced_var_m2: Floats
-    passed_s: Floats
-    start_m: Floats
-    counts: Mapping[str, Int64s]
+    advanced_m: NDArray[np.float64]
+    advanced_var_m2: NDArray[np.float64]
+    passed_s: NDArray[np.float64]
+    start_m: NDArray[np.float64]
+    counts: Mapping[str, NDArray[np.int64]]
     ranges: tuple[tuple[MeasuredRange, ...], ...]
     features: Mapping[str, bool]
     place: str
@@ -159,7 +159,7 @@ def log_loss(drive: AnnotatedDrive, graph: FactorGraph, model: TemporalModel) ->
     return float(np.mean(losses))
 
 
-def filtered(drive: AnnotatedDrive, model: TemporalModel) -> Floats:
+def filtered(drive: AnnotatedDrive, model: TemporalModel) -> NDArray[np.float64]:
     """Probabilities after each frame, shape (N, features)."""
     belief = TemporalFilter(model)
     out = []

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
 from crosscue.localization.pose_filter import State, at_point, predict, update_position
 from crosscue.localization.start_pose import start_pose
-from crosscue.replay.columns import Floats, Int64s
+
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
 
 STEP_S: Final = 0.2
 """Odometry is followed in arcs no longer than this."""

@@ -14,14 +14,15 @@ within two seconds is called one. Offset and drift are those of the longest stre
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
-
 from .order import EVENTS_KEPT, ClockStep, forward_min
+
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
 
 JUMP_FLOOR_NS: Final = 10_000_000
 JUMP_WINDOW_NS: Final = 2_000_000_000

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
-
 from .bits import Words
+
+Int64s: TypeAlias = NDArray[np.int64]
 
 NO_STATUS: Final = "obstacle before the first status frame"
 LATE: Final = "too long after its status frame"

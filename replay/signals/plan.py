@@ -186,6 +186,11 @@ def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[in
     return _Planner(topics, vehicle).only(Role.CAMERA, vehicle.topics.camera, "topics.camera")
 
 
+def pictures_only(camera: tuple[int, Topic]) -> Plan:
+    """A plan that reads nothing but the camera's pictures."""
+    return with_pictures(Plan((), {}), camera)
+
+
 def with_pictures(planned: Plan, camera: tuple[int, Topic]) -> Plan:
     """The same plan, with the camera's pictures read as well; see ``Extractor.on_pictures``."""
     log, topic = camera

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import BLUE, GREEN, MARGIN_PX, Drawer, draw
-from crosscue.detectors.runner import FrameResult
 
 SIZE = (640, 360)
 GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
@@ -25,8 +23,7 @@ GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
 def _drawn(
     found: tuple[Detections | RoadMask, ...], cues: dict[str, int], enlarge: float = 1.0
 ) -> np.typing.NDArray[np.uint8]:
-    result = FrameResult(0, SIZE, Encoded("jpeg", memoryview(b"")), found)
-    return draw(GREY, result, FrameCues(cues, None), enlarge)
+    return draw(GREY, found, cues, enlarge)
 
 
 def test_a_box_is_drawn_on_its_sides_and_nowhere_inside() -> None:
@@ -74,7 +71,7 @@ def test_pictures_are_spread_evenly_over_a_drive_of_any_length(frames: int, most
         drawer = Drawer(Path(name) / "pictures", most)
         for t_ns in range(frames):
             picture = Encoded("jpeg", memoryview(coded.tobytes()))
-            drawer(FrameResult(t_ns, (16, 16), picture, ()), FrameCues({}, None))
+            drawer(t_ns, picture, (), {})
         drawn = sorted(int(path.stem) for path in Path(name).glob("pictures/*"))
 
     assert len(drawn) <= most

@@ -18,7 +18,7 @@ from crosscue.eval.runs.folder import clear, create, locked, write_manifest
 from crosscue.eval.runs.manifest import EstimateTimings
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.replay.base import LogFormatError
-from crosscue.replay.losses import LossWarning
+from crosscue.replay.errors import LossWarning
 
 from .manifests import estimated, log_account
 

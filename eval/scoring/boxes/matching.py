@@ -15,7 +15,9 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
+
 
 Bools: TypeAlias = NDArray[np.bool_]
 OVERLAPS: Final = np.linspace(0.5, 0.95, 10)

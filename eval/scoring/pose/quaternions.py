@@ -5,14 +5,15 @@ scipy's ``Rotation`` computes; it is imported at the first use, which takes a qu
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-
-from crosscue.replay.columns import Floats
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
+
+Floats: TypeAlias = NDArray[np.float64]
 
 
 def rotation_of(quat: Floats) -> Rotation:

@@ -9,10 +9,8 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import Found, RoadMask
-from crosscue.detectors.cues.observed import FrameCues
 from crosscue.detectors.images import decode
 from crosscue.detectors.overlay import draw, write_label
-from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
@@ -96,8 +94,7 @@ def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes 
     if picture is None:
         return None
     pixels, _ = decode(picture)
-    result = FrameResult(t_ns, frame.size_px, picture, tuple(found))
-    return draw(pixels, result, FrameCues(_cues_at(run, t_ns), None), ENLARGE)
+    return draw(pixels, found, _cues_at(run, t_ns), ENLARGE)
 
 
 def _cues_at(run: RunFolder, t_ns: int) -> dict[str, int]:

@@ -10,13 +10,11 @@ from __future__ import annotations
 import bz2
 import struct
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-
-from crosscue.replay.columns import Bytes, Int64s
 
 from .records import (
     CONNECTION,
@@ -31,6 +29,9 @@ from .records import (
     tally,
     time_ns,
 )
+
+Bytes: TypeAlias = NDArray[np.uint8]
+Int64s: TypeAlias = NDArray[np.int64]
 
 DAMAGED_BYTES: Final = "damaged bytes in a chunk"
 DISAGREES: Final = "record and index disagree"

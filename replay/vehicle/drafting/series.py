@@ -7,12 +7,14 @@ GNSS course is too rough to be differentiated.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
+Floats: TypeAlias = NDArray[np.float64]
+Int64s: TypeAlias = NDArray[np.int64]
+
 
 STEP_S: Final = 0.1
 WINDOW_S: Final = 2.0

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import local
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from crosscue.replay.columns import Bytes
 from crosscue.replay.files.checksum import crc32
 from crosscue.replay.readers.mcap.records import BrokenRecordError, ChunkHead
 
 if TYPE_CHECKING:
     import zstandard
+
+Bytes: TypeAlias = NDArray[np.uint8]
 
 UNKNOWN_SIZES: Final = (-1, 0)
 """What zstandard and lz4 say when a frame does not declare its size."""
