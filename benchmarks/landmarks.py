@@ -28,7 +28,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmarks.features import Features, grey_of, read_picture
+from crosscue.localization.landmarks.features import Features
+from crosscue.localization.landmarks.images import grey_of, read_picture
 from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
 from crosscue.localization.landmarks.update import best_of
 from crosscue.replay.base import Floats

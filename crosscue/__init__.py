@@ -87,7 +87,7 @@ _EXPORTS: Final = {
     "CueSpec": "replay.vehicle.cue_spec",
     "Format": "replay.formats",
     "DataSet": "replay.formats",
-    "PluginWarning": "replay.errors",
+    "PluginWarning": "replay.plugins",
     "CrosscueError": "replay.errors",
     "UsageError": "replay.errors",
     "LogError": "replay.errors",
@@ -362,7 +362,6 @@ if TYPE_CHECKING:
     from crosscue.replay.errors import LossWarning as LossWarning
     from crosscue.replay.errors import MissingTopicError as MissingTopicError
     from crosscue.replay.errors import OutputError as OutputError
-    from crosscue.replay.errors import PluginWarning as PluginWarning
     from crosscue.replay.errors import RunError as RunError
     from crosscue.replay.errors import SchemaError as SchemaError
     from crosscue.replay.errors import UnknownFormatError as UnknownFormatError
@@ -370,6 +369,7 @@ if TYPE_CHECKING:
     from crosscue.replay.errors import VehicleError as VehicleError
     from crosscue.replay.formats import DataSet as DataSet
     from crosscue.replay.formats import Format as Format
+    from crosscue.replay.plugins import PluginWarning as PluginWarning
     from crosscue.replay.vehicle.cue_spec import CueSpec as CueSpec
     from crosscue.replay.vehicle.vehicle import Vehicle as Vehicle
 

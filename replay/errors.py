@@ -17,8 +17,8 @@
     * EmptyResultError       nothing of what was asked for is in the logs
     * AccountError           rows in are not rows used, skipped and dropped: a bug of ours
 
-A wrong argument from the caller's own code stays a ``ValueError``. What stops nothing is a
-warning: ``LossWarning`` for dropped rows, ``PluginWarning`` for a plug-in that does not load.
+A wrong argument from the caller's own code stays a ``ValueError``. Dropped rows, which
+stop nothing, are a ``LossWarning``.
 """
 
 
@@ -116,7 +116,3 @@ def one_line(error: BaseException, most: int | None = None) -> str:
 
 class LossWarning(UserWarning):
     """Something of a log was dropped, in one line."""
-
-
-class PluginWarning(UserWarning):
-    """An installed plug-in does not load, so crosscue goes on without it."""

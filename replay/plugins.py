@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final, Literal, TypeVar
 
-from .errors import PluginWarning
-
 Kind = Literal["detector", "cue", "reader", "dataset"]
 T = TypeVar("T")
 
@@ -28,6 +26,10 @@ GROUPS: Final[dict[Kind, str]] = {
     "dataset": "crosscue.datasets",
 }
 """From what is offered to its entry point group."""
+
+
+class PluginWarning(UserWarning):
+    """An installed plug-in does not load, so crosscue goes on without it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from crosscue.eval.fit.landmarks.database import (
 from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmarks.features import grey_of, read_picture
+from crosscue.localization.landmarks.images import grey_of, read_picture
 from crosscue.replay.base import EmptyResultError, Floats, Ledger, UsageError, visible, warn_of
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 

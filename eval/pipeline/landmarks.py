@@ -12,14 +12,8 @@ from typing import Final
 from crosscue.detectors.images import Encoded
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.localization.landmarks.features import (
-    CameraGeometry,
-    Features,
-    Matcher,
-    grey_of,
-    make_matcher,
-    picture_of,
-)
+from crosscue.localization.landmarks.features import CameraGeometry, Features, Matcher, make_matcher
+from crosscue.localization.landmarks.images import grey_of, picture_of
 from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
 from crosscue.localization.pose_track import ACCEPTED

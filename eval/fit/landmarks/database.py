@@ -19,7 +19,8 @@ from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth, mounting_of
 from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.landmarks.database import LandmarkWriter, Place
-from crosscue.localization.landmarks.features import Matcher, grey_of, picture_of, read_picture
+from crosscue.localization.landmarks.features import Matcher
+from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
 from crosscue.replay.base import (
     AnnotationError,
     Floats,

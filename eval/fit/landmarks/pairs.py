@@ -16,8 +16,9 @@ import tomlkit
 from crosscue.eval.fit.landmarks.database import CameraPoses, Frame, drop_picture, place_at
 from crosscue.localization.angles import wrap
 from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
-from crosscue.localization.landmarks.features import Features, Matcher, grey_of, read_picture
+from crosscue.localization.landmarks.features import Features, Matcher
 from crosscue.localization.landmarks.fit import ScoredPairs
+from crosscue.localization.landmarks.images import grey_of, read_picture
 from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at_most
 
 MAX_PAIRS: Final = 1_000_000

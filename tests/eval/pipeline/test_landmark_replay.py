@@ -24,7 +24,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.pose.measured import read_measured
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.localization.landmarks.features import grey_of
+from crosscue.localization.landmarks.images import grey_of
 from crosscue.localization.landmarks.update import best_of
 from crosscue.replay.base import Block, Bytes, Floats, Images, Ledger, Messages
 from crosscue.replay.vehicle.vehicle import Vehicle, load

@@ -9,14 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.localization.landmarks.features import (
-    CameraGeometry,
-    Features,
-    grey_of,
-    make_matcher,
-    picture_of,
-    read_picture,
-)
+from crosscue.localization.landmarks.features import CameraGeometry, Features, make_matcher
+from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
 from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
 from crosscue.replay.base import (
     Bytes,
