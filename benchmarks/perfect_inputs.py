@@ -8,17 +8,16 @@ Roads are not covered: their true masks are not stored with a drive.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from crosscue.datasets.truth.truth import Truth, load
-from crosscue.detectors.base import Detections
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from crosscue.datasets.truth.truth import load
 from crosscue.detectors.cues.cars import (
     CarShapes,
     car_shapes,
@@ -27,35 +26,13 @@ from crosscue.detectors.cues.cars import (
     parked_cars,
 )
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
-from crosscue.eval.scoring.truth import cue_at
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
+from support.perfect_boxes import frames, is_there
 
 VISIBLE = (0.3, 0.5, 0.7, 0.9)
 LABELLED = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
 Claims = dict[str, tuple[list[bool], list[int]]]
-
-
-def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
-    """The drive's objects as a perfect detector would find them, picture by picture."""
-    content: dict[str, Any] = json.loads((drive / "objects.json").read_text())
-    names = {one["id"]: one["name"] for one in content["categories"]}
-    by_image: dict[int, list[dict[str, Any]]] = {one["id"]: [] for one in content["images"]}
-    for one in content["annotations"]:
-        if one["visible"] >= min_visible:
-            by_image[one["image_id"]].append(one)
-    for image in content["images"]:
-        found = by_image[image["id"]]
-        boxes = np.array([one["bbox"] for one in found], np.float64).reshape(-1, 4)
-        boxes[:, 2:] += boxes[:, :2]
-        yield Detections(
-            image["t_ns"],
-            (image["width"], image["height"]),
-            boxes,
-            np.ones(len(found)),
-            tuple(names[one["category_id"]] for one in found),
-            tuple(one["segmentation"]["counts"].encode() for one in found),
-        )
 
 
 def counts(drive: Path, vehicle: Vehicle, min_visible: float) -> Iterator[tuple[int, str, int]]:
@@ -75,12 +52,6 @@ def counts(drive: Path, vehicle: Vehicle, min_visible: float) -> Iterator[tuple[
                 for side, number in zip(("left", "right"), sides, strict=True):
                     yield found.t_ns, f"{cue}_{side}", number
         before = now
-
-
-def is_there(truth: Truth, cue: str, t_ns: int) -> bool | None:
-    """Whether the thing is there in the frame; None where the truth does not say."""
-    at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
-    return None if at.present[0] < 0 else bool(at.present[0])
 
 
 def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion, Proportion]]:

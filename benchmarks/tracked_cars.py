@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from perfect_inputs import frames, is_there
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.datasets.truth.truth import load
 from crosscue.detectors.cues.observed import Place
@@ -30,6 +31,7 @@ from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.eval.scoring.intervals import wilson
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
+from support.perfect_boxes import frames, is_there
 
 VISIBLE = 0.5
 PLACE_SD_M = 2.0

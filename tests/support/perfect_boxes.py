@@ -1,0 +1,42 @@
+"""The true objects of a simulated drive as a perfect detector would find them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crosscue.datasets.truth.truth import Truth
+from crosscue.detectors.base import Detections
+from crosscue.eval.scoring.truth import cue_at
+
+
+def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
+    """The drive's objects as a perfect detector would find them, picture by picture."""
+    content: dict[str, Any] = json.loads((drive / "objects.json").read_text())
+    names = {one["id"]: one["name"] for one in content["categories"]}
+    by_image: dict[int, list[dict[str, Any]]] = {one["id"]: [] for one in content["images"]}
+    for one in content["annotations"]:
+        if one["visible"] >= min_visible:
+            by_image[one["image_id"]].append(one)
+    for image in content["images"]:
+        found = by_image[image["id"]]
+        boxes = np.array([one["bbox"] for one in found], np.float64).reshape(-1, 4)
+        boxes[:, 2:] += boxes[:, :2]
+        yield Detections(
+            image["t_ns"],
+            (image["width"], image["height"]),
+            boxes,
+            np.ones(len(found)),
+            tuple(names[one["category_id"]] for one in found),
+            tuple(one["segmentation"]["counts"].encode() for one in found),
+        )
+
+
+def is_there(truth: Truth, cue: str, t_ns: int) -> bool | None:
+    """Whether the thing is there in the frame; None where the truth does not say."""
+    at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
+    return None if at.present[0] < 0 else bool(at.present[0])
