@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from crosscue.replay.errors import CrosscueError, UsageError, one_line
 
+GIB: Final = 1 << 30
 LOCAL: Final = "local"
 WAIT_S: Final = 5.0
 STORE_BYTES: Final = 96 << 20
@@ -48,6 +49,24 @@ def joined(address: str, workers: int | None = None) -> Iterator[Any]:
     finally:
         if is_ours:
             ray.shutdown()
+
+
+def check_fits(ray: Any, address: str, cores: int, memory_bytes: int) -> None:
+    """Refuse what no node can hold: Ray would wait for such a node forever.
+
+    Raises:
+        CrosscueError: Naming what a drive needs and what the largest nodes have.
+    """
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    has = [(int(one.get("CPU", 0)), int(one.get("memory", 0))) for one in nodes]
+    if not any(its_cores >= cores and its_bytes >= memory_bytes for its_cores, its_bytes in has):
+        most_cores = max((one for one, _ in has), default=0)
+        most_bytes = max((one for _, one in has), default=0)
+        raise CrosscueError(
+            f"--ray {address}: a drive declares {cores} cores and {memory_bytes / GIB:.3g} GiB; no "
+            f"node has both: the largest have {most_cores} cores and {most_bytes / GIB:.3g} GiB; "
+            "declare less with --cores-per-drive and --memory-per-drive"
+        )
 
 
 def _check_reachable(address: str) -> None:

@@ -1,8 +1,9 @@
 """Drives on a Ray cluster, with the interface of ``worker_pool``.
 
 Every node needs this version of crosscue, and sees logs and run folders under the same paths (a
-shared file system, or logs on an object store). A drive is one task on one core. Ray's own retries
-are off: a drive whose worker died is begun again here, so that its lock is taken away first and
+shared file system, or logs on an object store). A drive is one task that declares its cores and
+memory, so that no node gets more drives than it holds. A node that is lost costs the drives that
+were running there, which are begun again on others. Ray's own retries are off: a drive whose worker died is begun again here, so that its lock is taken away first and
 the count of attempts is true.
 """
 
@@ -14,13 +15,16 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 from crosscue.eval.runs.folder import LOCK
 
 from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
 from .processes import GRACE_S, THREAD_VARIABLES, TICK_S
-from .ray_cluster import LOCAL, joined
+from .ray_cluster import GIB, LOCAL, check_fits, joined
+
+MEMORY_BYTES: Final = 2 * GIB
+"""Of a drive with a camera and a network, on one core."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +35,15 @@ class OnRay:
         address: As Ray's clients take it (``auto``, ``10.0.0.1:6379``), or ``local``.
         workers: At most so many drives at a time; None takes all cores there are.
         attempts: How often a drive is begun when its worker dies.
+        cores: Of each drive.
+        memory_bytes: Of each drive.
     """
 
     address: str
     workers: int | None = None
     attempts: int = 3
+    cores: int = 1
+    memory_bytes: int = MEMORY_BYTES
 
     def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         """Work; see ``many_drives.Engine``.
@@ -50,8 +58,11 @@ class OnRay:
     def _on(self, ray: Any, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         running: dict[Any, tuple[Job, int]] = {}
         try:
-            limit = self.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
-            task = ray.remote(num_cpus=1, max_retries=0)(attempt).options(
+            check_fits(ray, self.address, self.cores, self.memory_bytes)
+            cores = int(ray.cluster_resources().get("CPU", 1))
+            limit = self.workers or max(1, cores // self.cores)
+            declared = {"num_cpus": self.cores, "memory": self.memory_bytes}
+            task = ray.remote(max_retries=0, **declared)(attempt).options(
                 runtime_env={"env_vars": self._environment()}
             )
             shared = ray.put(work)
@@ -80,7 +91,7 @@ class OnRay:
 
     def _environment(self) -> dict[str, str]:
         """Of a worker; on this machine it finds the modules that this process finds."""
-        found = dict.fromkeys(THREAD_VARIABLES, "1")
+        found = dict.fromkeys(THREAD_VARIABLES, str(self.cores))
         return found | ({"PYTHONPATH": os.pathsep.join(sys.path)} if self.address == LOCAL else {})
 
 

@@ -73,6 +73,13 @@ def _account(log: Path, word: str) -> LogAccount:
     return found.model_copy(update={"is_whole": word != "loss"})
 
 
+def _node() -> str:
+    """The Ray node that this process works for, as its cluster calls it."""
+    import ray
+
+    return str(ray.get_runtime_context().get_node_id())
+
+
 def _obey(word: str, log: Path) -> None:
     match word:
         case "damaged":
@@ -90,6 +97,11 @@ def _obey(word: str, log: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         case "leaves":
             os._exit(7)
+        case "waits once" if not log.with_suffix(".begun").exists():
+            log.with_suffix(".begun").write_text(_node())
+            end = time.monotonic() + 60.0
+            while time.monotonic() < end and not log.with_suffix(".go").exists():
+                time.sleep(0.05)
         case "slow":
             log.with_suffix(".begun").write_text(str(os.getpid()))
             time.sleep(60.0)

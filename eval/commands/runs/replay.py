@@ -74,6 +74,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, auto, or local"
     )
+    parser.add_argument(
+        "--cores-per-drive", type=int, metavar="N", help="cores declared to Ray (default: 1)"
+    )
+    parser.add_argument(
+        "--memory-per-drive",
+        type=float,
+        metavar="GIB",
+        help="memory declared to Ray for each drive (default: 2)",
+    )
     add_detector_arguments(parser)
     add_first_pose_arguments(parser, "gnss.use of the vehicle file, which is start unless set")
     parser.add_argument(
@@ -148,6 +157,8 @@ def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
             draw=args.draw,
             workers=args.workers,
             ray=args.ray,
+            cores=args.cores_per_drive,
+            memory_gib=args.memory_per_drive,
             overwrite=args.overwrite,
             resume=args.resume,
             retry_failed=args.retry_failed,

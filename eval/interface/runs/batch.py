@@ -200,6 +200,8 @@ def replay_drives(
     draw: int = 0,
     workers: int | None = None,
     ray: str | None = None,
+    cores: int | None = None,
+    memory_gib: float | None = None,
     overwrite: bool = False,
     resume: bool = False,
     retry_failed: bool = False,
@@ -224,6 +226,8 @@ def replay_drives(
         draw: As in ``replay_drive``.
         workers: Drives side by side; one, or the cores of the cluster, if left out.
         ray: Address of a Ray cluster to work on.
+        cores: What a drive declares to Ray; one core if left out.
+        memory_gib: The same of memory; 2 GiB if left out.
         overwrite: Replace runs of other logs or settings.
         resume: As in ``replay_drive``.
         retry_failed: Only the drives whose last attempt failed; without it they are begun again
@@ -235,7 +239,7 @@ def replay_drives(
         UsageError: No drive is found, or too few workers.
     """
     found = drives if isinstance(drives, DriveList) else find_drives(*_several(drives), each=True)
-    engine = engine_of(workers, ray)
+    engine = engine_of(workers, ray, cores, memory_gib)
     folder = Path(output)
     work = _Work(
         vehicle,
