@@ -3,8 +3,8 @@
 Every node needs this version of crosscue, and sees logs and run folders under the same paths (a
 shared file system, or logs on an object store). A drive is one task that declares its cores and
 memory, so that no node gets more drives than it holds. A node that is lost costs the drives that
-were running there, which are begun again on others. Ray's own retries are off: a drive whose worker died is begun again here, so that its lock is taken away first and
-the count of attempts is true.
+were running there, which are begun again on others. Ray's own retries are off: a drive whose worker
+died is begun again here, so that its lock is taken away first and the count of attempts is true.
 """
 
 from __future__ import annotations

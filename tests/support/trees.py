@@ -6,13 +6,16 @@ import hashlib
 import json
 from pathlib import Path
 
+NO_RESULTS = {".drives", "failure.log"}
+"""Where and when drives were worked on."""
+
 
 def tree(folder: Path) -> dict[str, str]:
     """From relative name to a hash of the bytes; of a manifest without timings and logs' places."""
     return {
         path.relative_to(folder).as_posix(): _hash(path)
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and ".drives" not in path.relative_to(folder).parts
+        if path.is_file() and not NO_RESULTS & {*path.relative_to(folder).parts}
     }
 
 
