@@ -14,6 +14,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.cars import (
     CarShapes,
