@@ -1,0 +1,44 @@
+"""What no cue spoke of is not seen, which is another thing than improbable."""
+
+from __future__ import annotations
+
+import pytest
+
+from crosscue.eval.runs.folder import EstimateManifest, RunFolder, SceneSummary
+from support.gap_drive import Clock, GreyNumber, replayed, write_drive
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["signs alone", "anything"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A drive to a stop sign and nothing else, by a detector with labels and by one without."""
+    folder = tmp_path_factory.mktemp("drive")
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param:
+            patch.setattr(GreyNumber, "labels", ("stop sign",), raising=False)
+        return replayed(folder, write_drive(folder, Clock()), "run")
+
+
+def scene_of(run: RunFolder) -> SceneSummary:
+    manifest = run.drive_manifest()
+    assert isinstance(manifest, EstimateManifest)
+    assert manifest.scene is not None
+    return manifest.scene
+
+
+def test_roads_are_not_seen_unless_cars_were_looked_for_and_were_not_there(run: RunFolder) -> None:
+    scene = scene_of(run)
+    (approach,) = scene.approaches
+
+    were_looked_for = "cross_traffic_left" not in scene.not_looked_for
+    assert approach.not_seen == (
+        ("straight",) if were_looked_for else ("left", "right", "straight")
+    )
+    assert approach.probabilities["intersection"] > 0.9
+
+
+def test_what_was_not_seen_has_its_prior_in_every_row_and_all_else_has_not(run: RunFolder) -> None:
+    rows = run.table("belief").to_pydict()
+    (approach,) = scene_of(run).approaches
+
+    for feature in ("intersection", "left", "right", "straight"):
+        assert (len(set(rows[feature])) == 1) == (feature in approach.not_seen)
