@@ -57,6 +57,10 @@ _EXPORTS: Final = {
     "Failures": "eval.interface.failures.failures",
     "Failure": "eval.failures.record",
     "browse": "eval.interface.failures.browse",
+    "export": "eval.interface.failures.labels",
+    "ExportedLabels": "eval.interface.failures.labels",
+    "import_labels": "eval.interface.failures.labels",
+    "ImportedLabels": "eval.interface.failures.labels",
     "Site": "eval.interface.failures.browse",
     "load_vehicle": "eval.interface.runs.run",
     "demo": "eval.interface.demo",
@@ -232,6 +236,10 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.failures.browse import browse as browse
     from crosscue.eval.interface.failures.failures import Failures as Failures
     from crosscue.eval.interface.failures.failures import failures as failures
+    from crosscue.eval.interface.failures.labels import ExportedLabels as ExportedLabels
+    from crosscue.eval.interface.failures.labels import ImportedLabels as ImportedLabels
+    from crosscue.eval.interface.failures.labels import export as export
+    from crosscue.eval.interface.failures.labels import import_labels as import_labels
     from crosscue.eval.interface.fits.compass import FittedCompass as FittedCompass
     from crosscue.eval.interface.fits.compass import fit_compass as fit_compass
     from crosscue.eval.interface.fits.detector import FittedDetector as FittedDetector

@@ -13,11 +13,12 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import Int64s, SchemaError, UsageError
+from crosscue.replay.base import AnnotationError, Int64s, SchemaError, UsageError
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .truth import CueTruth
@@ -46,6 +47,7 @@ class Thing:
         segmentation: COCO's polygons or runs, or None.
         place: Where it stands in its file, for errors.
         range_m: From the camera, or None where the file does not say.
+        score: Of a detector, for a box that nobody has confirmed yet.
     """
 
     label: str
@@ -56,6 +58,7 @@ class Thing:
     segmentation: Any = None
     place: str = ""
     range_m: float | None = None
+    score: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +125,24 @@ class Placed:
 
     t_ns: tuple[int, ...]
     rule: str
+
+
+Sizes = Mapping[str, tuple[int, int]]
+"""From a picture's name without its ending to its width and height; ``*`` for all others."""
+
+
+def size_of(stem: str, sizes: Sizes, path: Path) -> tuple[int, int]:
+    """Of a picture whose labels are in fractions of it.
+
+    Raises:
+        AnnotationError: It is not known.
+    """
+    size = sizes.get(stem, sizes.get("*"))
+    if size is None:
+        raise AnnotationError(
+            f"{path}: {stem}: no such picture was exported; expected names as exported"
+        )
+    return size
 
 
 def place(annotations: Annotations, log: LogPictures) -> Placed:
@@ -192,7 +213,16 @@ def _by_time(annotations: Annotations, log: LogPictures) -> Placed | None:
 def _time_of(picture: Picture) -> int | None:
     if picture.t_ns is not None:
         return picture.t_ns
-    stem = re.split(r"[/\\]", picture.name)[-1].rpartition(".")[0]
+    name = re.split(r"[/\\]", picture.name)[-1]
+    stem = re.sub(r"\.[A-Za-z]+$", "", name)
+    return time_in_name(stem)
+
+
+def time_in_name(stem: str) -> int | None:
+    """The log time in a picture's name: ``DRIVE_17...ns`` as exported, or nanoseconds alone."""
+    exported = re.search(r"_([0-9]{1,19})ns$", stem)
+    if exported is not None:
+        return int(exported[1])
     # Nanoseconds since 1970 have nineteen digits, and no frame's number has.
     return int(stem) if re.fullmatch(r"[0-9]{16,19}", stem) else None
 

@@ -7,12 +7,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import MIB, AnnotationError, json_tree, read_at_most
+from crosscue.replay.base import (
+    MIB,
+    AnnotationError,
+    json_tree,
+    read_at_most,
+    strict_json,
+    write_text,
+)
 
 from .annotations import Annotations, Picture, Thing
 
 MAX_BYTES: Final = 512 * MIB
 MAX_SIDE: Final = 100_000
+WRITTEN: Final = "annotations.json"
 
 
 def read_coco(path: Path) -> Annotations:
@@ -127,3 +135,40 @@ def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def write_coco(folder: Path, labels: Annotations) -> Path:
+    """Write a COCO file with times of pictures and scores of boxes; returns its path.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    numbers = {name: number for number, name in enumerate(labels.labels, 1)}
+    images: list[dict[str, Any]] = []
+    things: list[dict[str, Any]] = []
+    for number, picture in enumerate(labels.pictures, 1):
+        wide, high = picture.size_px
+        images.append({"id": number, "file_name": picture.name, "width": wide, "height": high})
+        if picture.t_ns is not None:
+            images[-1]["t_ns"] = picture.t_ns
+        for thing in picture.things:
+            if thing.box_px is None:
+                continue
+            x0, y0, x1, y1 = thing.box_px
+            box = {
+                "id": len(things) + 1,
+                "image_id": number,
+                "category_id": numbers[thing.label],
+                "bbox": [x0, y0, x1 - x0, y1 - y0],
+                "area": (x1 - x0) * (y1 - y0),
+                "iscrowd": int(thing.is_crowd),
+            }
+            things.append(box if thing.score is None else box | {"score": thing.score})
+    tree = {
+        "info": {"description": labels.where},
+        "images": images,
+        "annotations": things,
+        "categories": [{"id": number, "name": name} for name, number in numbers.items()],
+    }
+    write_text(folder / WRITTEN, strict_json(tree) + "\n")
+    return folder / WRITTEN

@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 from xml.parsers import expat
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from crosscue.replay.base import MIB, AnnotationError
+from crosscue.replay.base import MIB, AnnotationError, write_text
 
 from .annotations import Annotations, Picture, Thing
 
@@ -24,6 +25,7 @@ MAX_BYTES: Final = 512 * MIB
 MAX_DEPTH: Final = 64
 MAX_FRAMES: Final = 10_000_000
 MAX_SIDE: Final = 100_000
+WRITTEN: Final = "annotations.xml"
 SHAPES: Final = ("box", "polygon", "mask", "tag")
 IGNORED: Final = ("polyline", "points", "cuboid", "ellipse", "skeleton")
 
@@ -245,3 +247,39 @@ class _Reader:
                 f"{self.where}: meta: {name} {text[:40]!r}: expected a whole number"
             )
         return otherwise
+
+
+def write_cvat(folder: Path, labels: Annotations) -> Path:
+    """Write "CVAT for images" 1.1; returns its path.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    lines = [
+        '<?xml version="1.0" encoding="utf-8"?>',
+        "<annotations>",
+        "<version>1.1</version>",
+        "<meta><task>",
+        f"<name>{escape(labels.where)}</name><size>{len(labels.pictures)}</size>",
+        "<mode>annotation</mode><labels>",
+        *(f"<label><name>{escape(name)}</name></label>" for name in labels.labels),
+        "</labels></task></meta>",
+    ]
+    for number, picture in enumerate(labels.pictures):
+        lines += _written(number, picture)
+    write_text(folder / WRITTEN, "\n".join([*lines, "</annotations>"]) + "\n")
+    return folder / WRITTEN
+
+
+def _written(number: int, picture: Picture) -> list[str]:
+    wide, high = picture.size_px
+    boxes = []
+    for thing in picture.things:
+        if thing.box_px is not None:
+            x0, y0, x1, y1 = (repr(float(side)) for side in thing.box_px)
+            boxes.append(
+                f'<box label={quoteattr(thing.label)} source="auto" occluded="0" xtl="{x0}" '
+                f'ytl="{y0}" xbr="{x1}" ybr="{y1}" z_order="0"></box>'
+            )
+    head = f'<image id="{number}" name={quoteattr(picture.name)} width="{wide}" height="{high}">'
+    return [head, *boxes, "</image>"]

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.datasets.labels.table import read_labels
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.annotations import (
     Annotations,
@@ -22,7 +23,6 @@ from crosscue.datasets.truth.annotations import (
     place,
 )
 from crosscue.datasets.truth.coco import read_coco
-from crosscue.datasets.truth.cvat import read_cvat
 from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
@@ -32,7 +32,6 @@ from crosscue.replay.base import (
     Limits,
     OutputError,
     SchemaError,
-    UsageError,
     sha256_of,
     strict_json,
     visible,
@@ -42,6 +41,7 @@ from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
 
 from .log_images import LogSpan, log_pictures, log_span
 
+FILE: Final = truth_file.FILE
 SLACK_NS: Final = 1_000_000_000
 """Truth may begin or end so far outside its log: clocks and last pictures differ a little."""
 
@@ -245,21 +245,6 @@ def _check_objects(path: Path, pictures: LogPictures, own_cues: Sequence[str]) -
     return sum(len(picture.things) for picture in annotations.pictures)
 
 
-def read_annotations(path: Path) -> Annotations:
-    """Read a COCO (``.json``) or CVAT (``.xml``) file.
-
-    Raises:
-        UsageError: Another kind of file.
-        SchemaError: Not what it should be.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".json":
-        return read_coco(path)
-    if suffix == ".xml":
-        return read_cvat(path)
-    raise UsageError(f"{path}: expected a COCO .json or a CVAT .xml file")
-
-
 def import_truth(
     annotations: Path | str,
     log: Path | str,
@@ -269,18 +254,22 @@ def import_truth(
     labels: Mapping[str, str] = MappingProxyType({}),
     add: bool = False,
     overwrite: bool = False,
+    kind: str | None = None,
     limits: Limits = DEFAULT_LIMITS,
 ) -> ImportedTruth:
     """Turn annotated pictures of a log into its truth.
 
     Args:
-        annotations: COCO (``.json``) or CVAT 1.1 (``.xml``).
+        annotations: COCO, FiftyOne or Label Studio (``.json``), CVAT 1.1 (``.xml``), or a folder of
+            YOLO or FiftyOne.
         log: The log whose pictures were annotated.
         output: The truth file, or its folder; labelled objects go beside it.
         vehicle: Names the camera where the log has several, and cues of the user's own.
         labels: From label to cue; an empty cue leaves the label out.
         add: Keep everything but cues and objects of the truth file that is there.
         overwrite: Replace a truth file that is there.
+        kind: One of ``coco``, ``cvat``, ``yolo``, ``fiftyone``, ``labelstudio``; recognised if left
+            out.
         limits: What the log is read with.
 
     Raises:
@@ -291,24 +280,69 @@ def import_truth(
     target = place_of / truth_file.FILE if place_of.is_dir() else place_of
     if target.exists() and not (add or overwrite):
         raise OutputError(f"{target}: exists; --add to it, --overwrite it, or give another name")
-    return _imported(source, log_path, target, vehicle_given(vehicle), labels, add, limits)
+    settings = vehicle_given(vehicle)
+    pictures = log_pictures(log_path, settings, limits)
+    read = read_labels(source, {"*": pictures.size_px}, kind)
+    cues = meanings(read, labels, tuple(settings.cues.own))
+    return write_imported(read, cues, pictures, log_path, target, add=add)
 
 
-def _imported(
-    source: Path,
-    log_path: Path,
+def import_part(
+    annotations: Annotations,
+    cues: Mapping[str, str | None],
+    log: Path,
     output: Path,
     vehicle: Vehicle,
-    labels: Mapping[str, str],
-    add: bool,
-    limits: Limits,
+    *,
+    add: bool = False,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> ImportedTruth:
-    annotations = read_annotations(source)
-    cues = meanings(annotations, labels, tuple(vehicle.cues.own))
+    """Write the annotated pictures of one log, as ``write_imported`` does.
+
+    Args:
+        annotations: As read.
+        cues: From label to cue.
+        log: The log.
+        output: The truth file.
+        vehicle: Names the camera where the log has several.
+        add: Keep everything but cues and objects.
+        limits: What the log is read with.
+
+    Raises:
+        LogError: The log cannot be read.
+        SchemaError: The annotations do not fit it.
+        OutputError: The files cannot be written.
+    """
+    pictures = log_pictures(log, vehicle, limits)
+    return write_imported(annotations, cues, pictures, log, output, add=add)
+
+
+def write_imported(
+    annotations: Annotations,
+    cues: Mapping[str, str | None],
+    pictures: LogPictures,
+    log_path: Path,
+    output: Path,
+    *,
+    add: bool = False,
+) -> ImportedTruth:
+    """Write the annotated pictures of one log as its truth and its labelled objects.
+
+    Args:
+        annotations: As read.
+        cues: From label to cue; None for a label that is not one.
+        pictures: Of the log.
+        log_path: The log.
+        output: The truth file; objects go beside it.
+        add: Keep everything but cues and objects of the truth file that is there.
+
+    Raises:
+        SchemaError: The annotations do not fit the log.
+        OutputError: The files cannot be written.
+    """
     check_boxes(annotations)
-    pictures = log_pictures(log_path, vehicle, limits)
     placed = place(annotations, pictures)
-    truth = _truth(annotations, placed, cues, pictures, log_path, source)
+    truth = _truth(annotations, placed, cues, pictures, log_path, Path(annotations.where))
     if add:
         before = truth_file.load(output)
         kept = {

@@ -37,6 +37,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "view": ("gone -o x.rrd", INPUT),
     "failures": ("gone", INPUT),
     "browse": ("gone -o site", INPUT),
+    "export": ("gone.parquet -o out", INPUT),
     "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
     "truth from-gnss": ("gone.mcap -o out", INPUT),
     "fit odometry": ("gone.mcap --vehicle gone.toml", SETTINGS),

@@ -28,7 +28,7 @@ CALLS: Final = {
     "vehicle init": ("draft_vehicle",),
     "vehicle check": ("check_vehicle",),
     "truth": ("write_truth",),
-    "truth import": ("import_truth",),
+    "truth import": ("import_truth", "import_labels"),
     "truth check": ("check_truth",),
     "truth schema": ("truth_schema",),
     "run schema": ("run_schema",),
@@ -51,6 +51,7 @@ CALLS: Final = {
     ),
     "failures": ("failures",),
     "browse": ("browse",),
+    "export": ("export",),
     "plugins": ("plugins",),
     "info": ("open",),
     "landmarks add": (

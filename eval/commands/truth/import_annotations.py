@@ -1,14 +1,18 @@
 """Turn annotated pictures of a log into its truth.
 
-Takes COCO (.json) and CVAT for images or video, XML 1.1 (.xml). Pictures find their frames by t_ns,
-by file name, or by the frame's number. A label that is a cue's name ("stop sign", "parked_left")
-says that the cue is there, and pictures annotated without it that it is not; --map says what other
-labels mean. Approaches are no part of such files: write them into the truth file by hand (see
-crosscue truth schema), and --add leaves them as they are. Cues of your own are those that the
-vehicle file has under [cues.own].
+Takes COCO, FiftyOne and Label Studio (.json), CVAT for images or video, XML 1.1 (.xml), and folders
+of YOLO and FiftyOne. Pictures find their frames by t_ns, by file name, or by the frame's number;
+those of an export (--export) by the export, which may be of many drives: each gets its truth file
+below DIR, and DIR/coco.json has all of them, to train with.
+
+A label that is a cue's name ("stop sign", "parked_left") says that the cue is there, and pictures
+annotated without it that it is not; --map says what other labels mean. Approaches are no part of
+such files: write them into the truth file by hand (see crosscue truth schema), and --add leaves
+them as they are. Cues of your own are those that the vehicle file has under [cues.own].
 
 examples:
   crosscue truth import coco.json --log drive.mcap -o truth.json
+  crosscue truth import corrected.json --export labelling -o labelled
   crosscue truth import annotations.xml --log drive.mcap -o truth.json --map 'halt=stop_sign' 'dog='
 """
 
@@ -24,9 +28,16 @@ from crosscue.replay.errors import UsageError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("source", type=Path, metavar="ANNOTATIONS", help="COCO .json, CVAT .xml")
+    parser.add_argument("source", type=Path, metavar="ANNOTATIONS", help="file or folder")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--log", type=Path, metavar="LOG", help="the log that was annotated")
+    what.add_argument(
+        "--export", type=Path, metavar="DIR", help="folder of crosscue export that was annotated"
+    )
     parser.add_argument(
-        "--log", type=Path, required=True, metavar="LOG", help="the log that was annotated"
+        "--format",
+        choices=("coco", "cvat", "yolo", "fiftyone", "labelstudio"),
+        help="format of the annotations (default: recognised)",
     )
     parser.add_argument(
         "-o",
@@ -34,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="T.json",
-        help="truth file, or its folder",
+        help="truth file, or its folder; with --export the folder of all",
     )
     parser.add_argument(
         "--vehicle",
@@ -61,6 +72,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Import, and print the result."""
+    if args.export is not None:
+        print_result(
+            crosscue.import_labels(
+                args.source,
+                args.export,
+                args.output,
+                args.vehicle,
+                labels=dict(_meaning(text) for text in args.map),
+                add=args.add,
+                overwrite=args.overwrite,
+                kind=args.format,
+                limits=limits_of(args),
+            ),
+            args,
+        )
+        return 0
     found = crosscue.import_truth(
         args.source,
         args.log,
@@ -69,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
         labels=dict(_meaning(text) for text in args.map),
         add=args.add,
         overwrite=args.overwrite,
+        kind=args.format,
         limits=limits_of(args),
     )
     print_result(found, args)

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
@@ -15,6 +16,9 @@ from crosscue.replay.base import EmptyResultError, OutputError, UsageError, cann
 from crosscue.replay.processes import in_processes
 
 from .failures import ENDINGS, Failures, failures
+
+PRINTED: Final = 3
+"""Reasons of missing pictures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -59,7 +63,9 @@ class Site:
         lines = [f"failures   {self.failures:,}, {self.pictures:,} pictures"]
         if self.without_picture:
             lines.append(f"           {self.without_picture:,} failures without a picture")
-        lines += [f"           {visible(why)}" for why in self.reasons]
+        lines += [f"           {visible(why)}" for why in self.reasons[:PRINTED]]
+        if len(self.reasons) > PRINTED:
+            lines.append(f"           and {len(self.reasons) - PRINTED:,} more reasons (--json)")
         if self.found is not None:
             lines += [f"left out   {visible(str(error))}" for error in self.found.failed.values()]
         lines.append(f"open       {visible(str(self.index.resolve()))}")

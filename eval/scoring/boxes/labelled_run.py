@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from crosscue.datasets.truth.annotations import time_in_name
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.catalog.class_names import meaning_of
@@ -235,9 +236,7 @@ def _stem(name: str) -> str:
 def _time_of(picture: LabelPicture) -> int | None:
     if picture.t_ns is not None:
         return picture.t_ns
-    stem = _stem(picture.name)
-    # Nanoseconds since 1970 have nineteen digits, and no frame's number has.
-    return int(stem) if re.fullmatch(r"[0-9]{16,19}", stem) else None
+    return time_in_name(_stem(picture.name))
 
 
 def _classes(

@@ -1,0 +1,1 @@
+"""Pictures with labelled boxes, written for and read from labelling tools."""

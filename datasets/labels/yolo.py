@@ -1,0 +1,58 @@
+"""YOLO as Ultralytics lays it out: ``data.yaml``, ``labels/NAME.txt`` and ``images``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from crosscue.datasets.truth.annotations import Annotations, Picture, Sizes, Thing, size_of
+from crosscue.datasets.truth.box_labels import read_box_labels
+from crosscue.replay.base import strict_json, write_text
+
+FILE = "data.yaml"
+LABELS = "labels"
+
+
+def write_yolo(folder: Path, labels: Annotations) -> Path:
+    """Write them; a picture without boxes gets an empty file, for that is an answer.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    numbers = {name: number for number, name in enumerate(labels.labels)}
+    for picture in labels.pictures:
+        wide, high = picture.size_px
+        lines = []
+        for thing in picture.things:
+            if thing.box_px is not None:
+                x0, y0, x1, y1 = thing.box_px
+                box = (x0 + x1) / 2 / wide, (y0 + y1) / 2 / high, (x1 - x0) / wide, (y1 - y0) / high
+                lines.append(" ".join([str(numbers[thing.label]), *map(repr, map(float, box))]))
+        place = folder / LABELS / f"{Path(picture.name).stem}.txt"
+        write_text(place, "".join(f"{line}\n" for line in lines))
+    # JSON's strings are YAML's.
+    names = [f"  {number}: {strict_json(name).strip()}" for name, number in numbers.items()]
+    text = ["path: .", "train: images", "val: images", "names:", *names]
+    write_text(folder / FILE, "\n".join(text) + "\n")
+    return folder / FILE
+
+
+def read_yolo(path: Path, sizes: Sizes) -> Annotations:
+    """Read the folder, its ``labels``, or its ``data.yaml``.
+
+    Raises:
+        AnnotationError: A file cannot be read, or no size of a picture is known.
+    """
+    folder = path.parent if path.is_file() else path
+    inside = folder / LABELS
+    found = read_box_labels(inside if inside.is_dir() else folder, "yolo")
+    pictures = []
+    for one in found.pictures:
+        stem = Path(one.name).stem
+        size = size_of(stem, sizes, path)
+        things = []
+        for box in one.boxes:
+            x0, y0, x1, y1 = box.box
+            in_px = (x0 * size[0], y0 * size[1], x1 * size[0], y1 * size[1])
+            things.append(Thing(box.label, in_px, place=one.name))
+        pictures.append(Picture(stem, size, None, None, tuple(things)))
+    return Annotations(str(path), found.classes, tuple(pictures))

@@ -1,0 +1,57 @@
+"""Export the pictures of failures for labelling, with the detections in them as pre-labels.
+
+FAILURES is a table that crosscue failures -o wrote; each frame is exported once, its picture as
+recorded. Names of pictures hold their drive and time, so that crosscue truth import --export finds
+both again. Boxes that nobody has corrected are detections, not labels.
+
+examples:
+  crosscue failures runs --top 10 -o worst.parquet
+  crosscue export worst.parquet --to cvat -o labelling
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import crosscue
+from crosscue.eval.commands.shared.terminal import print_result, progress_line
+
+FORMATS = ("coco", "cvat", "yolo", "fiftyone", "labelstudio")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare flags."""
+    parser.add_argument("failures", type=Path, metavar="FAILURES", help="table of failures")
+    parser.add_argument("--to", choices=FORMATS, default="coco", help="format (default: coco)")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the export"
+    )
+    parser.add_argument(
+        "--classes",
+        nargs="+",
+        default=[],
+        metavar="LABEL",
+        help="labels to choose from (default: those that the runs' cues are made of)",
+    )
+    parser.add_argument(
+        "--logs", type=Path, metavar="DIR", help="folder that the runs' logs have moved to"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier export")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export; 3 when a run could not be read."""
+    with progress_line(args, "exporting") as line:
+        found = crosscue.export(
+            args.failures,
+            args.output,
+            args.to,
+            classes=args.classes,
+            logs=args.logs,
+            overwrite=args.overwrite,
+            on_runs=line.counting("runs"),
+        )
+    print_result(found, args)
+    return 3 if found.failed else 0

@@ -1,0 +1,156 @@
+"""Failing frames for labelling: their pictures as recorded, and what detectors found in them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.datasets.truth.annotations import Picture, Thing
+from crosscue.detectors.images import Encoded, decode, size_of
+from crosscue.eval.runs.folder import RunFolder, open_run
+from crosscue.eval.runs.stored_images import camera_of, pictures_at
+from crosscue.eval.runs.tables.stored_frames import stored_frames
+from crosscue.replay.base import CrosscueError, write_bytes
+
+ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}
+"""Codings that every tool reads; others are written as PNG, without loss."""
+NO_PICTURE: Final = "frames whose picture cannot be read"
+OTHER: Final = "detections of labels that no cue is made of"
+
+
+@dataclass(slots=True)
+class ExportedRun:
+    """One run's frames.
+
+    Attributes:
+        name: Of its folder.
+        log: Path or URL of the log with the pictures.
+        labels: To choose from, with the cue that each counts as; empty for things like cars.
+        pictures: With detections as pre-labels; names are those of the files.
+        left_out: What was not exported, by reason.
+    """
+
+    name: str
+    log: Path | str = ""
+    labels: Mapping[str, str] = field(default_factory=dict)
+    pictures: list[Picture] = field(default_factory=list)
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    def as_index(self, folder: Path) -> dict[str, Any]:
+        """What ``crosscue_export.json`` in a folder says of it."""
+        log = str(self.log)
+        if isinstance(self.log, Path):
+            log = os.path.relpath(self.log.resolve(), folder.resolve())
+        pictures = {
+            one.name: {"t_ns": one.t_ns, "width": one.size_px[0], "height": one.size_px[1]}
+            for one in self.pictures
+        }
+        return {
+            "drive": self.name,
+            "log": log,
+            "labels": dict(self.labels),
+            "pictures": pictures,
+        }
+
+
+def export_run(
+    path: Path,
+    times: Sequence[int],
+    images: Path,
+    classes: Sequence[str] | None,
+    logs: Path | None = None,
+) -> ExportedRun:
+    """Write the pictures of some frames, and collect what detectors found in them.
+
+    Args:
+        path: The run.
+        times: Of the frames, as in the run's tables.
+        images: Folder for the pictures.
+        classes: Labels to keep; None for those that the run's cues are made of.
+        logs: Where its logs have moved to, if they have.
+
+    Raises:
+        RunError: The run or its log cannot be read.
+        OutputError: A picture cannot be written.
+    """
+    run = open_run(path, logs)
+    vehicle = run.drive_manifest().settings
+    # A car is a thing, and only how it stands or moves is a cue.
+    known = {
+        label: "" if label in vehicle.cars.labels else cue
+        for cue, labels in vehicle.cue_labels().items()
+        for label in labels
+    }
+    wanted = {label: known.get(label, "") for label in classes or known}
+    found = ExportedRun(path.resolve().name, labels=wanted)
+    camera = camera_of(run)
+    if camera is None:
+        found.left_out[NO_PICTURE] = len(times)
+        return found
+    found.log = camera.log
+    things, log_ns = _things(run, frozenset(times), found), _log_times(run)
+    written: dict[int, Picture] = {}
+
+    def on_picture(t_ns: int, picture: Encoded) -> None:
+        try:
+            content, ending, size = _content(picture)
+        except CrosscueError:
+            return
+        # In the log's time, which truth and labels have.
+        at_ns = log_ns.get(t_ns, t_ns)
+        name = f"{found.name}_{at_ns}ns{ending}"
+        write_bytes(images / name, content)
+        written[t_ns] = Picture(name, size, at_ns, None, things.get(t_ns, ()))
+
+    pictures_at(camera, times, on_picture)
+    found.pictures = [written[t_ns] for t_ns in sorted(written)]
+    if len(written) < len(times):
+        found.left_out[NO_PICTURE] = len(times) - len(written)
+    return found
+
+
+def _things(
+    run: RunFolder, times: frozenset[int], found: ExportedRun
+) -> Mapping[int, tuple[Thing, ...]]:
+    """Detections above their detector's threshold, by time."""
+    detected = run.drive_manifest().detected
+    things: dict[int, tuple[Thing, ...]] = {}
+    for frame in stored_frames(run, detected.detectors) if detected is not None else ():
+        seen = frame.seen
+        if seen.t_ns not in times:
+            continue
+        kept = []
+        for one in (*seen.objects, *seen.signs):
+            for box, score, label in zip(one.boxes_px, one.scores, one.labels, strict=True):
+                if label not in found.labels:
+                    found.left_out[OTHER] = found.left_out.get(OTHER, 0) + 1
+                    continue
+                x0, y0, x1, y1 = _inside(box.tolist(), frame.size_px)
+                if x0 < x1 and y0 < y1:
+                    kept.append(Thing(label, (x0, y0, x1, y1), score=round(float(score), 4)))
+        things[seen.t_ns] = tuple(kept)
+    return things
+
+
+def _inside(box: Sequence[float], size_px: tuple[int, int]) -> list[float]:
+    """A box cut off at the picture's edges: tools refuse others."""
+    return [min(max(side, 0.0), float(size_px[k % 2])) for k, side in enumerate(box)]
+
+
+def _log_times(run: RunFolder) -> Mapping[int, int]:
+    table = run.table("frames", ["t_ns", "log_t_ns"])
+    return dict(zip(table["t_ns"].to_pylist(), table["log_t_ns"].to_pylist(), strict=True))
+
+
+def _content(picture: Encoded) -> tuple[bytes, str, tuple[int, int]]:
+    """A picture's file, its ending, and its size."""
+    if picture.coding in ENDINGS:
+        return bytes(picture.content), ENDINGS[picture.coding], size_of(picture)
+    import cv2
+
+    pixels, size = decode(picture)
+    _, content = cv2.imencode(".png", pixels)
+    return content.tobytes(), ".png", size

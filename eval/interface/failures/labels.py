@@ -1,0 +1,336 @@
+"""The labelling loop: failing frames exported for a labelling tool, and taken back corrected."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
+from crosscue.datasets.truth.annotations import Annotations, Picture, meanings
+from crosscue.datasets.truth.coco import write_coco
+from crosscue.eval.failures.export import ExportedRun, export_run
+from crosscue.eval.failures.record import Failure, read_failures
+from crosscue.eval.fit.truth_check import FILE, ImportedTruth, import_part
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    AnnotationError,
+    CrosscueError,
+    EmptyResultError,
+    Limits,
+    OutputError,
+    SchemaError,
+    UsageError,
+    cannot_write,
+    json_tree,
+    strict_json,
+    visible,
+    write_text,
+)
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+
+INDEX: Final = "crosscue_export.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ExportedLabels:
+    """Pictures for a labelling tool; printed as ``crosscue export`` prints it.
+
+    Attributes:
+        file: What to give to the tool.
+        format: One of the table of formats.
+        pictures: How many.
+        boxes: Detections in them, as pre-labels.
+        labels: Classes to choose from.
+        left_out: What was not exported, by reason.
+        failed: Runs that could not be read, and why.
+    """
+
+    file: Path
+    format: str
+    pictures: int
+    boxes: int
+    labels: tuple[str, ...]
+    left_out: Mapping[str, int]
+    failed: Mapping[str, CrosscueError]
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue export --json`` prints."""
+        return {
+            "file": str(self.file),
+            "format": self.format,
+            "pictures": self.pictures,
+            "boxes": self.boxes,
+            "labels": list(self.labels),
+            "left_out": dict(self.left_out),
+            "failed": {run: str(error) for run, error in self.failed.items()},
+        }
+
+    def __repr__(self) -> str:
+        title = LABEL_FORMATS[self.format].title
+        lines = [
+            f"pictures   {self.pictures:,} with {self.boxes:,} boxes to correct, for {title}",
+            f"classes    {visible(', '.join(self.labels))}",
+            *(f"left out   {count:,} {visible(why)}" for why, count in self.left_out.items()),
+            *(f"left out   {visible(str(error))}" for error in self.failed.values()),
+            f"written to {visible(str(self.file))}",
+        ]
+        return "\n".join(lines)
+
+
+def export(
+    failures: Sequence[Failure] | Path | str,
+    output: Path | str,
+    to: str = "coco",
+    *,
+    classes: Sequence[str] = (),
+    logs: Path | str | None = None,
+    overwrite: bool = False,
+    on_runs: Callable[[int, int], None] = lambda done, of: None,
+) -> ExportedLabels:
+    """Export the pictures of failures for labelling, with detections as pre-labels.
+
+    Args:
+        failures: A table that ``failures`` wrote, or failures.
+        output: Folder, new or empty.
+        to: ``coco``, ``cvat``, ``yolo``, ``fiftyone`` or ``labelstudio``.
+        classes: Labels to choose from; those that the runs' cues are made of if empty.
+        logs: Where the runs' logs have moved to, if they have.
+        overwrite: Replace an earlier export.
+        on_runs: Called with the number of runs that are exported, and of how many.
+
+    Raises:
+        UsageError: Another format.
+        EmptyResultError: No picture to export; nothing was written.
+        OutputError: The folder holds something else, or cannot be written.
+    """
+    if to not in LABEL_FORMATS:
+        raise UsageError(f"--to {to}: expected one of {', '.join(LABEL_FORMATS)}")
+    given = isinstance(failures, Path | str)
+    chosen = read_failures(Path(failures)) if isinstance(failures, Path | str) else failures
+    where = str(failures) if given else "failures"
+    folder, kind = Path(output), LABEL_FORMATS[to]
+    _check_place(folder, overwrite)
+    made = folder.with_name(f".{folder.name}.partial")
+    by_run: dict[str, set[int]] = {}
+    for one in chosen:
+        by_run.setdefault(one.run, set()).add(one.t_ns)
+    runs: list[ExportedRun] = []
+    failed: dict[str, CrosscueError] = {}
+    try:
+        shutil.rmtree(made, ignore_errors=True)
+        (made / kind.pictures).mkdir(parents=True)
+        for done, (run, times) in enumerate(by_run.items(), 1):
+            moved = None if logs is None else Path(logs)
+            try:
+                images = made / kind.pictures
+                runs.append(export_run(Path(run), sorted(times), images, classes or None, moved))
+            except OutputError:
+                raise
+            except CrosscueError as error:
+                failed[run] = error
+            on_runs(done, len(by_run))
+        found = _together(where, runs)
+        if not found.pictures:
+            reasons = [str(error) for error in failed.values()] or ["no failure in the table"]
+            raise EmptyResultError(f"{where}: no picture to export: {reasons[0]}")
+        file = kind.write(made, found)
+        index = [one.as_index(folder) for one in runs if one.pictures]
+        write_text(made / INDEX, strict_json({"format": 1, "to": to, "drives": index}) + "\n")
+        shutil.rmtree(folder, ignore_errors=True)
+        made.rename(folder)
+    except OSError as error:
+        raise cannot_write(Path(error.filename or folder), error) from None
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+    left_out: dict[str, int] = {}
+    for part in runs:
+        for why, count in part.left_out.items():
+            left_out[why] = left_out.get(why, 0) + count
+    boxes = sum(len(one.things) for one in found.pictures)
+    return ExportedLabels(
+        folder / file.name, to, len(found.pictures), boxes, found.labels, left_out, failed
+    )
+
+
+def _check_place(folder: Path, overwrite: bool) -> None:
+    there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if there and not (folder / INDEX).is_file():
+        raise OutputError(f"{folder}: holds something that is not an export; give another folder")
+    if there and not overwrite:
+        raise OutputError(f"{folder}: holds an export; give another folder or --overwrite")
+
+
+def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:
+    """The pictures of all runs.
+
+    Raises:
+        UsageError: Two runs have one name and a frame in common.
+    """
+    names = [one.name for run in runs for one in run.pictures]
+    twice = sorted({name for name in names if names.count(name) > 1}) if len(runs) > 1 else []
+    if twice:
+        raise UsageError(f"{where}: two runs would write {twice[0]}; export them one by one")
+    labels = dict.fromkeys(label for run in runs for label in run.labels)
+    return Annotations(where, tuple(labels), tuple(one for run in runs for one in run.pictures))
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ImportedLabels:
+    """Corrected labels, drive by drive; printed as ``truth import --export`` prints it.
+
+    Attributes:
+        coco: All pictures together, to train and fit with.
+        images: Folder of the pictures, as exported.
+        drives: By name of the drive.
+        missing: Exported pictures that the file does not have.
+        ignored: Shapes and tasks that were not taken, by kind.
+    """
+
+    coco: Path
+    images: Path
+    drives: Mapping[str, ImportedTruth]
+    missing: int
+    ignored: Mapping[str, int]
+
+    def as_dict(self) -> dict[str, object]:
+        """What ``crosscue truth import --export --json`` prints."""
+        return {
+            "coco": str(self.coco),
+            "images": str(self.images),
+            "drives": {name: one.as_dict() for name, one in self.drives.items()},
+            "missing": self.missing,
+            "ignored": dict(self.ignored),
+        }
+
+    def __repr__(self) -> str:
+        pictures = sum(one.pictures for one in self.drives.values())
+        things = sum(one.things for one in self.drives.values())
+        lines = [f"pictures   {pictures:,} with {things:,} things, of {len(self.drives):,} drives"]
+        if self.missing:
+            lines.append(f"missing    {self.missing:,} exported pictures did not come back")
+        lines += [f"not taken  {count:,} {visible(kind)}" for kind, count in self.ignored.items()]
+        lines += [f"truth      {visible(str(one.truth))}" for one in self.drives.values()]
+        lines.append(f"to train   --data {visible(str(self.coco))} --images {self.images}")
+        return "\n".join(lines)
+
+
+def import_labels(
+    annotations: Path | str,
+    exported: Path | str,
+    output: Path | str,
+    vehicle: Vehicle | Path | str | None = None,
+    *,
+    labels: Mapping[str, str] = MappingProxyType({}),
+    add: bool = False,
+    overwrite: bool = False,
+    kind: str | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+) -> ImportedLabels:
+    """Take corrected labels of an export back: truth and objects of each drive, and one COCO file.
+
+    Args:
+        annotations: What the labelling tool exported, in any of the formats of ``export``.
+        exported: The folder that ``export`` wrote, which knows the time of each picture.
+        output: Folder; gets a folder for each drive, and ``coco.json``.
+        vehicle: Cues of the user's own.
+        labels: From label to cue; an empty cue leaves the label out.
+        add: Keep everything but cues and objects of truth files that are there.
+        overwrite: Replace truth files that are there.
+        kind: The format; recognised if left out.
+        limits: What the logs are read with.
+
+    Raises:
+        AnnotationError: The labels or the export cannot be read.
+        SchemaError: A picture was not exported, or has another size.
+        OutputError: A truth file exists, or cannot be written.
+    """
+    source, folder, target = Path(annotations), Path(exported), Path(output)
+    drives = _read_index(folder)
+    known = {
+        Path(name).stem: (name, row) for one in drives for name, row in one["pictures"].items()
+    }
+    sizes = {stem: (row["width"], row["height"]) for stem, (_, row) in known.items()}
+    read = read_labels(source, sizes, kind)
+    placed = tuple(_placed(one, known, read.where) for one in read.pictures)
+    settings = vehicle_given(vehicle)
+    exported_as = {label: cue for one in drives for label, cue in one["labels"].items()}
+    meant = {label: cue for label, cue in exported_as.items() if label in read.labels}
+    cues = meanings(read, meant | dict(labels), tuple(settings.cues.own), any_thing=True)
+    wanted = {name for one in drives for name in one["pictures"]}
+    there = {one["drive"]: target / one["drive"] / FILE for one in drives}
+    for path in there.values():
+        if path.exists() and not (add or overwrite):
+            raise OutputError(f"{path}: exists; --add to it, --overwrite it, or give another name")
+    done: dict[str, ImportedTruth] = {}
+    for one in drives:
+        mine = tuple(picture for picture in placed if picture.name in one["pictures"])
+        if not mine:
+            continue
+        log = _log_of(one["log"], folder)
+        part = replace(read, pictures=mine)
+        keeps = add and there[one["drive"]].exists()
+        path = there[one["drive"]]
+        done[one["drive"]] = import_part(part, cues, log, path, settings, add=keeps, limits=limits)
+    if not done:
+        raise EmptyResultError(f"{source}: not one labelled picture of the export in it")
+    whole = replace(read, pictures=placed)
+    coco = write_coco(target, whole).replace(target / "coco.json")
+    images = folder / LABEL_FORMATS[_format(folder)].pictures
+    missing = len(wanted - {one.name for one in placed})
+    return ImportedLabels(coco, images, done, missing, read.ignored)
+
+
+def _placed(
+    picture: Picture, known: Mapping[str, tuple[str, Mapping[str, Any]]], where: str
+) -> Picture:
+    """With its exported name and its time.
+
+    Raises:
+        SchemaError: It was not exported, or has another size.
+    """
+    stem = re.split(r"[/\\]", picture.name)[-1]
+    found = known.get(stem) or known.get(re.sub(r"\.[A-Za-z]+$", "", stem))
+    if found is None:
+        # CVAT and Label Studio put a prefix of their own before names of uploaded files.
+        ends = [name for name in known if re.sub(r"\.[A-Za-z]+$", "", stem).endswith(name)]
+        found = known[ends[0]] if len(ends) == 1 else None
+    if found is None:
+        raise SchemaError(f"{where}: {picture.name}: no such picture was exported; give its export")
+    name, row = found
+    if picture.size_px != (row["width"], row["height"]):
+        raise SchemaError(
+            f"{where}: {picture.name}: {picture.size_px[0]} x {picture.size_px[1]} pixels; "
+            f"exported were {row['width']} x {row['height']}: label pictures as exported"
+        )
+    return replace(picture, name=name, t_ns=row["t_ns"])
+
+
+def _read_index(folder: Path) -> list[dict[str, Any]]:
+    path = folder / INDEX
+    try:
+        drives = json_tree(path.read_bytes())["drives"]
+        for one in drives:
+            assert one["drive"]
+            assert isinstance(one["log"], str)
+            assert isinstance(one["labels"], dict)
+            for row in one["pictures"].values():
+                assert all(isinstance(row[name], int) for name in ("t_ns", "width", "height"))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError):
+        raise AnnotationError(
+            f"{path}: missing or damaged; give the folder that crosscue export wrote"
+        ) from None
+    return list(drives)
+
+
+def _format(folder: Path) -> str:
+    return str(json_tree((folder / INDEX).read_bytes())["to"])
+
+
+def _log_of(log: str, folder: Path) -> Path:
+    return Path(os.path.normpath(folder / log))

@@ -1,0 +1,126 @@
+"""Every format for labelling tools returns the boxes, labels and times that were written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
+from crosscue.datasets.truth.annotations import Annotations, Picture, Thing, time_in_name
+from crosscue.replay.base import CrosscueError, UsageError
+
+T_NS: Final = 1_700_000_000_123_456_789
+SIZE: Final = (1280, 719)
+
+
+def labels() -> Annotations:
+    """Boxes at edges and between pixels, a label that needs escaping, a picture without any."""
+    names = ("stop sign", 'a "car" & <more>: #1')
+    things = (
+        Thing(names[0], (0.0, 0.0, 1280.0, 719.0), score=0.25),
+        Thing(names[1], (10.125, 20.5, 11.375, 700.0625), score=1.0),
+    )
+    pictures = (
+        Picture(f"A-01_{T_NS}ns.jpg", SIZE, T_NS, None, things),
+        Picture("A-01_5000000000ns.jpg", SIZE, 5_000_000_000, None, ()),
+    )
+    return Annotations("worst.parquet", names, pictures)
+
+
+def confirmed(path: Path) -> Path:
+    """As Label Studio exports tasks whose predictions a person has confirmed."""
+    tree = json.loads(path.read_text())
+    if isinstance(tree, list):
+        for task in tree:
+            task["annotations"] = [{"result": task["predictions"][0]["result"]}]
+        path.write_text(json.dumps(tree))
+    return path
+
+
+def times(read: Annotations) -> dict[int, Picture]:
+    found = {}
+    for one in read.pictures:
+        t_ns = one.t_ns if one.t_ns is not None else time_in_name(Path(one.name).stem)
+        assert t_ns is not None
+        found[t_ns] = one
+    return found
+
+
+@pytest.mark.parametrize("name", LABEL_FORMATS)
+@pytest.mark.parametrize("is_named", [True, False], ids=["format named", "recognised"])
+def test_what_was_written_is_read(name: str, is_named: bool, tmp_path: Path) -> None:
+    wrote = labels()
+    path = LABEL_FORMATS[name].write(tmp_path, wrote)
+    path = confirmed(path) if path.suffix == ".json" else path
+
+    sizes = {Path(one.name).stem: one.size_px for one in wrote.pictures}
+    read = read_labels(path, sizes, name if is_named else None)
+
+    assert times(read).keys() == {T_NS, 5_000_000_000}
+    for one in wrote.pictures:
+        assert one.t_ns is not None
+        same = times(read)[one.t_ns]
+        assert same.size_px == one.size_px
+        assert [thing.label for thing in same.things] == [thing.label for thing in one.things]
+        for thing, was in zip(same.things, one.things, strict=True):
+            assert thing.box_px == pytest.approx(was.box_px, abs=1e-6)
+    assert {*read.labels} >= {thing.label for one in wrote.pictures for thing in one.things}
+
+
+@pytest.mark.parametrize("name", LABEL_FORMATS)
+@pytest.mark.parametrize("content", [b"{", b"[1]", b'{"labels": 3}', b"<a", b"\xff\xfe"])
+def test_what_is_damaged_is_one_error_that_names_the_file(
+    name: str, content: bytes, tmp_path: Path
+) -> None:
+    path = LABEL_FORMATS[name].write(tmp_path, labels())
+    path.write_bytes(content)
+    for text in tmp_path.glob("labels/*.txt"):
+        text.write_bytes(content)
+
+    with pytest.raises(CrosscueError, match=r"^[^\n]*$") as caught:
+        read_labels(path, {"*": SIZE}, name)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_another_format_or_file_is_wrong_usage(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x")
+    with pytest.raises(UsageError, match="expected one of coco, cvat"):
+        read_labels(tmp_path / "a.csv", {}, "voc")
+    with pytest.raises(UsageError, match=r"a\.csv"):
+        read_labels(tmp_path / "a.csv", {})
+
+
+def test_predictions_that_nobody_confirmed_are_not_labels(tmp_path: Path) -> None:
+    path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
+
+    read = read_labels(path, {})
+    assert not read.pictures
+    assert read.ignored == {"tasks without an annotation": 2}
+
+
+def test_the_last_annotation_that_was_not_cancelled_counts(tmp_path: Path) -> None:
+    path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
+    tasks: list[dict[str, Any]] = json.loads(path.read_text())
+    result = tasks[0]["predictions"][0]["result"]
+    tasks[0]["annotations"] = [
+        {"result": []},
+        {"result": result[:1]},
+        {"result": result, "was_cancelled": True},
+    ]
+    path.write_text(json.dumps(tasks[:1]))
+
+    (picture,) = read_labels(path, {}).pictures
+    assert [thing.label for thing in picture.things] == ["stop sign"]
+
+
+def test_coco_is_what_pycocotools_reads(tmp_path: Path) -> None:
+    tools = pytest.importorskip("pycocotools.coco")
+    tree = tools.COCO(str(LABEL_FORMATS["coco"].write(tmp_path, labels())))
+
+    boxes = tree.loadAnns(tree.getAnnIds())
+    assert boxes[0]["bbox"] == [0.0, 0.0, 1280.0, 719.0]
+    assert boxes[1]["bbox"] == [10.125, 20.5, 1.25, 679.5625]
+    assert [one["name"] for one in tree.loadCats(tree.getCatIds())] == list(labels().labels)

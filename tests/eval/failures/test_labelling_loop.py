@@ -1,0 +1,152 @@
+"""The labelling loop: failing frames go out with detections, come back corrected, and are used."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import crosscue
+from crosscue.datasets.truth.coco import read_coco
+from crosscue.detectors.training.annotations import read_coco as read_to_train
+from crosscue.eval.failures.record import Failure
+from crosscue.eval.runs.folder import EstimateManifest, write_manifest
+from crosscue.replay.base import AnnotationError, OutputError, SchemaError, UsageError
+from support.scene_run import SIZE, scene_run
+from support.scoring import at, truth_folder
+
+
+@pytest.fixture(scope="module")
+def worst(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of what went wrong in the made-up run, beside the run."""
+    folder = tmp_path_factory.mktemp("loop")
+    run, truth = scene_run(folder), truth_folder(folder / "truth")
+    manifest = run.drive_manifest()
+    assert isinstance(manifest, EstimateManifest)
+    assert manifest.detect is not None
+    detect = manifest.detect.model_copy(update={"logs": manifest.logs})
+    write_manifest(run, manifest.model_copy(update={"detect": detect}))
+    crosscue.failures(run.path, truth=truth, output=folder / "worst.parquet")
+    return folder / "worst.parquet"
+
+
+@pytest.fixture(scope="module")
+def exported(worst: Path) -> Path:
+    return crosscue.export(worst, worst.parent / "labelling").file
+
+
+def corrected(exported: Path, to: Path, change: Callable[[dict[str, object]], None]) -> Path:
+    """The export after a person has worked on each box."""
+    tree = json.loads(exported.read_text())
+    for box in tree["annotations"]:
+        change(box)
+    to.write_text(json.dumps(tree))
+    return to
+
+
+def test_pictures_go_out_once_as_recorded_with_what_detectors_found(
+    worst: Path, exported: Path
+) -> None:
+    import pyarrow.parquet as pq
+
+    frames = set(pq.read_table(worst)["t_ns"].to_pylist())
+    labels = read_coco(exported)
+
+    assert {one.t_ns for one in labels.pictures} == frames
+    assert {one.size_px for one in labels.pictures} == {SIZE}
+    for one in labels.pictures:
+        assert (exported.parent / "images" / one.name).read_bytes()[:2] == b"\xff\xd8"
+        # The car, and not the thing that no cue is made of.
+        assert one.t_ns is not None
+        x = 20.0 + (one.t_ns - at(0)) // 100_000_000
+        assert [thing.box_px for thing in one.things] == [(x, 40.0, x + 40.0, 52.0)]
+
+
+def test_a_corrected_box_comes_back_with_its_time_and_is_trained_and_fitted_with(
+    worst: Path, exported: Path, tmp_path: Path
+) -> None:
+    def wider(box: dict[str, object]) -> None:
+        box["bbox"] = [*box["bbox"][:2], 44.0, 12.0]  # type: ignore[index]
+
+    mine = corrected(exported, tmp_path / "corrected.json", wider)
+    found = crosscue.import_labels(mine, exported.parent, tmp_path / "labelled")
+
+    (drive,) = found.drives.values()
+    assert found.missing == 0
+    objects = read_coco(Path(drive.objects))
+    was = {one.t_ns: one for one in read_coco(exported).pictures}
+    for one in objects.pictures:
+        (thing,), (before,) = one.things, was[one.t_ns].things
+        assert thing.box_px is not None
+        assert before.box_px is not None
+        assert thing.box_px[2] - thing.box_px[0] == 44.0
+        assert thing.box_px[0] == before.box_px[0]
+    # Its truth fits the log; train reads pictures and boxes; the detector's score reads times.
+    log = worst.parent / "drive.mcap"
+    assert crosscue.check_truth(drive.truth, log).objects == len(objects.pictures)
+    assert read_to_train(found.coco, found.images, ("car",)).objects == len(objects.pictures)
+    fitted = crosscue.fit_detector(worst.parent / "run", drive.objects, detector="finder")
+    assert [one.name for one in fitted.classes] == ["car"]
+    assert fitted.fitted_to + fitted.held_out == len(objects.pictures)
+
+
+def test_a_picture_without_its_cue_says_that_the_cue_is_not_there(
+    exported: Path, tmp_path: Path
+) -> None:
+    found = crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
+
+    (drive,) = found.drives.values()
+    assert drive.cues["stop_sign"] == 0
+
+
+def test_pictures_that_did_not_come_back_are_counted_and_others_refused(
+    exported: Path, tmp_path: Path
+) -> None:
+    tree = json.loads(exported.read_text())
+    gone = tree["images"].pop()
+    tree["annotations"] = [one for one in tree["annotations"] if one["image_id"] != gone["id"]]
+    (tmp_path / "fewer.json").write_text(json.dumps(tree))
+    found = crosscue.import_labels(tmp_path / "fewer.json", exported.parent, tmp_path / "fewer")
+    assert found.missing == 1
+
+    tree["images"][0]["file_name"] = "another.jpg"
+    (tmp_path / "other.json").write_text(json.dumps(tree))
+    with pytest.raises(SchemaError, match=r"another.jpg: no such picture was exported"):
+        crosscue.import_labels(tmp_path / "other.json", exported.parent, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_what_exists_is_not_replaced_unasked(worst: Path, exported: Path, tmp_path: Path) -> None:
+    crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
+    with pytest.raises(OutputError, match="exists"):
+        crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
+    crosscue.import_labels(exported, exported.parent, tmp_path / "labelled", add=True)
+
+    with pytest.raises(OutputError, match="holds an export"):
+        crosscue.export(worst, exported.parent)
+    with pytest.raises(OutputError, match="not an export"):
+        crosscue.export(worst, worst.parent, overwrite=True)
+
+
+def test_a_folder_that_is_no_export_and_a_format_that_is_none_are_refused(
+    worst: Path, exported: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(AnnotationError, match="crosscue export wrote"):
+        crosscue.import_labels(exported, tmp_path, tmp_path / "labelled")
+    with pytest.raises(UsageError, match="expected one of coco"):
+        crosscue.export(worst, tmp_path / "x", to="voc")
+
+
+def test_a_run_that_is_gone_is_left_out_with_its_reason(worst: Path, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from crosscue.eval.failures.record import read_failures
+
+    here: tuple[Failure, ...] = read_failures(worst)
+    gone = replace(here[0], run=str(tmp_path / "gone"))
+
+    found = crosscue.export([*here, gone], tmp_path / "labelling")
+    assert list(found.failed) == [gone.run]
+    assert found.pictures == len({one.t_ns for one in here})
