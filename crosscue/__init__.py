@@ -198,6 +198,9 @@ _EXPORTS: Final = {
     "run_intersection_study": "eval.interface.studies.intersections",
     "IntersectionResult": "eval.interface.studies.intersections",
     "IntersectionStudy": "eval.studies.intersections.settings",
+    "run_layout_study": "eval.interface.studies.layouts",
+    "LayoutResult": "eval.interface.studies.layouts",
+    "LayoutStudy": "eval.studies.layouts.settings",
 }
 """From a public name to its module."""
 
@@ -330,6 +333,8 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.studies.intersections import (
         run_intersection_study as run_intersection_study,
     )
+    from crosscue.eval.interface.studies.layouts import LayoutResult as LayoutResult
+    from crosscue.eval.interface.studies.layouts import run_layout_study as run_layout_study
     from crosscue.eval.interface.studies.town import FieldResult as FieldResult
     from crosscue.eval.interface.studies.town import StudyResult as StudyResult
     from crosscue.eval.interface.studies.town import calibrate_study as calibrate_study
@@ -358,6 +363,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.vehicles import check_vehicle as check_vehicle
     from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
     from crosscue.eval.studies.intersections.settings import IntersectionStudy as IntersectionStudy
+    from crosscue.eval.studies.layouts.settings import LayoutStudy as LayoutStudy
     from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy

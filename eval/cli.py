@@ -83,6 +83,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "study.intersections",
         "repeat the published experiment on simulated drives",
     ),
+    "study layouts": ("study.layouts", "test beliefs on random layouts they were not fitted on"),
     "study range": ("study.range", "measure how far a vehicle gets without landmarks"),
     "study landmarks": ("study.landmarks", "measure the success rate with landmarks"),
     "study field": ("study.field", "repeat the field protocol on simulated drives"),

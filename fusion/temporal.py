@@ -14,6 +14,9 @@ what is believed of the intersection itself, and it is withdrawn with it.
   sign where no intersection is stands at some place too, and its ranges agree as well; so that
   state has a distance as well, and ranges alone say where, not whether.
 
+What is reported is the posterior, but for a *lapse*: a place may be unlike all that were learned
+from, and then what is usual stands. Both shares obey the same bounds.
+
 With likelihoods raised to one exponent (cues repeat one another), the posterior is
 ``p(x | now) ~ L(now | x)^a sum p(x | x') p(x' | before)``: the forward recursion (Rabiner, *A
 Tutorial on Hidden Markov Models*, Proc. IEEE 77, 1989, section III.A).
@@ -117,6 +120,11 @@ class TemporalModel:
     has_feature: NDArray[np.float64]
 
     @property
+    def usual(self) -> Floats:
+        """Probabilities before a drive, shape (features,)."""
+        return np.asarray(self.settings.ahead * (self.has_feature @ self.way_probabilities))
+
+    @property
     def cells(self) -> int:
         """Of distance."""
         reach_m = self.settings.edges_m[-1] + self.settings.behind_m
@@ -201,8 +209,10 @@ class TemporalFilter:
 
     def probabilities(self) -> NDArray[np.float64]:
         """Of each feature, in the graph's order, within (0, 1)."""
+        lapse = self.model.settings.lapse
         mass = self.model.has_feature @ self.ahead.sum(axis=0)
-        return np.asarray(np.clip(mass, FLOOR, 1.0 - FLOOR))
+        mixed = (1.0 - lapse) * mass + lapse * self.model.usual
+        return np.asarray(np.clip(mixed, FLOOR, 1.0 - FLOOR))
 
     def distance_m(self) -> float:
         """Expected distance, if an intersection is ahead."""

@@ -11,11 +11,12 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from crosscue.datasets.truth.truth import Truth
+from crosscue.eval.fit.frame_counts import counts_at, places_in
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.travelled import odometer_of
@@ -23,13 +24,10 @@ from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
 from crosscue.eval.scoring.intervals import Interval, mean_by_cluster, wilson
 from crosscue.eval.scoring.truth import CROSSING_NS
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
-from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
+from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.replay.base import Floats, Int64s, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 COVERED: Final = 0.9
 """Of the time between two frames, at least so much must have odometry."""
@@ -153,33 +151,9 @@ def _near(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> np.typing.NDArray[n
     best = np.full(len(t_ns), np.inf)
     is_wanted = reference == vehicle.fusion.reference
     for rows in (~is_wanted, is_wanted):
-        where, found = _places(t_ns, at[rows])
+        where, found = places_in(t_ns, at[rows])
         best[where] = range_m[rows][found]
     return np.asarray(best <= vehicle.fusion.dissent_within_m)
-
-
-def counts_at(table: pa.Table, t_ns: Int64s) -> dict[str, Int64s]:
-    """From each cue of a table ``cues`` to how many at sorted times, or ``NOT_LOOKED``."""
-    at, count = _whole(table["t_ns"]), _whole(table["count"])
-    cue = np.array(table["cue"].to_pylist(), np.str_)
-    out: dict[str, Int64s] = {}
-    for name in np.unique(cue).tolist():
-        column = np.full(len(t_ns), NOT_LOOKED, np.int64)
-        where, found = _places(t_ns, at[cue == name])
-        column[where] = count[cue == name][found]
-        out[name] = column
-    return out
-
-
-def _places(
-    t_ns: Int64s, at: Int64s
-) -> tuple[np.typing.NDArray[np.intp], np.typing.NDArray[np.bool_]]:
-    """Where in the sorted ``t_ns`` the times of ``at`` stand, and which of them do."""
-    where = np.searchsorted(t_ns, at)
-    found = np.zeros(len(at), np.bool_)
-    inside = where < len(t_ns)
-    found[inside] = t_ns[where[inside]] == at[inside]
-    return where[found], found
 
 
 class SideTold(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Truth
-from crosscue.eval.fit.messages import NOTHING_THERE, counts_at
+from crosscue.eval.fit.frame_counts import counts_at
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.travelled import odometer_of
@@ -28,6 +28,7 @@ from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 if TYPE_CHECKING:
     import pyarrow as pa
 
+NOTHING_THERE: Final = {"intersection": False, "left": False, "right": False}
 CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 
 
@@ -166,6 +167,7 @@ def section_of(fit: TemporalFit) -> str:
         f"ahead = {learned.ahead:.4f}",
         f"edges_m = {list(learned.edges_m)}",
         f"exponent = {learned.exponent}",
+        f"lapse = {learned.lapse}",
         f"stray = {learned.stray}",
         "chains = [",
         *(f"  {_chain_line(one)}," for one in learned.chains),

@@ -8,8 +8,8 @@
 * *Ways*: how often which roads lead on from an intersection, each place counting once, with half a
   place more for each.
 * *Stray* ranges: more than ``STRAY_SD`` standard deviations off, one more of two added.
-* The *exponent*: the one of ``EXPONENTS`` with the best log score where one half of the places is
-  judged by chains counted on the other half, and the other way round.
+* *Exponent* and *lapse*: the pair of ``EXPONENTS`` and ``LAPSES`` with the best log score where one
+  half of the places is judged by chains counted on the other half, and the other way round.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ EDGES_M: Final = (0.0, 10.0, 20.0, 35.0, 50.0, 80.0)
 PULL_STEPS: Final = 20.0
 """About as many as a drive has: one more place that says what others say."""
 STRAY_SD: Final = 3.0
-EXPONENTS: Final = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
+EXPONENTS: Final = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
+LAPSES: Final = (0.0, 0.02, 0.05, 0.1)
 LEAST: Final = 0.002
 """No probability is learned nearer to 0 or 1: what was never seen can happen."""
 
@@ -95,14 +96,16 @@ class TemporalFit(NamedTuple):
         drives: Learned from.
         places: That they were at.
         steps: Heard in all.
-        log_scores: From exponent to the log score by which it was chosen.
+        model: The same, ready for a filter.
+        log_scores: From exponent and lapse to the log score by which they were chosen.
     """
 
     temporal: Temporal
     drives: int
     places: int
     steps: int
-    log_scores: Mapping[float, float]
+    model: TemporalModel
+    log_scores: Mapping[tuple[float, float], float]
 
 
 def fit_temporal(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> TemporalFit:
@@ -116,41 +119,35 @@ def fit_temporal(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> Tempor
         raise ValueError("expected drives at two places or more, one with an intersection")
     whole = _counted(drives, graph)
     halves = ([d for d in drives if places.index(d.place) % 2 == k] for k in (0, 1))
-    scores = _exponent_scores(list(halves), graph)
-    best = max(scores, key=lambda exponent: (-scores[exponent], exponent)) if scores else 1.0
+    scores = _scores(list(halves), graph)
+    exponent, lapse = min(scores, key=lambda pair: (scores[pair], pair)) if scores else (1.0, 0.0)
     steps = sum(int(_steps(one, whole).sum()) for one in drives)
-    chosen = whole.model_copy(update={"exponent": best})
-    return TemporalFit(chosen, len(drives), len(places), steps, scores)
+    chosen = whole.model_copy(update={"exponent": exponent, "lapse": lapse})
+    model = temporal_model(graph, chosen)
+    return TemporalFit(chosen, len(drives), len(places), steps, model, scores)
 
 
-def _exponent_scores(
+def _scores(
     halves: Sequence[Sequence[AnnotatedDrive]], graph: FactorGraph
-) -> dict[float, float]:
+) -> dict[tuple[float, float], float]:
     if not all(any(one.features.get(PRESENCE) for one in half) for half in halves):
         return {}
-    learned = [_counted(half, graph) for half in halves]
-    return {
-        exponent: float(
-            np.mean(
-                [
-                    log_loss(one, graph, model)
-                    for half, other in ((0, 1), (1, 0))
-                    for model in [_with(learned[other], exponent, graph)]
-                    for one in halves[half]
-                ]
-            )
-        )
-        for exponent in EXPONENTS
-    }
+    losses: dict[tuple[float, float], list[float]] = {}
+    for half, other in ((0, 1), (1, 0)):
+        learned = _counted(halves[other], graph)
+        for exponent in EXPONENTS:
+            model = temporal_model(graph, learned.model_copy(update={"exponent": exponent}))
+            for drive in halves[half]:
+                beliefs = filtered(drive, model)
+                for lapse in LAPSES:
+                    mixed = (1.0 - lapse) * beliefs + lapse * model.usual
+                    loss = log_loss(drive, graph, mixed)
+                    losses.setdefault((exponent, lapse), []).append(loss)
+    return {pair: float(np.mean(some)) for pair, some in losses.items()}
 
 
-def _with(learned: Temporal, exponent: float, graph: FactorGraph) -> TemporalModel:
-    return temporal_model(graph, learned.model_copy(update={"exponent": exponent}))
-
-
-def log_loss(drive: AnnotatedDrive, graph: FactorGraph, model: TemporalModel) -> float:
+def log_loss(drive: AnnotatedDrive, graph: FactorGraph, beliefs: Floats) -> float:
     """Mean over frames and known features of -ln(probability of what is so)."""
-    beliefs = filtered(drive, model)
     losses = [
         -np.log(beliefs[:, column] if drive.features[name] else 1.0 - beliefs[:, column])
         for column, name in enumerate(graph.feature_names)

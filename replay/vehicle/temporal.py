@@ -56,6 +56,8 @@ class Temporal(Section):
     chains: tuple[CueChain, ...]
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     """On all cues' likelihoods: given the state they still repeat one another."""
+    lapse: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.0
+    """A place is unlike all others so often; cues say nothing there, and what is usual stands."""
     stray: Probability = 0.05
     """A sign's range has nothing to do with the intersection so often."""
     step_m: Positive = 1.5

@@ -72,6 +72,7 @@ READS_NOTHING: Final = {
     "simulate",
     "train frames",
     "study drive",
+    "study layouts",
     "demo",
     "plugins",
     "completion",

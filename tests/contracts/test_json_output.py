@@ -82,6 +82,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
 ELSEWHERE: Final[dict[str, str]] = {
     "demo": "simulates and replays for minutes",
     "study intersections": "simulates and replays for minutes",
+    "study layouts": "simulates and replays for minutes",
     "study range": "simulates for half a minute, and prints what study landmarks does",
     "study field": "simulates for minutes",
     "fit temporal": "needs many drives; tests/eval/fit/test_temporal_runs.py parses it",

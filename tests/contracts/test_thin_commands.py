@@ -80,6 +80,7 @@ CALLS: Final = {
     "train road": ("train_road", "measure_road"),
     "train mask-rcnn": ("train_mask_rcnn", "measure_mask_rcnn"),
     "study intersections": ("run_intersection_study",),
+    "study layouts": ("run_layout_study",),
     "model list": ("models",),
     "model show": ("model",),
     "model fetch": ("fetch_model",),

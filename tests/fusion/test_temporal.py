@@ -198,6 +198,21 @@ def test_ranges_that_agree_say_where_and_not_whether() -> None:
     assert belief.distance_m() == pytest.approx(5.0, abs=0.5)
 
 
+def test_a_lapse_keeps_a_belief_from_certainty_and_the_law() -> None:
+    sure, careful = (
+        TemporalFilter(temporal_model(GRAPH, learned(lapse=lapse))) for lapse in (0.0, 0.1)
+    )
+    for belief in (sure, careful):
+        for _ in range(3):
+            belief.hear({"sign": 1, "road": 1}, moved_m=2.0)
+
+    usual = careful.model.usual
+    np.testing.assert_allclose(
+        careful.probabilities(), 0.9 * sure.probabilities() + 0.1 * usual, rtol=1e-12
+    )
+    assert careful.probabilities()[1] <= careful.probabilities()[0]
+
+
 def test_a_car_that_stands_before_the_same_pictures_learns_little_more() -> None:
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
     belief.hear({"sign": 1}, moved_m=2.0, passed_s=0.1)

@@ -18,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "truth from-gnss": "{log} -o {out} --vehicle {car}",
     "fit odometry": "{log} --vehicle {car}",
     "fit signs": "{empty}/labels.csv --label stop",
+    "fit temporal": "{run} --truth {empty}/truth.json -o {out}.toml",
     "fit messages": "{run} --truth {empty}/truth.json -o {out}.toml",
     "fit ranges": "--cue stop_sign --truth {empty}/truth.json",
     "fit landmarks": "--pairs {empty}/pairs.csv",

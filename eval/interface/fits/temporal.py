@@ -42,18 +42,22 @@ class FittedTemporal:
             "drives": self.fitted.drives,
             "places": self.fitted.places,
             "steps": self.fitted.steps,
-            "log_scores": {str(key): value for key, value in self.fitted.log_scores.items()},
+            "log_scores": [
+                {"exponent": exponent, "lapse": lapse, "log_score": value}
+                for (exponent, lapse), value in self.fitted.log_scores.items()
+            ],
             "temporal": self.fitted.temporal.model_dump(mode="json"),
         }
 
     def __repr__(self) -> str:
         end = self.section if self.path is None else f"written to {self.path}"
-        scores = ", ".join(f"{key:g}: {value:.3f}" for key, value in self.fitted.log_scores.items())
+        learned = self.fitted.temporal
+        score = self.fitted.log_scores.get((learned.exponent, learned.lapse))
+        judged = "too few places to judge" if score is None else f"log score {score:.3f} elsewhere"
         return (
             f"{self.runs} runs, {self.fitted.drives} drives at {self.fitted.places} places, "
             f"{self.fitted.steps} steps\n"
-            f"exponent {self.fitted.temporal.exponent:g}; log scores of other places by "
-            f"exponent: {scores or 'too few places'}\n\n{end}"
+            f"exponent {learned.exponent:g}, lapse {learned.lapse:g}: {judged}\n\n{end}"
         )
 
 

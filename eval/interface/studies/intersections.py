@@ -11,8 +11,9 @@ from crosscue.eval.batch.jobs import Done, Progress, exit_status_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.intersections.report import StudyFiles, summary, write_study
 from crosscue.eval.studies.intersections.settings import IntersectionStudy
-from crosscue.eval.studies.intersections.study import run_drives, score_study
+from crosscue.eval.studies.intersections.study import score_study
 from crosscue.eval.studies.intersections.tables import StudyScores
+from crosscue.eval.studies.simulated_drives import run_drives
 from crosscue.replay.base import RunError, json_tree, visible
 
 
@@ -72,7 +73,14 @@ def run_intersection_study(
         OutputError: A file cannot be written.
     """
     folder = Path(output)
-    done = run_drives(folder, study, engine_of(workers, ray), on_progress)
+    done = run_drives(
+        folder,
+        study.scenes(),
+        study.detectors,
+        engine_of(workers, ray),
+        on_progress,
+        vehicle=study.vehicle,
+    )
     names = [one.job.name for one in done if one.error is None]
     if not names:
         raise RunError(f"{folder}: every drive failed; the first: {done[0].error}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
-from crosscue.datasets.scenes.layout import KINDS, mixed_kind
+from crosscue.datasets.scenes.layout import KINDS, mixed_layout
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.replay.errors import UsageError
 
-MIN_FOLDS = 2
+MIN_FOLDS: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,7 @@ class LayoutStudy:
 
     blocks: int = 9
     runs: int = 2
-    folds: int = 9
+    folds: int = 3
     seed: int = 0
     width_px: int = 640
 
@@ -56,9 +57,9 @@ class LayoutStudy:
         """Which fold a layout is tested in."""
         return int(layout[1:]) // len(KINDS) % self.folds
 
-    def kind_of(self, layout: str) -> str:
-        """Of which kind it is."""
-        return mixed_kind(int(layout[1:]))
+    def features_of(self, layout: str) -> dict[str, bool]:
+        """What is true of it, as far as that can be said."""
+        return mixed_layout(int(layout[1:])).features
 
     def scenes(self) -> tuple[SceneSettings, ...]:
         """Every drive, in the order in which they are done: one of each layout, then the next."""

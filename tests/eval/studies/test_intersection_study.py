@@ -11,7 +11,7 @@ import pytest
 from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
 from crosscue.eval.interface.studies import intersections as study_intersections
-from crosscue.eval.studies.intersections import study as intersection_study
+from crosscue.eval.studies import simulated_drives
 from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_table import groups
 from crosscue.replay.vehicle.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
@@ -39,7 +39,7 @@ def _with_oracle(path: Path) -> Vehicle:
 
 def _stay_here(patch: pytest.MonkeyPatch) -> None:
     """No process of its own for a drive: it would not know of the patched detectors."""
-    patch.setattr(intersection_study, "load", _with_oracle)
+    patch.setattr(simulated_drives, "load", _with_oracle)
     patch.setattr(study_intersections, "engine_of", lambda *_args: in_turn)
 
 
@@ -90,7 +90,7 @@ def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.Monk
     before = (study / "study.json").read_bytes()
     _stay_here(monkeypatch)
     monkeypatch.setattr(
-        intersection_study, "replay_drive", lambda *_args, **_more: pytest.fail("ran again")
+        simulated_drives, "replay_drive", lambda *_args, **_more: pytest.fail("ran again")
     )
 
     assert run(["study", "intersections", "-o", str(study), *ARGUMENTS, "-q"]) == 0

@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import rle
-from .base import Detections, Found, Frame, RoadMask, View, nothing_found
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, Found, Frame, RoadMask, View, nothing_found
 
 CLASSES: Final = (
     "car", "stop sign", "traffic light", "one way left", "one way right", "do not enter",

@@ -1,0 +1,119 @@
+"""Beliefs of each kind about drives that had no part in what they were fitted on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.pipeline.scene.variants import scene_tables
+from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, filtered
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+from .drives import StudyDrive
+from .score import FEATURES, THRESHOLD, DriveBelief
+
+KINDS: Final = ("source", "persistent", "calibrated", "calibrated, base rates", "temporal")
+"""Beliefs that are compared; the fourth is the third with the training layouts' frequencies for
+priors, since ``temporal`` learns those too."""
+EVERYWHERE: Final = "temporal, every picture"
+"""The same belief outside approaches as well, where the others say nothing."""
+REAL_ROADS: Final[Mapping[str, Mapping[str, str]]] = {
+    "regions": {"kind": "ground"},
+    "cars": {"kind": "tracks"},
+    "fusion": {"kind": "persistent"},
+}
+"""The rules for real roads, by section of the vehicle file."""
+RULES: Final[Mapping[str, tuple[str, str]]] = {
+    "range-anchored regions": ("regions", "picture"),
+    "motion-compensated trackers": ("cars", "pairs"),
+    "persistence": ("fusion", "source"),
+}
+"""From each rule to its section, and what stands there where it is left out."""
+
+
+def believed(
+    drive: StudyDrive,
+    vehicle: Vehicle,
+    base_rates: Mapping[str, float],
+) -> DriveBelief:
+    """What is believed in each picture; where no approach is open, the base rates.
+
+    Args:
+        drive: Of which detections are stored.
+        vehicle: Settings.
+        base_rates: By feature.
+    """
+    t_ns = np.asarray(drive.run.table("frames", ["t_ns"])["t_ns"], np.int64)
+    table = scene_tables(drive.run, vehicle)["belief"]
+    at = np.searchsorted(t_ns, np.asarray(table["t_ns"], np.int64))
+    said = np.full((len(t_ns), len(FEATURES)), np.nan)
+    for column, name in enumerate(FEATURES):
+        said[at, column] = np.asarray(table[name], np.float64)
+    established: NDArray[np.bool_] = np.zeros(len(t_ns), np.bool_)
+    established[at] = np.asarray(table["established"], np.bool_)
+    rates = np.array([base_rates[name] for name in FEATURES])
+    is_silent = np.isnan(said[:, 0])
+    said[is_silent] = rates
+    start_m = drive.truth.start_m(t_ns)
+    kept = np.isfinite(start_m) | (not drive.features["intersection"])
+    return DriveBelief(
+        drive.name,
+        drive.layout,
+        drive.features,
+        start_m[kept],
+        said[kept],
+        established[kept],
+        is_silent[kept],
+    )
+
+
+def believed_everywhere(
+    drive: StudyDrive,
+    parts: Sequence[AnnotatedDrive],
+    learned: TemporalFit,
+    without: frozenset[str] = frozenset(),
+) -> DriveBelief:
+    """What the belief over time says in each picture, approach or not.
+
+    Args:
+        drive: Which.
+        parts: Its annotated parts.
+        learned: Elsewhere.
+        without: Cues that nothing looked for; ranges by signs stay, so that what a cue says of
+            the intersection is apart from what it says of the distance.
+    """
+    part = next(
+        one for one in parts if one.features["intersection"] == drive.features["intersection"]
+    )
+    left = {cue: count for cue, count in part.counts.items() if cue not in without}
+    said = filtered(replace(part, counts=left), learned.model)
+    silent = np.zeros(len(said), np.bool_)
+    return DriveBelief(
+        drive.name, drive.layout, drive.features, part.start_m, said, said[:, 0] > THRESHOLD, silent
+    )
+
+
+def with_fusion(drive: StudyDrive, changes: Mapping[str, Any]) -> Vehicle:
+    """The run's settings with another belief."""
+    vehicle = drive.run.drive_manifest().settings
+    fusion = vehicle.fusion.model_copy(update=dict(changes))
+    return vehicle.model_copy(update={"fusion": fusion})
+
+
+def with_rules(drive: StudyDrive, without: str | None = None) -> Vehicle:
+    """The run's settings with the rules for real roads, all or all but one."""
+    vehicle = drive.run.drive_manifest().settings
+    rules = {name: dict(changes) for name, changes in REAL_ROADS.items()}
+    if without is not None:
+        section, kind = RULES[without]
+        rules[section] = {"kind": kind}
+    return vehicle.model_copy(
+        update={
+            name: getattr(vehicle, name).model_copy(update=changes)
+            for name, changes in rules.items()
+        }
+    )

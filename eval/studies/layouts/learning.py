@@ -1,0 +1,84 @@
+"""What some drives of the study of layouts teach, for each kind of belief."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
+from crosscue.eval.fit.temporal import annotated_drives
+from crosscue.fusion.fit.message_fit import fit_messages
+from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_temporal
+
+from .drives import StudyDrive
+
+Annotations = Mapping[str, Sequence[Any]]
+"""From a drive to its annotated approaches."""
+
+
+class Learned(NamedTuple):
+    """What one fold's drives are judged by.
+
+    Attributes:
+        fusions: From each kind to what it changes in ``Fusion``.
+        base_rates: How often each feature is there in the training layouts.
+        temporal: The belief over time.
+    """
+
+    fusions: Mapping[str, Mapping[str, Any]]
+    base_rates: Mapping[str, float]
+    temporal: TemporalFit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lessons:
+    """What every drive has to teach, read once for all folds."""
+
+    approaches: Annotations
+    drives: Mapping[str, Sequence[AnnotatedDrive]]
+
+
+def lessons_of(drives: Sequence[StudyDrive]) -> Lessons:
+    """Annotated approaches and drives, by drive; a layout is one place, however often driven."""
+    approaches, parts = {}, {}
+    for drive in drives:
+        vehicle = drive.run.drive_manifest().settings
+        found = Annotated([], Counter())
+        annotate(drive.run, drive.truth.truth, vehicle, found)
+        approaches[drive.name] = [replace(one, place=drive.layout) for one in found.approaches]
+        parts[drive.name] = [
+            replace(one, place=drive.layout)
+            for one in annotated_drives(drive.run, drive.truth, vehicle)
+        ]
+    return Lessons(approaches, parts)
+
+
+def learn(drives: Sequence[StudyDrive], lessons: Lessons) -> Learned:
+    """All kinds, from these drives alone."""
+    graph, vehicle = graph_of_runs([one.run for one in drives])
+    calibrated = fit_messages(
+        [part for one in drives for part in lessons.approaches[one.name]], graph
+    ).calibrated
+    fitted = fit_temporal([part for one in drives for part in lessons.drives[one.name]], graph)
+    by_layout = {one.layout: one.features for one in drives}
+    rates = {
+        name: float(np.mean([known[name] for known in by_layout.values() if name in known]))
+        for name in graph.feature_names
+    }
+    priors = {
+        name: entry.model_copy(update={"prior": min(max(rates[name], 0.01), 0.99)})
+        for name, entry in vehicle.fusion.features.items()
+    }
+    learned = {"kind": "calibrated", "calibrated": calibrated}
+    fusions: dict[str, dict[str, Any]] = {
+        "source": {"kind": "source"},
+        "persistent": {"kind": "persistent"},
+        "calibrated": learned,
+        "calibrated, base rates": {**learned, "features": priors},
+        "temporal": {"kind": "temporal", "temporal": fitted.temporal},
+    }
+    return Learned(fusions, rates, fitted)

@@ -1,0 +1,147 @@
+"""The results of the study of layouts as tables: one page, one JSON file, one text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from crosscue.eval.scoring.intervals import TOO_FEW, Mean
+from crosscue.eval.studies.page import Table, write_page
+from crosscue.replay.base import strict_json, versions, write_text
+
+from .score import LayoutDifference, LayoutScore
+from .score import LayoutScores as LayoutScores
+from .settings import LayoutStudy
+
+PAGE: Final = "study.html"
+TABLES: Final = "study.json"
+TITLE: Final = "Random layouts, simulated: fitted on some, tested on the others"
+NOTE: Final = (
+    "Everything here is simulated. No network saw a picture: masks are the renderer's, with "
+    "misses, false finds and errors of height drawn from settings that were measured nowhere. "
+    "Intervals are 95 %, over layouts."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutFiles:
+    """What was written."""
+
+    page: Path
+    tables: Path
+
+
+def write_layout_study(
+    out: Path, settings: LayoutStudy, scores: LayoutScores, failures: Mapping[str, str]
+) -> LayoutFiles:
+    """Write page and tables into ``out``.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    flags = (
+        f"--blocks {settings.blocks} --runs {settings.runs} --folds {settings.folds} "
+        f"--seed {settings.seed} --width {settings.width_px}"
+    )
+    tree: dict[str, Any] = {
+        "is_simulated": True,
+        "command": f"crosscue study layouts {flags}",
+        "versions": versions(),
+        "failures": dict(failures),
+        **_without_nan(asdict(scores)),
+    }
+    write_text(out / TABLES, strict_json(tree) + "\n")
+    counts = f"{scores.drives} drives over {scores.layouts} layouts in {settings.folds} folds."
+    write_page(out / PAGE, TITLE, [NOTE, counts], tables_of(scores), [])
+    return LayoutFiles(out / PAGE, out / TABLES)
+
+
+def tables_of(scores: LayoutScores) -> list[Table]:
+    """All tables, for the page and for a terminal."""
+    found = [
+        Table(
+            "Beliefs",
+            ("belief", "Brier", "log score", "false a drive", "full", "full, m"),
+            tuple(_score_row(kind, one) for kind, one in scores.kinds.items()),
+        ),
+        Table(
+            "Brier score by feature",
+            ("belief", *next(iter(scores.kinds.values())).brier_by_feature),
+            tuple(
+                (kind, *map(text, one.brier_by_feature.values()))
+                for kind, one in scores.kinds.items()
+            ),
+        ),
+        Table(
+            "Belief over time less others",
+            DIFFERENCE_HEAD,
+            tuple(_difference_row(kind, one) for kind, one in scores.less.items()),
+        ),
+        Table(
+            "Law and coverage, fractions of pictures",
+            ("belief", "a way before the intersection", "no approach open"),
+            tuple(
+                (kind, text(one.full_before_detected), text(one.silent))
+                for kind, one in scores.kinds.items()
+            ),
+        ),
+    ]
+    if scores.cues:
+        found.append(
+            Table(
+                "Each cue left out of the belief over time in every picture, without less with",
+                DIFFERENCE_HEAD,
+                tuple(_difference_row(cue, one) for cue, one in scores.cues.items()),
+            )
+        )
+    if scores.rules:
+        found.append(
+            Table(
+                "Rules for real roads, each left out",
+                ("left out", "Brier", "log score", "false a drive", "full", "full, m"),
+                tuple(_score_row(rule or "none", one) for rule, one in scores.rules.items()),
+            )
+        )
+        found.append(
+            Table(
+                "Rules for real roads, without less with",
+                DIFFERENCE_HEAD,
+                tuple(_difference_row(rule, one) for rule, one in scores.rules_less.items()),
+            )
+        )
+    return found
+
+
+DIFFERENCE_HEAD: Final = ("left out or compared", "Brier", "log score", "false a drive")
+
+
+def _score_row(name: str, one: LayoutScore) -> tuple[str, ...]:
+    values = (one.brier, one.log_score, one.false_features, one.full)
+    return (name, *map(text, values), text(one.full_m, 1))
+
+
+def _difference_row(name: str, one: LayoutDifference) -> tuple[str, ...]:
+    values = (one.brier, one.log_score, one.false_features)
+    return (name, *(text(value, signed=True) for value in values))
+
+
+def text(value: Mean, digits: int = 3, *, signed: bool = False) -> str:
+    """A mean with its interval."""
+    if math.isnan(value.value):
+        return "-"
+    sign = "+" if signed else ""
+    shown = f"{value.value:{sign}.{digits}f}"
+    if math.isnan(value.low):
+        return f"{shown} ({TOO_FEW})"
+    return f"{shown} ({value.low:{sign}.{digits}f} to {value.high:{sign}.{digits}f})"
+
+
+def _without_nan(tree: Any) -> Any:
+    if isinstance(tree, dict):
+        return {str(key): _without_nan(value) for key, value in tree.items()}
+    if isinstance(tree, float) and math.isnan(tree):
+        return None
+    return tree

@@ -1,0 +1,216 @@
+"""Beliefs of the study of layouts against the truth, with intervals over layouts.
+
+Every picture counts, so that all beliefs are judged on the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.eval.scoring.intervals import Mean, mean
+from crosscue.eval.scoring.scene.belief import brier, log_score
+from crosscue.eval.scoring.scene.detection import CONFIRM_FRAMES, held
+from crosscue.eval.scoring.truth import FEATURES as FEATURES
+from crosscue.replay.columns import Floats, Int64s
+
+THRESHOLD: Final = 0.9
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveBelief:
+    """What was believed in N pictures of a drive.
+
+    Attributes:
+        drive: Name.
+        layout: Name; drives of one are a cluster.
+        features: What is true, as far as that can be said.
+        start_m: Shape (N,): to the intersection, NaN where none is ahead.
+        probabilities: Shape (N, features), in the order of ``FEATURES``.
+        established: Shape (N,): presence was.
+        is_silent: Shape (N,): no approach was open, so the base rates stand.
+    """
+
+    drive: str
+    layout: str
+    features: Mapping[str, bool]
+    start_m: Floats
+    probabilities: Floats
+    established: Flags
+    is_silent: Flags
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutScore:
+    """One kind of belief over all drives, its intervals over layouts.
+
+    Attributes:
+        brier: Mean squared error over pictures and features.
+        log_score: Mean of -ln(probability of what is so).
+        brier_by_feature: By feature.
+        false_features: Features that are not there and were above 0.9, mean of a drive.
+        full: Fraction of the drives to an intersection with full detection.
+        full_m: True distance there.
+        full_before_detected: Pictures in which a way was above 0.9 and the intersection was not.
+        silent: Fraction of pictures without an approach.
+    """
+
+    brier: Mean
+    log_score: Mean
+    brier_by_feature: Mapping[str, Mean]
+    false_features: Mean
+    full: Mean
+    full_m: Mean
+    full_before_detected: Mean
+    silent: Mean
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutDifference:
+    """One kind less another over the same pictures; negative is an improvement."""
+
+    brier: Mean
+    log_score: Mean
+    false_features: Mean
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutScores:
+    """All results.
+
+    Attributes:
+        kinds: From each kind of belief to its score.
+        less: The belief over time less each other, by what they are called.
+        cues: From cues left out to the belief over time in every picture without them, less that
+            with all.
+        rules: From what is left out (empty for nothing) to the score with the other rules.
+        rules_less: From the rule to the belief without it less that with all.
+        drives: How many.
+        layouts: How many.
+        exponents: Exponent and lapse of the belief over time, by fold.
+    """
+
+    kinds: Mapping[str, LayoutScore]
+    less: Mapping[str, LayoutDifference]
+    cues: Mapping[str, LayoutDifference]
+    rules: Mapping[str, LayoutScore]
+    rules_less: Mapping[str, LayoutDifference]
+    drives: int
+    layouts: int
+    exponents: Mapping[int, tuple[float, float]]
+
+
+def score_layouts(beliefs: Sequence[DriveBelief]) -> LayoutScore:
+    """Score one kind of belief."""
+    rows = _Rows.of(beliefs)
+    drives = _clusters([one.layout for one in beliefs])
+    full = [_full_m(one) for one in beliefs if one.features["intersection"]]
+    at = _clusters([one.layout for one in beliefs if one.features["intersection"]])
+    found_m = np.array([np.nan if one is None else one for one in full], np.float64)
+    return LayoutScore(
+        brier=mean(rows.brier, rows.cluster),
+        log_score=mean(rows.log_score, rows.cluster),
+        brier_by_feature={
+            name: mean(rows.brier[rows.feature == i], rows.cluster[rows.feature == i])
+            for i, name in enumerate(FEATURES)
+        },
+        false_features=mean(_false_features(beliefs), drives),
+        full=mean(np.isfinite(found_m).astype(np.float64), at),
+        full_m=mean(found_m, at),
+        full_before_detected=_of_pictures(beliefs, _ways_first),
+        silent=_of_pictures(beliefs, lambda one: one.is_silent),
+    )
+
+
+def difference(first: Sequence[DriveBelief], second: Sequence[DriveBelief]) -> LayoutDifference:
+    """The second less the first, picture by picture; both of the same drives in the same order.
+
+    Raises:
+        ValueError: They are not.
+    """
+    if [one.drive for one in first] != [one.drive for one in second]:
+        raise ValueError("difference: expected beliefs about the same drives, in one order")
+    before, after = _Rows.of(first), _Rows.of(second)
+    return LayoutDifference(
+        mean(after.brier - before.brier, before.cluster),
+        mean(after.log_score - before.log_score, before.cluster),
+        mean(
+            _false_features(second) - _false_features(first),
+            _clusters([one.layout for one in first]),
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """One row a picture and known feature."""
+
+    brier: Floats
+    log_score: Floats
+    feature: Int64s
+    cluster: Int64s
+
+    @classmethod
+    def of(cls, beliefs: Sequence[DriveBelief]) -> _Rows:
+        clusters = _clusters([one.layout for one in beliefs])
+        said, is_there, feature, cluster = [], [], [], []
+        for one, number in zip(beliefs, clusters.tolist(), strict=True):
+            for i, name in enumerate(FEATURES):
+                if name in one.features:
+                    n = len(one.probabilities)
+                    said.append(one.probabilities[:, i])
+                    is_there.append(np.full(n, one.features[name]))
+                    feature.append(np.full(n, i))
+                    cluster.append(np.full(n, number))
+        p, so = np.concatenate(said), np.concatenate(is_there)
+        return cls(brier(p, so), log_score(p, so), np.concatenate(feature), np.concatenate(cluster))
+
+
+def _clusters(layouts: Sequence[str]) -> Int64s:
+    numbers = {name: i for i, name in enumerate(dict.fromkeys(layouts))}
+    return np.array([numbers[name] for name in layouts], np.int64)
+
+
+def _false_features(beliefs: Sequence[DriveBelief]) -> Floats:
+    return np.array(
+        [
+            sum(
+                bool((one.probabilities[~one.is_silent, i] > THRESHOLD).any())
+                for i, name in enumerate(FEATURES)
+                if one.features.get(name) is False
+            )
+            for one in beliefs
+        ],
+        np.float64,
+    )
+
+
+def _full_m(one: DriveBelief) -> float | None:
+    """Where all features that are there were believed and stayed so for some pictures."""
+    is_full = ~one.is_silent
+    for i, name in enumerate(FEATURES):
+        if one.features.get(name):
+            above = one.probabilities[:, i] > THRESHOLD
+            # Nothing speaks of the presence of an intersection without sign or light.
+            is_full &= (above | one.established) if name == "intersection" else above
+    places = np.flatnonzero(held(is_full & np.isfinite(one.start_m), CONFIRM_FRAMES))
+    return float(one.start_m[places[0]]) if len(places) else None
+
+
+def _ways_first(one: DriveBelief) -> Flags:
+    ways = (one.probabilities[:, 1:] > THRESHOLD).any(axis=1)
+    return np.asarray(ways & (one.probabilities[:, 0] <= THRESHOLD) & ~one.is_silent)
+
+
+def _of_pictures(beliefs: Sequence[DriveBelief], flags_of: Callable[[DriveBelief], Flags]) -> Mean:
+    clusters = _clusters([one.layout for one in beliefs])
+    flags = [flags_of(one).astype(np.float64) for one in beliefs]
+    numbers = [
+        np.full(len(one), number) for one, number in zip(flags, clusters.tolist(), strict=True)
+    ]
+    return mean(np.concatenate(flags), np.concatenate(numbers))

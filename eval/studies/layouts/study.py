@@ -1,0 +1,117 @@
+"""The study of layouts: every drive judged by what other layouts taught, then rule by rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from crosscue.replay.vehicle.cue_table import groups
+
+from .beliefs import (
+    EVERYWHERE,
+    KINDS,
+    RULES,
+    believed,
+    believed_everywhere,
+    with_fusion,
+    with_rules,
+)
+from .drives import StudyDrive
+from .learning import Learned, learn, lessons_of
+from .score import DriveBelief, LayoutDifference, LayoutScores, difference, score_layouts
+
+OnStep = Callable[[str, int, int], None]
+
+
+def score_study(
+    drives: Sequence[StudyDrive],
+    *,
+    ablation: bool = True,
+    on_step: OnStep = lambda what, done, of: None,
+) -> LayoutScores:
+    """Fit on all folds but one, judge that one, for each; then leave out cues and rules.
+
+    Args:
+        drives: Finished.
+        ablation: Leave out cues and rules.
+        on_step: Called with what is being done, how much of it is, and of how much.
+    """
+    lessons = lessons_of(drives)
+    folds = sorted({one.fold for one in drives})
+    learned = {}
+    for done, fold in enumerate(folds, 1):
+        learned[fold] = learn([one for one in drives if one.fold != fold], lessons)
+        on_step("folds", done, len(folds))
+
+    def of_kind(kind: str) -> list[DriveBelief]:
+        return _all(
+            drives,
+            lambda one: believed(
+                one,
+                with_fusion(one, learned[one.fold].fusions[kind]),
+                learned[one.fold].base_rates,
+            ),
+            lambda done, of: on_step(kind, done, of),
+        )
+
+    kinds = {kind: of_kind(kind) for kind in KINDS}
+
+    def without(cues: frozenset[str]) -> list[DriveBelief]:
+        return [
+            believed_everywhere(one, lessons.drives[one.name], learned[one.fold].temporal, cues)
+            for one in drives
+        ]
+
+    kinds[EVERYWHERE] = without(frozenset())
+    cues: dict[str, LayoutDifference] = {}
+    for done, (group, some) in enumerate(groups().items() if ablation else (), 1):
+        left = without(frozenset(cue.name for cue in some))
+        cues[group] = difference(kinds[EVERYWHERE], left)
+        on_step("cues", done, len(groups()))
+    rules = _by_rule(drives, learned, on_step) if ablation else {}
+    return LayoutScores(
+        {kind: score_layouts(some) for kind, some in kinds.items()},
+        {
+            f"{name} less {kind}": difference(kinds[kind], kinds[name])
+            for name in ("temporal", EVERYWHERE)
+            for kind in KINDS
+            if kind != name
+        },
+        cues,
+        {rule: score_layouts(some) for rule, some in rules.items()},
+        {rule: difference(rules[""], some) for rule, some in rules.items() if rule},
+        len(drives),
+        len({one.layout for one in drives}),
+        {
+            fold: (one.temporal.temporal.exponent, one.temporal.temporal.lapse)
+            for fold, one in learned.items()
+        },
+    )
+
+
+def _by_rule(
+    drives: Sequence[StudyDrive], learned: Mapping[int, Learned], on_step: OnStep
+) -> dict[str, list[DriveBelief]]:
+    return {
+        rule: _all(
+            drives,
+            lambda one, rule=rule: believed(  # type: ignore[misc]
+                one, with_rules(one, rule or None), learned[one.fold].base_rates
+            ),
+            lambda done, of, rule=rule: on_step(  # type: ignore[misc]
+                f"without {rule or 'nothing'}", done, of
+            ),
+        )
+        for rule in ("", *RULES)
+    }
+
+
+def _all(
+    drives: Sequence[StudyDrive],
+    belief_of: Callable[[StudyDrive], DriveBelief],
+    on_drive: Callable[[int, int], None],
+) -> list[DriveBelief]:
+    found = []
+    for done, one in enumerate(drives, 1):
+        found.append(belief_of(one))
+        on_drive(done, len(drives))
+    return found

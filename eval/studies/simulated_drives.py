@@ -1,0 +1,102 @@
+"""Drives of a study, each from its seed to a finished run.
+
+Drives are done in the order of runs (A-01 to H-01, then A-02 ...), so that a study that is cut
+short has each layout about as often; a second start goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from crosscue.datasets.scenes.drive import PHOTOGRAPHS, Imager, write_scene
+from crosscue.datasets.scenes.settings import SceneSettings
+from crosscue.detectors.registry import chosen
+from crosscue.eval.batch.jobs import Done, Engine, Job, Progress, fingerprint_of, run_many
+from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.outcome import Outcome
+from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.runs.folder import create
+from crosscue.replay.base import EVERYTHING, versions
+from crosscue.replay.logs.opening import open_log
+from crosscue.replay.vehicle.vehicle import load
+
+LOG: Final = "drive.mcap"
+VEHICLE: Final = "vehicle.toml"
+TRUTH: Final = "truth.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What is done for one drive, here or in another process.
+
+    Attributes:
+        drives: Folder of the simulated drives.
+        scenes: By name.
+        vehicle: A vehicle file to replay with, or None.
+        detectors: Comma-separated.
+        cache: Where detectors' results are kept.
+        imager: What cameras record.
+    """
+
+    drives: Path
+    scenes: Mapping[str, SceneSettings]
+    vehicle: Path | None
+    detectors: str
+    cache: Path
+    imager: Imager = PHOTOGRAPHS
+
+    def __call__(self, job: Job) -> Outcome:
+        """Simulate the drive unless it is there, then replay it."""
+        folder = self.drives / job.name
+        if not (folder / TRUTH).exists():
+            write_scene(folder, self.scenes[job.name], overwrite=True, imager=self.imager)
+        vehicle = load(self.vehicle or folder / VEHICLE)
+        choices = chosen(self.detectors, choices_of(vehicle))
+        # One cache a drive: workers never wait for one another.
+        detecting = Detecting(choices, self.cache / f"{job.name}.sqlite")
+        run = create(job.run, overwrite=True)
+        with open_log(folder / LOG) as log:
+            outcome = replay_drive([log], vehicle, run, EVERYTHING, detecting=detecting)
+        return replace(outcome, ledgers=(), detected=None)
+
+
+def run_drives(
+    out: Path,
+    scenes: Sequence[SceneSettings],
+    detectors: str,
+    engine: Engine,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+    *,
+    vehicle: Path | None = None,
+    imager: Imager = PHOTOGRAPHS,
+) -> tuple[Done[Outcome], ...]:
+    """Simulate and replay all drives that are not there yet, below ``out``.
+
+    Args:
+        out: Folder of the study.
+        scenes: Drives, in the order in which they are done.
+        detectors: Comma-separated, as ``replay`` takes them.
+        engine: Where to work.
+        on_progress: Reported about once a second.
+        vehicle: A vehicle file to replay with; each drive's own, if left out.
+        imager: What cameras record.
+
+    Raises:
+        VehicleError: The vehicle file cannot be read.
+    """
+    by_name = {scene.name: scene for scene in scenes}
+    settings = None if vehicle is None else load(vehicle).model_dump(mode="json")
+    jobs = [
+        Job(
+            name=name,
+            logs=(),
+            run=out / "runs" / name,
+            fingerprint=fingerprint_of(asdict(scene), settings, detectors, versions()),
+        )
+        for name, scene in by_name.items()
+    ]
+    work = Work(out / "drives", by_name, vehicle, detectors, out / "cache", imager)
+    return run_many(jobs, work, engine, overwrite=True, on_progress=on_progress)

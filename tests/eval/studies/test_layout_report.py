@@ -1,0 +1,64 @@
+"""The page and the tables of the study of layouts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from crosscue.eval.scoring.truth import FEATURES
+from crosscue.eval.studies.layouts.report import tables_of, write_layout_study
+from crosscue.eval.studies.layouts.score import (
+    DriveBelief,
+    LayoutScores,
+    difference,
+    score_layouts,
+)
+from crosscue.eval.studies.layouts.settings import LayoutStudy
+
+
+def beliefs(p: float) -> list[DriveBelief]:
+    n = 4
+    return [
+        DriveBelief(
+            f"M{i}-01",
+            f"M{i}",
+            dict.fromkeys(FEATURES, i % 2 == 0),
+            np.linspace(30.0, 3.0, n),
+            np.full((n, len(FEATURES)), p),
+            np.full(n, False),
+            np.full(n, False),
+        )
+        for i in range(6)
+    ]
+
+
+def scores() -> LayoutScores:
+    first, second = beliefs(0.5), beliefs(0.95)
+    less = difference(first, second)
+    return LayoutScores(
+        {"source": score_layouts(first), "temporal": score_layouts(second)},
+        {"temporal less source": less},
+        {"stop_sign": less},
+        {"": score_layouts(first), "persistence": score_layouts(second)},
+        {"persistence": less},
+        6,
+        6,
+        {0: (0.5, 0.02)},
+    )
+
+
+def test_every_table_has_as_many_entries_in_each_row_as_columns() -> None:
+    for table in tables_of(scores()):
+        assert {len(row) for row in table.rows} == {len(table.head)}
+        assert table.as_text().startswith(table.heading)
+
+
+def test_files_say_that_all_is_simulated_and_how_to_do_it_again(tmp_path: Path) -> None:
+    files = write_layout_study(tmp_path, LayoutStudy(), scores(), {"M3-01": "disk full"})
+
+    tree = json.loads(files.tables.read_text(encoding="utf-8"))
+    assert tree["is_simulated"]
+    assert tree["command"].startswith("crosscue study layouts --blocks 9 --runs 2")
+    assert tree["failures"] == {"M3-01": "disk full"}
+    assert tree["kinds"]["source"]["brier"]["value"] == 0.25
+    assert "No network saw a picture" in files.page.read_text(encoding="utf-8")

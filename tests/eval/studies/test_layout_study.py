@@ -1,0 +1,115 @@
+"""The study of layouts: what every fold holds, and what its scores say of beliefs made up here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.scenes.layout import layout_named
+from crosscue.eval.scoring.truth import FEATURES
+from crosscue.eval.studies.layouts.score import DriveBelief, difference, score_layouts
+from crosscue.eval.studies.layouts.settings import LayoutStudy
+from crosscue.replay.errors import UsageError
+
+STUDY = LayoutStudy()
+TRUTH = {"intersection": True, "left": True, "right": False, "straight": True}
+NOTHING = {"intersection": False, "left": False, "right": False}
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+@pytest.mark.parametrize("fold", range(STUDY.folds))
+def test_every_fold_has_layouts_with_each_feature_and_without(fold: int, feature: str) -> None:
+    known = [
+        layout_named(name).features.get(feature)
+        for name in STUDY.layouts
+        if STUDY.fold_of(name) == fold
+    ]
+
+    assert {True, False} <= set(known)
+
+
+def test_there_are_a_hundred_layouts_with_two_drives_each_under_different_conditions() -> None:
+    scenes = STUDY.scenes()
+
+    assert len(set(STUDY.layouts)) >= 100
+    assert len(scenes) == 2 * len(STUDY.layouts)
+    assert len({scene.name for scene in scenes}) == len(scenes)
+
+
+def test_drives_of_one_layout_are_in_one_fold_and_folds_are_about_equal() -> None:
+    sizes = np.bincount([STUDY.fold_of(name) for name in STUDY.layouts])
+
+    assert len(sizes) == STUDY.folds
+    assert sizes.max() - sizes.min() <= 12
+
+
+@pytest.mark.parametrize(
+    "changes", [{"folds": 1}, {"folds": 10}, {"runs": 0}, {"width_px": 100}, {"seed": -1}]
+)
+def test_a_study_that_cannot_be_is_refused(changes: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match="expected"):
+        LayoutStudy(**changes)
+
+
+def belief(
+    p: Mapping[str, float],
+    features: Mapping[str, bool] = TRUTH,
+    layout: str = "M0",
+    silent: int = 0,
+) -> DriveBelief:
+    n = 10
+    said = np.tile([p.get(name, 0.5) for name in FEATURES], (n, 1))
+    is_silent = np.arange(n) < silent
+    start_m = np.linspace(60.0, 6.0, n) if features["intersection"] else np.full(n, np.nan)
+    return DriveBelief(layout, layout, features, start_m, said, said[:, 0] > 0.9, is_silent)
+
+
+SURE = {"intersection": 0.99, "left": 0.99, "right": 0.01, "straight": 0.99}
+
+
+def test_a_sure_and_right_belief_is_full_from_the_first_picture_and_has_no_false_feature() -> None:
+    scored = score_layouts([belief(SURE, layout=f"M{i}") for i in range(5)])
+
+    assert scored.brier.value == pytest.approx(1e-4)
+    assert (scored.full.value, scored.full_m.value) == (1.0, pytest.approx(60.0))
+    assert scored.false_features.value == 0.0
+
+
+def test_one_half_scores_a_quarter_whatever_is_so() -> None:
+    scored = score_layouts([belief({}), belief({}, NOTHING, "M8")])
+
+    assert scored.brier.value == pytest.approx(0.25)
+    assert scored.log_score.value == pytest.approx(np.log(2.0))
+
+
+def test_false_features_are_counted_once_a_drive_and_not_where_nothing_was_said() -> None:
+    wrong = {"intersection": 0.95, "left": 0.2, "right": 0.95}
+
+    assert score_layouts([belief(wrong, NOTHING)]).false_features.value == 2.0
+    assert score_layouts([belief(wrong, NOTHING, silent=10)]).false_features.value == 0.0
+
+
+def test_a_way_before_the_intersection_is_counted() -> None:
+    first = {"intersection": 0.5, "left": 0.95}
+
+    assert score_layouts([belief(first)]).full_before_detected.value == 1.0
+    assert score_layouts([belief(SURE)]).full_before_detected.value == 0.0
+
+
+def test_what_nobody_knows_is_not_scored() -> None:
+    one = belief({"intersection": 0.0, "left": 0.0, "straight": 1.0}, NOTHING)
+
+    assert np.isnan(score_layouts([one]).brier_by_feature["straight"].value)
+
+
+def test_a_difference_is_zero_against_itself_and_turns_round_with_the_order() -> None:
+    some = [belief({}, layout=f"M{i}") for i in range(6)]
+    sure = [belief(SURE, layout=f"M{i}") for i in range(6)]
+
+    assert difference(some, some).brier.value == 0.0
+    assert difference(some, sure).brier.value == pytest.approx(-difference(sure, some).brier.value)
+    assert difference(some, sure).brier.value < 0.0
+    with pytest.raises(ValueError, match="the same drives"):
+        difference(some, sure[1:])
