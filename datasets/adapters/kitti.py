@@ -3,7 +3,8 @@
 A raw drive has folders ``image_00`` to ``image_03`` and ``oxts``, each with ``data/`` (one file a
 row) and ``timestamps.txt`` (UTC date-times to the nanosecond). The tracking set keeps one line of
 ``oxts/SEQ.txt`` and one picture ``image_0x/SEQ/NNNNNN.png`` for every frame, and no times: they are
-made from the frame number at 10 Hz, which is reported.
+made from the frame number, at the rate by which the box's speeds add up to the distances between
+its positions (9.65 Hz; 10 Hz where the car stands), which is reported.
 
 Topics: one per camera folder; from the OXTS box ``oxts/imu``, ``oxts/gnss`` and ``oxts/ins_speed``.
 Intrinsics are those of ``calib/SEQ.txt`` or of ``calib_cam_to_cam.txt`` in the folder of the raw
@@ -17,7 +18,7 @@ raw fix.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -54,6 +55,10 @@ from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
 
 POSE_FILE: Final = "pose.tum"
 TRACKING_PERIOD_NS: Final = 100_000_000
+"""Of a frame, where positions and speeds do not show it."""
+PERIOD_STEP_S: Final = 1e-4
+MAX_PERIOD_ERROR: Final = 0.2
+"""A share; a period further off the published 10 Hz is damage."""
 ROWS_PER_BLOCK: Final = 100
 FRAMES_FOR_PERIOD: Final = 10_000
 Unreadable: TypeAlias = tuple[str, str, int | None, str]
@@ -76,11 +81,13 @@ class Oxts:
     Attributes:
         files: One file a packet, and times; for a single file, times of its lines.
         single: The one file, or None.
+        period_ns: Time between two of its lines.
         touched: Takes note of what is read, for a seal.
     """
 
     files: TimedFiles
     single: Path | None = None
+    period_ns: int = TRACKING_PERIOD_NS
     touched: Touched = field(default_factory=Touched, kw_only=True)
 
     @property
@@ -121,7 +128,7 @@ class Oxts:
                 rest = raw
                 while rest and not rest.endswith(b"\n"):
                     rest = file.readline(LINE_BYTES)
-                yield f"{single.name} line {number + 1}", number * TRACKING_PERIOD_NS, raw
+                yield f"{single.name} line {number + 1}", number * self.period_ns, raw
                 number += 1
 
 
@@ -224,11 +231,11 @@ def write_truth(path: Path, folder: Path) -> Path:
 
 def _objects(path: Path, oxts: Oxts | None, folder: Path) -> tuple[str | None, int]:
     """Labels of a tracking sequence, as a file beside the truth; and how many were damaged."""
-    single = oxts.single if oxts is not None else None
-    if single is None or not (path / "label_02" / single.name).is_file():
+    single = None if oxts is None else oxts.single
+    if oxts is None or single is None or not (path / "label_02" / single.name).is_file():
         return None, 0
     pictures = path / "image_02" / single.stem
-    found = read_labels(path / "label_02" / single.name, pictures, TRACKING_PERIOD_NS)
+    found = read_labels(path / "label_02" / single.name, pictures, oxts.period_ns)
     return found.objects.save(folder, "KITTI tracking (CC BY-NC-SA 3.0): label_02"), found.lost
 
 
@@ -301,20 +308,24 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
         )
     name = singles[0].stem
     cameras, touched = [], Touched()
+    oxts = Oxts(TimedFiles((), _no_times(), _no_times(), None, ()), singles[0], touched=touched)
+    period_s = _driven_period_s(oxts)
+    if period_s is not None:
+        oxts = replace(oxts, period_ns=round(period_s / PERIOD_STEP_S) * round(PERIOD_STEP_S * 1e9))
     for folder in sorted(path.glob(f"image_[0-9][0-9]/{name}")):
         paths = list_pictures(folder)
         if paths:
             topic = Topic(folder.parent.name, "crosscue/Images", "columns")
-            t_ns = np.array([_frame_ns(path.stem) for path in paths], dtype=np.int64)
+            t_ns = np.array(
+                [_frame_ns(path.stem, oxts.period_ns) for path in paths], dtype=np.int64
+            )
             files = TimedFiles(tuple(paths), t_ns, _no_times(), None, ())
             cameras.append(PictureFiles(topic, files, touched))
-    oxts = Oxts(TimedFiles((), _no_times(), _no_times(), None, ()), singles[0], touched=touched)
+    why = "as published" if period_s is None else "by which speeds add up to distances"
     notice = (
-        f"{name}: the tracking set keeps no times; they are made from frame numbers at "
-        f"{1e9 / TRACKING_PERIOD_NS:g} Hz, starting at 0"
+        f"{name}: the tracking set keeps no times; they are made from frame numbers, "
+        f"{oxts.period_ns * 1e-6:g} ms each ({why}), starting at 0"
     )
-    if (period_s := _driven_period_s(oxts)) is not None:
-        notice += f" (distance over speed says {period_s * 1e3:.1f} ms a frame)"
     return Drive(path, cameras, oxts, limits, touched, notices=[notice])
 
 
@@ -328,13 +339,16 @@ def _driven_period_s(oxts: Oxts) -> float | None:
     way_m = float(np.hypot(*np.diff(enu_m[:, :2], axis=0).T).sum())
     speed_mps = np.hypot(packets["ve"], packets["vn"])
     speeds_mps = float((speed_mps[1:] + speed_mps[:-1]).sum()) / 2.0
-    return way_m / speeds_mps if speeds_mps > len(packets) else None
+    if speeds_mps <= len(packets):
+        return None
+    period_s, published_s = way_m / speeds_mps, TRACKING_PERIOD_NS * 1e-9
+    return period_s if abs(period_s / published_s - 1.0) < MAX_PERIOD_ERROR else None
 
 
-def _frame_ns(stem: str) -> int:
+def _frame_ns(stem: str, period_ns: int) -> int:
     """Time of a numbered frame, or -1 for a name that is not a number."""
     is_number = stem.isascii() and stem.isdecimal() and len(stem) <= 9
-    return int(stem) * TRACKING_PERIOD_NS if is_number else -1
+    return int(stem) * period_ns if is_number else -1
 
 
 def _read_oxts(oxts: Oxts, ledger: Ledger, selection: Selection) -> Iterator[Block]:

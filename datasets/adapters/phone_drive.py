@@ -9,7 +9,6 @@ of several topics, so a damaged line is lost from each of them.
 from __future__ import annotations
 
 import csv
-import heapq
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -22,7 +21,6 @@ from crosscue.replay.base import (
     EVERYTHING,
     MIB,
     Block,
-    Closing,
     Floats,
     Int64s,
     Ledger,
@@ -33,7 +31,8 @@ from crosscue.replay.base import (
     Topic,
     read_at_most,
 )
-from crosscue.replay.readers.held_rows import HeldRows, Loss
+from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
+from crosscue.replay.seal.touched import Touched
 
 MAX_FILE_BYTES: Final = 256 * MIB
 MILE_H_MPS: Final = 0.44704
@@ -127,34 +126,15 @@ FIX: Final = _Stream(
 )
 
 
-class Drive(Closing):
+class Drive(CameraDrive):
     """One folder as a ``Log``."""
 
     format: Final = "phone-drive"
 
-    def __init__(self, path: Path, rows: Sequence[HeldRows]) -> None:
-        """Put a drive together."""
-        self.path: Final = path
-        self._rows: Final = tuple(rows)
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """The car's, then the phone's."""
-        return tuple(rows.topic for rows in self._rows)
-
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All streams, in order of each one's first time; see ``Log.read``."""
         ledger.integrity = "not checkable: no checksums, and a missing line cannot be seen"
-        streams = [rows.read(ledger, selection) for rows in self._rows]
-        yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
-
-    def report_missing(self, ledger: Ledger) -> None:
-        """Damaged lines; see ``KnowsItsEnd``."""
-        for rows in self._rows:
-            rows.report_missing(ledger)
-
-    def close(self) -> None:
-        """Nothing is held open."""
+        yield from super().read(ledger, selection)
 
 
 class _Lines(NamedTuple):
@@ -172,6 +152,7 @@ def open_drive(path: Path, limits: Limits) -> Drive:
         LogFormatError: A file is missing or too large, there are two of a kind, or columns lack.
     """
     rows: list[HeldRows] = []
+    touched = Touched()
     for kind, streams in (("car", CAR), ("phone", PHONE)):
         files = sorted(path.glob(f"*_{kind}.csv"))
         if len(files) != 1:
@@ -180,10 +161,11 @@ def open_drive(path: Path, limits: Limits) -> Drive:
         wanted = {name for one in streams.values() for name in one.fields}
         wanted |= {*FIX.fields} if kind == "phone" else set()
         lines = _read(files[0], wanted)
+        touched.add(files[0], 0, files[0].stat().st_size)
         rows += [_held(name, one, lines) for name, one in streams.items()]
         if kind == "phone":
             rows.append(_fixes(lines))
-    return Drive(path, rows)
+    return Drive(path, (), rows, limits, touched)
 
 
 def _read(file: Path, wanted: set[str]) -> _Lines:

@@ -128,9 +128,28 @@ def test_the_tracking_layout_gives_made_up_times_and_says_so(tmp_path: Path) -> 
     assert times(by_topic["image_02"]) == [100_000_000 * i for i in range(30) if i != 4]
     assert ledger.topic("image_02").dropped == {"a picture without its time": 1}
     assert ledger.notices == [
-        "0003: the tracking set keeps no times; they are made from frame numbers at 10 Hz, "
-        "starting at 0 (distance over speed says 100.0 ms a frame)"
+        "0003: the tracking set keeps no times; they are made from frame numbers, "
+        "100 ms each (by which speeds add up to distances), starting at 0"
     ]
+
+
+@pytest.mark.parametrize("period_ms", [103.5, 96.0])
+def test_the_tracking_layouts_period_is_what_its_speeds_and_positions_show(
+    period_ms: float, tmp_path: Path
+) -> None:
+    drive = tracking_drive(tmp_path / "drive")
+    (file,) = (drive / "oxts").glob("*.txt")
+    rows = [line.split() for line in file.read_text().splitlines()]
+    for row in rows:
+        # East, north, ahead, left and up: slower by as much as frames are further apart.
+        row[6:11] = [repr(float(value) * 100.0 / period_ms) for value in row[6:11]]
+    file.write_text("".join(f"{' '.join(row)}\n" for row in rows))
+
+    by_topic, _ = read(drive)
+
+    period_ns = round(period_ms * 1e6)
+    assert times(by_topic["oxts/gnss"]) == [period_ns * i for i in range(30)]
+    assert times(by_topic["image_02"]) == [period_ns * i for i in range(30)]
 
 
 @pytest.mark.parametrize("make", [raw_drive, tracking_drive])
@@ -319,7 +338,7 @@ def test_the_real_sequence_turns_74_degrees_and_its_speeds_fit_its_positions(
     # The true frame rate is 9.65 Hz: positions are 3.6 % further apart than speeds at 10 Hz say.
     period_s = np.hypot(*steps_m.T).sum() / ((speed_mps[1:] + speed_mps[:-1]) / 2).sum()
     assert period_s == pytest.approx(0.1036, abs=0.0003)
-    assert "103.7 ms a frame" in ledger.notices[0]
+    assert "103.7 ms each" in ledger.notices[0]
     moving = speed_mps[1:] > 3.0
     course = np.arctan2(steps_m[:, 1], steps_m[:, 0])
     off = np.angle(np.exp(1j * (course - heading[1:])))[moving]
