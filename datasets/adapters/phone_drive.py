@@ -226,7 +226,7 @@ def _fixes(lines: _Lines) -> HeldRows:
 
 
 def _wall_ns(text: str) -> int | None:
-    """A wall clock's time as if it were UTC; None where it is none."""
+    """A wall clock's time as if it were UTC; None where it is not a time."""
     try:
         at = datetime.fromisoformat(text.strip()).replace(tzinfo=UTC)
     except ValueError:

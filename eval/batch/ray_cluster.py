@@ -60,11 +60,11 @@ def check_fits(ray: Any, address: str, cores: int, memory_bytes: int) -> None:
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     has = [(int(one.get("CPU", 0)), int(one.get("memory", 0))) for one in nodes]
     if not any(its_cores >= cores and its_bytes >= memory_bytes for its_cores, its_bytes in has):
-        most_cores = max((one for one, _ in has), default=0)
-        most_bytes = max((one for _, one in has), default=0)
+        max_cores = max((one for one, _ in has), default=0)
+        max_bytes = max((one for _, one in has), default=0)
         raise CrosscueError(
             f"--ray {address}: a drive declares {cores} cores and {memory_bytes / GIB:.3g} GiB; no "
-            f"node has both: the largest have {most_cores} cores and {most_bytes / GIB:.3g} GiB; "
+            f"node has both: the largest have {max_cores} cores and {max_bytes / GIB:.3g} GiB; "
             "declare less with --cores-per-drive and --memory-per-drive"
         )
 
