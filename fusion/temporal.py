@@ -120,7 +120,7 @@ class TemporalModel:
     has_feature: NDArray[np.float64]
 
     @property
-    def usual(self) -> Floats:
+    def usual(self) -> NDArray[np.float64]:
         """Probabilities before a drive, shape (features,)."""
         return np.asarray(self.settings.ahead * (self.has_feature @ self.way_probabilities))
 

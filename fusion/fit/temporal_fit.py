@@ -146,7 +146,7 @@ def _scores(
     return {pair: float(np.mean(some)) for pair, some in losses.items()}
 
 
-def log_loss(drive: AnnotatedDrive, graph: FactorGraph, beliefs: Floats) -> float:
+def log_loss(drive: AnnotatedDrive, graph: FactorGraph, beliefs: NDArray[np.float64]) -> float:
     """Mean over frames and known features of -ln(probability of what is so)."""
     losses = [
         -np.log(beliefs[:, column] if drive.features[name] else 1.0 - beliefs[:, column])
