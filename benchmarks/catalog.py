@@ -15,8 +15,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -27,8 +29,8 @@ from support.catalog_runs import scene, seen
 from support.manifests import estimated
 
 SQL = (
-    "select control, count(*) as n, avg(detected_range_m) as mean_m "
-    "from approaches group by control"
+    "select approach, count(*) as n, avg(detected_range_m) as mean_m "
+    "from approaches group by approach"
 )
 
 
@@ -47,12 +49,16 @@ def main() -> None:
 
 
 def _make(folder: Path, runs: int, approaches: int) -> None:
-    seen_there = scene(*(seen(number, 20.0 + number) for number in range(approaches)))
+    seen_there = scene(*(seen(number, 20.125) for number in range(approaches)))
     manifest = estimated(scene=seen_there).model_dump_json(by_alias=True)
+    parts = manifest.split("20.125")
+    ranges_m = np.random.default_rng(0).uniform(5.0, 80.0, (runs, approaches))
     for number in range(runs):
         run = folder / f"{number % 100:02}" / f"drive-{number:06}"
         run.mkdir(parents=True)
-        (run / "manifest.json").write_text(manifest)
+        drawn = [*map(repr, ranges_m[number].tolist()), ""]
+        text = "".join(chain.from_iterable(zip(parts, drawn, strict=True)))
+        (run / "manifest.json").write_text(text)
     print(f"made      {runs:,} runs of {approaches} approaches, {len(manifest):,} bytes each")
 
 
@@ -74,8 +80,8 @@ def _measure(folder: Path) -> None:
 
 
 def _grouped(path: Path) -> pa.Table:
-    table = pq.read_table(path, columns=["control", "detected_range_m"])
-    return table.group_by("control").aggregate([([], "count_all"), ("detected_range_m", "mean")])
+    table = pq.read_table(path, columns=["approach", "detected_range_m"])
+    return table.group_by("approach").aggregate([([], "count_all"), ("detected_range_m", "mean")])
 
 
 def _timed(work: Callable[[], object], times: int = 3) -> tuple[float, float]:

@@ -53,7 +53,7 @@ INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
             "STRUCT(name VARCHAR, identity VARCHAR)[]",
             "detectors; the identity is a hash of weights, settings and code",
         ),
-        "settings": Column("VARCHAR", "JSON of all settings: settings->>'$.fusion.established'"),
+        "settings": Column("VARCHAR", "JSON of all settings: (settings->>'$.fusion.established')"),
         "settings_sha256": Column("VARCHAR", "of settings, models and the part of the logs"),
         "tags": Column("MAP(VARCHAR, VARCHAR)", "set by crosscue tag: tags['weather']"),
         "conditions": Column("VARCHAR[]", "of the drive's approaches, from the truth"),

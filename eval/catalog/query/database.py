@@ -1,7 +1,8 @@
 """SQL over tables in memory and data sets, in a DuckDB that can touch nothing else.
 
 It has no file system, network, extensions, Python variables or temporary files, and its settings
-are locked before a query is read; only a single SELECT is run. So what a query can reach are the
+are locked before a query is read; only a single SELECT is run. (Before version 2, a locked DuckDB
+could still be told to write its log to a file.) So what a query can reach are the
 tables that were handed over, which Arrow reads.
 """
 
@@ -31,6 +32,8 @@ LOCKED: Final[Mapping[str, str]] = {
     "lock_configuration": "true",
 }
 """Settings, in an order in which each can still be set."""
+MAX_LINE: Final = 300
+"""Characters of DuckDB's messages, which quote values."""
 _QUOTED: Final = re.compile(r'"([^"]+)"')
 _SCHEMA: Final = "crosscue query --schema lists all"
 
@@ -110,14 +113,14 @@ def _message(error: duckdb.Error, tables: list[str], columns: list[str]) -> str:
         report = json.loads(text[text.index("{") :])
         said = str(report["exception_message"])
     except (ValueError, KeyError, TypeError):
-        return f"query: {one_line(error)}; {_SCHEMA}"
+        return f"query: {one_line(error, MAX_LINE)}; {_SCHEMA}"
     named = _QUOTED.findall(said.split("\n")[0])
     name = str(report.get("name") or (named[-1] if named else ""))
     if report.get("type") == "Table":
         return f"query: no table {name}; {_nearest(name, tables)}"
     if report.get("exception_type") == "Binder" and name and name not in columns:
         return f"query: no column {name}; {_nearest(name, columns)}"
-    return f"query: {one_line(ValueError(said))}; {_SCHEMA}"
+    return f"query: {one_line(ValueError(said), MAX_LINE)}; {_SCHEMA}"
 
 
 def _nearest(name: str, there: list[str]) -> str:

@@ -7,6 +7,7 @@ import base64
 import csv
 import io
 import json
+import sys
 from collections.abc import Callable, Iterator
 from datetime import date, datetime
 from decimal import Decimal
@@ -21,6 +22,8 @@ from .terminal import print_json
 if TYPE_CHECKING:
     import pyarrow as pa
 
+UNBOUNDED: Final = 1 << 30
+
 
 def print_rows(found: pa.Table, args: argparse.Namespace) -> None:
     """The rows on stdout: with ``--json`` or ``--csv`` so, else as a table of text."""
@@ -29,7 +32,9 @@ def print_rows(found: pa.Table, args: argparse.Namespace) -> None:
     elif args.csv:
         print(_csv(found), end="")
     elif not args.quiet:
-        print("\n".join(_lines(found)))
+        # Cells are cut to fit a terminal; what another program reads, and a schema, stay whole.
+        is_cut = sys.stdout.isatty() and not args.schema
+        print("\n".join(_lines(found, terminal_width() if is_cut else UNBOUNDED)))
 
 
 def write_rows(found: pa.Table, args: argparse.Namespace) -> None:
@@ -49,13 +54,13 @@ def write_rows(found: pa.Table, args: argparse.Namespace) -> None:
         print(f"{args.output}: {found.num_rows} rows")
 
 
-def _lines(found: pa.Table) -> Iterator[str]:
+def _lines(found: pa.Table, width: int) -> Iterator[str]:
     import pyarrow as pa
 
     rows = [[_cell(value) for value in row.values()] for row in _records(found)]
     numbers = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
     texts = [i for i, one in enumerate(found.schema) if not any(is_a(one.type) for is_a in numbers)]
-    yield from table(found.column_names, rows, terminal_width(), texts)
+    yield from table(found.column_names, rows, width, texts)
     yield f"{len(rows)} row{'' if len(rows) == 1 else 's'}"
 
 

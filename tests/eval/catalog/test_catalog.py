@@ -118,7 +118,7 @@ def test_what_was_dropped_is_counted_with_its_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("query", "named"),
     [
-        ("settings->>'$.fusion.established' = '0.3'", ["b/monday", "b/tuesday"]),
+        ("(settings->>'$.fusion.established') = '0.3'", ["b/monday", "b/tuesday"]),
         ("name = 'monday' -- both", ["a/monday", "b/monday"]),
         ("", ["a/monday", "a/tuesday", "b/monday", "b/tuesday"]),
         ("select run from runs where name = 'monday' order by run desc", ["b/monday", "a/monday"]),
