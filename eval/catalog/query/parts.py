@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 WORKERS: Final = 8
 SCORE: Final = "score/"
+ONLY_RUN: Final = {"run": OWN["cues"]["run"]}
+"""Of a table without a readable file, whose columns are therefore not known."""
 
 
 def file_of(table: str) -> str:
@@ -69,7 +71,7 @@ class Parts:
                 self.left_out[run] = _why(runs[run], error)
                 continue
             self._fragments[run] = fragment
-        self._schema: Final = schema if self._fragments else arrow_schema(OWN.get(table, {}))
+        self._schema: Final = schema if self._fragments else arrow_schema(OWN.get(table, ONLY_RUN))
 
     @property
     def dataset(self) -> ds.Dataset:

@@ -223,3 +223,12 @@ def test_drives_with_several_settings_are_noted(runs: Path) -> None:
         "settings_sha256 tells them apart"
     )
     assert crosscue.catalog(runs / "a").notices == ()
+
+
+def test_a_table_that_no_run_can_show_is_empty(tmp_path: Path) -> None:
+    add_run(tmp_path / "one", "one").file("frames.parquet").write_bytes(b"PAR1")
+
+    found = crosscue.catalog(tmp_path)
+
+    assert found.query("from frames").column_names == ["run"]
+    assert "frames.parquet: damaged" in found.left_out["one"]
