@@ -183,7 +183,7 @@ def catalog(place: Path | str) -> Catalog:
             as ``s3://bucket/runs``, of which only what a query needs is fetched.
 
     Raises:
-        UnreadableRunError: It is no folder, holds no run, or cannot be listed.
+        RunError: It is no folder, holds no run, or cannot be listed.
     """
     if is_remote(place) and not str(place).startswith("file://"):
         places: Runs = RemoteRuns(str(place))
