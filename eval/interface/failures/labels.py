@@ -246,8 +246,8 @@ def import_labels(
         limits: What the logs are read with.
 
     Raises:
-        AnnotationError: The labels or the export cannot be read.
-        SchemaError: A picture was not exported, or has another size.
+        SchemaError: The labels or the export cannot be read, or a picture was not exported or has
+            another size.
         OutputError: A truth file exists, or cannot be written.
     """
     source, folder, target = Path(annotations), Path(exported), Path(output)
