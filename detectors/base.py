@@ -121,6 +121,14 @@ class Detections:
         """
         return rle.decode(self.masks[i], self.size_px)
 
+    def column_heights_px(self, i: int) -> NDArray[np.float64] | None:
+        """Pixels of one detection in each column of the picture; None where it has no mask.
+
+        Raises:
+            ValueError: The mask is not one of this picture.
+        """
+        return rle.column_heights_px(self.masks[i], self.size_px) if self.masks[i] else None
+
     def of(self, label: str) -> Self:
         """The detections with this label, in the same order."""
         return self.taken(np.array([one == label for one in self.labels], np.bool_))

@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.replay.vehicle.vehicle import Cars, CueSpec, Vehicle
 
@@ -84,25 +83,25 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
         raise ValueError("found: expected at least one detector's result")
     t_ns, size = found[0].t_ns, found[0].size_px
     rows = [
-        (box, mask)
+        (box, detections.column_heights_px(i))
         for detections in found
-        for label, is_sure, box, mask in zip(
-            detections.labels,
-            detections.are_sure(settings.score).tolist(),
-            detections.boxes_px.tolist(),
-            detections.masks,
-            strict=True,
+        for i, (label, is_sure, box) in enumerate(
+            zip(
+                detections.labels,
+                detections.are_sure(settings.score).tolist(),
+                detections.boxes_px.tolist(),
+                strict=True,
+            )
         )
         if label in settings.labels and is_sure and _is_long(box, settings)
     ]
     boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
     # Counting pixels by column gives both area and nose from one reading of the runs.
-    heights = [rle.column_heights_px(mask, size) if mask else None for _, mask in rows]
     areas = [
         (box[2] - box[0]) * (box[3] - box[1]) if columns is None else float(columns.sum())
-        for columns, (box, _) in zip(heights, rows, strict=True)
+        for box, columns in rows
     ]
-    noses = [0 if columns is None else nose_of(columns) for columns in heights]
+    noses = [0 if columns is None else nose_of(columns) for _, columns in rows]
     center = (boxes[:, :2] + boxes[:, 2:]) / 2.0
     return CarShapes(t_ns, size, center, np.array(areas), np.array(noses, np.int64))
 

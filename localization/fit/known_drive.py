@@ -8,6 +8,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.localization.compiled import kept
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
 from crosscue.localization.pose_filter import State, at_point, predict, update_position
@@ -139,29 +140,50 @@ class KnownDrive:
             cov_m2: Shape (N, 2, 2): of the positions, which the filter then weighs in one after
                 the other; None lets it dead reckon.
         """
-        ahead, left = self.lever_m
-        fixes = self.fixes.xy_m.tolist()
-        covs = None if cov_m2 is None else cov_m2.tolist()
-        found: list[State] = []
-        state = start
-        columns = (column.tolist() for column in steps)
-        for k, distance, turn, distance_var, turn_var in zip(*columns, strict=True):
-            state = predict(state, distance, turn, distance_var, turn_var, 0.0)
-            if k < 0:
-                continue
-            seen = at_point(state, ahead, left)
-            found.append(seen)
-            if covs is not None:
-                state = at_point(_weighed(seen, fixes[k], covs[k]), -ahead, -left)
-        table = np.array(found).reshape(-1, len(State._fields))
-        x, y, heading, _, xx, xy, _, _, yy = table.T[:9]
-        cov = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
-        return Predicted(np.stack([x, y], axis=1), heading, cov)
+        found = np.empty((len(self.fixes), len(State._fields)))
+        cov = np.empty((0, 2, 2)) if cov_m2 is None else cov_m2
+        # A fit drives along hundreds of times.
+        count = kept(_follow)(start, *steps, self.fixes.xy_m, cov, *self.lever_m, found)
+        x, y, heading, _, xx, xy, _, _, yy = found[:count].T[:9]
+        spread = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        return Predicted(np.stack([x, y], axis=1), heading, spread)
 
 
-def _weighed(seen: State, xy_m: list[float], cov_m2: list[list[float]]) -> State:
+def _follow(
+    state: State,
+    at_fix: Int64s,
+    distance_m: Floats,
+    turn_rad: Floats,
+    distance_var_m2: Floats,
+    turn_var_rad2: Floats,
+    fixes_m: Floats,
+    cov_m2: Floats,
+    ahead_m: float,
+    left_m: float,
+    found: Floats,
+) -> int:
+    """Write the state at each position into ``found``; how many there are."""
+    count = 0
+    for row in range(len(at_fix)):
+        state = predict(
+            state, distance_m[row], turn_rad[row], distance_var_m2[row], turn_var_rad2[row], 0.0
+        )
+        k = at_fix[row]
+        if k < 0:
+            continue
+        seen = at_point(state, ahead_m, left_m)
+        for column in range(len(seen)):
+            found[count, column] = seen[column]
+        count += 1
+        if len(cov_m2):
+            x, y = fixes_m[k, 0], fixes_m[k, 1]
+            weighed = _weighed(seen, x, y, cov_m2[k, 0, 0], cov_m2[k, 0, 1], cov_m2[k, 1, 1])
+            state = at_point(weighed, -ahead_m, -left_m)
+    return count
+
+
+def _weighed(seen: State, x: float, y: float, var_x: float, cov_xy: float, var_y: float) -> State:
     """After one position; an outlier counts as one that bad, without a jump at the gate."""
-    (x, y), ((var_x, cov_xy), (_, var_y)) = xy_m, cov_m2
     nis = update_position(seen, x, y, var_x, cov_xy, var_y, 0.0).nis
     more = max(nis / GATE_NIS, 1.0)
     return update_position(seen, x, y, more * var_x, more * cov_xy, more * var_y, math.inf).state

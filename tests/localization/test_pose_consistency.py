@@ -78,11 +78,11 @@ def run(seed: int, settings: TrackSettings, persists_s: float = 0.0) -> tuple[Ad
 
 
 def test_simulated_errors_are_as_large_as_claimed() -> None:
-    runs = [run(seed, EVERY_READING) for seed in range(200)]
+    runs = [run(seed, EVERY_READING) for seed in range(100)]
 
     for row in (2, -1):
         mean = np.mean([nees_of(done.poses, truth, row) for done, truth in runs])
-        low, high = mean_band(3, 200)
+        low, high = mean_band(3, 100)
         assert low < mean < high
     nis = np.concatenate([done.headings.nis for done, _ in runs])
     low, high = mean_band(1, len(nis))

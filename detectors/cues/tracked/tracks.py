@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.cues.tracked.motion import (
@@ -160,8 +159,8 @@ class CarTracks:
             return None
         left, right = np.arctan2(-rays[:, 1], rays[:, 0]).tolist()
         error = math.hypot(BOX_PX / (y1 - y0), HIDDEN_FRACTION if is_hidden else BOX_FRACTION)
-        mask = found.masks[i]
-        nose = 0 if not mask else nose_of(rle.column_heights_px(mask, found.size_px))
+        heights_px = found.column_heights_px(i)
+        nose = 0 if heights_px is None else nose_of(heights_px)
         long = (x1 - x0) / (y1 - y0)
         return Observation(
             self._t_s, self._pose, (left, right), distance_m, error, long, nose, is_hidden

@@ -19,6 +19,8 @@ from crosscue.eval.runs.manifest import FORMAT_VERSION
 from support.trees import tree
 
 pytestmark = pytest.mark.slow
+PART = ("--to", "4", "-q")
+"""A few seconds of each drive are enough to tell runs apart."""
 
 DRIVES: int = 4
 REFUSAL: str = f"format 1, this crosscue reads {FORMAT_VERSION}: replay again"
@@ -167,7 +169,7 @@ def test_shards_merged_in_any_way_are_the_single_batch(
     chance = random.Random(seed)
     logs = [str(path) for path in sorted(drives.glob("*/drive.mcap"))]
     single = tmp_path / "single"
-    assert run(["replay", *logs, "--each", "-o", str(single), "-q"]) == 3
+    assert run(["replay", *logs, "--each", "-o", str(single), *PART]) == 3
     whole = _bytes(single / "merged")
 
     shards: list[list[str]] = [[], [], []]
@@ -180,7 +182,7 @@ def test_shards_merged_in_any_way_are_the_single_batch(
         folder = tmp_path / "deep" / "er" / str(number)
         if shard:
             workers = ["--workers", chance.choice(["1", "2"])]
-            run(["replay", *shard, "--each", "-o", str(folder), "-q", *workers])
+            run(["replay", *shard, "--each", "-o", str(folder), *PART, *workers])
             folders.append(str(folder))
     folders = [folder for folder in folders if Path(folder, "merged").exists()]
     chance.shuffle(folders)
@@ -192,8 +194,8 @@ def test_shards_merged_in_any_way_are_the_single_batch(
 def test_a_folder_used_again_keeps_the_drives_of_both_batches(drives: Path, tmp_path: Path) -> None:
     first, second = (str(drives / name / "drive.mcap") for name in ("D-0", "D-1"))
     for log in (first, second):
-        assert run(["replay", log, "--each", "-o", str(tmp_path / "again"), "-q"]) == 0
-    assert run(["replay", second, first, "--each", "-o", str(tmp_path / "once"), "-q"]) == 0
+        assert run(["replay", log, "--each", "-o", str(tmp_path / "again"), *PART]) == 0
+    assert run(["replay", second, first, "--each", "-o", str(tmp_path / "once"), *PART]) == 0
 
     assert _bytes(tmp_path / "again" / "merged") == _bytes(tmp_path / "once" / "merged")
     names = {one["name"] for one in _manifest(tmp_path / "again" / "merged")["drives"]}

@@ -15,7 +15,7 @@ from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
-DRIVES = 6
+DRIVES = 4
 
 
 def test_simulated_drives_are_as_wrong_as_their_noise_says(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def landmark_nis(traced: Traced) -> list[float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("goals", [1, 1_000_000], ids=["to the goal", "as far as allowed"])
 def test_nees_at_ten_degrees_is_in_its_band(goals: int) -> None:
-    count = 2000 if goals == 1 else 300
+    count = 1000 if goals == 1 else 150
     settings = fine(10.0, goals=goals).model_copy(update={"longest_m": 20_000.0})
     rows = drive_many(settings, np.arange(count, dtype=np.uint64))
     low, high = mean_band(3, count)

@@ -132,7 +132,7 @@ def test_a_last_line_without_end_is_not_trusted(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path) -> None:
-    frames = made(40)
+    frames = made(14)
     text = candump(frames)
     ends = {0, *(k + 1 for k, c in enumerate(text) if c == 10)}
     for at in range(1, len(text), 3):
