@@ -74,6 +74,13 @@ def add_first_pose_arguments(parser: argparse.ArgumentParser, default: str) -> N
     )
 
 
+def add_file_output(parser: argparse.ArgumentParser, metavar: str, what: str) -> None:
+    """``-o``, ``--overwrite`` and ``--json`` of a command that writes one file."""
+    parser.add_argument("-o", "--output", type=Path, metavar=metavar, help=what)
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
 def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
     """``--max-chunk``."""
     parser.add_argument(

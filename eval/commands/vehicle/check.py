@@ -13,7 +13,12 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_result
+from crosscue.eval.commands.shared.terminal import (
+    add_file_output,
+    add_limit_arguments,
+    limits_of,
+    print_result,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,15 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seconds of the log to read (default: 10)",
     )
     add_limit_arguments(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="FILE",
-        help="page (.html) or picture (.jpg, .png) to write",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_file_output(parser, "FILE", "page (.html) or picture (.jpg, .png) to write")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import Final
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_json
+from crosscue.eval.commands.shared.terminal import (
+    add_file_output,
+    add_limit_arguments,
+    limits_of,
+    print_json,
+)
 
 MOUNTING: Final = {
     "x-m": "how far the camera sits ahead of the rear axle",
@@ -39,15 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             f"--camera-{name}", type=float, metavar=name.rpartition("-")[2].upper(), help=what
         )
     add_limit_arguments(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="V.toml",
-        help="vehicle file to write (default: print it)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_file_output(parser, "V.toml", "vehicle file to write (default: print it)")
 
 
 def run(args: argparse.Namespace) -> int:
