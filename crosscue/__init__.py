@@ -55,6 +55,7 @@ _EXPORTS: Final = {
     "save_recording": "eval.interface.runs.recording",
     "failures": "eval.interface.failures.failures",
     "Failures": "eval.interface.failures.failures",
+    "read_failures": "eval.interface.failures.failures",
     "Failure": "eval.failures.record",
     "browse": "eval.interface.failures.browse",
     "export": "eval.interface.failures.labels",
@@ -239,6 +240,7 @@ if TYPE_CHECKING:
     from crosscue.eval.interface.failures.browse import browse as browse
     from crosscue.eval.interface.failures.failures import Failures as Failures
     from crosscue.eval.interface.failures.failures import failures as failures
+    from crosscue.eval.interface.failures.failures import read_failures as read_failures
     from crosscue.eval.interface.failures.labels import ExportedLabels as ExportedLabels
     from crosscue.eval.interface.failures.labels import ImportedLabels as ImportedLabels
     from crosscue.eval.interface.failures.labels import export as export

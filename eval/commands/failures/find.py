@@ -9,6 +9,7 @@ cause and run before a second of any.
 examples:
   crosscue failures runs
   crosscue failures runs --top 20 -o worst.parquet
+  crosscue failures runs --where "'dusk' in conditions"
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import print_result, progress_line, refuse_existing
+from crosscue.replay.errors import EmptyResultError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="T.json",
         help="truth of all runs (default: truth.json beside each run's log)",
+    )
+    parser.add_argument(
+        "--where", metavar="QUERY", help="only runs that a query selects, of the one folder given"
     )
     parser.add_argument(
         "--any-log",
@@ -60,9 +65,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Find and print; 3 when a run could not be examined."""
     refuse_existing(args)
+    runs = args.runs
+    if args.where is not None:
+        if len(runs) != 1:
+            raise UsageError("--where: expected one folder of runs to select from")
+        runs = crosscue.catalog(runs[0]).select(args.where)
+        if not runs:
+            raise EmptyResultError(f"{args.runs[0]}: no run where {args.where}")
     with progress_line(args, "examining") as line:
         found = crosscue.failures(
-            args.runs,
+            runs,
             truth=args.truth,
             output=args.output,
             top=args.top,

@@ -11,6 +11,7 @@ from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.failures.find import failures_beside_truth, failures_without_truth
 from crosscue.eval.failures.order import CauseGroup, cause_groups, diverse, ranked
 from crosscue.eval.failures.record import Failure, failure_table, write_failures
+from crosscue.eval.failures.record import read_failures as read_table
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.runs import find_truth, judge_scene
@@ -145,7 +146,8 @@ def failures(
     Nothing is written into the runs. A run that cannot be examined does not stop the others.
 
     Args:
-        runs: Run folders, folders of them, patterns, or ``@list.txt``.
+        runs: Run folders, folders of them, patterns, or ``@list.txt``; what ``Catalog.select``
+            returns.
         truth: Truth of all runs; None for the ``truth.json`` beside each run's log.
         output: Table to write: ``.parquet`` or ``.json``.
         top: Only so many, of as many causes and runs as possible; None for all, by severity.
@@ -188,6 +190,18 @@ def failures(
     return Failures(
         chosen, cause_groups(found), len(found), len(paths), tuple(without), failed, path
     )
+
+
+def read_failures(table: Path | str) -> tuple[Failure, ...]:
+    """Failures as ``failures`` wrote them.
+
+    Args:
+        table: ``.parquet`` or ``.json``; runs are found relative to its folder.
+
+    Raises:
+        SchemaError: It is missing, damaged, or another table.
+    """
+    return read_table(Path(table))
 
 
 def _checked_output(output: Path | str | None) -> Path | None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import crosscue
+from crosscue.eval import cli
 from crosscue.eval.failures.approach_level import flips_without_truth
 from crosscue.eval.failures.order import cause_groups, diverse, ranked
 from crosscue.eval.failures.record import Failure, distance_bin, read_failures, write_failures
@@ -240,3 +241,17 @@ def test_every_distance_has_one_bin() -> None:
     assert [distance_bin(d) for d in (None, -1.0, 0.0, 9.9, 10.0, 79.9, 80.0)] == [
         "unknown", "0-10 m", "0-10 m", "0-10 m", "10-20 m", "40-80 m", "80 m and more",
     ]  # fmt: skip
+
+
+def test_a_query_selects_the_runs_of_one_folder(
+    drive: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["failures", str(drive[0].parent), "--truth", str(drive[1]), "--json"]
+
+    assert cli.run(line) == 0
+    everything = capsys.readouterr().out
+    assert cli.run([*line, "--where", "stage = 'estimate'"]) == 0
+    assert capsys.readouterr().out == everything
+    assert cli.run([*line, "--where", "false"]) == 1
+    assert "no run where false" in capsys.readouterr().err
+    assert cli.run([*line, str(drive[0]), "--where", "true"]) == 2
