@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.intervals import Mean, mean
+from crosscue.eval.scoring.intervals import Mean, mean, share
 from crosscue.eval.scoring.scene.belief import brier, log_score
 from crosscue.eval.scoring.scene.detection import CONFIRM_FRAMES, held
 from crosscue.eval.scoring.truth import FEATURES as FEATURES
@@ -88,7 +88,8 @@ class LayoutScores:
         less: The belief over time less each other, by what they are called.
         cues: From cues left out to the belief over time in every picture without them, less that
             with all.
-        rules: From what is left out (empty for nothing) to the score with the other rules.
+        rules: From what is left out (empty for nothing) to the score with the other rules, over
+            one drive of each layout.
         rules_less: From the rule to the belief without it less that with all.
         drives: How many.
         layouts: How many.
@@ -120,7 +121,7 @@ def score_layouts(beliefs: Sequence[DriveBelief]) -> LayoutScore:
             for i, name in enumerate(FEATURES)
         },
         false_features=mean(_false_features(beliefs), drives),
-        full=mean(np.isfinite(found_m).astype(np.float64), at),
+        full=_fraction(np.isfinite(found_m), at),
         full_m=mean(found_m, at),
         full_before_detected=_of_pictures(beliefs, _ways_first),
         silent=_of_pictures(beliefs, lambda one: one.is_silent),
@@ -209,8 +210,14 @@ def _ways_first(one: DriveBelief) -> Flags:
 
 def _of_pictures(beliefs: Sequence[DriveBelief], flags_of: Callable[[DriveBelief], Flags]) -> Mean:
     clusters = _clusters([one.layout for one in beliefs])
-    flags = [flags_of(one).astype(np.float64) for one in beliefs]
+    flags = [flags_of(one) for one in beliefs]
     numbers = [
         np.full(len(one), number) for one, number in zip(flags, clusters.tolist(), strict=True)
     ]
-    return mean(np.concatenate(flags), np.concatenate(numbers))
+    return _fraction(np.concatenate(flags), np.concatenate(numbers))
+
+
+def _fraction(flags: Flags, clusters: Int64s) -> Mean:
+    """As ``mean``, its interval within 0 and 1."""
+    found = share(flags, clusters)
+    return Mean(found.value, found.clusters_low, found.clusters_high, found.of, found.clusters)
