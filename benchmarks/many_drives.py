@@ -1,6 +1,6 @@
 """Many drives: what the engine costs beside the work, what a drive hour costs, and merging.
 
-    python benchmarks/many_drives.py [--rounds 5] [--drives 4] [--minutes 1.5]
+    python benchmarks/many_drives.py [--rounds 5] [--tiny 204] [--drives 4] [--minutes 1.5]
 
 First tiny drives (a run folder with one table each), so that nothing but the engine counts: a plain
 loop, our engines with their journal, and ``concurrent.futures`` as the peer, all in rotation. Then
@@ -89,8 +89,8 @@ def peer(workers: int) -> Callable[[Sequence[Job]], None]:
     return work
 
 
-def engines(folder: Path, rounds: int) -> None:
-    few, many = 4, 204
+def engines(folder: Path, rounds: int, drives: int) -> None:
+    few, many = 4, drives
     ways: dict[str, Callable[[Sequence[Job]], object]] = {
         "plain loop": loop,
         "ours, in turn": lambda jobs: run_many(jobs, tiny, in_turn),
@@ -100,20 +100,23 @@ def engines(folder: Path, rounds: int) -> None:
         "concurrent.futures, 2": peer(2),
     }
     spent: dict[tuple[str, int], list[float]] = {(way, n): [] for way in ways for n in (few, many)}
+    used: dict[tuple[str, int], list[float]] = {place: [] for place in spent}
     for _ in range(rounds):
         for way, work in ways.items():
             for n in (few, many):
                 jobs = tiny_jobs(folder, n)
-                began = time.perf_counter()
+                began, began_cpu = time.perf_counter(), cpu_s()
                 work(jobs)
                 spent[way, n].append(time.perf_counter() - began)
+                used[way, n].append(cpu_s() - began_cpu)
     base = (median(spent["plain loop", many]) - median(spent["plain loop", few])) / (many - few)
     print(f"tiny drives: to begin, and for each of {many - few} more\n")
-    print("engine                  begin s   ms/drive   of plain loop")
+    print("engine                  begin s   ms/drive   of plain loop   CPU ms/drive")
     for way in ways:
         begin, whole = median(spent[way, few]), median(spent[way, many])
         each = (whole - begin) / (many - few)
-        print(f"{way:22} {begin:8.2f} {each * 1e3:10.2f} {each / base:15.2f}")
+        cpu = (median(used[way, many]) - median(used[way, few])) / (many - few)
+        print(f"{way:22} {begin:8.2f} {each * 1e3:10.2f} {each / base:15.2f} {cpu * 1e3:14.2f}")
     jobs = tiny_jobs(folder, many)
     run_many(jobs, tiny, in_turn)
     began = time.perf_counter()
@@ -258,11 +261,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--drives", type=int, default=4)
+    parser.add_argument("--tiny", type=int, default=204)
     parser.add_argument("--minutes", type=float, default=1.5)
     args = parser.parse_args()
     with TemporaryDirectory() as name:
         folder = Path(name)
-        engines(folder, args.rounds)
+        engines(folder, args.rounds, args.tiny)
+        if args.drives == 0:
+            return
         seconds = town_drives(folder / "drives", args.drives, args.minutes)
         drive_hours(folder, seconds, args.rounds)
         merging(folder, args.rounds)

@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 
+@cache
 def installed(package: str) -> str:
     """The version of ``package``, or "unknown" where its metadata is missing or not readable."""
     from importlib.metadata import version  # 20 ms, which ``crosscue --help`` need not wait for

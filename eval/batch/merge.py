@@ -9,8 +9,9 @@ same bytes however the drives were spread over batches.
 from __future__ import annotations
 
 import hashlib
+import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -39,7 +40,6 @@ from crosscue.replay.base import (
     UnreadableRunError,
     UsageError,
     one_line,
-    strict_json,
 )
 
 from .status import MERGED, NO_RUN, unfinished
@@ -191,7 +191,8 @@ def _settings_hash(manifest: DriveManifest) -> str:
         None if detected is None else [one.as_json() for one in detected.detectors],
         manifest.selection.as_json(),
     ]
-    return hashlib.sha256(strict_json(_without_places(made_with)).encode()).hexdigest()
+    text = json.dumps(_without_places(made_with), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _without_places(value: object) -> object:
@@ -235,11 +236,11 @@ def gathered(
     reasons: dict[str, set[str]] = {}
     for folder in folders:
         missing = unfinished(folder)
-        for path in _finished(folder):
+        for run in _finished(folder):
+            path = run.path
             if path.name in missing:
                 # It is of other settings: the last attempt, which should replace it, has failed.
                 continue
-            run = open_run(path)
             first = runs.setdefault(path.resolve().name, run)
             if first is not run and _content(first) != _content(run):
                 raise UsageError(
@@ -264,20 +265,23 @@ def gathered(
     return runs, dict(sorted(chosen.items()))
 
 
-def _finished(folder: Path) -> list[Path]:
-    """Runs of single drives in a folder, which may be one itself."""
+def _finished(folder: Path) -> Iterator[RunFolder]:
+    """Runs of single drives in a folder, which may be one itself; each manifest is read once."""
     if folder.joinpath(MANIFEST).exists():
         if is_merged(RunFolder(folder)):
             raise UsageError(
                 f"{folder}: tables that were merged before; give the folder that holds the runs"
             )
-        return [folder]
+        yield open_run(folder)
+        return
     try:
         inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError as error:
         raise UnreadableRunError(f"{folder}: {error.strerror}; give a folder of runs") from None
-    holding = [entry for entry in inside if entry.joinpath(MANIFEST).exists()]
-    return [entry for entry in holding if not is_merged(RunFolder(entry))]
+    for entry in inside:
+        run = RunFolder(entry)
+        if entry.joinpath(MANIFEST).exists() and not is_merged(run):
+            yield run
 
 
 def _content(run: RunFolder) -> tuple[str, ...]:
