@@ -69,7 +69,8 @@ class BatchStatus:
         counted = (f"{self.count(state)} {state}" for state in DriveState)
         lines.append(f"drives    {total}: {', '.join(counted)}")
         if math.isfinite(self.pace.per_hour):
-            lines.append(f"rate      {self.pace.per_hour:.3g} drives an hour")
+            digits = 0 if self.pace.per_hour >= 10.0 else 1
+            lines.append(f"rate      {self.pace.per_hour:,.{digits}f} drives an hour")
         if math.isfinite(self.pace.left_s):
             lines.append(f"time left {_duration(self.pace.left_s)}")
         return "\n".join(map(visible, lines))
