@@ -2,7 +2,7 @@
 
 It has no file system, network, extensions, Python variables or temporary files, and its settings
 are locked before a query is read; only a single SELECT is run. (Before version 2, a locked DuckDB
-could still be told to write its log to a file.) So what a query can reach are the
+could still be made to write its log to a file.) So what a query can reach are the
 tables that were handed over, which Arrow reads.
 """
 
