@@ -13,7 +13,7 @@ from crosscue.detectors.images import Encoded, decode, size_of
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.stored_images import camera_of, pictures_at
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.replay.base import CrosscueError, write_bytes
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, write_bytes
 
 ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}
 """Codings that every tool reads; others are written as PNG, without loss."""
@@ -62,6 +62,7 @@ def export_run(
     images: Path,
     classes: Sequence[str] | None,
     logs: Path | None = None,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> ExportedRun:
     """Write the pictures of some frames, and collect what detectors found in them.
 
@@ -71,12 +72,13 @@ def export_run(
         images: Folder for the pictures.
         classes: Labels to keep; None for those that the run's cues are made of.
         logs: Where its logs have moved to, if they have.
+        limits: On what one chunk of a log may declare.
 
     Raises:
         RunError: The run or its log cannot be read.
         OutputError: A picture cannot be written.
     """
-    run = open_run(path, logs)
+    run = open_run(path, logs, limits=limits)
     vehicle = run.drive_manifest().settings
     # A car is a thing, and only how it stands or moves is a cue.
     known = {

@@ -163,6 +163,8 @@ def read_failures(path: Path) -> tuple[Failure, ...]:
     Raises:
         AnnotationError: It is missing, damaged, or has other columns.
     """
+    if path.is_dir():
+        raise _unreadable(path, "a folder")
     rows = _json_rows(path) if path.suffix == ".json" else _parquet_rows(path)
     names = {field.name for field in fields(Failure)}
     found = []

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 from crosscue.eval.report.html import page_template, template_text
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.replay.base import strict_json, write_bytes, write_text
+from crosscue.replay.base import Limits, strict_json, write_bytes, write_text
 
 from .chart import RunRows, belief_around
 from .pictures import draw_pictures
@@ -75,16 +75,18 @@ class RunWork:
         total: Failures of the site.
         logs: Where the runs' logs have moved to, if they have.
         has_recordings: Each failure has a recording beside its page.
+        limits: On what one chunk of a log may declare.
     """
 
     site: Path
     total: int
     logs: Path | None
     has_recordings: bool
+    limits: Limits
 
     def __call__(self, entries: Sequence[Entry]) -> tuple[frozenset[str], str]:
         """Write pictures and pages of one run's failures; pictures written, why some are not."""
-        run = open_run(Path(entries[0].failure.run), self.logs)
+        run = open_run(Path(entries[0].failure.run), self.logs, limits=self.limits)
         names = {one.failure.t_ns: one.picture for one in entries}
         written: set[str] = set()
 

@@ -15,7 +15,8 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
-from support.gap_drive import Clock, replayed, write_drive
+from support.failures import table_of_failures
+from support.gap_drive import BEGIN, Clock, replayed, write_drive
 from support.onnx_models import bright_box_model
 from support.pictures import picture
 from support.trees import tree
@@ -63,6 +64,14 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("query", "RUNS"): ("{gone} --schema", INPUT),
     ("tag", "RUN"): ("{gone} weather=rain", INPUT),
     ("status", "RUNS"): ("{gone}", INPUT),
+    ("failures", "RUN"): ("{gone}", INPUT),
+    ("failures", "--truth"): ("{run} --truth {gone}", INPUT),
+    ("browse", "RUN"): ("{gone} -o {out}", INPUT),
+    ("browse", "--truth"): ("{run} -o {out} --truth {gone}", INPUT),
+    ("browse", "--logs"): ("{failures} -o {out} --logs {gone}", INPUT),
+    ("export", "FAILURES"): ("{gone} -o {out}", INPUT),
+    ("export", "--logs"): ("{failures} -o {out} --logs {gone}", INPUT),
+    ("truth import", "--export"): ("{coco} --export {gone} -o {out}", INPUT),
     ("history", "RUNS"): ("{gone}", INPUT),
     ("fit messages", "RUN"): ("{gone} --truth {truth} -o {out}.toml", INPUT),
     ("fit signs", "LABELS"): ("{gone}.csv --label stop", INPUT),
@@ -182,6 +191,8 @@ FOLDERS: Final = {
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
     ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
     ("merge", "RUNS"), ("query", "RUNS"), ("status", "RUNS"), ("history", "RUNS"),
+    ("failures", "RUN"), ("browse", "RUN"), ("browse", "--logs"), ("export", "--logs"),
+    ("truth import", "--export"), ("truth import", "ANNOTATIONS"),
 }  # fmt: skip
 """An empty folder in their place lacks a file, which is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
@@ -248,6 +259,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "onnx": photos / "net.onnx",
         "card": photos / "net.toml",
         "there": photos,
+        "failures": table_of_failures(run.path, photos / "failures.parquet", BEGIN),
     }
 
 

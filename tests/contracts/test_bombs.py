@@ -21,6 +21,7 @@ from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.base import MIB, Floats
 from support.every_format import EVERY_FORMAT
+from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
 from support.mcap_files import MAGIC, record, text
 from support.onnx_models import bright_box_model, open_model
@@ -52,13 +53,15 @@ OPENS_LOGS: dict[str, str] = {
     "landmarks add": "{out}.db {log} --poses {truth} --vehicle {car}",
     "truth import": "{coco} --log {log} -o {out}.json --vehicle {car}",
     "truth check": "{truth} --log {log} --vehicle {car}",
+    "browse": "{run} --truth {truth} --any-log -o {out}",
+    "export": "{failures} -o {out}",
 }
 """Arguments with which a command reads every chunk of a log."""
-REPORTS_THE_RUN = {"score", "score detector", "fit detector"}
+REPORTS_THE_RUN = {"score", "score detector", "fit detector", "browse", "export"}
 """They read single pictures or none, and report what was dropped as the run does."""
 OPENS_NONE: dict[str, str] = {
     "compare": "tables", "query": "tables", "tag": "texts", "merge": "tables",
-    "status": "the journal",
+    "status": "the journal", "failures": "tables",
     "fit ranges": "tables", "fit messages": "tables", "fit temporal": "tables",
     "history": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
@@ -104,6 +107,7 @@ def names(tmp_path: Path) -> dict[str, Path]:
         "its_car": compass.vehicle,
         "gnss_car": gnss_car,
         "its_truth": compass.truth,
+        "failures": table_of_failures(run.path, tmp_path / "failures.parquet", BEGIN + 10**9),
     }
 
 

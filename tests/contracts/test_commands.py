@@ -88,6 +88,7 @@ NAMED_BY_COMMAND: Final = {
     "--layouts",
     "--truth",
     "--test",
+    "--to",
 }
 """Options whose value is a file, folder or name of the command's own kind."""
 

@@ -109,7 +109,11 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     "`landmarks add`": _nothing("landmarks"),
     "`vehicle init`, `vehicle check`": _nothing("vehicle"),
     "`merge`": _nothing("merge"),
-    "`info`": [(0, "info {rowless}"), (3, "info {nothing_whole}")],
+    "`info`, `query`": [
+        (0, "info {rowless}"),
+        (3, "info {nothing_whole}"),
+        (0, "query {run} select/**/cue/**/from/**/cues/**/where/**/false"),
+    ],
     "many drives": [
         (4, "replay --each {noise} {noise2} -o {out}"),
         (1, "replay --each {noise} {can_log} -o {out}"),

@@ -16,6 +16,8 @@ ELSEWHERE: dict[str, str] = {
     "convert": "test_empty_result.py",
     "info": "that there is no row is its result", "landmarks list": "an empty list is its result",
     "landmarks match": "that nothing matches is its result",
+    "failures": "that nothing went wrong is its result",
+    "status": "that no drive is there is its result", "history": "test_history.py",
     "query": "a table without rows is its result", "tag": "sets what it is asked to set",
     "compare": "that nothing changed is its result", "view": "shows whatever a run holds",
     "seal": "seals whatever bytes there are", "train frames": "simulates", "simulate": "simulates",

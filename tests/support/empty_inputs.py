@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from crosscue.datasets.truth.truth import Truth, save
+from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SECOND, Clock, replayed, write_drive
 from support.pictures import picture, picture_folder
 from support.rosbag_files import Row, write_folder
@@ -31,6 +32,8 @@ COMMANDS: dict[str, str] = {
     "vehicle init": "{strange} -o {out}.toml",
     "vehicle check": "{strange} --vehicle {bare} -o {out}.html",
     "merge": "{empty} -o {out}",
+    "browse": "{empty}/failures.parquet -o {out}",
+    "export": "{empty}/failures.parquet -o {out}",
 }
 """Commands that find nothing in such input, and their arguments."""
 
@@ -49,6 +52,7 @@ def empty_inputs(folder: Path) -> dict[str, Path]:
     (empty / "labels.csv").write_text("picture,label,x0,y0,x1,y1\na.png,,,,,\n")
     (empty / "pairs.csv").write_text("query,known,same\n")
     (empty / "places.csv").write_text("image,x_m,y_m,sd_m\na.png,0,0,1\n")
+    table_of_failures(run.path, empty / "failures.parquet")
     (empty / "bare.toml").write_text("version = 1\n")
     message = Row("/can", BEGIN, b"\0\1\0\0\2\0\0\0a\0")
     return {

@@ -15,7 +15,12 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import print_result, progress_line
+from crosscue.eval.commands.shared.terminal import (
+    add_logs_argument,
+    limits_of,
+    print_result,
+    progress_line,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="accept truth made for another file of the same drive, such as a converted log",
     )
-    parser.add_argument(
-        "--logs", type=Path, metavar="DIR", help="folder that the runs' logs have moved to"
-    )
+    add_logs_argument(parser)
     parser.add_argument(
         "--top",
         type=int,
@@ -76,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
             threshold=args.threshold,
             any_log=args.any_log,
             logs=args.logs,
+            limits=limits_of(args),
             has_recordings=args.recordings,
             overwrite=args.overwrite,
             workers=args.workers,

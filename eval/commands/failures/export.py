@@ -15,7 +15,12 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import print_result, progress_line
+from crosscue.eval.commands.shared.terminal import (
+    add_logs_argument,
+    limits_of,
+    print_result,
+    progress_line,
+)
 
 FORMATS = ("coco", "cvat", "yolo", "fiftyone", "labelstudio")
 
@@ -31,12 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--classes",
         nargs="+",
         default=[],
-        metavar="LABEL",
+        metavar="NAME",
         help="labels to choose from (default: those that the runs' cues are made of)",
     )
-    parser.add_argument(
-        "--logs", type=Path, metavar="DIR", help="folder that the runs' logs have moved to"
-    )
+    add_logs_argument(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier export")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -50,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
             args.to,
             classes=args.classes,
             logs=args.logs,
+            limits=limits_of(args),
             overwrite=args.overwrite,
             on_runs=line.counting("runs"),
         )

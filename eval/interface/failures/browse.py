@@ -12,7 +12,16 @@ from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
 from crosscue.eval.interface.runs.recording import save_recording
-from crosscue.replay.base import EmptyResultError, OutputError, UsageError, cannot_write, visible
+from crosscue.eval.interface.runs.run import open_run
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    EmptyResultError,
+    Limits,
+    OutputError,
+    UsageError,
+    cannot_write,
+    visible,
+)
 from crosscue.replay.processes import in_processes
 
 from .failures import ENDINGS, Failures, failures
@@ -81,6 +90,7 @@ def browse(
     threshold: float = 0.9,
     any_log: bool = False,
     logs: Path | str | None = None,
+    limits: Limits = DEFAULT_LIMITS,
     has_recordings: bool = False,
     overwrite: bool = False,
     workers: int = 1,
@@ -96,6 +106,7 @@ def browse(
         threshold: As for ``failures``.
         any_log: As for ``failures``.
         logs: Where the runs' logs have moved to, if they have.
+        limits: What the logs are read with.
         has_recordings: Write a recording of each moment beside its page; megabytes each.
         overwrite: Replace an earlier site.
         workers: How many runs are drawn side by side.
@@ -117,7 +128,8 @@ def browse(
         shutil.rmtree(made, ignore_errors=True)
         for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
             (made / part).mkdir(parents=True)
-        work = RunWork(made, len(entries), None if logs is None else Path(logs), has_recordings)
+        moved = None if logs is None else Path(logs)
+        work = RunWork(made, len(entries), moved, has_recordings, limits)
         groups, pictures, reasons = by_run(entries), frozenset[str](), []
         for done, (written, why) in enumerate(in_processes(work, groups, workers), 1):
             pictures |= written
@@ -126,7 +138,8 @@ def browse(
         if has_recordings:
             for one in entries:
                 path = made / "r" / f"{one.number:05d}.rrd"
-                save_recording(one.failure.run, path, at=f"{one.failure.t_ns}ns")
+                run = open_run(one.failure.run, moved, limits=limits)
+                save_recording(run, path, at=f"{one.failure.t_ns}ns")
         write_lists(made, entries, pictures)
         shutil.rmtree(folder, ignore_errors=True)
         made.rename(folder)

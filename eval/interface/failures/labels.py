@@ -90,6 +90,7 @@ def export(
     *,
     classes: Sequence[str] = (),
     logs: Path | str | None = None,
+    limits: Limits = DEFAULT_LIMITS,
     overwrite: bool = False,
     on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> ExportedLabels:
@@ -101,12 +102,14 @@ def export(
         to: ``coco``, ``cvat``, ``yolo``, ``fiftyone`` or ``labelstudio``.
         classes: Labels to choose from; those that the runs' cues are made of if empty.
         logs: Where the runs' logs have moved to, if they have.
+        limits: What the logs are read with.
         overwrite: Replace an earlier export.
         on_runs: Called with the number of runs that are exported, and of how many.
 
     Raises:
         UsageError: Another format.
         EmptyResultError: No picture to export; nothing was written.
+        CrosscueError: Not one run could be read.
         OutputError: The folder holds something else, or cannot be written.
     """
     if to not in LABEL_FORMATS:
@@ -129,7 +132,8 @@ def export(
             moved = None if logs is None else Path(logs)
             try:
                 images = made / kind.pictures
-                runs.append(export_run(Path(run), sorted(times), images, classes or None, moved))
+                wanted = sorted(times), images, classes or None
+                runs.append(export_run(Path(run), *wanted, moved, limits))
             except OutputError:
                 raise
             except CrosscueError as error:
@@ -137,8 +141,10 @@ def export(
             on_runs(done, len(by_run))
         found = _together(where, runs)
         if not found.pictures:
-            reasons = [str(error) for error in failed.values()] or ["no failure in the table"]
-            raise EmptyResultError(f"{where}: no picture to export: {reasons[0]}")
+            if failed:
+                raise next(iter(failed.values()))
+            why = "none of its frames has one" if by_run else "no failure in it"
+            raise EmptyResultError(f"{where}: no picture to export: {why}")
         file = kind.write(made, found)
         index = [one.as_index(folder) for one in runs if one.pictures]
         write_text(made / INDEX, strict_json({"format": 1, "to": to, "drives": index}) + "\n")
