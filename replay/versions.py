@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import re
 from functools import cache
 from pathlib import Path
+
+from crosscue.replay.files.tree_text import json_tree
 
 
 @cache
@@ -73,6 +74,6 @@ def _installed_from() -> str:
 
     try:
         text = distribution("crosscue").read_text("direct_url.json") or "{}"
-        return str(json.loads(text).get("vcs_info", {}).get("commit_id", ""))
+        return str(json_tree(text).get("vcs_info", {}).get("commit_id", ""))
     except (ImportError, OSError, ValueError, AttributeError):
         return ""

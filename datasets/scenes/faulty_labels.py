@@ -28,10 +28,13 @@ from .layout import NEAR_KERB_M
 from .world import Category, World
 
 LABELS: Final[dict[Category, str]] = {
-    "car": "car", "stop_sign": "stop sign", "traffic_light": "traffic light",
-    "one_way_left": "one way left", "one_way_right": "one way right",
+    "car": "car",
+    "stop_sign": "stop sign",
+    "traffic_light": "traffic light",
+    "one_way_left": "one way left",
+    "one_way_right": "one way right",
     "do_not_enter": "do not enter",
-}  # fmt: skip
+}
 FROM_M: Final = 62.0
 """Pictures begin so far before the intersection, where one would see it at all."""
 MOVING_NS: Final = 200_000_000
@@ -41,12 +44,16 @@ STANDING_NS: Final = 400_000_000
 STANDS_MPS: Final = 0.3
 ROAD, LEFT, RIGHT, AHEAD, FIRST_PATCH, FIRST_FALSE = 1, 2, 3, 4, 10, 200
 FALSE_SIZE_M: Final[dict[Category, float]] = {
-    "stop_sign": 0.75, "traffic_light": 1.06, "one_way_left": 0.3, "one_way_right": 0.3,
+    "stop_sign": 0.75,
+    "traffic_light": 1.06,
+    "one_way_left": 0.3,
+    "one_way_right": 0.3,
     "do_not_enter": 0.75,
-}  # fmt: skip
+}
 MIRRORED: Final[dict[Category, Category]] = {
-    "one_way_left": "one_way_right", "one_way_right": "one_way_left",
-}  # fmt: skip
+    "one_way_left": "one_way_right",
+    "one_way_right": "one_way_left",
+}
 
 
 class Sight(NamedTuple):

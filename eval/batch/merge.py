@@ -9,7 +9,6 @@ same bytes however the drives were spread over batches.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +30,7 @@ from crosscue.eval.runs.folder import (
     summed,
     write_manifest,
 )
+from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
 from crosscue.replay.base import (
@@ -184,25 +184,12 @@ def _manifest(
 
 
 def _settings_hash(manifest: DriveManifest) -> str:
-    """Of the settings and detectors that a run was made with, wherever their files lay."""
     detected = manifest.detect if isinstance(manifest, EstimateManifest) else None
-    made_with = [
+    return settings_sha256(
         manifest.settings.model_dump(mode="json"),
         None if detected is None else [one.as_json() for one in detected.detectors],
         manifest.selection.as_json(),
-    ]
-    text = json.dumps(_without_places(made_with), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _without_places(value: object) -> object:
-    """Settings with the names of their files in place of the paths: another place, the same run."""
-    if isinstance(value, Mapping):
-        return {name: _without_places(one) for name, one in value.items()}
-    if isinstance(value, list):
-        return [_without_places(one) for one in value]
-    is_path = isinstance(value, str) and "/" in value and "." in value.rpartition("/")[2]
-    return str(value).rpartition("/")[2] if is_path else value
+    )
 
 
 def _tables_hash(run: RunFolder) -> str:

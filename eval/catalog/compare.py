@@ -35,8 +35,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 COMPARED: Final = {
-    "versions", "settings", "detectors", "camera", "selection", "logs", "landmarks",
-}  # fmt: skip
+    "versions",
+    "settings",
+    "detectors",
+    "camera",
+    "selection",
+    "logs",
+    "landmarks",
+}
 """Parts of a manifest."""
 MAX_BYTES: Final = 256 * MIB
 MAX_LINES: Final = 20

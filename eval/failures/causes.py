@@ -22,9 +22,14 @@ from crosscue.replay.vehicle.cue_table import CUES
 
 Failing = Literal["missing", "late", "invented"]
 Cause = Literal[
-    "nothing shows it", "hidden", "not found", "denied", "waited for presence", "too little",
+    "nothing shows it",
+    "hidden",
+    "not found",
+    "denied",
+    "waited for presence",
+    "too little",
     "claimed wrongly",
-]  # fmt: skip
+]
 
 MOSTLY: Final = 0.5
 """Found in less than this fraction of the frames that show it: the detectors are the cause."""

@@ -19,14 +19,34 @@ Direction = Literal["higher", "lower"]
 Kind = Literal["mean", "rms", "sum"]
 BETTER: Final[Mapping[str, Direction]] = {
     **dict.fromkeys(
-        ("precision", "recall", "scored", "matched", "detected", "full", "full_from_8_m",
-         "detected_m", "full_m"), "higher",
+        (
+            "precision",
+            "recall",
+            "scored",
+            "matched",
+            "detected",
+            "full",
+            "full_from_8_m",
+            "detected_m",
+            "full_m",
+        ),
+        "higher",
     ),
     **dict.fromkeys(
-        ("brier", "log_score", "rmse_m", "ape_rmse_m", "extra", "extra_detected", "splits",
-         "false_features", "lost"), "lower",
+        (
+            "brier",
+            "log_score",
+            "rmse_m",
+            "ape_rmse_m",
+            "extra",
+            "extra_detected",
+            "splits",
+            "false_features",
+            "lost",
+        ),
+        "lower",
     ),
-}  # fmt: skip
+}
 """By the last part of a metric's path; metrics of other names are shown but not judged."""
 PARTS: Final = (
     "by_distance",

@@ -85,9 +85,14 @@ def test_the_card_says_how_finely_pictures_are_decoded(
 def test_the_network_gets_scaled_pixels_with_the_pad_around_them() -> None:
     pixels = np.random.default_rng(3).integers(0, 256, (20, 40, 3), np.uint8)
     want = Input(
-        width_px=40, height_px=30, fit="letterbox-center", pad=7, colour="rgb",
-        mean=(1.0, 2.0, 3.0), scale=(0.5, 0.25, 2.0),
-    )  # fmt: skip
+        width_px=40,
+        height_px=30,
+        fit="letterbox-center",
+        pad=7,
+        colour="rgb",
+        mean=(1.0, 2.0, 3.0),
+        scale=(0.5, 0.25, 2.0),
+    )
 
     (numbers,), _ = prepared(pixels, want)
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from crosscue.eval import cli
 from crosscue.replay.base import MAX_DEPTH, json_tree, toml_tree
+from support.pictures import picture_folder
 from support.scoring import run_folder, truth_folder
 
 ROOT: Final = Path(__file__).parents[2]
@@ -114,13 +115,13 @@ def _truth(folder: Path) -> list[str]:
 
 def _coco(folder: Path) -> list[str]:
     (folder / "deep").rename(folder / "coco.json")
-    (folder / "can.log").write_text("(1.0) can0 1#00\n")
+    picture_folder(folder / "front", 2, "rate_hz: 10\n")
     return [
         "truth",
         "import",
         str(folder / "coco.json"),
         "--log",
-        str(folder / "can.log"),
+        str(folder / "front"),
         "-o",
         str(folder / "truth.json"),
     ]

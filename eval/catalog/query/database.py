@@ -9,12 +9,11 @@ tables that were handed over, which Arrow reads.
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import UsageError, one_line
+from crosscue.replay.base import UsageError, json_tree, one_line
 
 if TYPE_CHECKING:
     import duckdb
@@ -110,7 +109,7 @@ def _message(error: duckdb.Error, tables: list[str], columns: list[str]) -> str:
     """One line; of a misspelt table or column, with the nearest that exists."""
     text = str(error)
     try:
-        report = json.loads(text[text.index("{") :])
+        report = json_tree(text[text.index("{") :])
         said = str(report["exception_message"])
     except (ValueError, KeyError, TypeError):
         return f"query: {one_line(error, MAX_LINE)}; {_SCHEMA}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +22,9 @@ from crosscue.eval.runs.folder import (
     SceneSummary,
     TimeSegments,
 )
+from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tags import parse_tags
-from crosscue.replay.base import one_line, strict_json
+from crosscue.replay.base import json_tree, one_line
 from crosscue.replay.files.identity import identity_of_all
 
 from .local import Found
@@ -211,8 +211,8 @@ def _made_with(said: _Manifest, detect: _Detect | None) -> str:
 
 @lru_cache(maxsize=256)
 def _settings_sha256(made_with: str) -> str:
-    """As in the manifest of merged runs: of settings, detectors and the part of the logs."""
-    return hashlib.sha256(strict_json(json.loads(made_with)).encode()).hexdigest()
+    """As in the manifest of merged runs; few runs differ in what they were made with."""
+    return settings_sha256(*json_tree(made_with))
 
 
 def _approaches(

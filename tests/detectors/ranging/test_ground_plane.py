@@ -19,9 +19,15 @@ angles = st.floats(-0.25, 0.25)
 
 def plane(yaw_rad: float = 0.0, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> GroundPlane:
     camera = Camera(
-        x_m=1.7, y_m=0.3, z_m=1.5, focal_px=900.0, center_px=(640.0, 340.0),
-        yaw_rad=yaw_rad, pitch_rad=pitch_rad, roll_rad=roll_rad,
-    )  # fmt: skip
+        x_m=1.7,
+        y_m=0.3,
+        z_m=1.5,
+        focal_px=900.0,
+        center_px=(640.0, 340.0),
+        yaw_rad=yaw_rad,
+        pitch_rad=pitch_rad,
+        roll_rad=roll_rad,
+    )
     return GroundPlane.of(camera, SIZE)
 
 

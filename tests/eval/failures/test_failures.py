@@ -239,8 +239,14 @@ def test_values_that_mean_nothing_are_wrong_usage(drive: tuple[Path, Path]) -> N
 
 def test_every_distance_has_one_bin() -> None:
     assert [distance_bin(d) for d in (None, -1.0, 0.0, 9.9, 10.0, 79.9, 80.0)] == [
-        "unknown", "0-10 m", "0-10 m", "0-10 m", "10-20 m", "40-80 m", "80 m and more",
-    ]  # fmt: skip
+        "unknown",
+        "0-10 m",
+        "0-10 m",
+        "0-10 m",
+        "10-20 m",
+        "40-80 m",
+        "80 m and more",
+    ]
 
 
 def test_a_query_selects_the_runs_of_one_folder(

@@ -17,9 +17,15 @@ from support.every_format import EVERY_FORMAT
 TABLES = ("comma2k19", "kitti-raw", "images")
 """Formats with columns of their own: their types are chosen by ``convert``."""
 COLUMNS = {
-    "CAN/wheel_speed": 4, "CAN/speed": 1, "CAN/steering_angle": 1, "IMU/gyro": 3,
-    "IMU/accelerometer": 3, "IMU/gyro_bias": 3, "IMU/gyro_uncalibrated": 3, "IMU/magnetometer": 3,
-}  # fmt: skip
+    "CAN/wheel_speed": 4,
+    "CAN/speed": 1,
+    "CAN/steering_angle": 1,
+    "IMU/gyro": 3,
+    "IMU/accelerometer": 3,
+    "IMU/gyro_bias": 3,
+    "IMU/gyro_uncalibrated": 3,
+    "IMU/magnetometer": 3,
+}
 """Streams of a comma2k19 segment and their columns."""
 
 
