@@ -7,8 +7,6 @@ import re
 from functools import cache
 from pathlib import Path
 
-from crosscue.replay.files.tree_text import json_tree
-
 
 @cache
 def installed(package: str) -> str:
@@ -71,6 +69,8 @@ def _head(folder: Path) -> str:
 def _installed_from() -> str:
     """The commit in what pip writes beside a package that it took from a repository."""
     from importlib.metadata import distribution
+
+    from crosscue.replay.files.tree_text import json_tree  # not for ``--help``
 
     try:
         text = distribution("crosscue").read_text("direct_url.json") or "{}"
