@@ -33,14 +33,7 @@ from crosscue.eval.runs.folder import (
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Limits,
-    RunError,
-    UnreadableRunError,
-    UsageError,
-    one_line,
-)
+from crosscue.replay.base import RunError, UnreadableRunError, UsageError, one_line
 
 from .status import MERGED, NO_RUN, unfinished
 
@@ -289,23 +282,6 @@ def _versions(drives: Sequence[_Drive]) -> dict[str, tuple[str, ...]]:
         for library, version in one.manifest.versions.items():
             found.setdefault(library, set()).add(version)
     return {library: tuple(sorted(used)) for library, used in sorted(found.items())}
-
-
-def open_one(
-    path: Path,
-    logs: Path | None = None,
-    *,
-    without_images: bool = False,
-    limits: Limits = DEFAULT_LIMITS,
-) -> RunFolder:
-    """The run of one drive; arguments as of ``open_run``.
-
-    Raises:
-        RunError: It holds many drives; else as ``open_run``.
-    """
-    run = open_run(path, logs, without_images=without_images, limits=limits)
-    run.drive_manifest()
-    return run
 
 
 def is_merged(run: RunFolder) -> bool:

@@ -25,7 +25,7 @@ from crosscue.eval.commands.shared.terminal import (
     print_json,
     progress_line,
 )
-from crosscue.replay.base import UsageError, visible
+from crosscue.replay.base import visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     if not args.real and args.source is not None:
-        raise UsageError("--data: for a real drive; add --real")
+        raise crosscue.UsageError("--data: for a real drive; add --real")
     for name in ("layout", "run", "seed", "width") if args.real else ():
         if getattr(args, name) is not None:
-            raise UsageError(f"--{name}: for a simulated drive; leave it or --real out")
+            raise crosscue.UsageError(f"--{name}: for a simulated drive; leave it or --real out")

@@ -19,7 +19,6 @@ from pathlib import Path
 import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.eval.commands.shared.terminal import Done, print_json, progress_line
-from crosscue.replay.errors import UsageError
 
 PUBLISHED_RUNS = 10
 
@@ -121,13 +120,17 @@ def _sheet(layouts: Sequence[str], runs: Sequence[int], args: argparse.Namespace
 def _wanted(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
     """Layouts, and runs of each."""
     if args.all == bool(args.layouts):
-        raise UsageError("simulate: give layouts (A to H, L0, L1, ..., M0, M1, ...), or --all")
+        raise crosscue.UsageError(
+            "simulate: give layouts (A to H, L0, L1, ..., M0, M1, ...), or --all"
+        )
     if (args.output is None) == (args.sheet is None):
-        raise UsageError("simulate: give -o DIR for drives, or --sheet JPEG for pictures of them")
+        raise crosscue.UsageError(
+            "simulate: give -o DIR for drives, or --sheet JPEG for pictures of them"
+        )
     if args.run is not None and (args.runs is not None or args.all):
-        raise UsageError("--run: not together with --runs or --all; give one of them")
+        raise crosscue.UsageError("--run: not together with --runs or --all; give one of them")
     last = args.runs if args.runs is not None else PUBLISHED_RUNS if args.all else 1
     if last < 1:
-        raise UsageError(f"--runs {last}: expected 1 or more")
+        raise crosscue.UsageError(f"--runs {last}: expected 1 or more")
     runs = [args.run] if args.run is not None else list(range(1, last + 1))
     return list(SCORED) if args.all else args.layouts, runs

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.eval.scoring.boxes.reliability import Reliability
-from crosscue.replay.base import write_text
 
-from .html import render_page
+from .html import write_page
 
 TEMPLATE: Final = "detector.html.j2"
 
@@ -37,8 +36,7 @@ def write_detector_page(
     """
     figure = draw_reliability(calibration) if has_figures else None
     whole = {**content, "figure": figure, "calibration": calibration}
-    page = render_page(TEMPLATE, whole, {"number": _number, "ends": _ends})
-    write_text(path, page)
+    write_page(path, TEMPLATE, whole, {"number": _number, "ends": _ends})
 
 
 def draw_reliability(calibration: Sequence[Reliability]) -> str | None:

@@ -10,9 +10,7 @@ from typing import Final
 
 from markupsafe import Markup
 
-from crosscue.replay.base import write_text
-
-from .html import render_page
+from .html import write_page
 from .svg_plot import Drawing, Panel
 
 TEMPLATE: Final = "history.html.j2"
@@ -80,7 +78,7 @@ def write_history_page(
     """
     drawn = [(one, draw_chart(one, versions)) for one in charts]
     whole = {**content, "versions": versions, "charts": drawn}
-    write_text(path, render_page(TEMPLATE, whole, {"number": _number, "short": _short}))
+    write_page(path, TEMPLATE, whole, {"number": _number, "short": _short})
 
 
 def draw_chart(one: Chart, versions: Sequence[str]) -> Markup:

@@ -4,20 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib.resources import files
+from pathlib import Path
+
+from crosscue.replay.base import write_text
 
 
-def render_page(
-    template: str, content: Mapping[str, object], formats: Mapping[str, Callable[..., str]]
-) -> str:
-    """The HTML of a template.
+def write_page(
+    path: Path,
+    template: str,
+    content: Mapping[str, object],
+    formats: Mapping[str, Callable[..., str]],
+) -> None:
+    """Write the page that a template makes.
 
     Args:
-        template: Its file's name, with its ending.
+        path: Its file.
+        template: The template's file name, with its ending.
         content: By the names that the template has for it; a name it asks for and is not given is
             an error, never an empty place.
         formats: Functions that the template calls.
+
+    Raises:
+        OutputError: It cannot be written.
     """
-    return page_template(template, formats)(content)
+    write_text(path, page_template(template, formats)(content))
 
 
 def page_template(
@@ -30,7 +40,7 @@ def page_template(
         formats: Functions that the template calls.
 
     Returns:
-        From the content to the HTML, as ``render_page``.
+        From the content to the HTML.
     """
     from jinja2 import Environment, StrictUndefined
 

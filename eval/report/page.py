@@ -25,10 +25,10 @@ from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.base import strict_json, write_text
+from crosscue.replay.base import strict_json
 from crosscue.replay.vehicle.cue_table import CUES
 
-from .html import render_page
+from .html import write_page
 from .pose_figures import draw_all
 from .scene_figures import WorstFrame
 
@@ -116,7 +116,8 @@ def write_report(
         draw_all(scored[0].poses, folder)
     content["figures"] = _figures(scored, scores) if has_figures else NO_FIGURES
     content["pose_figures"] = _pose_figures(folder) if has_figures and len(scored) == 1 else []
-    page = render_page(
+    write_page(
+        folder / REPORT,
         TEMPLATE,
         content,
         {
@@ -128,7 +129,6 @@ def write_report(
             "by_cluster": _by_cluster,
         },
     )
-    write_text(folder / REPORT, page)
     return folder / REPORT
 
 

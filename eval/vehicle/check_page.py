@@ -11,8 +11,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from crosscue.eval.report.html import render_page
-from crosscue.replay.base import Bytes, OutputError, UsageError, write_bytes, write_text
+from crosscue.eval.report.html import write_page
+from crosscue.replay.base import Bytes, OutputError, UsageError, write_bytes
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .check import Checked
@@ -77,7 +77,7 @@ def write_check(
         "signals": found.signals,
         "missing": found.missing,
     }
-    write_text(path, render_page("vehicle_check.html.j2", content, {"number": _number}))
+    write_page(path, "vehicle_check.html.j2", content, {"number": _number})
 
 
 def _encoded(pixels: Bytes, ending: str) -> bytes:

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import print_result, progress_line, refuse_existing
-from crosscue.replay.errors import EmptyResultError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,10 +67,10 @@ def run(args: argparse.Namespace) -> int:
     runs = args.runs
     if args.where is not None:
         if len(runs) != 1:
-            raise UsageError("--where: expected one folder of runs to select from")
+            raise crosscue.UsageError("--where: expected one folder of runs to select from")
         runs = crosscue.catalog(runs[0]).select(args.where)
         if not runs:
-            raise EmptyResultError(f"{args.runs[0]}: no run where {args.where}")
+            raise crosscue.EmptyResultError(f"{args.runs[0]}: no run where {args.where}")
     with progress_line(args, "examining") as line:
         found = crosscue.failures(
             runs,

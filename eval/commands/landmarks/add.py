@@ -21,7 +21,6 @@ from crosscue.eval.commands.shared.terminal import (
     open_part,
     print_result,
 )
-from crosscue.replay.base import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,6 +90,8 @@ def run(args: argparse.Namespace) -> int:
             matcher=args.matcher,
         )
     else:
-        raise UsageError("landmarks add: give LOG... with --poses, or --images with --coordinates")
+        raise crosscue.UsageError(
+            "landmarks add: give LOG... with --poses, or --images with --coordinates"
+        )
     print_result(found, args)
     return 0 if found.is_whole else 3

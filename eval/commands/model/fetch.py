@@ -17,7 +17,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import Done, ProgressLine, print_json, progress_line
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fetch."""
     if args.given is not None and len(args.models) > 1:
-        raise UsageError("--weights: one model at a time")
+        raise crosscue.UsageError("--weights: one model at a time")
     found: dict[str, object] = {}
     for name in args.models:
         with progress_line(args, "fetching") as line:

@@ -21,7 +21,6 @@ from crosscue.eval.commands.shared.terminal import (
     open_part,
     print_result,
 )
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Detect; 3 when something was dropped."""
     if args.draw < 0:
-        raise UsageError(f"--draw {args.draw}: expected 0 or more")
+        raise crosscue.UsageError(f"--draw {args.draw}: expected 0 or more")
     with (
         open_part(args, args.logs) as log,
         DriveLine("detecting", is_shown=is_shown(args)) as line,

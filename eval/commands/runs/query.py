@@ -15,13 +15,11 @@ examples:
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.rows import print_rows, write_rows
-from crosscue.eval.commands.shared.terminal import refuse_existing
-from crosscue.replay.base import UsageError, visible
+from crosscue.eval.commands.shared.terminal import refuse_existing, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Ask, print or write; 3 when a run could not be read."""
     if (args.sql is None) != args.schema:
-        raise UsageError("query: expected either SQL or --schema; see crosscue query --help")
+        raise crosscue.UsageError(
+            "query: expected either SQL or --schema; see crosscue query --help"
+        )
     refuse_existing(args)
     catalog = crosscue.catalog(args.runs)
     found = catalog.schema() if args.schema else catalog.query(args.sql)
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         write_rows(found, args)
     for notice in () if args.quiet else catalog.notices:
-        print(f"crosscue: {visible(notice)}", file=sys.stderr)
+        warn(notice)
     for name, why in sorted(catalog.left_out.items()):
-        print(f"crosscue: left out: {visible(name)}: {visible(why)}", file=sys.stderr)
+        warn(f"left out: {name}: {why}")
     return 3 if catalog.left_out else 0

@@ -32,7 +32,6 @@ from crosscue.eval.commands.shared.terminal import (
     open_part,
     print_result,
 )
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -106,12 +105,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay; 3 when something was dropped."""
     if args.draw < 0:
-        raise UsageError(f"--draw {args.draw}: expected 0 or more")
+        raise crosscue.UsageError(f"--draw {args.draw}: expected 0 or more")
     found = crosscue.find_drives(*args.logs, each=args.each, shard=args.shard)
     if found.is_many:
         return _run_many(args, found)
     if args.workers is not None or args.ray is not None or args.retry_failed:
-        raise UsageError(
+        raise crosscue.UsageError(
             "--workers, --ray, --retry-failed: for many drives; this is one (--each makes it many)"
         )
     (drive,) = found.drives
@@ -140,7 +139,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
     if args.first_pose is not None:
-        raise UsageError("--start: for one drive; these are many, each with a start of its own")
+        raise crosscue.UsageError(
+            "--start: for one drive; these are many, each with a start of its own"
+        )
     with DrivesLine("replaying", is_shown=is_shown(args)) as line:
         done = crosscue.replay_drives(
             found,

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import print_result
-from crosscue.replay.base import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,6 +36,6 @@ def run(args: argparse.Namespace) -> int:
     tags = [word for word in args.words if "=" in word and not Path(word).exists()]
     runs = [word for word in args.words if word not in tags]
     if not runs:
-        raise UsageError("tag: no run named; give run folders before KEY=VALUE")
+        raise crosscue.UsageError("tag: no run named; give run folders before KEY=VALUE")
     print_result(crosscue.tag_runs(runs, tags, args.remove), args)
     return 0

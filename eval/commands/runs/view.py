@@ -30,7 +30,6 @@ from crosscue.eval.commands.shared.terminal import (
     print_json,
     refuse_existing,
 )
-from crosscue.replay.errors import CrosscueError, UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
     if args.output is not None and args.output.suffix != ".rrd":
-        raise UsageError(f"{args.output}: expected a name that ends in .rrd")
+        raise crosscue.UsageError(f"{args.output}: expected a name that ends in .rrd")
     refuse_existing(args)
     made = crosscue.open_run(
         args.run, args.logs, without_images=args.without_images, limits=limits_of(args)
@@ -99,7 +98,9 @@ def _open(path: Path, web: bool) -> None:
     try:
         viewer = subprocess.Popen(command, env=environment, process_group=0)
     except OSError as error:
-        raise CrosscueError(f"rerun: cannot be started ({error.strerror}); open {path}") from None
+        raise crosscue.CrosscueError(
+            f"rerun: cannot be started ({error.strerror}); open {path}"
+        ) from None
     try:
         status = viewer.wait()
     finally:
@@ -108,4 +109,6 @@ def _open(path: Path, web: bool) -> None:
             os.killpg(viewer.pid, signal.SIGTERM)
         viewer.wait()
     if status:
-        raise CrosscueError(f"rerun: ended with status {status}; open {path} with another viewer")
+        raise crosscue.CrosscueError(
+            f"rerun: ended with status {status}; open {path} with another viewer"
+        )

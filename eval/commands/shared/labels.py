@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from crosscue.replay.base import UsageError
+import crosscue
 
 FORMATS = ("coco", "yolo", "voc", "kitti")
 
@@ -52,6 +52,6 @@ def meanings_of(texts: Sequence[str]) -> dict[str, str]:
     for text in texts:
         name, equals, means = text.rpartition("=")
         if not equals or not name:
-            raise UsageError(f"--map {text}: expected LABEL=NAME")
+            raise crosscue.UsageError(f"--map {text}: expected LABEL=NAME")
         found[name] = means
     return found

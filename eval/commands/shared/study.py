@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import crosscue
-from crosscue.replay.base import UsageError
 
 from .terminal import print_json
 
@@ -69,7 +68,7 @@ def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:
     except ValidationError as error:
         first = error.errors()[0]
         flag = str(first["loc"][0])
-        raise UsageError(
+        raise crosscue.UsageError(
             f"--{flag.replace('_', '-')} {changed.get(flag)}: {first['msg'].lower()}"
         ) from None
 
@@ -85,7 +84,7 @@ def workers_of(args: argparse.Namespace) -> int:
     if args.workers is None:
         return default_workers()
     if args.workers < 1:
-        raise UsageError(f"--workers {args.workers}: expected 1 or more")
+        raise crosscue.UsageError(f"--workers {args.workers}: expected 1 or more")
     return int(args.workers)
 
 

@@ -198,6 +198,11 @@ def print_json(value: object) -> None:
     print(strict_json(value))
 
 
+def warn(sentence: str) -> None:
+    """One line on stderr, what would harm a terminal as escapes."""
+    print(f"crosscue: {visible(sentence)}", file=sys.stderr)
+
+
 def add_schema_output(parser: argparse.ArgumentParser) -> None:
     """``-o`` and ``--overwrite`` of commands that print a JSON Schema."""
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: print it")

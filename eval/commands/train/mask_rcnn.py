@@ -22,7 +22,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import print_result, progress_line
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -161,7 +160,7 @@ def run(args: argparse.Namespace) -> int:
     if args.measure is not None:
         return _measure(args)
     if args.output is None:
-        raise UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
+        raise crosscue.UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
     # JSON is alone on standard output.
     show = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
     found = crosscue.train_mask_rcnn(
@@ -177,7 +176,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _measure(args: argparse.Namespace) -> int:
     if args.output is not None or args.val_data is not None:
-        raise UsageError("--measure: trains nothing, so not with -o or --val-data; leave those")
+        raise crosscue.UsageError(
+            "--measure: trains nothing, so not with -o or --val-data; leave those"
+        )
     with progress_line(args, "measuring") as line:
         found = crosscue.measure_mask_rcnn(
             args.measure,

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import Done, print_result, progress_line
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
         if args.measure is not None:
             if args.output is not None or args.layouts is not None:
-                raise UsageError(
+                raise crosscue.UsageError(
                     "--measure: trains nothing, so not with -o or --layouts; leave those"
                 )
             found = crosscue.measure_road(
@@ -114,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
                 on_runs=rendered,
             )
         elif args.output is None:
-            raise UsageError("train road: give -o OUT.safetensors, or --measure")
+            raise crosscue.UsageError("train road: give -o OUT.safetensors, or --measure")
         else:
             found = crosscue.train_road(
                 _settings(args),

@@ -23,7 +23,6 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_result
-from crosscue.replay.errors import UsageError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -106,5 +105,5 @@ def run(args: argparse.Namespace) -> int:
 def _meaning(text: str) -> tuple[str, str]:
     label, equals, cue = text.rpartition("=")
     if not equals or not label:
-        raise UsageError(f"--map {text}: expected LABEL=NAME")
+        raise crosscue.UsageError(f"--map {text}: expected LABEL=NAME")
     return label, cue

@@ -21,8 +21,7 @@ from crosscue.eval.fit.detector.class_fit import (
     Judged,
     fit_class,
 )
-from crosscue.eval.interface.runs.run import Run
-from crosscue.eval.runs.folder import open_run
+from crosscue.eval.interface.runs.run import Run, open_run
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
@@ -205,9 +204,8 @@ def fit_detector(
     if card is not None:
         # What is wrong with a file is reported before any run is opened.
         read_card(Path(card))
-    moved = None if logs is None else Path(logs)
-    places = [run.path if isinstance(run, Run) else Path(run) for run in (*given, *test)]
-    folders = [open_run(place, moved, limits=limits) for place in places]
+    places = [run.path if isinstance(run, Run) else run for run in (*given, *test)]
+    folders = [open_run(place, logs, limits=limits).folder for place in places]
     listed = class_names_given(class_names)
     read = [read_box_labels(Path(path), kind, listed) for path in (*theirs, *test_labels)]
     whole = [

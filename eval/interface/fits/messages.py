@@ -17,8 +17,7 @@ from crosscue.eval.fit.messages import (
     rates_of,
     section_of,
 )
-from crosscue.eval.interface.runs.run import Run
-from crosscue.eval.runs.folder import open_run
+from crosscue.eval.interface.runs.run import Run, run_given
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
@@ -174,7 +173,7 @@ def fit_messages(
     path = None if output is None else Path(output)
     if path is not None and path.exists() and not overwrite:
         raise OutputError(f"{path}: exists; give another name or --overwrite")
-    folders = [one.folder if isinstance(one, Run) else open_run(Path(one)) for one in runs]
+    folders = [run_given(one).folder for one in runs]
     graph, vehicle = graph_of_runs(folders)
     found = Annotated([], Counter())
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from crosscue.eval.fit.messages import graph_of_runs
 from crosscue.eval.fit.temporal import annotated_drives, section_of
-from crosscue.eval.interface.runs.run import Run
-from crosscue.eval.runs.folder import open_run
+from crosscue.eval.interface.runs.run import Run, run_given
 from crosscue.eval.scoring.truth import load
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
@@ -91,7 +90,7 @@ def fit_temporal(
     path = None if output is None else Path(output)
     if path is not None and path.exists() and not overwrite:
         raise OutputError(f"{path}: exists; give another name or --overwrite")
-    folders = [one.folder if isinstance(one, Run) else open_run(Path(one)) for one in runs]
+    folders = [run_given(one).folder for one in runs]
     graph, vehicle = graph_of_runs(folders)
     drives: list[AnnotatedDrive] = []
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):

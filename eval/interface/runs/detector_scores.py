@@ -13,7 +13,6 @@ import numpy as np
 from crosscue.datasets.truth.box_labels import BoxLabels, class_names_given, read_box_labels
 from crosscue.eval.report.detector_page import write_detector_page
 from crosscue.eval.report.worst_boxes import worst_pictures
-from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
 from crosscue.eval.scoring.boxes.reliability import Reliability, reliability
@@ -27,10 +26,10 @@ from crosscue.replay.base import (
     write_text,
 )
 
+from .run import Run, open_run
+
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from .run import Run
 
 FOLDER: Final = "score"
 MEASURES: Final = ("ap50", "ap", "precision", "recall")
@@ -226,7 +225,8 @@ def score_detector(
         raise UsageError(f"--block-s {block_s}: expected seconds from 0")
     if draw < 0:
         raise UsageError(f"--draw {draw}: expected 0 or more")
-    folder = open_run(_path_of(run), _maybe(logs), without_images=without_images, limits=limits)
+    path = run.path if isinstance(run, Run) else run
+    folder = open_run(path, logs, without_images=without_images, limits=limits).folder
     read = read_box_labels(Path(labels), kind, class_names_given(class_names))
     of = labelled_run(folder, read, detector, meanings)
     scores = score_parts(
@@ -275,11 +275,3 @@ def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
         judged = ~matched.is_out[0]
         found.append(reliability(name, matched.scores[judged], matched.is_right[0][judged]))
     return tuple(found)
-
-
-def _path_of(run: Run | Path | str) -> Path:
-    return Path(run) if isinstance(run, Path | str) else run.path
-
-
-def _maybe(path: Path | str | None) -> Path | None:
-    return None if path is None else Path(path)

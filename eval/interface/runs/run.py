@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import Manifest, RunFolder, json_schema
+from crosscue.eval.runs.folder import open_run as open_folder
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
@@ -123,10 +124,10 @@ def open_run(
     Raises:
         RunError: It is no run, damaged, of another version, or holds many drives merged.
     """
-    from crosscue.eval.batch.merge import open_one
-
     moved = None if logs is None else Path(logs)
-    folder = open_one(Path(path), moved, without_images=without_images, limits=limits)
+    folder = open_folder(Path(path), moved, without_images=without_images, limits=limits)
+    # Refuses a folder of many drives merged.
+    folder.drive_manifest()
     return Run(folder)
 
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 from crosscue.eval.batch.jobs import Done
 from crosscue.eval.failures.causes import Finding, approach_findings, by_cause
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.report.html import render_page
+from crosscue.eval.report.html import write_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.files import write_scores
 from crosscue.eval.scoring.intervals import TOO_FEW
@@ -75,10 +75,12 @@ def write_study(
         "calibrated": None if scored.calibrated is None else scored.calibrated.approaches,
         "figures": _figures(out, scored, approaches),
     }
-    page = render_page(
-        TEMPLATE, content, {"number": _number, "signed": _signed, "between": _between}
+    write_page(
+        out / PAGE,
+        TEMPLATE,
+        content,
+        {"number": _number, "signed": _signed, "between": _between},
     )
-    write_text(out / PAGE, page)
     write_sheet(scored.scored, out / SHEET)
     return StudyFiles(out / PAGE, out / TABLES, folder / "metrics.json", out / SHEET)
 
