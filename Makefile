@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 WORKERS ?= auto
+# Neighbours in a file share what they set up: each worker begins with a half of its own.
 
 .PHONY: demo test lowest quick docs format lint types imports unit clean
 
@@ -27,7 +28,7 @@ imports: $(VENV)/.ready-dev
 	$(BIN)/lint-imports
 
 unit: $(VENV)/.ready-dev
-	$(BIN)/pytest -n $(WORKERS)
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal
 
 # The site, in docs/_build/html; warnings are errors. Reference pages are made from the code.
 docs: $(VENV)/.ready-dev
@@ -37,7 +38,7 @@ docs: $(VENV)/.ready-dev
 IN ?= $(shell git diff --name-only $$(git merge-base HEAD origin/main 2>/dev/null || echo HEAD) | cut -d/ -f1 | sort -u | grep -E '^(replay|detectors|fusion|localization|datasets|eval)$$')
 quick: $(VENV)/.ready-dev
 	$(BIN)/ruff check . && $(BIN)/lint-imports
-	$(if $(IN),$(BIN)/pytest -q -n $(WORKERS) -m "not slow" $(addprefix tests/,$(IN)),@echo "no package differs from main; name some: make quick IN=replay")
+	$(if $(IN),$(BIN)/pytest -q -n $(WORKERS) --dist worksteal -m "not slow" $(addprefix tests/,$(IN)),@echo "no package differs from main; name some: make quick IN=replay")
 
 format: $(VENV)/.ready-dev
 	$(BIN)/ruff format .
