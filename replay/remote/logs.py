@@ -20,8 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path, PurePosixPath
-from types import TracebackType
-from typing import Any, BinaryIO, Final, Protocol, Self, TypeVar, cast
+from typing import Any, BinaryIO, Final, Protocol, TypeVar, cast
 
 from crosscue.replay.base import (
     EVERYTHING,
@@ -234,7 +233,7 @@ def matches(pattern: str) -> tuple[str, ...]:
     return tuple(one if "://" in one else f"{scheme}://{one.lstrip('/')}" for one in found)
 
 
-class RemoteLog:
+class RemoteLog(Closing):
     """A log that was fetched; closing it lets go of the fetched file."""
 
     def __init__(
@@ -278,17 +277,6 @@ class RemoteLog:
         finally:
             self._fetched.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
 
 class _Partial(Protocol):
     """A log that can tell whether a part of it can be read alone."""
@@ -311,7 +299,7 @@ RANGED: Final = {
 """Formats of which a part can be read by ranges."""
 
 
-class RangedLog:
+class RangedLog(Closing):
     """A remote log of which only what is asked for is fetched; all of it once all is asked for."""
 
     def __init__(
@@ -372,17 +360,6 @@ class RangedLog:
         finally:
             if self._whole is not None:
                 self._whole.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _fetched(self, why: str) -> RemoteLog:
         if self._whole is None:

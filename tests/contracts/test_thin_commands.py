@@ -89,8 +89,8 @@ CALLS: Final = {
 }
 """The public functions that a command is made of."""
 WITHOUT: Final = {"completion": "it is about the shell"}
-ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|errors|safe_text))?")
-"""What a command may import of ours: the public interface, options, errors, and safe text.
+ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|safe_text))?")
+"""What a command may import of ours: the public interface, options, and safe text.
 
 Constants, too, for the help."""
 

@@ -16,7 +16,9 @@ from pathlib import Path
 
 import crosscue
 from crosscue.eval.commands.shared.terminal import (
+    add_choice_of_failures,
     add_logs_argument,
+    add_truth_of_runs,
     limits_of,
     print_result,
     progress_line,
@@ -31,31 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the site"
     )
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        metavar="T.json",
-        help="truth of all runs (default: truth.json beside each run's log)",
-    )
-    parser.add_argument(
-        "--any-log",
-        action="store_true",
-        help="accept truth made for another file of the same drive, such as a converted log",
-    )
+    add_truth_of_runs(parser)
     add_logs_argument(parser)
-    parser.add_argument(
-        "--top",
-        type=int,
-        metavar="N",
-        help="only N failures, of as many causes and runs as possible (default: all)",
-    )
-    parser.add_argument(
-        "--threshold",
-        type=float,
-        default=0.9,
-        metavar="P",
-        help="a feature is believed above this probability (default: 0.9)",
-    )
+    add_choice_of_failures(parser)
     parser.add_argument(
         "--recordings",
         action="store_true",

@@ -18,39 +18,23 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import print_result, progress_line, refuse_existing
+from crosscue.eval.commands.shared.terminal import (
+    add_choice_of_failures,
+    add_truth_of_runs,
+    print_result,
+    progress_line,
+    refuse_existing,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
     parser.add_argument(
-        "--truth",
-        type=Path,
-        metavar="T.json",
-        help="truth of all runs (default: truth.json beside each run's log)",
-    )
-    parser.add_argument(
         "--where", metavar="QUERY", help="only runs that a query selects, of the one folder given"
     )
-    parser.add_argument(
-        "--any-log",
-        action="store_true",
-        help="accept truth made for another file of the same drive, such as a converted log",
-    )
-    parser.add_argument(
-        "--top",
-        type=int,
-        metavar="N",
-        help="only N failures, of as many causes and runs as possible (default: all)",
-    )
-    parser.add_argument(
-        "--threshold",
-        type=float,
-        default=0.9,
-        metavar="P",
-        help="a feature is believed above this probability (default: 0.9)",
-    )
+    add_truth_of_runs(parser)
+    add_choice_of_failures(parser)
     parser.add_argument(
         "-o", "--output", type=Path, metavar="TABLE", help="table to write: .parquet or .json"
     )

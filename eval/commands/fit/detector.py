@@ -19,7 +19,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.labels import add_label_arguments, meanings_of
+from crosscue.eval.commands.shared.labels import add_label_arguments, label_options
 from crosscue.eval.commands.shared.terminal import add_logs_argument, limits_of, print_result
 
 
@@ -99,11 +99,7 @@ def run(args: argparse.Namespace) -> int:
         test_labels=args.test_labels,
         hold_out=args.hold_out,
         card=args.card,
-        detector=args.detector,
-        kind=args.format,
-        class_names=args.class_names,
-        meanings=meanings_of(args.map),
-        overlap=args.overlap,
+        **label_options(args),
         date=args.date,
         overwrite=args.overwrite,
         logs=args.logs,

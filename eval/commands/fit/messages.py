@@ -12,32 +12,20 @@ example:
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import print_result, progress_line
+from crosscue.eval.commands.shared.terminal import (
+    add_annotated_runs,
+    add_file_output,
+    print_result,
+    progress_line,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
-    parser.add_argument(
-        "--truth",
-        nargs="+",
-        required=True,
-        type=Path,
-        metavar="T.json",
-        help="truth of each run, in the same order",
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="TOML",
-        help="file to write the section to (default: print it)",
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_annotated_runs(parser)
+    add_file_output(parser, "TOML", "file to write the section to (default: print it)")
 
 
 def run(args: argparse.Namespace) -> int:

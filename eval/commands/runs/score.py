@@ -26,6 +26,7 @@ from pathlib import Path
 import crosscue
 from crosscue.eval.commands.shared.terminal import (
     add_logs_arguments,
+    add_truth_of_runs,
     limits_of,
     metres,
     print_json,
@@ -37,17 +38,7 @@ from crosscue.replay.base import CrosscueError, one_line, visible
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
-    parser.add_argument(
-        "--truth",
-        type=Path,
-        metavar="T.json",
-        help="truth of all runs (default: truth.json beside each run's log)",
-    )
-    parser.add_argument(
-        "--any-log",
-        action="store_true",
-        help="accept truth made for another file of the same drive, such as a converted log",
-    )
+    add_truth_of_runs(parser)
     add_logs_arguments(parser)
     parser.add_argument(
         "-o",

@@ -19,7 +19,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.labels import add_label_arguments, meanings_of
+from crosscue.eval.commands.shared.labels import add_label_arguments, label_options
 from crosscue.eval.commands.shared.terminal import add_logs_arguments, limits_of, print_result
 
 
@@ -63,11 +63,7 @@ def run(args: argparse.Namespace) -> int:
         args.run,
         args.labels,
         args.output,
-        detector=args.detector,
-        kind=args.format,
-        class_names=args.class_names,
-        meanings=meanings_of(args.map),
-        overlap=args.overlap,
+        **label_options(args),
         block_s=args.block_s,
         draw=args.draw,
         logs=args.logs,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import crosscue
 
@@ -42,11 +43,26 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def meanings_of(texts: Sequence[str]) -> dict[str, str]:
-    """What ``--map`` says.
+def label_options(args: argparse.Namespace) -> dict[str, Any]:
+    """What these flags say, by the names that ``fit_detector`` and ``score_detector`` have for it.
 
     Raises:
-        UsageError: Not ``LABEL=NAME``.
+        UsageError: ``--map`` is not ``LABEL=NAME``.
+    """
+    return {
+        "detector": args.detector,
+        "kind": args.format,
+        "class_names": args.class_names,
+        "meanings": meanings_of(args.map),
+        "overlap": args.overlap,
+    }
+
+
+def meanings_of(texts: Sequence[str]) -> dict[str, str]:
+    """What ``--map LABEL=NAME...`` says.
+
+    Raises:
+        UsageError: A text is not ``LABEL=NAME``.
     """
     found = {}
     for text in texts:

@@ -74,6 +74,51 @@ def add_first_pose_arguments(parser: argparse.ArgumentParser, default: str) -> N
     )
 
 
+def add_annotated_runs(parser: argparse.ArgumentParser) -> None:
+    """``RUN...`` and ``--truth``, one for each."""
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
+    parser.add_argument(
+        "--truth",
+        nargs="+",
+        required=True,
+        type=Path,
+        metavar="T.json",
+        help="truth of each run, in the same order",
+    )
+
+
+def add_truth_of_runs(parser: argparse.ArgumentParser) -> None:
+    """``--truth`` and ``--any-log``, for runs that have a truth each."""
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="T.json",
+        help="truth of all runs (default: truth.json beside each run's log)",
+    )
+    parser.add_argument(
+        "--any-log",
+        action="store_true",
+        help="accept truth made for another file of the same drive, such as a converted log",
+    )
+
+
+def add_choice_of_failures(parser: argparse.ArgumentParser) -> None:
+    """``--top`` and ``--threshold``."""
+    parser.add_argument(
+        "--top",
+        type=int,
+        metavar="N",
+        help="only N failures, of as many causes and runs as possible (default: all)",
+    )
+    parser.add_argument(
+        "--threshold",
+        type=float,
+        default=0.9,
+        metavar="P",
+        help="a feature is believed above this probability (default: 0.9)",
+    )
+
+
 def add_file_output(parser: argparse.ArgumentParser, metavar: str, what: str) -> None:
     """``-o``, ``--overwrite`` and ``--json`` of a command that writes one file."""
     parser.add_argument("-o", "--output", type=Path, metavar=metavar, help=what)

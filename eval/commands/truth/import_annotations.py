@@ -22,6 +22,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
+from crosscue.eval.commands.shared.labels import meanings_of
 from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_of, print_result
 
 
@@ -78,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
                 args.export,
                 args.output,
                 args.vehicle,
-                labels=dict(_meaning(text) for text in args.map),
+                labels=meanings_of(args.map),
                 add=args.add,
                 overwrite=args.overwrite,
                 kind=args.format,
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         args.log,
         args.output,
         args.vehicle,
-        labels=dict(_meaning(text) for text in args.map),
+        labels=meanings_of(args.map),
         add=args.add,
         overwrite=args.overwrite,
         kind=args.format,
@@ -100,10 +101,3 @@ def run(args: argparse.Namespace) -> int:
     )
     print_result(found, args)
     return 0
-
-
-def _meaning(text: str) -> tuple[str, str]:
-    label, equals, cue = text.rpartition("=")
-    if not equals or not label:
-        raise crosscue.UsageError(f"--map {text}: expected LABEL=NAME")
-    return label, cue

@@ -7,21 +7,18 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from crosscue.datasets.truth.truth import load
-from crosscue.eval.fit.messages import (
-    TOO_FEW,
-    Annotated,
-    annotate,
-    graph_of_runs,
-    rates_of,
-    section_of,
-)
+from crosscue.eval.fit.annotated_runs import Annotated, annotate, check_arguments, graph_of_runs
 from crosscue.eval.interface.runs.run import Run, run_given
+from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
-from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
+from crosscue.replay.base import EmptyResultError, write_text
 from crosscue.replay.vehicle.fusion import Rates
 
 
@@ -44,7 +41,7 @@ class FittedMessages:
     @property
     def section(self) -> str:
         """The vehicle file's section ``[fusion.calibrated]``."""
-        return section_of(self.fitted)
+        return _section_of(self.fitted)
 
     def as_dict(self) -> dict[str, object]:
         """What ``crosscue fit messages --json`` prints."""
@@ -117,7 +114,7 @@ def _unlearned_text(one: RateFit) -> str:
 
 
 def _side_text(side: Side) -> str:
-    reported = rates_of(side)
+    reported = _rates_of(side)
     low, high = reported.places
     by_place = TOO_FEW if math.isnan(low) else f"{low:.2f} to {high:.2f}"
     return (
@@ -134,13 +131,66 @@ def _fade_text(one: FadeFit) -> str:
 
 
 def _side_json(side: Side) -> dict[str, object]:
-    reported = rates_of(side)
+    reported = _rates_of(side)
     return {
         **side._asdict(),
         "rate": reported.rate,
         "wilson": list(reported.wilson),
         "by_places": list(reported.places),
     }
+
+
+class _SideRate(NamedTuple):
+    """A rate and how sure it is.
+
+    Attributes:
+        rate: Mean over places; NaN without any.
+        wilson: Interval by independent observations; rounding them to whole ones costs less than
+            pretending that every frame is one.
+        places: Interval over places; NaN for fewer than four.
+    """
+
+    rate: float
+    wilson: Interval
+    places: Interval
+
+
+def _rates_of(side: Side) -> _SideRate:
+    """A side's rate with both intervals."""
+    looks = round(side.looks)
+    rates = np.array(side.rates)
+    return _SideRate(
+        float(rates.mean()) if len(rates) else math.nan,
+        wilson(min(round(side.hits), looks), looks),
+        mean_by_cluster(rates, np.arange(len(rates))),
+    )
+
+
+def _section_of(fit: MessageFit) -> str:
+    """The vehicle file's section, with counts as comments."""
+    lines = ["[fusion.calibrated]", "rates = ["]
+    lines += [_rate_line(one) for one in fit.rates if one.rates is not None]
+    lines += ["]", "", "[fusion.calibrated.exponents]"]
+    lines += [f"{name} = {value:.3f}" for name, value in fit.calibrated.exponents.items()]
+    lines += ["", "[fusion.calibrated.fades]"]
+    for one in fit.fades:
+        if one.is_learned:
+            key, value = ("way_m", one.fade.way_m), ("time_s", one.fade.time_s)
+            name, number = key if key[1] is not None else value
+            lines.append(
+                f"{one.cue} = {{ {name} = {number:.3g} }}  "
+                f"# {one.positives} positive of {one.looks} frames"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _rate_line(one: RateFit) -> str:
+    assert one.rates is not None
+    return (
+        f'  {{ cue = "{one.cue}", feature = "{one.feature}", near = {str(one.near).lower()}, '
+        f"if_there = {one.rates.if_there:.4g}, if_not = {one.rates.if_not:.4g} }},  "
+        f"# {one.there.places} and {one.missing.places} places"
+    )
 
 
 def fit_messages(
@@ -165,14 +215,7 @@ def fit_messages(
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
-    if len(runs) != len(truth):
-        raise UsageError(
-            f"fit messages: {len(runs)} runs, {len(truth)} truth files; give one "
-            "for each, in the same order"
-        )
-    path = None if output is None else Path(output)
-    if path is not None and path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    path = check_arguments("fit messages", len(runs), len(truth), output, overwrite=overwrite)
     folders = [run_given(one).folder for one in runs]
     graph, vehicle = graph_of_runs(folders)
     found = Annotated([], Counter())
@@ -190,5 +233,5 @@ def fit_messages(
             "published message stands; give more drives and their truth"
         )
     if path is not None:
-        write_text(path, section_of(fitted))
+        write_text(path, _section_of(fitted))
     return FittedMessages(fitted, found.used, len(folders), path)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from crosscue.eval.fit.messages import graph_of_runs
-from crosscue.eval.fit.temporal import annotated_drives, section_of
+from crosscue.eval.fit.annotated_runs import annotated_drives, check_arguments, graph_of_runs
 from crosscue.eval.interface.runs.run import Run, run_given
 from crosscue.eval.scoring.truth import load
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
-from crosscue.replay.base import EmptyResultError, OutputError, UsageError, write_text
+from crosscue.replay.base import EmptyResultError, write_text
+from crosscue.replay.vehicle.temporal import CueChain
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -32,7 +32,7 @@ class FittedTemporal:
     @property
     def section(self) -> str:
         """The vehicle file's section ``[fusion.temporal]``."""
-        return section_of(self.fitted)
+        return _section_of(self.fitted)
 
     def as_dict(self) -> dict[str, object]:
         """What ``crosscue fit temporal --json`` prints."""
@@ -60,6 +60,37 @@ class FittedTemporal:
         )
 
 
+def _section_of(fit: TemporalFit) -> str:
+    """The vehicle file's section, with what it was learned from."""
+    learned = fit.temporal
+    lines = [
+        f"# Learned from {fit.drives} drives at {fit.places} places, {fit.steps} steps.",
+        "[fusion.temporal]",
+        f"ahead = {learned.ahead:.4f}",
+        f"edges_m = {list(learned.edges_m)}",
+        f"exponent = {learned.exponent}",
+        f"lapse = {learned.lapse}",
+        f"stray = {learned.stray}",
+        "chains = [",
+        *(f"  {_chain_line(one)}," for one in learned.chains),
+        "]",
+        "",
+        "[fusion.temporal.ways]",
+        *(f'"{name}" = {fraction}' for name, fraction in learned.ways.items()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _chain_line(one: CueChain) -> str:
+    parts = [f'cue = "{one.cue}"']
+    for name in ("there", "missing"):
+        if getattr(one, name):
+            features = ", ".join(f'"{feature}"' for feature in getattr(one, name))
+            parts.append(f"{name} = [{features}]")
+    parts += [f"{name} = {list(getattr(one, name))}" for name in ("first", "stays", "appears")]
+    return f"{{ {', '.join(parts)} }}"
+
+
 def fit_temporal(
     runs: Sequence[Run | Path | str],
     truth: Sequence[Path | str],
@@ -82,14 +113,7 @@ def fit_temporal(
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
-    if len(runs) != len(truth):
-        raise UsageError(
-            f"fit temporal: {len(runs)} runs, {len(truth)} truth files; give one for each, in the "
-            "same order"
-        )
-    path = None if output is None else Path(output)
-    if path is not None and path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    path = check_arguments("fit temporal", len(runs), len(truth), output, overwrite=overwrite)
     folders = [run_given(one).folder for one in runs]
     graph, vehicle = graph_of_runs(folders)
     drives: list[AnnotatedDrive] = []
@@ -103,5 +127,5 @@ def fit_temporal(
             f"fit temporal: nothing can be learned of {len(drives)} drives: {error}; give more"
         ) from None
     if path is not None:
-        write_text(path, section_of(fitted))
+        write_text(path, _section_of(fitted))
     return FittedTemporal(fitted, len(folders), path)

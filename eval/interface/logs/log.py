@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from crosscue.replay.base import (
     NOT_ASKED_TOPIC,
     Block,
     CanFrames,
+    Closing,
     Images,
     Ledger,
     Limits,
@@ -94,7 +94,7 @@ def opened(log: Log | Path | str) -> Iterator[Log]:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Log:
+class Log(Closing):
     """A recorded drive; make one with ``crosscue.open``.
 
     ``log[name]`` is one topic. ``part`` restricts everything that follows to a span of time or to
@@ -186,17 +186,6 @@ class Log:
     def close(self) -> None:
         """Close the files; nothing can be read afterwards."""
         self._files.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         names = ", ".join(f"{name_of(log)} ({log.format})" for log in self.logs)

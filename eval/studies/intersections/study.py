@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.truth.truth import FILE
-from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
+from crosscue.eval.fit.annotated_runs import Annotated, annotate, graph_of_runs
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.drives import ScoreSettings, judge, score
 from crosscue.eval.scoring.runs import RunScored, judge_run

@@ -9,8 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
-from crosscue.eval.fit.temporal import annotated_drives
+from crosscue.eval.fit.annotated_runs import (
+    Annotated,
+    annotate,
+    annotated_drives,
+    graph_of_runs,
+)
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_temporal
 

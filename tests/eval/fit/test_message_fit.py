@@ -11,7 +11,7 @@ import pytest
 
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.cli import run as crosscue
-from crosscue.eval.fit.messages import Annotated, annotate, graph_of_runs
+from crosscue.eval.fit.annotated_runs import Annotated, annotate, graph_of_runs
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.replay.base import RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, parse

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.eval.fit.temporal import annotated_drives
+from crosscue.eval.fit.annotated_runs import annotated_drives
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.truth import load
 from crosscue.replay.vehicle.vehicle import Vehicle, parse

@@ -1,0 +1,333 @@
+"""What runs and their truth teach: annotated approaches, and annotated drives.
+
+For the fit of messages, a run's approach stands for the true one that it shares most time with,
+while the car drives up to it. One that meets no true approach leads to nothing: no intersection,
+no road to the left or right (whether it goes straight on is not known). For the fit of the belief
+over time, a drive is divided into the parts that lead up to each intersection of the truth, and
+those with none ahead. Both leave out frames in an intersection or outside the truth's time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.datasets.truth.truth import Truth
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import refuse_set_back
+from crosscue.eval.runs.tables.travelled import odometer_of
+from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth
+from crosscue.fusion.factor_graph import FactorGraph, graph_of
+from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
+from crosscue.fusion.fit.temporal_fit import AnnotatedDrive
+from crosscue.fusion.intersection_range import Reference
+from crosscue.fusion.temporal import MeasuredRange, ranges_to_start
+from crosscue.replay.base import Floats, Int64s, OutputError, RunError, UsageError
+from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+COVERED: Final = 0.9
+"""Of the time between two frames, at least so much must have odometry."""
+NOTHING_THERE: Final = {"intersection": False, "left": False, "right": False}
+CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
+
+
+@dataclass(slots=True)
+class Annotated:
+    """What runs and truths gave.
+
+    Attributes:
+        approaches: To learn from.
+        used: Approaches of runs by what they were.
+    """
+
+    approaches: list[AnnotatedApproach]
+    used: Counter[str]
+
+
+def check_arguments(
+    command: str, runs: int, truth: int, output: Path | str | None, *, overwrite: bool
+) -> Path | None:
+    """Refuse, before any run is read, what a fit to ``runs`` with ``truth`` files cannot use.
+
+    Returns:
+        The output's path, if there is to be one.
+
+    Raises:
+        UsageError: Not a truth for each run.
+        OutputError: The output exists.
+    """
+    if runs != truth:
+        raise UsageError(
+            f"{command}: {runs} runs, {truth} truth files; give one for each, in the same order"
+        )
+    path = None if output is None else Path(output)
+    if path is not None and path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    return path
+
+
+def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
+    """The factor graph that all runs share, and the first one's settings.
+
+    Raises:
+        UsageError: They do not share one.
+        RunError: A manifest cannot be read.
+    """
+    vehicles = [run.drive_manifest().settings for run in runs]
+    graphs = [graph_of(vehicle.fusion) for vehicle in vehicles]
+    for run, graph in zip(runs, graphs, strict=True):
+        if graph != graphs[0]:
+            raise UsageError(
+                f"{run.path}: made with other cues or features than {runs[0].path}; "
+                "run crosscue estimate with one vehicle file"
+            )
+    return graphs[0], vehicles[0]
+
+
+def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) -> None:
+    """Add one run's approaches.
+
+    Raises:
+        RunError: A table is missing or damaged, or nothing of the run lies in the truth's time.
+    """
+    refuse_set_back(run.drive_manifest().timeline, run.path, "fit messages")
+    belief = run.table("belief", ["t_ns", "approach", "established"])
+    t_ns = _whole(belief["t_ns"])
+    number, established = _whole(belief["approach"]), np.asarray(belief["established"])
+    if len(t_ns) and not ((t_ns >= truth.start_ns) & (t_ns < truth.end_ns)).any():
+        raise RunError(
+            f"{run.path}: no approach between {truth.start_ns} and {truth.end_ns} ns, of which the "
+            "truth speaks; give the truth of this drive"
+        )
+    way_m = _ways(run, t_ns, vehicle)
+    near = _near(run, t_ns, vehicle)
+    counts = _counts_at(run.table("cues", ["t_ns", "cue", "count"]), t_ns)
+    for one in np.unique(number).tolist():
+        rows = np.flatnonzero(number == one)
+        kept, features, place, what = _meant(t_ns[rows], truth)
+        into.used[what] += 1
+        if features is None or not kept.any():
+            continue
+        rows = rows[kept]
+        before = np.concatenate([[False], established[number == one][:-1]])[kept]
+        into.approaches.append(
+            AnnotatedApproach(
+                way_m[rows] - way_m[rows[0]],
+                (t_ns[rows] - t_ns[rows[0]]) * 1e-9,
+                near[rows],
+                before.astype(np.bool_),
+                {cue: column[rows] for cue, column in counts.items()},
+                features,
+                place or f"{run.path}, approach {one}",
+            )
+        )
+
+
+def _meant(
+    t_ns: Int64s, truth: Truth
+) -> tuple[NDArray[np.bool_], dict[str, bool] | None, str, str]:
+    """Which frames count, what is true, which intersection, and what the approach was."""
+    shared = [((t_ns >= a.start_ns) & (t_ns < a.enter_ns)).sum() for a in truth.approaches]
+    if shared and max(shared) > 0:
+        one = truth.approaches[int(np.argmax(shared))]
+        features = {"intersection": True, **one.features.model_dump()}
+        before = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
+        if None in features.values():
+            return before, None, "", "to an intersection with unknown roads, left out"
+        return before, features, one.intersection, "to an intersection"
+    inside = (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
+    for a in truth.approaches:
+        if ((t_ns >= a.enter_ns) & (t_ns < a.enter_ns + CROSSING_NS)).any():
+            return inside, None, "", "in an intersection, left out"
+    if not inside.all():
+        return inside, None, "", "outside the truth's time, left out"
+    return inside, dict(NOTHING_THERE), "", "to nothing"
+
+
+def _whole(column: object) -> Int64s:
+    return np.asarray(column, np.int64)
+
+
+def _ways(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> Floats:
+    """Way gone up to each of the sorted times, forwards or back, reckoned where unknown."""
+    odometer = odometer_of(run)
+    gone, total, last_ns = np.empty(len(t_ns)), 0.0, None
+    for i, now_ns in enumerate(t_ns.tolist()):
+        way = odometer.until(now_ns)
+        gap_ns = 0 if last_ns is None else now_ns - last_ns
+        is_known = way.covered_ns >= COVERED * gap_ns
+        reckoned_m = vehicle.range_filter.unseen_mps * gap_ns * 1e-9
+        total += abs(way.distance_m) if is_known else reckoned_m
+        gone[i], last_ns = total, now_ns
+    return gone
+
+
+def _near(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> NDArray[np.bool_]:
+    """Frames in which the range that dissent goes by was within its reach."""
+    table = run.table("range", ["t_ns", "reference", "range_m"])
+    at, reference = _whole(table["t_ns"]), np.array(table["reference"].to_pylist(), np.str_)
+    range_m = np.asarray(table["range_m"], np.float64)
+    best = np.full(len(t_ns), np.inf)
+    is_wanted = reference == vehicle.fusion.reference
+    for rows in (~is_wanted, is_wanted):
+        where, found = _places_in(t_ns, at[rows])
+        best[where] = range_m[rows][found]
+    return np.asarray(best <= vehicle.fusion.dissent_within_m)
+
+
+class _Moves(NamedTuple):
+    """Between frames, shape (N,) each; of the first frame nothing."""
+
+    way_m: NDArray[np.float64]
+    var_m2: NDArray[np.float64]
+    passed_s: NDArray[np.float64]
+
+
+def annotated_drives(
+    run: RunFolder,
+    truth: DriveTruth,
+    vehicle: Vehicle,
+    tables: Mapping[str, pa.Table] | None = None,
+) -> Iterator[AnnotatedDrive]:
+    """The parts of one run.
+
+    Args:
+        run: With finished stages.
+        truth: Of the drive.
+        vehicle: Curves of ranges, and how fast they fade.
+        tables: ``cues`` and ``range``, estimated with other settings; the run's, if left out.
+
+    Raises:
+        RunError: A table is missing or damaged.
+    """
+    refuse_set_back(run.drive_manifest().timeline, run.path, "fit temporal")
+    if tables is None:
+        columns = ["t_ns", "reference", "range_m", "var_m2", "measured_m"]
+        tables = {
+            "cues": run.table("cues", ["t_ns", "cue", "count"]),
+            "range": run.table("range", columns),
+        }
+    t_ns = np.asarray(run.table("frames", ["t_ns"])["t_ns"], np.int64)
+    moves = _moves(run, t_ns)
+    counts = _counts_at(tables["cues"], t_ns)
+    ranges = _ranges(tables["range"], t_ns, moves.way_m, vehicle)
+    start_m = truth.start_m(t_ns)
+    for kept, features, place in _parts(truth.truth, t_ns):
+        rows = np.flatnonzero(kept)
+        if not len(rows):
+            continue
+        yield AnnotatedDrive(
+            _from_first(moves.way_m[rows]),
+            _from_first(moves.var_m2[rows]),
+            _from_first(moves.passed_s[rows]),
+            start_m[rows] if features["intersection"] else np.full(len(rows), np.nan),
+            {cue: column[rows] for cue, column in counts.items()},
+            tuple(ranges[i] for i in rows.tolist()),
+            features,
+            place or str(run.path),
+        )
+
+
+def _from_first(column: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same, without what lies before the part."""
+    out = column.copy()
+    out[0] = 0.0
+    return out
+
+
+def _parts(
+    truth: Truth, t_ns: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.bool_], dict[str, bool], str]]:
+    """Frames of a part, what is true there, and the intersection's name."""
+    ahead = np.zeros(len(t_ns), np.bool_)
+    for one in truth.approaches:
+        kept = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
+        ahead |= kept | ((t_ns >= one.enter_ns) & (t_ns < one.enter_ns + CROSSING_NS))
+        known = {
+            name: value for name, value in one.features.model_dump().items() if value is not None
+        }
+        yield kept, {"intersection": True, **known}, one.intersection
+    rest = ~ahead & (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
+    begins = np.flatnonzero(np.diff(rest.astype(np.int8), prepend=0) == 1)
+    for begin in begins.tolist():
+        gaps = np.flatnonzero(~rest[begin:])
+        end = begin + int(gaps[0]) if len(gaps) else len(rest)
+        kept = np.zeros(len(rest), np.bool_)
+        kept[begin:end] = True
+        yield kept, dict(NOTHING_THERE), ""
+
+
+def _moves(run: RunFolder, t_ns: NDArray[np.int64]) -> _Moves:
+    odometer = odometer_of(run)
+    ways = [odometer.until(now) for now in t_ns.tolist()]
+    return _Moves(
+        np.array([way.distance_m for way in ways], np.float64),
+        np.array([way.var_m2 for way in ways], np.float64),
+        np.diff(t_ns, prepend=t_ns[:1]) * 1e-9,
+    )
+
+
+def _ranges(
+    table: pa.Table, t_ns: NDArray[np.int64], way_m: NDArray[np.float64], vehicle: Vehicle
+) -> list[tuple[MeasuredRange, ...]]:
+    """Of each frame, as the filter takes them."""
+    measured: dict[int, dict[Reference, tuple[float, float]]] = {}
+    columns = [table[name].to_pylist() for name in ("t_ns", "reference", "measured_m", "var_m2")]
+    for at, reference, range_m, var_m2 in zip(*columns, strict=True):
+        if range_m is not None:
+            found = Reference(reference)
+            one = range_m, _var_m2(found, range_m, var_m2, vehicle)
+            measured.setdefault(at, {})[found] = one
+    out: list[tuple[MeasuredRange, ...]] = []
+    since_m = math.inf
+    for now, moved_m in zip(t_ns.tolist(), way_m.tolist(), strict=True):
+        since_m += abs(moved_m)
+        here = measured.get(now)
+        if not here:
+            out.append(())
+            continue
+        found_ranges = ranges_to_start(
+            here, since_m, vehicle.range_filter.fade_m, vehicle.fusion.length_m
+        )
+        out.append(tuple(MeasuredRange(*one) for one in found_ranges))
+        since_m = 0.0
+    return out
+
+
+def _var_m2(reference: Reference, range_m: float, believed_m2: float, vehicle: Vehicle) -> float:
+    """Of one measurement: that of its curve, or of the belief where it has no curve."""
+    curve: RangeCurve | None = getattr(vehicle.ranges, CURVES[reference])
+    own = believed_m2 if curve is None else curve.residual_sd_m**2
+    return own + (vehicle.range_filter.sd_fraction * range_m) ** 2
+
+
+def _counts_at(table: pa.Table, t_ns: Int64s) -> dict[str, Int64s]:
+    """From each cue of a table ``cues`` to how many at sorted times, or ``NOT_LOOKED``."""
+    at, count = np.asarray(table["t_ns"], np.int64), np.asarray(table["count"], np.int64)
+    cue = np.array(table["cue"].to_pylist(), np.str_)
+    out: dict[str, Int64s] = {}
+    for name in np.unique(cue).tolist():
+        column = np.full(len(t_ns), NOT_LOOKED, np.int64)
+        where, found = _places_in(t_ns, at[cue == name])
+        column[where] = count[cue == name][found]
+        out[name] = column
+    return out
+
+
+def _places_in(t_ns: Int64s, at: Int64s) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Where in the sorted ``t_ns`` the times of ``at`` stand, and which of them do."""
+    where = np.searchsorted(t_ns, at)
+    found = np.zeros(len(at), np.bool_)
+    inside = where < len(t_ns)
+    found[inside] = t_ns[where[inside]] == at[inside]
+    return where[found], found
