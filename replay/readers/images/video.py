@@ -214,6 +214,11 @@ class Video(Closing):
 
     def _shown_order(self, pts: list[int | None], notices: list[str]) -> Int64s:
         """Each packet's place in the order in which pictures are shown."""
+        stored = np.arange(len(pts), dtype=np.int64)
+        if self.path.suffix.lower() == ".avi" and not self._has_reordering:
+            # AVI carries no times of showing. What the demuxer reports is a guess, which a
+            # damaged picture misleads.
+            return stored
         known = [p for p in pts if p is not None]
         if len(known) == len(pts):
             shown = np.empty(len(pts), dtype=np.int64)
@@ -226,7 +231,7 @@ class Video(Closing):
                 "the stream may store pictures in another order than they are shown and does not "
                 "say which: times go by stored order"
             )
-        return np.arange(len(pts), dtype=np.int64)
+        return stored
 
     def _packets(self, index: _Index, wanted: list[bool], ledger: Ledger) -> Iterator[Block]:
         """Blocks of packets as they are stored."""
@@ -279,27 +284,40 @@ class Video(Closing):
         """Blocks of one decoded picture each, for codecs that nobody downstream knows."""
         name = self.topics[0].name
         ledger.notice(f"codec {self._codec}: decoded by the reader")
-        # Pictures come in the order in which they are shown, so they take the sorted times.
-        order = np.argsort(index.t_ns, kind="stable").tolist()
-        given = 0
+        shown = set[int]()
         with self._container() as container:
-            for frame, i in zip(self._frames(container), order, strict=False):
-                given += 1
+            for i, frame in self._frames(container, len(wanted)):
+                shown.add(i)
                 size = frame.width * frame.height * 3
                 if self._usable(index, i, size, wanted[i], ledger):
                     ledger.find(name, 1)
                     yield _raw_block(name, int(index.t_ns[i]), frame)
-        ledger.drop(name, "picture cannot be decoded", len(order) - given)
+        for i in sorted(set(range(len(wanted))) - shown):
+            t_ns = int(index.t_ns[i])
+            at_ns = None if t_ns == NO_TIME else t_ns
+            ledger.drop(name, "picture cannot be decoded", 1, f"packet {i}", at_ns)
 
-    def _frames(self, container: InputContainer) -> Iterator[VideoFrame]:
-        """Pictures that can be decoded."""
+    def _frames(self, container: InputContainer, packets: int) -> Iterator[tuple[int, VideoFrame]]:
+        """Pictures that can be decoded, each with the number of the packet that it came in.
+
+        Pictures before and after one that cannot be decoded so keep their own times.
+        """
+        from av.codec.context import Flags
+
         stream = _video_stream(container, self.path)
+        stream.codec_context.flags |= Flags.copy_opaque
+        number = 0
         for packet in _demuxed(container, stream):
+            packet.opaque = number
+            number += packet.size > 0
             try:
-                yield from packet.decode()
+                frames = packet.decode()
             except _failures():
-                # The picture is missing from the count at the end, which reports the loss.
                 continue
+            for frame in frames:
+                source = frame.opaque
+                if isinstance(source, int) and source < packets:
+                    yield source, frame
 
     def _settle(self, index: _Index, ledger: Ledger) -> None:
         (topic,) = self.topics

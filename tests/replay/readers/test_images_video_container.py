@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,6 +14,7 @@ from crosscue.eval.cli import run
 from crosscue.replay.base import (
     NOT_ASKED_TIME,
     NOT_ASKED_TOPIC,
+    Block,
     Images,
     LogError,
     LogFormatError,
@@ -64,6 +66,25 @@ def test_each_time_shows_the_picture_filmed_then(
             assert bytes(block.rows.bytes_.payload(0))[:3] in (b"\0\0\0", b"\0\0\1")
 
 
+def _number_in(block: Block) -> int:
+    """The number that is painted in a decoded picture."""
+    rows = block.rows
+    assert isinstance(rows, Images)
+    assert (rows.coding, rows.pixel_format) == (("raw",), ("rgb8",))
+    assert rows.width_px is not None
+    assert rows.width_px.tolist() == [64]
+    return number_of(np.frombuffer(rows.bytes_.payload(0), dtype=np.uint8))
+
+
+def _blank_packet(path: Path, which: int) -> None:
+    """Overwrite the bytes of one stored picture with zeros."""
+    with av.open(str(path)) as container:
+        packet = [bytes(p) for p in container.demux(video=0) if p.size][which]
+    data = path.read_bytes()
+    assert data.count(packet) == 1
+    path.write_bytes(data.replace(packet, bytes(len(packet))))
+
+
 def test_another_codec_is_decoded_here(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", N, "mpeg4")
     path.with_suffix(".csv").write_text(ODD_LINES)
@@ -71,16 +92,28 @@ def test_another_codec_is_decoded_here(tmp_path: Path) -> None:
     blocks, ledger = read(path)
 
     assert [int(b.log_ns[0]) for b in blocks] == ODD_NS
-    for i, block in enumerate(blocks):
-        assert isinstance(block.rows, Images)
-        rows = block.rows
-        assert (rows.coding, rows.pixel_format) == (("raw",), ("rgb8",))
-        assert rows.width_px is not None
-        assert rows.width_px.tolist() == [64]
-        rgb = np.frombuffer(rows.bytes_.payload(0), dtype=np.uint8)
-        assert number_of(rgb) == i
+    assert [_number_in(block) for block in blocks] == list(range(N))
     assert "codec mpeg4: decoded by the reader" in ledger.notices
     assert ledger.is_whole
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
+@pytest.mark.parametrize("which", [0, 7, N - 1])
+def test_a_picture_that_cannot_be_decoded_moves_no_other(
+    tmp_path: Path, name: str, which: int
+) -> None:
+    path = video(tmp_path / name, N, "mpeg4", {"g": "1"})
+    path.with_suffix(".txt").write_text(ODD_LINES)
+    _blank_packet(path, which)
+
+    blocks, ledger = read(path)
+
+    shown = [int(b.log_ns[0]) for b in blocks]
+    assert shown == ODD_NS[:which] + ODD_NS[which + 1 :]
+    assert [_number_in(b) for b in blocks] == [i for i in range(N) if i != which]
+    assert dict(ledger.topic("a").dropped) == {"picture cannot be decoded": 1}
+    (loss,) = (d for d in ledger.details if d.is_dropped)
+    assert (loss.t_ns, loss.detail) == (ODD_NS[which], f"packet {which}")
 
 
 @pytest.mark.parametrize("options", [NO_REORDERING, REORDERING], ids=["plain", "reordered"])
