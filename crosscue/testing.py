@@ -155,6 +155,9 @@ def check_dataset(
 ) -> None:
     """Check that a data set keeps the contract of a reader, and that its truth fits its log.
 
+    A true track states where the body sits whose track it is, or that nobody knows (null), and who
+    says so.
+
     Args:
         log: A small, whole drive of the data set.
         folder: An empty folder, for its truth.
@@ -175,6 +178,10 @@ def check_dataset(
         and min(times) < truth.end_ns
         and truth.start_ns <= max(times),
         f"truth from {truth.start_ns} to {truth.end_ns} ns; the log {min(times)} to {max(times)}",
+    )
+    _expect(
+        truth.pose is None or (truth.mounting is not None and bool(truth.mounting_source)),
+        f"truth: the track of {truth.pose_point}: expected its mounting and mounting_source",
     )
     check_reader(log, damage_one_row)
 

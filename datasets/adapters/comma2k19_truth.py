@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
-from crosscue.datasets.truth.truth import Origin, Truth, save
+from crosscue.datasets.truth.truth import Origin, Truth, mounting_in_car, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import Floats, LogFormatError
 
@@ -58,6 +58,7 @@ def write(path: Path, folder: Path) -> Path:
     quat_wxyz = np.roll(enu_r_car.as_quat(canonical=True), 1, axis=1)
     track = Trajectory(t_ns, east_north_up, quat_wxyz)
     note = "comma2k19 global_pose: the camera in a local frame, x east, y north, z up"
+    mounting, source = mounting_in_car(track)
     folder.mkdir(parents=True, exist_ok=True)
     write_tum(folder / POSE_FILE, track, note)
     return save(
@@ -68,6 +69,8 @@ def write(path: Path, folder: Path) -> Path:
             end_ns=int(t_ns[-1]) + 1,
             pose=POSE_FILE,
             pose_point="camera",
+            mounting=mounting,
+            mounting_source=source,
             origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude),
             source="comma2k19: tightly coupled INS, GNSS and vision, smoothed offline",
         ),

@@ -50,7 +50,7 @@ from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_file
 from crosscue.replay.seal.touched import Touched, open_noted
 
 from .kitti_labels import read_labels
-from .kitti_odometry import projection
+from .kitti_odometry import BOX, SETUP, projection
 from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
 
 POSE_FILE: Final = "pose.tum"
@@ -217,10 +217,12 @@ def write_truth(path: Path, folder: Path) -> Path:
         start_ns=int(packets.t_ns[0]),
         end_ns=int(packets.t_ns[-1]) + 1,
         pose=POSE_FILE,
-        pose_point="rear_axle",
+        pose_point="imu",
+        mounting=BOX,
+        mounting_source=SETUP,
         origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude),
         source=(
-            "KITTI: OXTS RT3003 GNSS/INS; the box's own position, taken for the rear axle; "
+            "KITTI: OXTS RT3003 GNSS/INS; the box's own position; "
             f"it claims {float(np.median(packets['pos_accuracy'])):.2g} m"
             + (f"; {lost} damaged labels are left out" if lost else "")
         ),

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.truth import Mounting, Truth, mounting_in_car, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
@@ -43,6 +43,12 @@ from crosscue.replay.seal.touched import Touched
 
 POSE_FILE: Final = "pose.tum"
 MAX_FILE_BYTES: Final = 64 * MIB
+SETUP: Final = (
+    "Geiger, Lenz, Stiller, Urtasun, Vision meets Robotics: The KITTI Dataset (IJRR 2013), figure "
+    "of the sensors' places on the car"
+)
+BOX: Final = Mounting(x_m=-0.05, y_m=0.32, z_m=0.93, roll_rad=None, pitch_rad=None)
+"""The GNSS/INS box; its yaw is the car's, as the set's ``dataformat.txt`` defines it."""
 AXES: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """From right, down, ahead to ahead, left, up."""
 
@@ -202,7 +208,9 @@ def write_truth(path: Path, folder: Path) -> Path:
     note = "KITTI odometry: the left grey camera; x ahead, y left, z up of the first picture"
     folder.mkdir(parents=True, exist_ok=True)
     wxyz = poses.turn.as_quat()[:, [3, 0, 1, 2]]
-    write_tum(folder / POSE_FILE, Trajectory(poses.t_ns, poses.xyz_m, wxyz), note)
+    track = Trajectory(poses.t_ns, poses.xyz_m, wxyz)
+    write_tum(folder / POSE_FILE, track, note)
+    mounting, mounting_source = mounting_in_car(track, SETUP, x_m=1.03, y_m=0.0, z_m=1.65)
     truth = Truth(
         version=1,
         log=path.resolve().name,
@@ -210,6 +218,8 @@ def write_truth(path: Path, folder: Path) -> Path:
         end_ns=int(poses.t_ns[-1]) + 1,
         pose=POSE_FILE,
         pose_point="camera",
+        mounting=mounting,
+        mounting_source=mounting_source,
         source=(
             "KITTI odometry (CC BY-NC-SA 3.0): published poses of the left grey camera, image_0; "
             "other cameras sit beside it by -P[0, 3] / P[0, 0] of calib.txt, in metres to its right"

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crosscue.datasets.truth.objects import Objects
-from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import Floats, LogFormatError
 
@@ -70,6 +70,8 @@ def write(path: Path, folder: Path) -> Path:
         end_ns=int(poses.t_ns[-1]) + 1,
         pose=POSE_FILE,
         pose_point="rear_axle",
+        mounting=Mounting(),
+        mounting_source="nuScenes: the ego frame's origin is the middle of the rear axle",
         source=(
             f"{what}: ego poses (localised against a map by laser, in the plane); boxes of key "
             f"frames in {FRONT}" + (f"; {lost} damaged annotations are left out" if lost else "")

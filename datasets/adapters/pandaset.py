@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.truth import Truth, mounting_in_car, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
     MIB,
@@ -199,7 +199,9 @@ def write_truth(path: Path, folder: Path) -> Path:
     wxyz = turn.as_quat()[:, [3, 0, 1, 2]]
     note = "PandaSet: the front camera in the sequence's local frame, z up"
     folder.mkdir(parents=True, exist_ok=True)
-    write_tum(folder / POSE_FILE, Trajectory(poses.t_ns, poses.xyz_m, wxyz), note)
+    track = Trajectory(poses.t_ns, poses.xyz_m, wxyz)
+    write_tum(folder / POSE_FILE, track, note)
+    mounting, mounting_source = mounting_in_car(track)
     truth = Truth(
         version=1,
         log=path.resolve().name,
@@ -207,6 +209,8 @@ def write_truth(path: Path, folder: Path) -> Path:
         end_ns=int(poses.t_ns[-1]) + 1,
         pose=POSE_FILE,
         pose_point="camera",
+        mounting=mounting,
+        mounting_source=mounting_source,
         source="PandaSet (Scale AI, Hesai; CC BY 4.0): published poses of the front camera",
     )
     return save(truth, folder)

@@ -19,7 +19,7 @@ from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, 
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.simulated.drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
 from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
-from crosscue.datasets.truth.truth import Approach, Features, Truth, save
+from crosscue.datasets.truth.truth import Approach, Features, Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
@@ -315,6 +315,8 @@ class _Record:
                 start_ns=start_ns,
                 end_ns=int(motion.t_ns[-1]) + step,
                 pose="pose.tum",
+                mounting=Mounting(),
+                mounting_source=SOURCE,
                 source=SOURCE,
                 approaches=(approach,) if layout.is_intersection else (),
                 cues=self._cues.finished(),

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.truth.truth import Truth, save
+from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.base import Ledger, write_text
 from crosscue.replay.write.convert import LogWriter
@@ -77,6 +77,8 @@ def _write_truth(folder: Path, motion: TrueMotion) -> Path:
             start_ns=int(motion.t_ns[0]),
             end_ns=int(motion.t_ns[-1]) + 1,
             pose="pose.tum",
+            mounting=Mounting(),
+            mounting_source=SOURCE,
             source=SOURCE,
         ),
         folder,

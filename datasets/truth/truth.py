@@ -7,6 +7,7 @@ section may be missing.
 from __future__ import annotations
 
 import difflib
+import math
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Protocol, cast
@@ -25,6 +26,8 @@ from crosscue.replay.base import (
 from crosscue.replay.formats import data_sets
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
+
+from .tum import Trajectory, turned_by
 
 VERSION: Final = 1
 FILE: Final = "truth.json"
@@ -57,20 +60,50 @@ class Origin(Section):
 class Mounting(Section):
     """A rigid transform from the rear axle, on the ground, to a body; ISO 8855 axes.
 
-    Angles turn yaw first, then pitch, then roll.
+    Angles turn yaw first, then pitch, then roll. Null: unknown; a score then takes x, y and yaw
+    from the vehicle file's ``[camera]`` or ``[gnss]``, and says so.
     """
 
-    x_m: float = 0.0
+    x_m: float | None = 0.0
     """Ahead of the rear axle."""
-    y_m: float = 0.0
+    y_m: float | None = 0.0
     """To its left."""
-    z_m: float = 0.0
+    z_m: float | None = 0.0
     """Above the ground."""
-    roll_rad: float = 0.0
-    pitch_rad: float = 0.0
+    roll_rad: float | None = 0.0
+    pitch_rad: float | None = 0.0
     """Downwards."""
-    yaw_rad: float = 0.0
+    yaw_rad: float | None = 0.0
     """Counter-clockwise."""
+
+
+def mounting_in_car(
+    track: Trajectory,
+    stated: str = "position not published",
+    *,
+    x_m: float | None = None,
+    y_m: float | None = None,
+    z_m: float | None = None,
+) -> tuple[Mounting, str]:
+    """The mounting of a body whose yaw nobody states: its yaw by how it travels.
+
+    Args:
+        track: Of that body.
+        stated: What is published of its place, and by whom.
+        x_m: Where that puts it; see ``Mounting``.
+        y_m: The same.
+        z_m: The same.
+
+    Returns:
+        The mounting, and its source.
+    """
+    found = turned_by(track)
+    yaw_rad = None if found is None else round(found.yaw_rad, 5)
+    mounting = Mounting(x_m=x_m, y_m=y_m, z_m=z_m, roll_rad=None, pitch_rad=None, yaw_rad=yaw_rad)
+    if found is None:
+        return mounting, f"{stated}; yaw unknown, and the drive does not show it"
+    degrees = math.degrees(found.sd_rad)
+    return mounting, f"{stated}; yaw by its direction of travel, +- {degrees:.2f} deg"
 
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
@@ -137,12 +170,14 @@ class Truth(Section):
     """Log times between which the truth speaks; half open."""
     pose: str | None = None
     """TUM trajectory, a file beside this one: seconds on the log clock, metres, quaternion."""
-    pose_point: Literal["rear_axle", "camera", "antenna"] = "rear_axle"
+    pose_point: Literal["rear_axle", "camera", "antenna", "imu"] = "rear_axle"
     """The body whose pose the trajectory is: the car, about its rear axle; a camera, x along its
-    optical axis; or a GNSS antenna, x along the car."""
+    optical axis; a GNSS antenna, x along the car; or an inertial unit, x along its forward axis."""
     mounting: Mounting | None = None
-    """Where that body sits on the car. Left out: nowhere but at the rear axle, or where the vehicle
-    file's ``[camera]`` or ``[gnss]`` puts it."""
+    """Where that body sits on the car. Left out: at the rear axle, or, for a camera or an antenna,
+    where the vehicle file's ``[camera]`` or ``[gnss]`` puts it."""
+    mounting_source: str = ""
+    """Who states the mounting, and how well."""
     position_sd_m: Annotated[float, Field(gt=0.0)] | None = None
     """S.d. of east and of north; left out: taken for exact."""
     heading_sd_rad: Annotated[float, Field(gt=0.0)] | None = None

@@ -14,6 +14,7 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.localization.compass import course_at
 from crosscue.replay.base import EmptyResultError, Floats, Int64s, Log, Selection, name_of
 from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.vehicle.pose import Gnss
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_signals import plan_of, read_signals
@@ -61,6 +62,7 @@ def write_gnss_truth(
     folder.mkdir(parents=True, exist_ok=True)
     note = f"GNSS ({source.topic.name}): the antenna in a local frame, x east, y north"
     write_tum(folder / POSE_FILE, track, note)
+    mounting, mounting_source = _antenna(gnss)
     name = name_of(logs[source.log]).rstrip("/").rpartition("/")[2]
     return save(
         Truth(
@@ -70,7 +72,8 @@ def write_gnss_truth(
             end_ns=int(t_ns[-1]) + 1,
             pose=POSE_FILE,
             pose_point="antenna",
-            mounting=Mounting(x_m=gnss.x_m, y_m=gnss.y_m),
+            mounting=mounting,
+            mounting_source=mounting_source,
             position_sd_m=float(np.sqrt(np.mean(stated**2))),
             heading_sd_rad=gnss.course_sd_rad,
             origin=Origin(latitude_deg=origin[0], longitude_deg=origin[1], altitude_m=origin[2]),
@@ -79,6 +82,15 @@ def write_gnss_truth(
         ),
         folder,
     )
+
+
+def _antenna(gnss: Gnss) -> tuple[Mounting, str]:
+    """Where it sits, and who says so."""
+    if gnss.model_fields_set.isdisjoint(("x_m", "y_m")):
+        place = Mounting(x_m=None, y_m=None, z_m=None, roll_rad=None, pitch_rad=None)
+        return place, "antenna's place unknown: [gnss] of the vehicle file does not state it"
+    place = Mounting(x_m=gnss.x_m, y_m=gnss.y_m, z_m=None, roll_rad=None, pitch_rad=None)
+    return place, "[gnss] of the vehicle file"
 
 
 def _headings(t_ns: Int64s, xyz_m: Floats, course: Samples | None, min_speed_mps: float) -> Floats:

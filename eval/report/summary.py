@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from textwrap import wrap
 from typing import Final
 
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.gates import GateResult
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, Mean, Proportion
 from crosscue.eval.scoring.metric_values import MetricValue
-from crosscue.eval.scoring.pose.score import Errors, PoseScore
+from crosscue.eval.scoring.pose.score import Errors, PlaneMounting, PoseScore
 from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueScore
@@ -245,6 +246,7 @@ def pose_summary(result: PoseScore) -> str:
     lines = [
         f"truth      {covered.scored} of {covered.truth_poses} poses scored over "
         f"{result.distance_m:.0f} m" + (f"; not: {', '.join(left_out)}" if left_out else ""),
+        *_compared_lines(result.compared_at),
         "",
         "error                       rmse     mean   median      max     rotation rmse",
     ]
@@ -254,6 +256,21 @@ def pose_summary(result: PoseScore) -> str:
     lost = "never lost" if result.lost_at_m is None else f"lost after {result.lost_at_m:.0f} m"
     lines.append(f"2-sigma ellipse at the end: {result.major_axis_m:.1f} m long; {lost}")
     return "\n".join(lines)
+
+
+def _compared_lines(at: PlaneMounting) -> list[str]:
+    """Which body's pose is compared, where it sits, and who says so."""
+    body = at.body.replace("_", " ")
+    if at.body != "rear_axle" or at.x_m or at.y_m or at.yaw_rad:
+        place = f"{at.x_m:.2f} m ahead and {at.y_m:.2f} m left of the rear axle"
+        body += f", {place}, turned {math.degrees(at.yaw_rad):.2f} deg left"
+    lines = [f"compared at the {body}"]
+    if at.assumed:
+        names = ", ".join(at.assumed)
+        lines.append(f"           {names}: unknown to the truth; as the vehicle file has it")
+    if at.source:
+        lines += wrap(at.source, 80, initial_indent=" " * 11, subsequent_indent=" " * 11)
+    return lines
 
 
 def _pose_row(name: str, errors: Errors) -> str:

@@ -379,3 +379,12 @@ def test_intrinsics_are_those_of_the_rectified_camera(tmp_path: Path) -> None:
             assert isinstance(log, KnowsItsCameras)
             assert log.intrinsics("image_02") == (721.5, 609.6, 172.9)
             assert log.intrinsics("image_03") is None
+
+
+def test_the_truth_is_of_the_box_and_says_where_that_sits(tmp_path: Path) -> None:
+    truth = load_truth(write_truth(raw_drive(tmp_path / "drive"), tmp_path / "truth"))
+
+    assert truth.pose_point == "imu"
+    assert truth.mounting is not None
+    assert (truth.mounting.x_m, truth.mounting.y_m) == (-0.05, 0.32)
+    assert "KITTI" in truth.mounting_source

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,18 +56,26 @@ NO_NEES: Final = (
 ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
 
 
-class PlaneMounting(NamedTuple):
-    """A body's pose seen from the rear axle, in the ground plane.
+@dataclass(frozen=True, slots=True)
+class PlaneMounting:
+    """A body's pose seen from the rear axle, in the ground plane: where poses are compared.
 
     Attributes:
+        body: What the true track is of.
         x_m: Ahead.
         y_m: To the left.
         yaw_rad: Counter-clockwise.
+        source: Who states that.
+        assumed: Which of the three the truth file does not know, so that the vehicle file's value
+            stands for them, or zero.
     """
 
+    body: str
     x_m: float
     y_m: float
     yaw_rad: float
+    source: str = ""
+    assumed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +99,8 @@ class PoseScore:
         nees_xyh: The same with heading.
         major_axis_m: Full major axis of the 2-sigma ellipse at the end.
         lost_at_m: Distance travelled when it first exceeded the vehicle file's limit, or None.
+        compared_at: The body whose pose is compared, and where it sits.
+        why_no_nees: Why there is no NEES at all; empty where there is.
     """
 
     coverage: Coverage
@@ -101,6 +111,7 @@ class PoseScore:
     nees_xyh: NeesSummary
     major_axis_m: float
     lost_at_m: float | None
+    compared_at: PlaneMounting
     why_no_nees: str = ""
 
 
@@ -220,6 +231,7 @@ def measure(
         nees_xyh=summarise_nees(values, 3),
         major_axis_m=float(table["major_axis_m"][-1].as_py()),
         lost_at_m=_lost_at(table, vehicle.lost_above_m),
+        compared_at=mounting_of(truth, vehicle),
         why_no_nees=why_no_nees,
     )
     folder = run.file("score")
@@ -271,16 +283,23 @@ def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajecto
 
 
 def mounting_of(truth: Truth, vehicle: Vehicle) -> PlaneMounting:
-    """What the truth file says of it, else what the vehicle file does."""
+    """What the truth file says of it; for what it does not know, what the vehicle file does."""
+    camera, gnss, body = vehicle.camera, vehicle.gnss, truth.pose_point
+    of_vehicle = {
+        "camera": (camera.x_m, camera.y_m, camera.yaw_rad),
+        "antenna": (gnss.x_m, gnss.y_m, 0.0),
+    }.get(body, (0.0, 0.0, 0.0))
     given = truth.mounting
-    if given is not None:
-        return PlaneMounting(given.x_m, given.y_m, given.yaw_rad)
-    if truth.pose_point == "camera":
-        camera = vehicle.camera
-        return PlaneMounting(camera.x_m, camera.y_m, camera.yaw_rad)
-    if truth.pose_point == "antenna":
-        return PlaneMounting(vehicle.gnss.x_m, vehicle.gnss.y_m, 0.0)
-    return PlaneMounting(0.0, 0.0, 0.0)
+    if given is None:
+        source = {"camera": "[camera] of the vehicle file", "antenna": "[gnss] of the vehicle file"}
+        return PlaneMounting(body, *of_vehicle, source=source.get(body, ""))
+    stated = {"x_m": given.x_m, "y_m": given.y_m, "yaw_rad": given.yaw_rad}
+    x_m, y_m, yaw_rad = (
+        spare if value is None else value
+        for value, spare in zip(stated.values(), of_vehicle, strict=True)
+    )
+    assumed = tuple(name for name, value in stated.items() if value is None)
+    return PlaneMounting(body, x_m, y_m, yaw_rad, truth.mounting_source, assumed)
 
 
 def at_truths_point(
@@ -301,7 +320,8 @@ def at_truths_point(
     east_m, north_m = map_shift(vehicle, truth)
     x, y = x + east_m, y + north_m
     cov = cov_xyh
-    ahead, left, yaw_rad = mounting_of(truth, vehicle)
+    mounting = mounting_of(truth, vehicle)
+    ahead, left = mounting.x_m, mounting.y_m
     if ahead or left:
         cos, sin = np.cos(heading), np.sin(heading)
         dx, dy = ahead * cos - left * sin, ahead * sin + left * cos
@@ -322,7 +342,7 @@ def at_truths_point(
         cov = cov + truth.position_sd_m**2 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])
     if truth.heading_sd_rad is not None:
         cov = cov + truth.heading_sd_rad**2 * np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    return planar(t_ns, x, y, heading + yaw_rad), cov
+    return planar(t_ns, x, y, heading + mounting.yaw_rad), cov
 
 
 def map_shift(vehicle: Vehicle, truth: Truth) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.simulated.drive import FIELD_T, START_NS
-from crosscue.datasets.truth.truth import Truth
+from crosscue.datasets.truth.truth import Mounting, Truth
 from crosscue.datasets.truth.truth import save as save_truth
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.localization.angles import wrap_all
@@ -322,6 +322,8 @@ def _write_truth(folder: Path, traced: Traced, t_ns: Int64s) -> Path:
         start_ns=int(t_ns[0]),
         end_ns=int(t_ns[-1]) + 1,
         pose="pose.tum",
+        mounting=Mounting(),
+        mounting_source=SOURCE,
         source=SOURCE,
     )
     return save_truth(truth, folder)

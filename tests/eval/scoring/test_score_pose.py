@@ -301,3 +301,26 @@ def test_no_nees_where_the_runs_frame_is_its_own(tmp_path: Path) -> None:
     assert "NEES of" not in text
     # What does not need a common frame is still measured.
     assert result.ape["yaw"].translation_m.max < 1e-2
+
+
+def test_a_score_says_which_body_it_compares_and_what_is_only_assumed(tmp_path: Path) -> None:
+    track = _turned(_circle(np.arange(0.5, 29.0, 0.05), 2.0), 0.016)
+    mounting = {"x_m": None, "y_m": 0.0, "yaw_rad": 0.016}
+    path = _truth(
+        tmp_path / "truth",
+        track,
+        pose_point="camera",
+        mounting=mounting,
+        mounting_source="by hand",
+    )
+    vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), camera=Camera(x_m=2.0))
+
+    result = score_pose(_run(tmp_path / "run", vehicle), path)
+
+    at = result.compared_at
+    assert (at.body, at.x_m, at.yaw_rad, at.assumed) == ("camera", 2.0, 0.016, ("x_m",))
+    assert result.ape["none"].rotation_deg.max < 0.01
+    text = pose_summary(result)
+    assert "compared at the camera, 2.00 m ahead" in text
+    assert "x_m: unknown to the truth" in text
+    assert "by hand" in text
