@@ -15,6 +15,7 @@ from crosscue.eval import cli
 from crosscue.replay.base import OutputError, strict_json
 from crosscue.replay.files.made_of import made_of
 from support.pictures import picture
+from support.scenes import shorten
 from support.trees import tree
 
 COMMANDS: dict[str, tuple[str, str, str]] = {
@@ -128,6 +129,7 @@ def test_other_pictures_are_refused_with_both_identities(
 def test_the_very_same_goes_on(
     name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    shorten(monkeypatch)
     argv = _begun(name, folder, tmp_path / "out", monkeypatch)
 
     assert cli.run([*argv, COMMANDS[name][1]]) == 0

@@ -17,6 +17,7 @@ from support.kitti_drive import raw_drive
 from support.landmark_files import database_of, encoded, seen_from, wall
 from support.onnx_models import bright_box_model
 from support.pictures import picture
+from support.scenes import shorten
 
 # In this order: each reads what those before it wrote. LOG is a drive with a gap.
 LINES: Final[dict[str, tuple[str, int]]] = {
@@ -125,6 +126,7 @@ def test_every_made_result_is_one_strict_document(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    shorten(monkeypatch)
     log = write_drive(tmp_path, Clock(), seconds=4)
     compass = simulated(tmp_path / "compass", DriveSettings(seed=3, blocks=2, block_m=60.0))
     _write_photos(tmp_path / "photos")

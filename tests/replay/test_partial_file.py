@@ -20,7 +20,7 @@ from crosscue.eval.runs.folder import create, locked
 from crosscue.replay.base import write_text
 from crosscue.replay.files import partial_file
 from crosscue.replay.files.partial_file import PARTIAL, PartialFile, Scratch, is_partial, sweep
-from support import faults
+from support import faults, scenes
 
 
 def _partials(folder: Path) -> list[str]:
@@ -159,25 +159,17 @@ def _convert(folder: Path) -> list[str]:
 
 
 def _simulate(folder: Path) -> list[str]:
-    return [
-        "simulate",
-        "C",
-        "-o",
-        str(folder / "out"),
-        "--width",
-        "192",
-        "--fps",
-        "10",
-        "--overwrite",
-        "-q",
-    ]
+    out = str(folder / "out")
+    return ["simulate", "C", "-o", out, "--width", "64", "--overwrite", "-q"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [_convert, _simulate])
 def test_killed_anywhere_the_next_start_leaves_no_half_file(
-    tmp_path: Path, command: Callable[[Path], list[str]]
+    tmp_path: Path, command: Callable[[Path], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Inherited by the forked processes.
+    scenes.shorten(monkeypatch)
     argv = command(tmp_path)
     out = tmp_path / "out"
     count = len(faults.operations(out, faults.CHANGES, argv))

@@ -7,7 +7,9 @@ from functools import cache
 from typing import Final
 
 import numpy as np
+import pytest
 
+from crosscue.datasets.scenes import drive
 from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import layout_named
 from crosscue.datasets.scenes.rendering.camera import Camera
@@ -23,6 +25,13 @@ SMALL: Final = Camera(width_px=384, height_px=216)
 def world(layout: str = "D", run: int = 1, seed: int = 0) -> World:
     plan = layout_named(layout)
     return build(plan, conditions_of(plan, run, seed))
+
+
+def shorten(patch: pytest.MonkeyPatch, pictures: int = 15) -> None:
+    """Simulated drives end after so many pictures, and a world is built once."""
+    all_times = drive.picture_times
+    patch.setattr(drive, "picture_times", lambda *of: all_times(*of)[:pictures])
+    patch.setattr(drive, "world_of", cache(drive.world_of))
 
 
 def renderer(of: World, camera: Camera = SMALL) -> Renderer:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.random import Generator
@@ -125,9 +125,8 @@ def paint(
     import cv2
 
     canvas = _Canvas()
-    high, wide = canvas.map.shape[:2]
-    patchy = _tiled(smooth_noise(rng, 512, 8).astype(np.float32), high, wide)
-    fine = _tiled(smooth_noise(rng, 512, 128).astype(np.float32), high, wide)
+    patchy = smooth_noise(rng, 512, 8).astype(np.float32)
+    fine = smooth_noise(rng, 512, 128).astype(np.float32)
     road = road_mask(layout)
     away = cv2.distanceTransform(255 - road, cv2.DIST_L2, 5) / TEXELS_PER_M
     stone = 0.9 + 0.1 * patchy + 0.08 * fine
@@ -168,24 +167,26 @@ def _put(
     canvas: Map,
     where: NDArray[np.bool_] | None,
     rgb: tuple[int, int, int],
-    light: NDArray[np.floating[Any]],
+    light: NDArray[np.float32],
     grain: int,
 ) -> None:
-    """Colour times light, everywhere or where it is wanted."""
-    everywhere = True if where is None else where
+    """Colour times light, everywhere or where it is wanted; ``light`` is repeated like a tile."""
+    tile = np.empty((*light.shape, 4), np.uint8)
     for k, value in enumerate(rgb):
-        shade = np.minimum(value * light, 255.0).astype(np.uint8)
-        np.copyto(canvas[..., k], shade, where=everywhere)
-    np.copyto(canvas[..., 3], np.uint8(grain), where=everywhere)
+        tile[..., k] = np.minimum(value * light, 255.0).astype(np.uint8)
+    tile[..., 3] = grain
+    # A texel's four bytes are copied as one number.
+    texels = _tiled(tile.view(np.uint32)[..., 0], *canvas.shape[:2])
+    np.copyto(canvas.view(np.uint32)[..., 0], texels, where=True if where is None else where)
 
 
 def _dim(canvas: Map, where: NDArray[np.bool_], factor: float) -> None:
     canvas[where, :3] = (canvas[where, :3] * factor).astype(np.uint8)
 
 
-def _tiled(noise: NDArray[np.float32], high: int, wide: int) -> NDArray[np.float32]:
-    size = len(noise)
-    return np.tile(noise, (high // size + 1, wide // size + 1))[:high, :wide]
+def _tiled(tile: NDArray[np.uint32], high: int, wide: int) -> NDArray[np.uint32]:
+    size = len(tile)
+    return np.tile(tile, (-(-high // size), -(-wide // size)))[:high, :wide]
 
 
 def _joints(canvas: Map, walk: NDArray[np.bool_]) -> None:
