@@ -5,6 +5,7 @@ Written a second at a time: memory holds that second's pictures, however long th
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -55,6 +56,10 @@ MOBILEYE_BUS: Final = "/can/mobileye"
 IMAGES: Final = "/camera/image/compressed"
 CALIBRATION: Final = "/camera/camera_info"
 SOURCE: Final = "simulated by crosscue, exact"
+FROM_M: Final = 62.0
+"""Drives of few pictures begin so far before the intersection."""
+SPACING_M: Final = 5.0
+SPACING_S: Final = 1.0
 TOPICS: Final = (
     Topic(CAR_BUS, "crosscue/CanFrames", "columns"),
     Topic(MOBILEYE_BUS, "crosscue/CanFrames", "columns"),
@@ -129,6 +134,24 @@ def _photograph(picture: Picture, settings: PictureSettings) -> bytes:
 
 
 PHOTOGRAPHS: Final = Imager("", pictures, _photograph, "jpeg")
+
+
+def sparse_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+    """Photographs every ``SPACING_M`` of the last ``FROM_M``, and every ``SPACING_S`` if slower."""
+    renderer, motion = Renderer(world, settings.camera, settings.picture), world.approach.motion
+    last_m, last_ns = -math.inf, 0
+    for number, t_ns in enumerate(picture_times(world, settings).tolist()):
+        x_m = float(np.interp(t_ns, motion.t_ns, motion.x_m))
+        t_s = (t_ns - START_NS) * 1e-9
+        if x_m < -FROM_M or t_s > world.approach.enter_s + 0.2:
+            continue
+        if x_m - last_m >= SPACING_M or t_ns - last_ns >= SPACING_S * 1e9:
+            last_m, last_ns = x_m, t_ns
+            yield t_ns, renderer.picture(t_s, number)
+
+
+SPARSE_PHOTOGRAPHS: Final = Imager("sparse photographs 1", sparse_pictures, _photograph, "jpeg")
+"""So few that a hundred layouts can be seen by networks."""
 
 
 def write_scene(

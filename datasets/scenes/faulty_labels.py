@@ -23,7 +23,7 @@ from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.detectors.label_images import LabelledObject, label_image
 
-from .drive import Imager, picture_times
+from .drive import FROM_M, Imager, picture_times
 from .layout import NEAR_KERB_M
 from .world import Category, World
 
@@ -35,8 +35,6 @@ LABELS: Final[dict[Category, str]] = {
     "one_way_right": "one way right",
     "do_not_enter": "do not enter",
 }
-FROM_M: Final = 62.0
-"""Pictures begin so far before the intersection, where one would see it at all."""
 MOVING_NS: Final = 200_000_000
 """Between two pictures ..."""
 STANDING_NS: Final = 400_000_000
@@ -271,7 +269,7 @@ def _ground_codes(
     world: World, faults: Faults, rng: Generator
 ) -> tuple[NDArray[np.uint8], dict[int, float]]:
     """The map of what may be taken for road, and how often what is not road counts as it."""
-    from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
+    from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M, along_curve
 
     layout, road = world.layout, world.ground.road
     codes: NDArray[np.uint8] = np.zeros(road.shape, np.uint8)
@@ -293,6 +291,7 @@ def _ground_codes(
         deep, w = float(rng.uniform(3.0, 6.0)), layout.half_width_m
         fill(FIRST_FALSE + number, (x, x + deep), (side * w, side * (w + 9.0)))
         chances[FIRST_FALSE + number] = faults.false_road
+    codes = along_curve(layout, codes)
     y = Y_M[0] + (np.arange(len(road)) + 0.5) / TEXELS_PER_M
     x_m = X_M[0] + (np.arange(road.shape[1]) + 0.5) / TEXELS_PER_M
     part = np.full(road.shape, ROAD, np.uint8)

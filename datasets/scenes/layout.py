@@ -1,7 +1,7 @@
 """Intersections as plans: the eight of Table 6, and any number of others from seeds.
 
-Layouts ``M`` are mixed: twelve kinds in turn, four of which are no intersection at all, so that
-every feature of an intersection has positives and negatives in any twelve that follow one another.
+Layouts ``M`` are mixed: thirteen kinds in turn, five of which are no intersection at all, so that
+every feature of an intersection has positives and negatives in any thirteen in a row.
 
 Local frame: x ahead along the approach road, y to the left, zero on the approach road's middle line
 where the intersection starts (stop line, and stop sign if there is one). The crossroad's near kerb
@@ -15,16 +15,19 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 Control = Literal["stop_sign", "traffic_light", "none"]
 Kind = Literal[
     "crossing", "light", "open", "t_both", "t_left", "t_right",
-    "one_way", "one_way_t", "straight", "bend", "driveways", "lot",
+    "one_way", "one_way_t", "straight", "bend", "driveways", "lot", "curve",
 ]  # fmt: skip
 Side = Literal["left", "right"]
 
 NEAR_KERB_M: Final = 4.5
 PARKING_LANE_M: Final = 2.05
+CURVE_FROM_M: Final = -45.0
+CURVE_SLOPE: Final = 0.35
 SCORED: Final = "ABCDEFGH"
 
 
@@ -48,6 +51,7 @@ class Layout:
         vegetation: Bushes and branches hide signs and roads.
         is_town: Shops rather than houses.
         has_lot: A parking lot beside the approach road.
+        curve_per_m: A gentle curve of the approach road, to the left if positive.
     """
 
     name: str
@@ -67,6 +71,18 @@ class Layout:
     vegetation: bool = False
     is_town: bool = False
     has_lot: bool = True
+    curve_per_m: float = 0.0
+
+    def aside_m(self, x_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far left of the x axis the road's middle line is.
+
+        A parabola from ``CURVE_FROM_M`` to a slope of ``CURVE_SLOPE``, and straight from there.
+        """
+        if self.curve_per_m == 0.0:
+            return np.zeros_like(x_m)
+        into_m = np.maximum(x_m - CURVE_FROM_M, 0.0)
+        bends_m = np.minimum(into_m, CURVE_SLOPE / abs(self.curve_per_m))
+        return np.asarray(self.curve_per_m * bends_m * (into_m - bends_m / 2.0))
 
     @property
     def is_intersection(self) -> bool:
@@ -178,6 +194,7 @@ KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 WITHOUT: Final[Mapping[Kind, tuple[str, ...]]] = {
     "t_both": ("ahead",), "t_left": ("right",), "t_right": ("left",), "one_way_t": ("ahead",),
     "straight": ("left", "right"), "driveways": ("left", "right"), "lot": ("left", "right"),
+    "curve": ("left", "right"),
 }  # fmt: skip
 """Roads that a kind does not have; a bend has one of the sides alone."""
 
@@ -187,7 +204,7 @@ CONTROLS: Final[Mapping[Kind, tuple[Control, ...]]] = {
     "t_both": ("stop_sign", "stop_sign", "none"), "t_left": ("stop_sign", "stop_sign", "none"),
     "t_right": ("stop_sign", "stop_sign", "none"), "one_way": ("stop_sign", "traffic_light"),
     "one_way_t": ("stop_sign",), "straight": ("none",), "bend": ("none",), "driveways": ("none",),
-    "lot": ("none",),
+    "lot": ("none",), "curve": ("none",),
 }  # fmt: skip
 """What a kind's control is drawn from."""
 
@@ -226,8 +243,14 @@ def mixed_layout(seed: int) -> Layout:
         vegetation=bool(rng.random() < 0.15),
         # Houses have driveways, shops do not.
         is_town=kind not in ("driveways", "lot") and bool(rng.random() < 0.5),
-        has_lot=kind == "lot" or (kind != "straight" and bool(rng.random() < 0.3)),
+        has_lot=kind == "lot" or (kind not in ("straight", "curve") and bool(rng.random() < 0.3)),
+        curve_per_m=_curve(rng, side) if kind == "curve" else 0.0,
     )
+
+
+def _curve(rng: np.random.Generator, side: Side) -> float:
+    """Of a radius of 130 to 250 m."""
+    return (1.0 if side == "left" else -1.0) / float(rng.uniform(130.0, 250.0))
 
 
 def _side(rng: np.random.Generator) -> Side:

@@ -80,7 +80,7 @@ def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:
     step = 0.1
     straight_on = layout.end_m + 16.0
     if turn == "ahead":
-        return np.zeros(round((straight_on - start_x) / step))
+        return _along_road(layout, start_x, straight_on, step)
     lane = 0.27 if turn == "right" else 0.73
     if layout.one_way:
         lane = 0.5
@@ -93,6 +93,18 @@ def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:
     kernel = np.hanning(41)[1:-1]
     smoothed: Floats = np.convolve(curvature, kernel / kernel.sum(), mode="same")
     return smoothed
+
+
+def _along_road(layout: Layout, start_x: float, end_x: float, step: float) -> Floats:
+    """Curvature of the way that keeps its distance from the middle line."""
+    if layout.curve_per_m == 0.0:
+        return np.zeros(round((end_x - start_x) / step))
+    x: Floats = np.arange(start_x, end_x, step / 10.0)
+    slope = np.gradient(layout.aside_m(x), x)
+    way = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(layout.aside_m(x))))))
+    turned = np.interp(np.arange(0.0, way[-1], step), way, np.arctan(slope))
+    curvature: Floats = np.gradient(turned, step)
+    return curvature
 
 
 def _speeds(

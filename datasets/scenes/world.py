@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final, Literal
 
@@ -12,6 +12,7 @@ from numpy.random import Generator
 from crosscue.datasets.scenes.rendering.ground import (
     Ground,
     Patch,
+    along_curve,
     cast_shadows,
     paint,
     unpainted,
@@ -66,6 +67,7 @@ class Thing:
         span_s: From when to when it is there.
         later: What it looks like from ``later_s`` on, or None.
         later_s: When that begins.
+        curved: The layout whose curve it follows while it moves, or None.
     """
 
     number: int
@@ -79,6 +81,7 @@ class Thing:
     span_s: tuple[float, float] = ALWAYS
     later: Mesh | None = None
     later_s: float = 0.0
+    curved: Layout | None = None
 
     @property
     def is_fixed(self) -> bool:
@@ -91,11 +94,21 @@ class Thing:
 
     def shift(self, t_s: float) -> Floats:
         """How far it has moved from where ``mesh`` is, (3,)."""
-        return np.array([self.velocity[0] * t_s, self.velocity[1] * t_s, 0.0])
+        x_m, y_m = self.velocity[0] * t_s, self.velocity[1] * t_s
+        if self.curved is not None:
+            y_m += float(self.curved.aside_m(np.array(self.at[0] + x_m)))
+        return np.array([x_m, y_m, 0.0])
 
     def mesh_at(self, t_s: float) -> Mesh:
         """Its look at this time."""
-        return self.later if self.later is not None and t_s >= self.later_s else self.mesh
+        mesh = self.later if self.later is not None and t_s >= self.later_s else self.mesh
+        curved = self.curved
+        if curved is None:
+            return mesh
+        # Sheared about its middle, which ``shift`` moves: it points along the curve.
+        moved_m = self.velocity[0] * t_s
+        middle_m = curved.aside_m(np.array(self.at[0] + moved_m))
+        return mesh.aside(lambda x_m: curved.aside_m(x_m + moved_m) - middle_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,6 +223,17 @@ class _Site:
             self.shadows.solids.append((foot, 1.0))
 
 
+def _along_curve(thing: Thing, layout: Layout) -> Thing:
+    """A thing beside or on a curve; one that moves finds its place at each time."""
+    if layout.curve_per_m == 0.0:
+        return thing
+    if not thing.is_fixed:
+        return replace(thing, curved=layout)
+    x, y, z = thing.at
+    at = (x, y + float(layout.aside_m(np.array(x))), z)
+    return replace(thing, mesh=thing.mesh.aside(layout.aside_m), at=at)
+
+
 def build(layout: Layout, conditions: Conditions, *, is_painted: bool = True) -> World:
     """The world of a run; the same from the same layout and conditions.
 
@@ -230,9 +254,13 @@ def build(layout: Layout, conditions: Conditions, *, is_painted: bool = True) ->
     _control(site, drive)
     _parked(site, varied)
     _traffic(site, conditions, drive, varied)
-    scenery = joined([*site.parts, *(t.mesh for t in site.things if t.is_fixed)])
+    things = tuple(_along_curve(thing, layout) for thing in site.things)
+    parts = (
+        [part.aside(layout.aside_m) for part in site.parts] if layout.curve_per_m else site.parts
+    )
+    scenery = joined([*parts, *(t.mesh for t in things if t.is_fixed)])
     ground = _painted(site, light) if is_painted else unpainted(layout)
-    things, patches = tuple(site.things), tuple(site.patches)
+    patches = tuple(site.patches)
     return World(layout, conditions, drive, light, ground, scenery, things, site.atlas, patches)
 
 
@@ -245,7 +273,7 @@ def _painted(site: _Site, light: Daylight) -> Ground:
         site.shadows.blobs(light.to_sun),
         light.in_shadow,
     )
-    return with_levels(painted, road)
+    return with_levels(along_curve(site.layout, painted), along_curve(site.layout, road))
 
 
 def _lot(site: _Site, fixed: Generator, varied: Generator) -> None:

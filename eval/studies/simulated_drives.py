@@ -6,26 +6,30 @@ short has each layout about as often; a second start goes on with what is missin
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.datasets.scenes.drive import PHOTOGRAPHS, Imager, write_scene
+from crosscue.datasets.scenes.drive import PHOTOGRAPHS, SPARSE_PHOTOGRAPHS, Imager, write_scene
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.detectors.registry import chosen
+from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Done, Engine, Job, Progress, fingerprint_of, run_many
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING, versions
+from crosscue.replay.base import EVERYTHING, versions, write_text
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
 LOG: Final = "drive.mcap"
 VEHICLE: Final = "vehicle.toml"
-TRUTH: Final = "truth.json"
+SPARSE_AND_EMBEDDED: Final = (SPARSE_PHOTOGRAPHS, EMBEDDED)
+"""What records and sees the drives of a study of many layouts."""
+MADE_BY: Final = "made_by.txt"
+"""In a simulated drive's folder, once it is whole: the key of its settings and of the code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,7 @@ class Work:
         vehicle: A vehicle file to replay with, or None.
         detectors: Comma-separated.
         cache: Where detectors' results are kept.
+        made_by: By name, the key of the settings and code that simulate the drive.
         imager: What cameras record.
     """
 
@@ -46,13 +51,12 @@ class Work:
     vehicle: Path | None
     detectors: str
     cache: Path
+    made_by: Mapping[str, str]
     imager: Imager = PHOTOGRAPHS
 
     def __call__(self, job: Job) -> Outcome:
         """Simulate the drive unless it is there, then replay it."""
-        folder = self.drives / job.name
-        if not (folder / TRUTH).exists():
-            write_scene(folder, self.scenes[job.name], overwrite=True, imager=self.imager)
+        folder = self.simulated(job.name)
         vehicle = load(self.vehicle or folder / VEHICLE)
         choices = chosen(self.detectors, choices_of(vehicle))
         # One cache a drive: workers never wait for one another.
@@ -61,6 +65,24 @@ class Work:
         with open_log(folder / LOG) as log:
             outcome = replay_drive([log], vehicle, run, EVERYTHING, detecting=detecting)
         return replace(outcome, ledgers=(), detected=None)
+
+    def simulated(self, name: str) -> Path:
+        """The drive's folder, written unless it is there whole, by the same settings and code."""
+        folder, key = self.drives / name, self.made_by[name]
+        made_by = folder / MADE_BY
+        if not made_by.exists() or made_by.read_text(encoding="utf-8") != key:
+            made_by.unlink(missing_ok=True)
+            write_scene(folder, self.scenes[name], overwrite=True, imager=self.imager)
+            write_text(made_by, key)
+        return folder
+
+
+def code_of(folder: str) -> str:
+    """A hash of a folder's sources: what they made is stale when they change."""
+    digest = hashlib.sha256()
+    for source in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
 
 
 def run_drives(
@@ -89,14 +111,20 @@ def run_drives(
     """
     by_name = {scene.name: scene for scene in scenes}
     settings = None if vehicle is None else load(vehicle).model_dump(mode="json")
+    scene_code = code_of("datasets/scenes")
+    made_by = {
+        name: fingerprint_of(asdict(scene), imager.name, scene_code)
+        for name, scene in by_name.items()
+    }
+    found_by = (settings, detectors, code_of("detectors"), versions())
     jobs = [
         Job(
             name=name,
             logs=(),
             run=out / "runs" / name,
-            fingerprint=fingerprint_of(asdict(scene), settings, detectors, versions()),
+            fingerprint=fingerprint_of(made_by[name], *found_by),
         )
-        for name, scene in by_name.items()
+        for name in by_name
     ]
-    work = Work(out / "drives", by_name, vehicle, detectors, out / "cache", imager)
+    work = Work(out / "drives", by_name, vehicle, detectors, out / "cache", made_by, imager)
     return run_many(jobs, work, engine, overwrite=True, on_progress=on_progress)

@@ -281,6 +281,47 @@ def test_presence_is_established_with_hysteresis_and_withdrawn_when_nothing_come
         assert intersection > 0.5 or not step.established
 
 
+SEQUENCE = st.lists(
+    st.tuples(
+        st.dictionaries(st.sampled_from(["sign", "road"]), st.integers(0, 2)),
+        st.floats(-1.0, 8.0),
+        st.floats(0.0, 4.0),
+        st.none() | st.tuples(st.floats(-10.0, 200.0), st.floats(1e-2, 1e3)),
+        st.booleans(),
+    ),
+    min_size=1,
+    max_size=40,
+)
+"""Counts, way and its variance, a sign's range, whether the picture is new."""
+
+
+@given(SEQUENCE, st.floats(0.0, 0.2))
+@settings(max_examples=60, deadline=None)
+def test_what_a_run_writes_keeps_the_bounds_and_the_hysteresis(
+    frames: list[tuple[dict[str, int], float, float, tuple[float, float] | None, bool]],
+    lapse: float,
+) -> None:
+    fusion = Fusion().model_copy(update=TEMPORAL | {"temporal": learned(lapse=lapse)})
+    belief, was, approach = Approaches(GRAPH, fusion, FILTER), False, None
+
+    for i, (counts, way_m, var_m2, sign, is_new) in enumerate(frames):
+        signs = () if sign is None else (SignRange(Reference.START, *sign),)
+        step = belief(
+            FrameEvidence(i * 200_000_000, way_m, var_m2, signs, counts, is_new_picture=is_new)
+        )
+        if step.approach != approach:
+            was, approach = False, step.approach
+        if step.approach is None:
+            continue
+        intersection = step.probabilities["intersection"]
+        assert 0.0 < step.probabilities["left"] <= intersection + 1e-12 < 1.0
+        # Established above 0.9, withdrawn below 0.5, and as before in between.
+        limit = fusion.withdrawn if was else fusion.established
+        if abs(intersection - limit) > 1e-9:
+            assert step.established == (intersection > limit)
+        was = step.established
+
+
 def test_a_drive_begins_again_after_a_gap() -> None:
     settings = Fusion().model_copy(update=TEMPORAL | {"temporal": learned()})
     belief = Approaches(GRAPH, settings, FILTER)

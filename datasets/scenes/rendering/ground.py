@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.random import Generator
@@ -27,6 +27,7 @@ KERB: Final = (190, 187, 178)
 GRASS: Final = (100, 114, 64)
 
 Map = NDArray[np.uint8]
+OfGround = TypeVar("OfGround", NDArray[np.uint8], NDArray[np.bool_])
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +310,18 @@ def with_levels(painted: Map, road: NDArray[np.bool_]) -> Ground:
 def unpainted(layout: Layout) -> Ground:
     """The map of road alone, without any colour."""
     nothing = np.zeros((1, 4), np.uint8)
-    return Ground(nothing, np.zeros((1, 3), np.int64), road_mask(layout) > 0)
+    road = along_curve(layout, road_mask(layout) > 0)
+    return Ground(nothing, np.zeros((1, 3), np.int64), road)
+
+
+def along_curve(layout: Layout, of_ground: OfGround) -> OfGround:
+    """A map of the ground, drawn for a straight road, with the road's gentle curve."""
+    if layout.curve_per_m == 0.0:
+        return of_ground
+    high, wide = of_ground.shape[:2]
+    aside_m = layout.aside_m(X_M[0] + (np.arange(wide) + 0.5) / TEXELS_PER_M)
+    rows = np.arange(high)[:, None] - np.rint(aside_m * TEXELS_PER_M).astype(np.int64)
+    return of_ground[np.clip(rows, 0, high - 1), np.arange(wide)]
 
 
 def cast_shadows(

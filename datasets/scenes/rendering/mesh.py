@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,6 +48,12 @@ class Mesh:
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         moved = self.corners @ turn.T + np.array([x_m, y_m, z_m])
         return replace(self, corners=moved.astype(np.float32))
+
+    def aside(self, of_x_m: Callable[[Floats], Floats]) -> Mesh:
+        """Each corner moved along y by a function of its x."""
+        moved = self.corners.copy()
+        moved[..., 1] += of_x_m(moved[..., 0].astype(np.float64)).astype(np.float32)
+        return replace(self, corners=moved)
 
     def normals(self) -> Floats:
         """Unit normals, shape (T, 3), counter-clockwise corners facing the viewer."""

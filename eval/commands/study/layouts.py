@@ -1,9 +1,9 @@
 """Random layouts, simulated: beliefs fitted on some layouts and tested on the others.
 
-Twelve kinds of layouts, four of them without an intersection. Every drive is simulated, its cues
-come from masks with simulated faults (no network sees a picture), and each belief is judged on
-layouts that it was not fitted on. Writes study.html and study.json. A second start does only what
-is missing.
+Thirteen kinds of layouts, five of them without an intersection. Every drive is rendered and seen by
+the embedded networks, and each belief is judged on layouts that it was not fitted on. With
+--perception faults no network sees a picture: masks are the renderer's, with faults made up.
+Writes study.html and study.json. Drives are kept: a second start does only what is missing.
 
 example:
   crosscue study layouts -o layouts --workers 2
@@ -29,21 +29,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder for drives, runs, tables and page",
     )
     parser.add_argument(
-        "--blocks", type=int, default=9, metavar="N", help="blocks of twelve layouts (default: 9)"
+        "--perception",
+        choices=("pixels", "faults"),
+        default="pixels",
+        help="what finds the cues (default: pixels)",
+    )
+    parser.add_argument(
+        "--blocks", type=int, default=8, metavar="N", help="blocks of thirteen layouts (default: 8)"
     )
     parser.add_argument(
         "--runs", type=int, default=2, metavar="N", help="drives per layout (default: 2)"
     )
     parser.add_argument(
-        "--folds", type=int, default=3, metavar="N", help="folds, by layout (default: 3)"
+        "--folds", type=int, default=4, metavar="N", help="folds, by layout (default: 4)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--width",
         type=int,
-        default=640,
+        default=960,
         metavar="PX",
-        help="image width in pixels; height is 9/16 (default: 640)",
+        help="image width in pixels; height is 9/16 (default: 960)",
     )
     parser.add_argument(
         "--workers",
@@ -61,6 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate, replay, fit, judge; 3 when a drive failed."""
     study = crosscue.LayoutStudy(
+        perception=args.perception,
         blocks=args.blocks,
         runs=args.runs,
         folds=args.folds,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
 from crosscue.eval.batch.engine import engine_of
@@ -16,10 +17,17 @@ from crosscue.eval.studies.layouts.report import (
     tables_of,
     write_layout_study,
 )
-from crosscue.eval.studies.layouts.settings import LayoutStudy
+from crosscue.eval.studies.layouts.settings import LayoutStudy, Perception
 from crosscue.eval.studies.layouts.study import OnStep, score_study
-from crosscue.eval.studies.simulated_drives import run_drives
+from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
 from crosscue.replay.base import RunError, json_tree
+
+SEEN_BY: Final = {
+    "pixels": SPARSE_AND_EMBEDDED,
+    "faults": (LABEL_IMAGES, DETECTORS),
+}
+"""From a perception to what cameras record and the detectors that look at it."""
+SEEN: Final = {"pixels": "seen by networks", "faults": "simulated detectors, no network"}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -27,12 +35,14 @@ class LayoutResult:
     """Beliefs about layouts that had no part in their fit; printed as tables.
 
     Attributes:
+        perception: What found the cues.
         scores: Of each belief, and of each with a cue or rule left out.
         files: The page, and its tables as JSON.
         failures: From drives that failed to why.
         exit_status: 0 when all is whole; 3 when a drive failed or something was dropped.
     """
 
+    perception: Perception
     scores: LayoutScores
     files: LayoutFiles
     failures: dict[str, str]
@@ -45,7 +55,7 @@ class LayoutResult:
     def __repr__(self) -> str:
         parts = [
             f"{self.scores.drives} simulated drives over {self.scores.layouts} layouts, "
-            "simulated detectors",
+            f"{SEEN[self.perception]}",
             *(f"  failed {name}: {why}" for name, why in self.failures.items()),
             *("\n" + table.as_text() for table in tables_of(self.scores)),
             f"\nwritten to {self.files.page}",
@@ -62,7 +72,7 @@ def run_layout_study(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     on_step: OnStep = lambda what, done, of: None,
 ) -> LayoutResult:
-    """Simulate every drive, find its cues with simulated detectors, and judge beliefs by fold.
+    """Simulate every drive, find its cues as the study says, and judge beliefs by fold.
 
     An interrupted study goes on with the drives that are missing; drives are kept, so that beliefs
     are judged again in minutes.
@@ -81,13 +91,14 @@ def run_layout_study(
         OutputError: A file cannot be written.
     """
     folder = Path(output)
+    imager, detectors = SEEN_BY[study.perception]
     done = run_drives(
         folder,
         study.scenes(),
-        DETECTORS,
+        detectors,
         engine_of(workers, None),
         on_progress,
-        imager=LABEL_IMAGES,
+        imager=imager,
     )
     failures = {one.job.name: one.error for one in done if one.error is not None}
     drives = [
@@ -107,4 +118,4 @@ def run_layout_study(
         raise RunError(f"{folder}: a fold has no drive; the first that failed: {': '.join(first)}")
     scores = score_study(drives, ablation=ablation, on_step=on_step)
     files = write_layout_study(folder, study, scores, failures)
-    return LayoutResult(scores, files, failures, exit_status_of(done))
+    return LayoutResult(study.perception, scores, files, failures, exit_status_of(done))

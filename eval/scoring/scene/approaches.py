@@ -284,6 +284,8 @@ def _result(
     for name in present:
         full &= known.get(name, never)
     was_full, full = full.any(), held(full, rule.frames)
+    if rule.full_after_detection and detected.any():
+        full &= np.maximum.accumulate(detected)
     distance = truth.start_m(steps.t_ns)
     is_spurious = bool(published.any()) and not detected[np.argmax(published)]
     missing = [name for name in present if not known.get(name, never).any()]

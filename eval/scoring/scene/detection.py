@@ -29,15 +29,17 @@ class Rule:
     Attributes:
         frames: For how many frames in a row it must hold.
         checks_range: The range must be right, where the truth has one.
+        full_after_detection: An approach that is detected is in full from there on at the earliest.
     """
 
     frames: int
     checks_range: bool
+    full_after_detection: bool
 
 
 RULES: Final[dict[Definition, Rule]] = {
-    "confirmed": Rule(CONFIRM_FRAMES, checks_range=True),
-    "published": Rule(1, checks_range=False),
+    "confirmed": Rule(CONFIRM_FRAMES, checks_range=True, full_after_detection=True),
+    "published": Rule(1, checks_range=False, full_after_detection=False),
 }
 
 

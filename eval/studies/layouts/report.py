@@ -14,16 +14,18 @@ from crosscue.replay.base import strict_json, versions, write_text
 
 from .score import LayoutDifference, LayoutScore
 from .score import LayoutScores as LayoutScores
-from .settings import LayoutStudy
+from .settings import LayoutStudy, Perception
 
 PAGE: Final = "study.html"
 TABLES: Final = "study.json"
 TITLE: Final = "Random layouts, simulated: fitted on some, tested on the others"
-NOTE: Final = (
-    "Everything here is simulated. No network saw a picture: masks are the renderer's, with "
-    "misses, false finds and errors of height drawn from settings that were measured nowhere. "
-    "Intervals are 95 %, over layouts."
-)
+NOTES: Final[dict[Perception, str]] = {
+    "pixels": "Everything here is simulated. The embedded networks saw rendered photographs; they "
+    "were trained on other layouts of the same renderer. Intervals are 95 %, over layouts.",
+    "faults": "Everything here is simulated. No network saw a picture: masks are the renderer's, "
+    "with misses, false finds and errors of height drawn from settings that were measured nowhere. "
+    "Intervals are 95 %, over layouts.",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +45,12 @@ def write_layout_study(
         OutputError: They cannot be written.
     """
     flags = (
-        f"--blocks {settings.blocks} --runs {settings.runs} --folds {settings.folds} "
-        f"--seed {settings.seed} --width {settings.width_px}"
+        f"--perception {settings.perception} --blocks {settings.blocks} --runs {settings.runs} "
+        f"--folds {settings.folds} --seed {settings.seed} --width {settings.width_px}"
     )
     tree: dict[str, Any] = {
         "is_simulated": True,
+        "perception": settings.perception,
         "command": f"crosscue study layouts {flags}",
         "versions": versions(),
         "failures": dict(failures),
@@ -55,7 +58,7 @@ def write_layout_study(
     }
     write_text(out / TABLES, strict_json(tree) + "\n")
     counts = f"{scores.drives} drives over {scores.layouts} layouts in {settings.folds} folds."
-    write_page(out / PAGE, TITLE, [NOTE, counts], tables_of(scores), [])
+    write_page(out / PAGE, TITLE, [NOTES[settings.perception], counts], tables_of(scores), [])
     return LayoutFiles(out / PAGE, out / TABLES)
 
 

@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal, get_args
 
 from crosscue.datasets.scenes.layout import KINDS, mixed_layout
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.replay.errors import UsageError
 
 MIN_FOLDS: Final = 2
+Perception = Literal["pixels", "faults"]
+PERCEPTIONS: Final[tuple[Perception, ...]] = get_args(Perception)
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutStudy:
-    """What to simulate.
+    """What to simulate, and what sees it.
 
-    Layouts are ``M`` and a seed. Twelve that follow one another hold every kind once, so they stay
-    together: each fold is whole blocks of twelve.
+    Layouts are ``M`` and a seed. Thirteen in a row hold every kind once, so they stay together:
+    each fold is whole blocks of thirteen.
 
     Attributes:
-        blocks: Of twelve layouts.
+        perception: ``pixels``: the embedded networks see photographs. ``faults``: no network sees
+            anything, and the renderer's masks have faults made up by ``faulty_labels``.
+        blocks: Of thirteen layouts.
         runs: Drives of each layout, under different conditions.
         folds: Parts of the blocks; each is tested by what was fitted on the others.
         seed: Of everything that differs from run to run.
-        width_px: Of the label images, 9/16 high.
+        width_px: Of the pictures, 9/16 high.
     """
 
-    blocks: int = 9
+    perception: Perception = "pixels"
+    blocks: int = 8
     runs: int = 2
-    folds: int = 3
+    folds: int = 4
     seed: int = 0
-    width_px: int = 640
+    width_px: int = 960
 
     def __post_init__(self) -> None:
         """Refuse what cannot be.
@@ -39,6 +44,10 @@ class LayoutStudy:
         Raises:
             UsageError: Naming what was wanted.
         """
+        if self.perception not in PERCEPTIONS:
+            raise UsageError(
+                f"perception {self.perception!r}: expected one of {', '.join(PERCEPTIONS)}"
+            )
         if not MIN_FOLDS <= self.folds <= self.blocks:
             raise UsageError(
                 f"folds {self.folds}, blocks {self.blocks}: expected {MIN_FOLDS} folds or more, "

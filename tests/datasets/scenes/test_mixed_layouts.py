@@ -1,9 +1,13 @@
-"""Layouts M: every feature is there and not there wherever twelve follow one another."""
+"""Layouts M: every feature is there and not there in any thirteen in a row."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import (
+    CURVE_SLOPE,
     KINDS,
     TABLE_6,
     any_layout,
@@ -11,13 +15,17 @@ from crosscue.datasets.scenes.layout import (
     mixed_kind,
     mixed_layout,
 )
+from crosscue.datasets.scenes.motion import lane_y_m
+from crosscue.datasets.scenes.world import build
 
 FEATURES = ("intersection", "left", "right", "straight")
 
 
-@pytest.mark.parametrize("first", [0, 12, 5, 1000])
+@pytest.mark.parametrize("first", [0, 13, 5, 1000])
 @pytest.mark.parametrize("feature", FEATURES)
-def test_any_twelve_in_a_row_have_every_feature_with_both_values(first: int, feature: str) -> None:
+def test_any_thirteen_in_a_row_have_every_feature_with_both_values(
+    first: int, feature: str
+) -> None:
     known = [mixed_layout(first + i).features.get(feature) for i in range(len(KINDS))]
 
     assert {True, False} <= set(known)
@@ -27,7 +35,7 @@ def test_a_road_without_an_intersection_has_no_control_and_no_sign_of_one() -> N
     roads = [mixed_layout(seed) for seed in range(120) if not mixed_layout(seed).is_intersection]
 
     kinds = {mixed_kind(int(road.name[1:])) for road in roads}
-    assert kinds == {"straight", "bend", "driveways", "lot"}
+    assert kinds == {"straight", "bend", "driveways", "lot", "curve"}
     for road in roads:
         assert (road.control, road.one_way, road.do_not_enter) == ("none", None, False)
 
@@ -42,6 +50,24 @@ def test_a_name_stands_for_the_same_layout_every_time_and_no_two_are_alike() -> 
 
     assert layouts == [mixed_layout(seed) for seed in range(120)]
     assert len({layout.half_width_m for layout in layouts}) == 120
+
+
+def test_a_car_keeps_to_its_lane_through_a_gentle_curve_and_things_stand_beside_it() -> None:
+    curved = mixed_layout(12)
+    straight = replace(curved, curve_per_m=0.0)
+    one, other = (
+        build(layout, conditions_of(layout, 1), is_painted=False) for layout in (curved, straight)
+    )
+    motion = one.approach.motion
+
+    np.testing.assert_allclose(motion.y_m - curved.aside_m(motion.x_m), lane_y_m(curved), atol=0.05)
+    assert abs(motion.heading_rad[-1]) == pytest.approx(np.arctan(CURVE_SLOPE), abs=0.01)
+    for bent, plain in zip(one.things, other.things, strict=True):
+        at_s = max(bent.span_s[0], 0.0)
+        moved = plain.at[0] + plain.shift(at_s)[0]
+        aside = (bent.at[1] + bent.shift(at_s)[1]) - (plain.at[1] + plain.shift(at_s)[1])
+        assert aside == pytest.approx(float(curved.aside_m(np.array(moved))), abs=1e-6)
+    assert one.ground.road.sum() == pytest.approx(other.ground.road.sum(), rel=0.02)
 
 
 def test_two_runs_of_a_layout_differ_in_light_or_weather_traffic_and_speed() -> None:

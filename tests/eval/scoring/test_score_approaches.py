@@ -6,6 +6,8 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.scene.approaches import associate, judge_approaches, score_approaches
@@ -69,6 +71,33 @@ def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None
         assert judged.results[0].why_not_detected == why
         # The full detection needs no range, as in the source's intersection H.
         assert judged.results[0].full_m == 15.0
+
+
+CHANGES = st.dictionaries(st.integers(0, 44), st.sampled_from([0.05, 0.6, 0.95]), max_size=6)
+
+
+@given(st.fixed_dictionaries(dict.fromkeys(BELIEF, CHANGES)), st.integers(0, 44))
+@settings(max_examples=60, deadline=None)
+def test_nothing_is_in_full_before_it_is_detected(
+    changes: dict[str, dict[int, float]], ranged_from: int
+) -> None:
+    run = tables(belief=belief_table(changes), ranges=range_table(ranged_from, 45))
+    judged = judge_approaches(run, truth())
+    assert judged is not None
+
+    for one in judged.results:
+        if one.detected_m is not None and one.full_m is not None:
+            assert one.full_m <= one.detected_m
+
+
+def test_full_waits_for_the_range_that_makes_it_a_detection_but_not_as_published() -> None:
+    run = tables(belief=belief_table(BELIEF), ranges=range_table(30, 45))
+
+    cases: list[tuple[Definition, float]] = [("confirmed", 10.0), ("published", 15.0)]
+    for definition, full_m in cases:
+        judged = judge_approaches(run, truth(), definition=definition)
+        assert judged is not None
+        assert (judged.results[0].detected_m, judged.results[0].full_m) == (10.0, full_m)
 
 
 @pytest.mark.parametrize(("control", "full_m"), [("none", 15.0), ("stop_sign", None)])

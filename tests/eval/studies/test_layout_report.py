@@ -58,7 +58,12 @@ def test_files_say_that_all_is_simulated_and_how_to_do_it_again(tmp_path: Path) 
 
     tree = json.loads(files.tables.read_text(encoding="utf-8"))
     assert tree["is_simulated"]
-    assert tree["command"].startswith("crosscue study layouts --blocks 9 --runs 2")
+    assert tree["command"].startswith("crosscue study layouts --perception pixels --blocks 8")
     assert tree["failures"] == {"M3-01": "disk full"}
     assert tree["kinds"]["source"]["brier"]["value"] == 0.25
+    assert tree["perception"] == "pixels"
+    page = files.page.read_text(encoding="utf-8")
+    assert "networks saw rendered photographs" in page
+
+    files = write_layout_study(tmp_path, LayoutStudy("faults"), scores(), {})
     assert "No network saw a picture" in files.page.read_text(encoding="utf-8")

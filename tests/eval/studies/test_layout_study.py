@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from crosscue.datasets.scenes.drive import FROM_M, SPACING_M, SPACING_S, sparse_pictures
 from crosscue.datasets.scenes.layout import layout_named
+from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width, world_of
 from crosscue.eval.scoring.truth import FEATURES
+from crosscue.eval.studies import simulated_drives
 from crosscue.eval.studies.layouts.score import DriveBelief, difference, score_layouts
 from crosscue.eval.studies.layouts.settings import LayoutStudy
+from crosscue.eval.studies.simulated_drives import MADE_BY, Work
 from crosscue.replay.errors import UsageError
 
 STUDY = LayoutStudy()
@@ -42,15 +48,61 @@ def test_drives_of_one_layout_are_in_one_fold_and_folds_are_about_equal() -> Non
     sizes = np.bincount([STUDY.fold_of(name) for name in STUDY.layouts])
 
     assert len(sizes) == STUDY.folds
-    assert sizes.max() - sizes.min() <= 12
+    assert sizes.max() - sizes.min() <= 13
 
 
 @pytest.mark.parametrize(
-    "changes", [{"folds": 1}, {"folds": 10}, {"runs": 0}, {"width_px": 100}, {"seed": -1}]
+    "changes",
+    [
+        {"folds": 1},
+        {"folds": 10},
+        {"runs": 0},
+        {"perception": "none"},
+        {"width_px": 100},
+        {"seed": -1},
+    ],
 )
-def test_a_study_that_cannot_be_is_refused(changes: dict[str, int]) -> None:
+def test_a_study_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="expected"):
         LayoutStudy(**changes)
+
+
+def test_a_drive_is_made_again_when_it_is_not_whole_or_what_made_it_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def write_scene(folder: Path, *_: object, **__: object) -> None:
+        folder.mkdir(exist_ok=True)
+        made.append(folder.name)
+
+    monkeypatch.setattr(simulated_drives, "write_scene", write_scene)
+    scene = SceneSettings(layout="M12")
+
+    def simulate(key: str) -> None:
+        by_name = {"M12-01": scene}
+        Work(tmp_path, by_name, None, "signs", tmp_path, {"M12-01": key}).simulated("M12-01")
+
+    for key in ("a", "a", "b"):
+        simulate(key)
+    assert made == ["M12-01", "M12-01"]
+
+    (tmp_path / "M12-01" / MADE_BY).unlink()  # as if it had been interrupted
+    simulate("b")
+    assert len(made) == 3
+
+
+def test_pictures_are_few_and_end_where_the_intersection_begins() -> None:
+    scene = SceneSettings(layout="M0", camera=camera_of_width(64))
+    _, _, world = world_of(scene, is_painted=False)
+    motion = world.approach.motion
+
+    times = [t_ns for t_ns, _ in sparse_pictures(world, scene)]
+
+    x_m = np.interp(times, motion.t_ns, motion.x_m)
+    assert -FROM_M <= x_m[0] < -FROM_M + SPACING_M
+    assert ((np.diff(x_m) >= SPACING_M) | (np.diff(times) >= SPACING_S * 1e9)).all()
+    assert x_m[-1] < 5.0
 
 
 def belief(
