@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 import numpy as np
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
-from crosscue.eval.scoring.by_drive import BY_DRIVE, FOLDER, METRICS, DriveMetric, direction
+from crosscue.eval.scoring.by_drive import (
+    BY_DRIVE,
+    FOLDER,
+    METRICS,
+    DriveMetric,
+    direction,
+    no_longer_scored,
+)
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.replay.base import (
     MIB,
@@ -124,7 +131,7 @@ class Comparison:
         tables: Tables that differ.
         judged: Metrics that both runs have and that have a good direction, differing or not.
         metrics: Other metrics that differ.
-        no_longer_scored: Judged metrics that only the first run has.
+        no_longer_scored: Metrics that only the first run has, or of which nothing is scored now.
         tables_same: How many tables are equal.
         drives: Drives in both runs, only in the first, only in the second.
         why_no_metrics: Empty where both runs were scored.
@@ -235,14 +242,11 @@ def compare_runs(
         why = f"not scored, or by an earlier version: {', '.join(bare)}"
         return Comparison(changes, tuple(tables), (), (), (), same, (0, 0, 0), why, is_whole)
     judged = compare_drives(before, after, lambda path, value: allowed_by(path, value, tolerances))
-    known = {one.metric for one in after}
-    missing = {one.metric: None for one in before if one.rows and one.metric not in known}
     logs = [{one.log for one in part} for part in (before, after)]
     counts = (len(logs[0] & logs[1]), len(logs[0] - logs[1]), len(logs[1] - logs[0]))
     others = _others(scores[0] or {}, scores[1] or {})
-    return Comparison(
-        changes, tuple(tables), judged, others, tuple(missing), same, counts, "", is_whole
-    )
+    missing = no_longer_scored(before, after)
+    return Comparison(changes, tuple(tables), judged, others, missing, same, counts, "", is_whole)
 
 
 def allowed_by(path: str, before: float, tolerances: Sequence[Tolerance]) -> float:

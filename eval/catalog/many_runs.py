@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from crosscue.eval.scoring.by_drive import DriveMetric
+from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
 from crosscue.replay.base import RunError, UnreadableRunError, UsageError
 
 from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, parts_of
@@ -44,15 +44,13 @@ def compare_many(
     judged = compare_drives(
         before.parts, after.parts, lambda path, value: allowed_by(path, value, tolerances)
     )
-    known = {one.metric for one in after.parts}
-    missing = {one.metric: None for one in before.parts if one.rows and one.metric not in known}
     both, theirs, ours = before.logs & after.logs, before.logs, after.logs
     return Comparison(
         changes=(),
         tables=(),
         judged=judged,
         metrics=(),
-        no_longer_scored=tuple(missing),
+        no_longer_scored=no_longer_scored(before.parts, after.parts),
         tables_same=0,
         drives=(len(both), len(theirs - ours), len(ours - theirs)),
         why_no_metrics="",

@@ -103,7 +103,7 @@ def compare_drives(
     logs = sorted({one.log for one in first} & {one.log for one in second})
     kinds: dict[str, Kind] = {one.metric: one.kind for one in (*first, *second)}
     known = {one.metric for one in first} & {one.metric for one in second}
-    paths = [path for path in kinds if path in known]
+    paths = [path for path in kinds if path in known and direction(path) is not None]
     found = _sums(logs, first, second)
     sums = {path: found[path] for path in paths if path in found}
     sums = {path: one for path, one in sums.items() if one.rows.any() and one.other_rows.any()}

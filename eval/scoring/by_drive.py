@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from .metric_values import MetricValue, metric_values
@@ -22,13 +22,12 @@ BETTER: Final[Mapping[str, Direction]] = {
         (
             "precision",
             "recall",
-            "scored",
             "matched",
             "detected",
             "full",
             "full_from_8_m",
-            "detected_m",
-            "full_m",
+            "detected_m_or_0",
+            "full_m_or_0",
         ),
         "higher",
     ),
@@ -47,7 +46,15 @@ BETTER: Final[Mapping[str, Direction]] = {
         "lower",
     ),
 }
-"""By the last part of a metric's path; metrics of other names are shown but not judged."""
+"""By the last part of a metric's path; metrics of other names are shown but not judged.
+
+How much was scored is no merit. Nor is the mean distance of the approaches that were detected: one
+more, detected late, lowers it. So where it is judged, approaches not detected count as 0 m.
+"""
+OR_0: Final = "_or_0"
+SCORED: Final = "scored"
+SHOWN: Final = frozenset({SCORED, "detected_m", "full_m"})
+"""Kept for each drive, too, for queries, and to see what is no longer scored at all."""
 PARTS: Final = (
     "by_distance",
     "by_control",
@@ -84,10 +91,27 @@ def direction(path: str) -> Direction | None:
     return None if set(parts) & set(PARTS) else BETTER.get(parts[-1])
 
 
+def no_longer_scored(
+    before: Sequence[DriveMetric], after: Sequence[DriveMetric]
+) -> tuple[str, ...]:
+    """Paths that only the first run has, or of which no row of the drives of both is scored now."""
+    known = {one.metric for one in after}
+    logs = {one.log for one in before} & {one.log for one in after}
+    scored = {one.metric for one in after if one.log in logs and one.total > 0.0}
+
+    def is_lost(one: DriveMetric) -> bool:
+        if one.metric not in known:
+            return one.rows > 0
+        was_scored = one.metric.endswith(f".{SCORED}") and one.log in logs and one.total > 0.0
+        return was_scored and one.metric not in scored
+
+    return tuple(dict.fromkeys(one.metric for one in before if is_lost(one)))
+
+
 def parts_of(
     log: str, tree: Mapping[str, Any], pose_rmse_m: float | None, is_lost: bool
 ) -> Iterator[DriveMetric]:
-    """What one drive adds to every judged metric.
+    """What one drive adds to every metric that is judged or shown.
 
     Args:
         log: Identity of its log.
@@ -98,8 +122,12 @@ def parts_of(
     sections = {name: tree[name] or {} for name in ("cues", "approaches", "belief", "range")}
     values = metric_values(sections, parts=False)
     for path, value in values.items():
-        if direction(path) is not None:
-            yield _part(log, path, value, values)
+        name = path.rpartition(".")[2]
+        if direction(path) is not None or (name in SHOWN and not set(path.split(".")) & {*PARTS}):
+            part = _part(log, path, value, values)
+            yield part
+            if name in SHOWN - {SCORED}:
+                yield _of_all(part, values)
     if pose_rmse_m is not None:
         yield _part(log, "pose.ape_rmse_m", MetricValue(pose_rmse_m, of=1), {})
         yield _part(log, "pose.lost", MetricValue(float(is_lost)), {})
@@ -131,6 +159,14 @@ def _part(
     if value.of is not None:
         return DriveMetric(log, path, "mean", value.of * value.value, value.of)
     return DriveMetric(log, path, "sum", value.value, 1)
+
+
+def _of_all(part: DriveMetric, values: Mapping[str, MetricValue]) -> DriveMetric:
+    """A mean distance over every approach whose range is known, those not detected at 0 m."""
+    outer = part.metric.rpartition(".")[0]
+    unknown = values.get(f"{outer}.without_range", MetricValue(0.0)).value
+    rows = int(values[f"{outer}.approaches"].value - unknown)
+    return part._replace(metric=part.metric + OR_0, rows=rows)
 
 
 def table_of(parts: Iterator[DriveMetric]) -> pa.Table:
