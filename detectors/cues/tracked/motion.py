@@ -25,6 +25,8 @@ CAR_HEIGHT_M: Final = 1.55
 HEIGHT_FRACTION: Final = 0.15
 USUAL_MPS: Final = 10.0
 """Standard deviation of a car's speed, before anything is known of it."""
+ALONG_ASIDE_MPS: Final = 0.3
+"""Likewise to the side, of one that drives along the ego vehicle's road: 10 m/s at 2 degrees."""
 MAX_MISFIT: Final = 4.0
 """Of residuals, squared, per degree of freedom: beyond it the motion is not steady."""
 
@@ -41,6 +43,7 @@ class Observation(NamedTuple):
         long: Length over height.
         nose: -1 left, 1 right, 0 unknown.
         is_hidden: Another car's box covers its lower end, so it may be higher and nearer.
+        is_sure: Its score is that of a cue; others only carry on what sure ones began.
     """
 
     t_s: float
@@ -51,6 +54,7 @@ class Observation(NamedTuple):
     long: float
     nose: int
     is_hidden: bool = False
+    is_sure: bool = True
 
 
 class CarMotion(NamedTuple):
@@ -95,10 +99,17 @@ class CarMotion(NamedTuple):
         return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
 
 
-def motion_of(seen: Sequence[Observation]) -> CarMotion:
-    """Fit a steady motion to a car's observations, of which there is at least one."""
+def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarMotion:
+    """Fit a steady motion to a car's observations, of which there is at least one.
+
+    Args:
+        seen: From the oldest on.
+        aside_mps: Standard deviation of its speed across before anything is known of it. Of a car
+            on the ego vehicle's road that is small, and how its bearing changes then says how fast
+            it comes or goes, far sooner than how it grows.
+    """
     newest = seen[-1]
-    ends = [_fit(seen, side) for side in (0, 1)]
+    ends = [_fit(seen, side, aside_mps) for side in (0, 1)]
     (left, left_sd, *_), (right, right_sd, *_) = ends
     agree = left * right > 0.0
     right_mps = math.copysign(min(abs(left), abs(right)), left) if agree else 0.0
@@ -123,7 +134,9 @@ def motion_of(seen: Sequence[Observation]) -> CarMotion:
     )
 
 
-def _fit(seen: Sequence[Observation], side: int) -> tuple[float, float, float, float, float]:
+def _fit(
+    seen: Sequence[Observation], side: int, aside_mps: float
+) -> tuple[float, float, float, float, float]:
     """Speed to the right and its s.d., speed ahead and its s.d., misfit; of one end of a car."""
     newest = seen[-1]
     places = np.array([place_of_end(one, side, newest) for one in seen])
@@ -133,7 +146,7 @@ def _fit(seen: Sequence[Observation], side: int) -> tuple[float, float, float, f
         [np.tile(np.eye(2), (len(seen), 1, 1)), late_s[:, None, None] * np.eye(2)], axis=2
     )
     weighted = np.swapaxes(models, 1, 2) @ weights
-    prior = np.diag([0.0, 0.0, USUAL_MPS**-2, USUAL_MPS**-2])
+    prior = np.diag([0.0, 0.0, USUAL_MPS**-2, aside_mps**-2])
     covariance = np.linalg.inv(prior + (weighted @ models).sum(axis=0))
     state = covariance @ np.einsum("nij,nj->i", weighted, places)
     off = places - models @ state

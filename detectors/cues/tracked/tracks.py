@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.cues.tracked.motion import (
+    ALONG_ASIDE_MPS,
     CAR_HEIGHT_M,
+    USUAL_MPS,
     CarMotion,
     Observation,
     motion_of,
@@ -102,7 +104,7 @@ class CarTracks:
             ego: Motion since the frame before; its way is known.
 
         Returns:
-            One entry for each car that is in this frame and was in earlier ones, too.
+            One entry for each car that is surely in this frame and was in earlier ones, too.
         """
         self._axle = _moved(self._axle, ego)
         x, y, heading = self._axle
@@ -113,15 +115,17 @@ class CarTracks:
         again = self._assign(cars)
         newest = self._t_s - self._settings.max_gap_s
         self._tracks = [one for one in self._tracks if one.seen[-1].t_s >= newest]
-        self.seen = sum(one.distance_m <= self._settings.within_m for _, one in cars)
-        self._again = again
-        return [_motion(track, self._settings.max_frames) for track in again]
+        within_m = self._settings.within_m
+        self.seen = sum(one.is_sure and one.distance_m <= within_m for _, one in cars)
+        self._again = [track for track in again if track.seen[-1].is_sure]
+        return [_motion(track, self._settings.max_frames) for track in self._again]
 
     def longer(self) -> list[CarMotion]:
         """The same cars by their newest ``past_frames``: far ones grow slowly.
 
-        By fewer, but not fewer than ``max_frames``, where no steady motion fits all of them: the
-        car has begun to move, or was taken for another one.
+        They are taken for cars on the ego vehicle's road (``ALONG_ASIDE_MPS``). Fewer frames
+        count, but not fewer than ``max_frames``, where no steady motion fits all of them: the car
+        has begun to move, or was taken for another one.
         """
         return [_steady_motion(track, self._settings) for track in self._again]
 
@@ -129,20 +133,25 @@ class CarTracks:
         self, found: Sequence[Detections]
     ) -> list[tuple[NDArray[np.float64], Observation]]:
         rows = [
-            (detections, i)
+            (detections, i, is_sure)
             for detections in found
-            for i in np.flatnonzero(detections.are_sure(self._settings.score)).tolist()
+            for i, is_sure in enumerate(detections.are_sure(self._settings.score).tolist())
             if detections.labels[i] in self._settings.labels
         ]
-        boxes_px = np.array([found.boxes_px[i] for found, i in rows]).reshape(-1, 4)
+        boxes_px = np.array([found.boxes_px[i] for found, i, _ in rows]).reshape(-1, 4)
+        are_sure = np.array([is_sure for *_, is_sure in rows], np.bool_)
         cars = []
-        for (detections, i), hidden in zip(rows, are_hidden(boxes_px), strict=True):
-            one = self._observation(detections, i, is_hidden=hidden)
+        for (detections, i, is_sure), hidden in zip(
+            rows, are_hidden(boxes_px, are_sure), strict=True
+        ):
+            one = self._observation(detections, i, is_hidden=hidden, is_sure=is_sure)
             if one is not None:
                 cars.append((detections.boxes_px[i], one))
         return cars
 
-    def _observation(self, found: Detections, i: int, *, is_hidden: bool) -> Observation | None:
+    def _observation(
+        self, found: Detections, i: int, *, is_hidden: bool, is_sure: bool
+    ) -> Observation | None:
         width, height = found.size_px
         x0, y0, x1, y1 = found.boxes_px[i].tolist()
         is_cut = min(x0, y0) < BORDER_PX or x1 > width - BORDER_PX or y1 > height - BORDER_PX
@@ -163,22 +172,25 @@ class CarTracks:
         nose = 0 if heights_px is None else nose_of(heights_px)
         long = (x1 - x0) / (y1 - y0)
         return Observation(
-            self._t_s, self._pose, (left, right), distance_m, error, long, nose, is_hidden
+            self._t_s, self._pose, (left, right), distance_m, error, long, nose, is_hidden, is_sure
         )
 
     def _assign(self, cars: Sequence[tuple[NDArray[np.float64], Observation]]) -> list[_Track]:
         """Cars that are where they were on their way to first; new cars begin a track.
 
-        What is left after that is looked for where a standing car must be now.
+        What is left after that is looked for where a standing car must be now. A box that is not
+        sure only carries on a track, where it lies on the car's way: the score of a far or half
+        hidden car falls below the threshold in every other frame.
         """
         used: set[int] = set()
         again: list[_Track] = []
-        for cost in (_astray, _away):
+        for cost, sure in ((_astray, True), (_away, True), (_astray, False)):
             pairs = sorted(
                 (away, i, j)
                 for j, track in enumerate(self._tracks)
                 for i, (box, one) in enumerate(cars)
                 if i not in used
+                and one.is_sure == sure
                 and track.seen[-1].t_s < self._t_s
                 and (away := cost(track, box, one)) < math.inf
             )
@@ -189,27 +201,28 @@ class CarTracks:
                     track.take(*cars[i], self._settings)
                     again.append(track)
         for i, (box, one) in enumerate(cars):
-            if i not in used:
+            if i not in used and one.is_sure:
                 self._begun += 1
                 self._tracks.append(_Track(self._begun, box, np.zeros(4), [one]))
         return again
 
 
-def are_hidden(boxes_px: NDArray[np.float64]) -> list[bool]:
+def are_hidden(boxes_px: NDArray[np.float64], are_sure: NDArray[np.bool_]) -> list[bool]:
     """Which of N boxes, shape (N, 4), have their lower end behind another car's box.
 
-    On a road the lower edge of a nearer car is the lower one.
+    On a road the lower edge of a nearer car is the lower one. A box that is not sure hides none: it
+    may be the same car's.
     """
     x0, y0, x1, y1 = boxes_px.T
     shared = np.minimum(x1[:, None], x1) - np.maximum(x0[:, None], x0)
     lower = y1 > (y1 + BOX_FRACTION * (y1 - y0))[:, None]
-    is_covered = lower & (y0 < y1[:, None]) & (shared > MAX_COVERED * (x1 - x0)[:, None])
+    is_covered = are_sure & lower & (y0 < y1[:, None]) & (shared > MAX_COVERED * (x1 - x0)[:, None])
     return [bool(one) for one in is_covered.any(axis=1)]
 
 
-def _motion(track: _Track, frames: int) -> CarMotion:
+def _motion(track: _Track, frames: int, aside_mps: float = USUAL_MPS) -> CarMotion:
     x0, y0, x1, y1 = track.box_px.tolist()
-    found = motion_of(track.seen[-frames:])
+    found = motion_of(track.seen[-frames:], aside_mps)
     return found._replace(number=track.number, box_px=(x0, y0, x1, y1), step_px=track.step_px)
 
 
@@ -226,10 +239,10 @@ def _moved(axle: tuple[float, float, float], motion: Motion) -> tuple[float, flo
 
 def _steady_motion(track: _Track, settings: Cars) -> CarMotion:
     frames = settings.past_frames
-    found = _motion(track, frames)
+    found = _motion(track, frames, ALONG_ASIDE_MPS)
     while not found.is_steady and found.frames > settings.max_frames:
         frames = max(found.frames // 2, settings.max_frames)
-        found = _motion(track, frames)
+        found = _motion(track, frames, ALONG_ASIDE_MPS)
     return found
 
 

@@ -237,6 +237,32 @@ def test_oncoming_and_outgoing_cars_count_past_the_intersection_alone(
     assert past(car, steps, None) is None
 
 
+def test_a_car_aside_shows_by_its_bearing_that_it_comes_sooner_than_by_its_growth() -> None:
+    tracks = CarTracks(CAMERA, RULES)
+    car = Car(90.0, -9.0, ahead_mps=-10.0)
+    *_, free = drive([car], steady(10, 0.3), jitter_px=0.5, tracks=tracks)
+
+    (by_growth,), (by_bearing,) = free, tracks.longer()
+
+    assert abs(by_growth.ahead_mps) < 2.0 * by_growth.ahead_sd_mps
+    assert by_bearing.ahead_mps == pytest.approx(-10.0, abs=2.0 * by_bearing.ahead_sd_mps)
+    assert by_bearing.ahead_mps < -2.0 * by_bearing.ahead_sd_mps
+
+
+@pytest.mark.parametrize("scores", [(0.9, 0.4, 0.4, 0.9), (0.4, 0.4, 0.4, 0.9)])
+def test_an_unsure_box_carries_on_a_car_that_a_sure_one_began(scores: tuple[float, ...]) -> None:
+    tracks = CarTracks(CAMERA, RULES)
+    now: list[CarMotion] = []
+    for score in scores:
+        one = found(np.array([[600.0, 350.0, 660.0, 380.0]]), [0])
+        now = tracks([replace(one, scores=np.array([score]))], Motion(0.0, 0.0, 0.0, PERIOD_S))
+
+        assert tracks.seen == (score > 0.5)
+        assert len(now) <= tracks.seen
+
+    assert [car.frames for car in now] == ([4] if scores[0] > 0.5 else [])
+
+
 @settings(max_examples=100, deadline=None)
 @given(steps=ego_motions, car=standing)
 def test_a_standing_car_neither_comes_nor_goes(steps: list[Motion], car: Car) -> None:
@@ -251,8 +277,11 @@ def test_a_car_that_turns_off_or_drives_on_another_road_shows_nothing() -> None:
 def test_a_car_behind_another_is_not_further_away_than_it_seems() -> None:
     near, behind, aside = (600, 350, 680, 400), (640, 352, 700, 380), (690, 352, 740, 380)
 
-    assert are_hidden(np.array([near, behind, aside], np.float64)) == [False, True, False]
-    assert are_hidden(np.empty((0, 4))) == []
+    boxes = np.array([near, behind, aside], np.float64)
+
+    assert are_hidden(boxes, np.ones(3, np.bool_)) == [False, True, False]
+    assert are_hidden(boxes, np.array([False, True, True])) == [False, False, False]
+    assert are_hidden(np.empty((0, 4)), np.empty(0, np.bool_)) == []
 
 
 def cues(steps: Sequence[Motion | None], vehicle: Vehicle = VEHICLE) -> CuePass:
