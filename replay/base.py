@@ -9,11 +9,15 @@ from here; the modules that define them import nothing but each other.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .columns import (
     BLOCK_BYTES,
@@ -138,6 +142,7 @@ __all__ = [
     "cannot_write",
     "file_sha256",
     "installed",
+    "is_remote",
     "json_tree",
     "losses_heard",
     "name_of",
@@ -178,8 +183,18 @@ class Selection:
         """Is ``topic`` wanted?"""
         return self.topics is None or topic in self.topics
 
+    def inside(self, t_ns: Int64s) -> NDArray[np.bool_]:
+        """Which of these times are wanted, shape (N,)."""
+        keep = np.ones(len(t_ns), dtype=np.bool_)
+        if self.start_ns is not None:
+            keep &= t_ns >= self.start_ns
+        if self.end_ns is not None:
+            keep &= t_ns < self.end_ns
+        return keep
+
 
 EVERYTHING: Final = Selection()
+_URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 
 
 class Readable(Protocol):
@@ -253,6 +268,11 @@ class HasUrl(Protocol):
 def origin(log: Log) -> Path | str:
     """Where a log comes from: a path or a URL."""
     return log.url if isinstance(log, HasUrl) else log.path
+
+
+def is_remote(path: Path | str) -> bool:
+    """Is it a URL? A ``Path`` never is: it would have lost one of the slashes."""
+    return isinstance(path, str) and _URL.match(path) is not None
 
 
 def name_of(log: Log) -> str:

@@ -46,7 +46,7 @@ from crosscue.replay.base import (
 from crosscue.replay.readers.held_rows import CameraDrive
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file
-from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files, pair
+from crosscue.replay.readers.timed_files import TimedFiles, list_files, pair
 from crosscue.replay.seal.touched import Touched, open_noted
 
 from .kitti_labels import read_labels
@@ -361,13 +361,13 @@ def _read_oxts(oxts: Oxts, ledger: Ledger, selection: Selection) -> Iterator[Blo
     lines = oxts.lines()
     while some := list(islice(lines, ROWS_PER_BLOCK)):
         packets = _packets(some)
-        wanted = is_inside(packets.t_ns, selection) & (packets.t_ns >= 0)
+        wanted = selection.inside(packets.t_ns) & (packets.t_ns >= 0)
         for name in TOPICS:
             _account(name, some, packets, wanted, ledger, selection)
         for name, (_, to_table) in TOPICS.items():
             if wanted.any() and selection.wants(name):
                 yield Block(name, packets.t_ns, to_table(packets)).take(wanted)
-    missing = oxts.files.missing_ns[is_inside(oxts.files.missing_ns, selection)]
+    missing = oxts.files.missing_ns[selection.inside(oxts.files.missing_ns)]
     for name in TOPICS:
         ledger.drop(name, "a time without its packet", len(missing))
         if selection.start_ns is None and selection.end_ns is None:

@@ -27,8 +27,8 @@ from crosscue.replay.base import (
     toml_tree,
 )
 from crosscue.replay.files.transfer import Progress, download, is_there, take
+from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.validation_errors import explain
-from crosscue.replay.vehicle.vehicle import tuples
 
 FOLDER: Final = Path(__file__).parent
 VARIABLE: Final = "CROSSCUE_DRIVES"

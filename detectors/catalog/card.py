@@ -29,8 +29,8 @@ from crosscue.detectors.decoders.table import AnyBoxOutput
 from crosscue.detectors.networks.weights import Weights
 from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
+from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.validation_errors import explain
-from crosscue.replay.vehicle.vehicle import tuples
 
 from .architectures import WEIGHTS_SUFFIXES, ArchitectureName
 from .class_scores import ClassScores

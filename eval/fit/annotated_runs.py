@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
@@ -100,7 +99,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
     Raises:
         RunError: A table is missing or damaged, or nothing of the run lies in the truth's time.
     """
-    refuse_set_back(run.drive_manifest().timeline, run.path, "fit messages")
+    run.refuse_set_back("fit messages")
     belief = run.table("belief", ["t_ns", "approach", "established"])
     t_ns = _whole(belief["t_ns"])
     number, established = _whole(belief["approach"]), np.asarray(belief["established"])
@@ -210,7 +209,7 @@ def annotated_drives(
     Raises:
         RunError: A table is missing or damaged.
     """
-    refuse_set_back(run.drive_manifest().timeline, run.path, "fit temporal")
+    run.refuse_set_back("fit temporal")
     if tables is None:
         columns = ["t_ns", "reference", "range_m", "var_m2", "measured_m"]
         tables = {

@@ -203,6 +203,18 @@ class RunFolder(TableFolder):
             raise RunError(f"{self.path}: holds tables of crosscue decode; give a run of replay")
         return found
 
+    def refuse_set_back(self, what: str) -> None:
+        """Refuse a run whose times do not fit the truth's, for ``what`` compares them.
+
+        Raises:
+            RunError: A clock was set back during the drive; else as ``drive_manifest``.
+        """
+        if self.drive_manifest().timeline.was_set_back:
+            raise RunError(
+                f"{self.path}: a clock was set back during the drive, so its times are not the "
+                f"truth's; {what} takes drives without: replay each side alone with --from and --to"
+            )
+
 
 def create(path: Path, *, overwrite: bool) -> RunFolder:
     """An empty run folder.

@@ -26,6 +26,7 @@ from crosscue.replay.base import (
     Selection,
     UnreadableRunError,
     UsageError,
+    is_remote,
     json_tree,
     origin,
     read_at_most,
@@ -37,7 +38,7 @@ from crosscue.replay.files.identity import identity_of, identity_of_all, identit
 from crosscue.replay.files.log_identity import Identity, as_row, of_row
 from crosscue.replay.files.made_of import SIMULATED, difference
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.remote.logs import RangedLog, is_remote, version_of
+from crosscue.replay.remote.logs import RangedLog, version_of
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 

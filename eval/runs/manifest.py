@@ -16,7 +16,8 @@ from crosscue.replay.base import Selection, json_tree
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.time.segments import LogClock, Segment, Timeline
-from crosscue.replay.vehicle.vehicle import Vehicle, tuples
+from crosscue.replay.vehicle.section import tuples
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .account import Account, SummedAccount
 from .candidates import CandidateRow

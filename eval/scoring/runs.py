@@ -22,12 +22,7 @@ from crosscue.eval.runs.folder import (
     summed,
 )
 from crosscue.eval.runs.logs import place_of
-from crosscue.replay.base import (
-    RunError,
-    SchemaError,
-    UsageError,
-)
-from crosscue.replay.remote.logs import is_remote
+from crosscue.replay.base import RunError, SchemaError, UsageError, is_remote
 
 from . import intervals
 from . import truth as score_truth

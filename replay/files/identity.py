@@ -26,9 +26,9 @@ from contextlib import closing, suppress
 from pathlib import Path, PurePosixPath
 from typing import Final, Protocol
 
-from crosscue.replay.base import MIB, Log, LogError
+from crosscue.replay.base import MIB, Log, LogError, is_remote
 from crosscue.replay.files.log_identity import Identity
-from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch, is_remote
+from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch
 from crosscue.replay.remote.ranges import RangedFile
 
 SHARE_BYTES: Final = 4 * MIB

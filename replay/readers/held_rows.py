@@ -22,7 +22,6 @@ from crosscue.replay.base import (
     Topic,
 )
 from crosscue.replay.readers.images.files import PictureFiles
-from crosscue.replay.readers.timed_files import is_inside
 from crosscue.replay.seal.touched import Touched
 
 NO_PARTNER: Final = "a row without its time, or a time without its row"
@@ -67,7 +66,7 @@ class HeldRows:
         if not selection.wants(name):
             ledger.skip(name, NOT_ASKED_TOPIC, n)
         else:
-            wanted = is_inside(self.t_ns, selection)
+            wanted = selection.inside(self.t_ns)
             ledger.skip(name, NOT_ASKED_TIME, n - int(wanted.sum()))
             if wanted.any():
                 yield Block(name, self.t_ns, self.table).take(wanted)

@@ -22,8 +22,6 @@ from crosscue.replay.base import (
     Selection,
 )
 
-from .timed_files import is_inside
-
 TOO_LARGE: Final = "message over the size limit"
 
 
@@ -106,6 +104,6 @@ def _within_time(
 ) -> NDArray[np.intp]:
     if selection.start_ns is None and selection.end_ns is None:
         return picked
-    inside = is_inside(rows.log_ns[picked], selection)
+    inside = selection.inside(rows.log_ns[picked])
     ledger.skip(name, NOT_ASKED_TIME, int(len(picked) - inside.sum()))
     return picked[inside]

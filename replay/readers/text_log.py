@@ -23,8 +23,6 @@ from crosscue.replay.base import (
     Topic,
 )
 
-from .timed_files import is_inside
-
 MAX_LINE: Final = 4096
 """Characters of a line; a longer one is no row of numbers, and memory stays bounded."""
 Row: TypeAlias = tuple[int, *tuple[float, ...]]
@@ -66,7 +64,7 @@ class TextLog(Closing):
                 if not selection.wants(self.topic):
                     ledger.skip(self.topic, NOT_ASKED_TOPIC, len(block))
                     continue
-                wanted = block.take(is_inside(block.log_ns, selection))
+                wanted = block.take(selection.inside(block.log_ns))
                 ledger.skip(self.topic, NOT_ASKED_TIME, len(block) - len(wanted))
                 yield wanted
 

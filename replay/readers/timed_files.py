@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s, LogFormatError, Selection
+from crosscue.replay.base import Int64s, LogFormatError
 
 from .time_file import TimeFile
 
@@ -127,16 +126,6 @@ def _numbers(paths: Sequence[Path]) -> Int64s | None:
     usual = int(np.median(steps))
     places: Int64s = (numbers - numbers[0]) // usual
     return places if not (steps % usual).any() else None
-
-
-def is_inside(t_ns: Int64s, selection: Selection) -> NDArray[np.bool_]:
-    """Which times lie in the part of the log that is wanted, shape (N,)."""
-    keep = np.ones(len(t_ns), dtype=np.bool_)
-    if selection.start_ns is not None:
-        keep &= t_ns >= selection.start_ns
-    if selection.end_ns is not None:
-        keep &= t_ns < selection.end_ns
-    return keep
 
 
 def _natural(name: str) -> list[str | int]:

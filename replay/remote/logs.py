@@ -13,7 +13,6 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -38,6 +37,7 @@ from crosscue.replay.base import (
     Topic,
     UsageError,
     cannot_write,
+    is_remote,
     one_line,
     report_missing,
 )
@@ -46,7 +46,6 @@ from crosscue.replay.formats import known_formats
 
 from .ranges import RangedFile, Spool
 
-URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 CHUNK_BYTES: Final = 8 << 20
 VERSION_KEYS: Final = (
     "ETag",
@@ -69,11 +68,6 @@ LIMIT_VARIABLE: Final = "CROSSCUE_STORE_GIB"
 LIMIT_GIB: Final = 50.0
 
 T = TypeVar("T")
-
-
-def is_remote(path: Path | str) -> bool:
-    """Is it a URL? A ``Path`` never is: it would have lost one of the slashes."""
-    return isinstance(path, str) and URL.match(path) is not None
 
 
 class _System(Protocol):

@@ -151,6 +151,11 @@ class Timeline:
         """Is there more than one segment?"""
         return len(self.segments) > 1
 
+    @property
+    def was_set_back(self) -> bool:
+        """Was a clock of the drive set back?"""
+        return any(one.cause is Cause.SET_BACK for one in self.segments)
+
 
 ONE_SEGMENT: Final = Timeline()
 

@@ -28,7 +28,7 @@ from .cue_table import TRAFFIC_LIGHT as TRAFFIC_LIGHT
 from .fusion import Fusion, Name, RangeFilter
 from .mobileye_cues import Past
 from .pose import DEGREE, Gnss, Odometry, Start
-from .section import Finite, NotNegative, Positive, Section
+from .section import Finite, NotNegative, Positive, Section, tuples
 from .time import Time
 from .validation_errors import explain
 
@@ -450,10 +450,3 @@ def parse(text: str, where: str) -> Vehicle:
         return Vehicle.model_validate(tuples(tree))
     except ValidationError as error:
         raise VehicleError(explain(error, text, where, Vehicle)) from None
-
-
-def tuples(value: Any) -> Any:
-    """TOML values with tuples for lists, which strict models want."""
-    if isinstance(value, dict):
-        return {key: tuples(item) for key, item in value.items()}
-    return tuple(tuples(item) for item in value) if isinstance(value, list) else value

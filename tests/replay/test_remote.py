@@ -8,11 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.replay.base import Ledger, LogError, LogTooLargeError, OutputError, UsageError
+from crosscue.replay.base import (
+    Ledger,
+    LogError,
+    LogTooLargeError,
+    OutputError,
+    UsageError,
+    is_remote,
+)
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
-from crosscue.replay.remote.logs import Store, fetch, is_remote, matches, version_of
+from crosscue.replay.remote.logs import Store, fetch, matches, version_of
 from support.can_files import candump, made
 from support.can_files import read_back as read_file
 

@@ -8,8 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import UnreadableRunError, UsageError
-from crosscue.replay.remote.logs import is_remote
+from crosscue.replay.base import UnreadableRunError, UsageError, is_remote
 
 from . import database, parts
 from .columns import INDEXED, OWN, VIEWS

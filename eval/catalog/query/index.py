@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from crosscue.replay.base import OutputError, UnreadableRunError
-from crosscue.replay.remote.logs import is_remote
+from crosscue.replay.base import OutputError, UnreadableRunError, is_remote
 
 from .columns import INDEXED, arrow_schema
 from .local import CUT_SHORT, Found

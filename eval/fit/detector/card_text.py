@@ -13,7 +13,7 @@ from crosscue.detectors.catalog.card import ModelCard
 from crosscue.detectors.catalog.class_names import CUE_LABELS
 from crosscue.detectors.catalog.class_scores import ClassScores
 from crosscue.replay.base import UsageError, VehicleError, one_line
-from crosscue.replay.vehicle.vehicle import tuples
+from crosscue.replay.vehicle.section import tuples
 
 from .class_fit import ClassFit
 

@@ -19,7 +19,6 @@ from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
 from crosscue.replay.base import EmptyResultError, write_text
-from crosscue.replay.vehicle.fusion import Rates
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -81,7 +80,7 @@ def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
     lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
     lines += ["", "fractions of positive frames, feature there and not there (95 % intervals)"]
-    lines += [_rate_text(one, one.rates) for one in fitted.rates if one.rates is not None]
+    lines += [_rate_text(one) for one in fitted.rates if one.rates is not None]
     lines += ["", "too little seen, so the published message stands"]
     lines += [_unlearned_text(one) for one in fitted.rates if one.rates is None]
     lines += ["", "frames become independent over"]
@@ -95,9 +94,11 @@ def _name_of(one: RateFit) -> str:
     return f"  {one.cue} -> {one.feature}, {'near' if one.near else 'far'}"
 
 
-def _rate_text(one: RateFit, rates: Rates) -> str:
-    says = math.log(rates.if_there / rates.if_not)
-    silence = math.log((1.0 - rates.if_there) / (1.0 - rates.if_not))
+def _rate_text(one: RateFit) -> str:
+    assert one.rates is not None
+    there, missing = one.rates.if_there, one.rates.if_not
+    says = math.log(there / missing)
+    silence = math.log((1.0 - there) / (1.0 - missing))
     return (
         f"{_name_of(one)}\n    there     {_side_text(one.there)}\n"
         f"    not there {_side_text(one.missing)}\n"

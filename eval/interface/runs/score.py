@@ -11,7 +11,7 @@ from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import headline, pose_summary, summary
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import locked, open_run
-from crosscue.eval.scoring.drives import ScoreSettings
+from crosscue.eval.scoring.drives import Scores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.score import load_truth
@@ -98,12 +98,9 @@ class ScoreWork:
             smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
             if smoothed is not None:
                 metrics["smoother"] = asdict(smoothed)
-            # First what may lack pictures: then nothing is written.
-            worst = worst_frames([one])
-            report = write_report(
-                folder.file(FOLDER), [one], scores, metrics, worst, has_figures=self.has_figures
+            report = write_files(
+                folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures
             )
-            write_scores(folder.file(FOLDER), [one], metrics)
         return Scored(one, metrics, report, smoothed)
 
     def attempt(self, path: Path) -> Scored | Failed:
@@ -112,6 +109,38 @@ class ScoreWork:
             return self(path)
         except CrosscueError as error:
             return Failed(path, error)
+
+
+def write_files(
+    place: Path,
+    ones: Sequence[RunScored],
+    scores: Scores,
+    metrics: Mapping[str, Any],
+    *,
+    has_figures: bool,
+) -> Path:
+    """Write the report and the metrics of one run or many into ``place``.
+
+    Returns:
+        The report's path.
+    """
+    # First what may lack pictures: then nothing is written.
+    worst = worst_frames(ones)
+    report = write_report(place, ones, scores, metrics, worst, has_figures=has_figures)
+    write_scores(place, ones, metrics)
+    return report
+
+
+def settings_given(threshold: float, detection: Definition) -> ScoreSettings:
+    """Settings of scores.
+
+    Raises:
+        UsageError: A value is out of range.
+    """
+    try:
+        return ScoreSettings(threshold=threshold, detection=detection)
+    except ValueError as error:
+        raise UsageError(f"score: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -204,10 +233,7 @@ def score_run(
         UsageError: No truth is given and none lies beside the log.
     """
     of = run_given(run)
-    try:
-        settings = ScoreSettings(threshold=threshold, detection=detection)
-    except ValueError as error:
-        raise UsageError(f"score: {error}") from None
+    settings = settings_given(threshold, detection)
     work = ScoreWork(
         None if truth is None else Path(truth),
         settings,

@@ -9,14 +9,19 @@ from typing import Any, Literal
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.interface.runs.run import Run
-from crosscue.eval.interface.runs.score import Failed, ScoredRun, ScoreWork, score_each
+from crosscue.eval.interface.runs.score import (
+    Failed,
+    ScoredRun,
+    ScoreWork,
+    score_each,
+    settings_given,
+    write_files,
+)
 from crosscue.eval.report.junit import write_junit
-from crosscue.eval.report.page import REPORT, write_report
 from crosscue.eval.report.summary import gate_lines, pose_summary, reported_line, summary
-from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import account_lines, locked
 from crosscue.eval.scoring.drives import Scores, ScoreSettings
-from crosscue.eval.scoring.files import FOLDER, write_scores
+from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import smoother_text
@@ -195,10 +200,7 @@ def score_runs(
         raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
     if workers < 1:
         raise UsageError(f"--workers {workers}: expected 1 or more")
-    try:
-        settings = ScoreSettings(threshold=threshold, detection=detection)
-    except ValueError as error:
-        raise UsageError(f"score: {error}") from None
+    settings = settings_given(threshold, detection)
     bounds = () if gates is None else load_gates(Path(gates))
     work = ScoreWork(
         None if truth is None else Path(truth),
@@ -253,16 +255,9 @@ def _one(
     worth = _attribution([one], metrics, settings) if has_attribution else {}
     if worth:
         with locked(one.run):
-            place = one.run.file(FOLDER)
-            write_report(
-                place, [one], scores, metrics, worst_frames([one]), has_figures=has_figures
-            )
-            write_scores(place, [one], metrics)
+            write_files(one.run.file(FOLDER), [one], scores, metrics, has_figures=has_figures)
     if output is not None:
-        report = write_report(
-            output, [one], scores, metrics, worst_frames([one]), has_figures=has_figures
-        )
-        write_scores(output, [one], metrics)
+        report = write_files(output, [one], scores, metrics, has_figures=has_figures)
     return ScoredRuns(tuple(runs), failed, metrics, scores, (), worth, report)
 
 
@@ -282,9 +277,7 @@ def _pool(
     worth = _attribution(ones, tree, settings) if has_attribution else {}
     report = None
     if output is not None:
-        write_report(output, ones, scores, tree, worst_frames(ones), has_figures=has_figures)
-        write_scores(output, ones, tree)
-        report = output / REPORT
+        report = write_files(output, ones, scores, tree, has_figures=has_figures)
     return ScoredRuns(tuple(runs), failed, tree, scores, (), worth, report)
 
 

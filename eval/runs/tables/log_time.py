@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s, RunError
+from crosscue.replay.base import Int64s
 from crosscue.replay.time.segments import Cause, Timeline
 
 if TYPE_CHECKING:
@@ -64,11 +63,6 @@ def broken_at(gaps: Sequence[Gap], t_ns: Int64s) -> Int64s:
     return np.unique(rows[(rows > 0) & (rows < len(t_ns))])
 
 
-def was_set_back(timeline: Timeline) -> bool:
-    """Was a clock of the drive set back?"""
-    return any(one.cause is Cause.SET_BACK for one in timeline.segments)
-
-
 def ambiguous(timeline: Timeline, log_ns: Int64s, numbers: Int64s) -> NDArray[np.bool_]:
     """Which rows have a log time that another segment has, too, shape (N,)."""
     found = np.zeros(len(log_ns), np.bool_)
@@ -80,7 +74,7 @@ def ambiguous(timeline: Timeline, log_ns: Int64s, numbers: Int64s) -> NDArray[np
 
 def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
     """A run's table with ``t_ns`` as recorded, in order, without rows whose time comes twice."""
-    if not was_set_back(timeline) or not table.num_rows:
+    if not timeline.was_set_back or not table.num_rows:
         return table
     import pyarrow as pa
 
@@ -93,19 +87,6 @@ def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
 def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
     """Which moments of the log's clock lie in more than one segment, shape (N,)."""
     inside = np.zeros(len(log_ns), np.int64)
-    for one in timeline.segments if was_set_back(timeline) else ():
+    for one in timeline.segments if timeline.was_set_back else ():
         inside += (log_ns >= one.log_start_ns) & (log_ns <= one.log_end_ns)
     return np.asarray(inside > 1)
-
-
-def refuse_set_back(timeline: Timeline, run: Path, what: str) -> None:
-    """Say that a run's times do not fit the truth's.
-
-    Raises:
-        RunError: A clock was set back during it.
-    """
-    if was_set_back(timeline):
-        raise RunError(
-            f"{run}: a clock was set back during the drive, so its times are not the truth's; "
-            f"{what} takes drives without: replay each side alone with --from and --to"
-        )

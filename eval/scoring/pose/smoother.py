@@ -11,7 +11,6 @@ import numpy as np
 
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.log_time import refuse_set_back
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
 from crosscue.replay.base import Floats, Int64s, SchemaError, strict_json, write_text
@@ -60,7 +59,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
         SchemaError: The truth does not fit the run.
     """
     truth, track = load_truth(truth_path)
-    refuse_set_back(run.drive_manifest().timeline, run.path, "the smoother")
+    run.refuse_set_back("the smoother")
     measured = read_measured(run)
     vehicle = run.drive_manifest().settings
     first_ns, last_ns = measured.start.t_ns, int(measured.increments.stop_ns[-1])

@@ -21,9 +21,8 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Drive, Proportion
 from crosscue.replay.base import CrosscueError, read_at_most, toml_tree
-from crosscue.replay.vehicle.section import Section
+from crosscue.replay.vehicle.section import Section, tuples
 from crosscue.replay.vehicle.validation_errors import explain
-from crosscue.replay.vehicle.vehicle import tuples
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000

@@ -24,7 +24,7 @@ from crosscue.replay.base import (
     Topic,
 )
 from crosscue.replay.decode.coding import IMAGE_SUFFIXES, MAGIC_BYTES, coding_of
-from crosscue.replay.readers.timed_files import TimedFiles, is_inside, list_files
+from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched, open_noted
 
 from .damage import CHECKED, damage_of
@@ -81,14 +81,14 @@ class PictureFiles:
         return len(without)
 
     def _drop_missing(self, ledger: Ledger, selection: Selection) -> None:
-        missing = self.files.missing_ns[is_inside(self.files.missing_ns, selection)]
+        missing = self.files.missing_ns[selection.inside(self.files.missing_ns)]
         first_ns = int(missing[0]) if len(missing) else None
         ledger.drop(self.topic.name, "a time without its picture", len(missing), "", first_ns)
 
     def _blocks(self, ledger: Ledger, selection: Selection, limits: Limits) -> Iterator[Block]:
         name = self.topic.name
         without = self._drop_timeless(ledger)
-        wanted = is_inside(self.files.t_ns, selection) & (self.files.t_ns >= 0)
+        wanted = selection.inside(self.files.t_ns) & (self.files.t_ns >= 0)
         outside = len(self.files.paths) - without - int(np.count_nonzero(wanted))
         ledger.find(name, outside)
         ledger.skip(name, NOT_ASKED_TIME, outside)

@@ -40,7 +40,6 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.files.time_file_names import time_file_of_video
 from crosscue.replay.readers.time_file import SECOND_NS, TimeFile, read_time_file
-from crosscue.replay.readers.timed_files import is_inside
 
 from .files import image_block
 
@@ -130,7 +129,7 @@ class Video(Closing):
         else:
             for sentence in index.notices:
                 ledger.notice(sentence)
-            wanted = (index.t_ns != NO_TIME) & is_inside(index.t_ns, selection)
+            wanted = (index.t_ns != NO_TIME) & selection.inside(index.t_ns)
             if self._codec in CODINGS:
                 yield from self._packets(index, wanted.tolist(), ledger)
             else:

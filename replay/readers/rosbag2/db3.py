@@ -30,7 +30,6 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
-from crosscue.replay.readers.timed_files import is_inside
 
 from .inflate import DAMAGED, inflated
 from .pages import page_rows
@@ -221,7 +220,7 @@ class _Pass:
         if self._indexed is not None:
             self._drop_disputed(rows.ids, rows.times, place)
         if self._in_time_by_index is not None:
-            self._in_time += int(is_inside(rows.times, self._selection).sum())
+            self._in_time += int(self._selection.inside(rows.times).sum())
         yield from self._grouped(messages, place, rows.times)
 
     def _grouped(self, messages: Messages, place: Int64s, log_ns: Int64s) -> Iterator[Block]:
