@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
-from crosscue.datasets.truth.truth import Origin, Truth, mounting_in_car, save
+from crosscue.datasets.truth.mounting import mounting_in_car
+from crosscue.datasets.truth.truth import Origin, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import Floats, LogFormatError
 

@@ -22,7 +22,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.truth import Mounting, Truth, mounting_in_car, save
+from crosscue.datasets.truth.mounting import mounting_in_car
+from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
     DEFAULT_LIMITS,

@@ -20,7 +20,8 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.truth import Truth, mounting_in_car, save
+from crosscue.datasets.truth.mounting import mounting_in_car
+from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.base import (
     MIB,

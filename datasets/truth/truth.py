@@ -7,7 +7,6 @@ section may be missing.
 from __future__ import annotations
 
 import difflib
-import math
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Protocol, cast
@@ -26,8 +25,6 @@ from crosscue.replay.base import (
 from crosscue.replay.formats import data_sets
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
-
-from .tum import Trajectory, turned_by
 
 VERSION: Final = 1
 FILE: Final = "truth.json"
@@ -75,35 +72,6 @@ class Mounting(Section):
     """Downwards."""
     yaw_rad: float | None = 0.0
     """Counter-clockwise."""
-
-
-def mounting_in_car(
-    track: Trajectory,
-    stated: str = "position not published",
-    *,
-    x_m: float | None = None,
-    y_m: float | None = None,
-    z_m: float | None = None,
-) -> tuple[Mounting, str]:
-    """The mounting of a body whose yaw nobody states: its yaw by how it travels.
-
-    Args:
-        track: Of that body.
-        stated: What is published of its place, and by whom.
-        x_m: Where that puts it; see ``Mounting``.
-        y_m: The same.
-        z_m: The same.
-
-    Returns:
-        The mounting, and its source.
-    """
-    found = turned_by(track)
-    yaw_rad = None if found is None else round(found.yaw_rad, 5)
-    mounting = Mounting(x_m=x_m, y_m=y_m, z_m=z_m, roll_rad=None, pitch_rad=None, yaw_rad=yaw_rad)
-    if found is None:
-        return mounting, f"{stated}; yaw unknown, and the drive does not show it"
-    degrees = math.degrees(found.sd_rad)
-    return mounting, f"{stated}; yaw by its direction of travel, +- {degrees:.2f} deg"
 
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]

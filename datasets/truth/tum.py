@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
 from itertools import chain
 from pathlib import Path
-from typing import Final, NamedTuple, TextIO
+from typing import Final, TextIO
 
 import numpy as np
 
@@ -30,17 +30,6 @@ _COLUMNS: Final = 8
 _LINE_CHARACTERS: Final = 4096
 _NORM_OFF: Final = 1e-2
 _LATEST_S: Final = (2**63 - 1) // 1_000_000_000
-_TRAVEL_STEP_S: Final = 1.0
-_TRAVEL_MIN_M: Final = 3.0
-"""Over a shorter step, positions good to centimetres do not show the course to half a degree."""
-_TRAVEL_MIN_STEPS: Final = 3
-_TRAVEL_SD_RAD: Final = 0.005
-"""What a car slips and a track errs at the least, over a step."""
-_LEVER_M: Final = 1.0
-_LEVER_SD_M: Final = 1.5
-"""A body sits between the rear axle and the windscreen."""
-_TURNED_MAX_SD_RAD: Final = 0.005
-"""0.3 degrees."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,48 +88,6 @@ def heading_rad(trajectory: Trajectory) -> Floats:
     east: Floats = 1.0 - 2.0 * (y * y + z * z)
     north: Floats = 2.0 * (w * z + x * y)
     return np.arctan2(north, east)
-
-
-class TurnedBy(NamedTuple):
-    """By how much a body is turned in its car, counter-clockwise, and the standard deviation."""
-
-    yaw_rad: float
-    sd_rad: float
-
-
-def turned_by(trajectory: Trajectory) -> TurnedBy | None:
-    """A body's yaw in the car that carries it, by the way that it travels.
-
-    The middle of the rear axle moves where the car points (a car does not slide sideways), and a
-    point ahead of it swings outwards by its lever times the curvature. So the body's heading less
-    its course is its yaw less that swing; both are fitted, the lever with a wide prior.
-
-    Returns:
-        None where the drive does not show it: too short, too slow, or bent all the way.
-    """
-    ends_s = (trajectory.t_ns - trajectory.t_ns[0]) * 1e-9
-    at_s = np.arange(0.0, ends_s[-1], _TRAVEL_STEP_S)
-    x, y = (np.interp(at_s, ends_s, trajectory.xyz_m[:, axis]) for axis in (0, 1))
-    turned = np.unwrap(heading_rad(trajectory))
-    heading, middle = (
-        np.interp(t_s, ends_s, turned) for t_s in (at_s, at_s[:-1] + 0.5 * _TRAVEL_STEP_S)
-    )
-    step_m = np.hypot(np.diff(x), np.diff(y))
-    moves = step_m > _TRAVEL_MIN_M
-    if np.count_nonzero(moves) < _TRAVEL_MIN_STEPS:
-        return None
-    aside = np.angle(np.exp(1j * (middle - np.arctan2(np.diff(y), np.diff(x)))))[moves]
-    curvature = (np.diff(heading) / np.maximum(step_m, _TRAVEL_MIN_M))[moves]
-    rows = np.column_stack([np.ones(len(aside)), -curvature])
-    sd_rad = _TRAVEL_SD_RAD
-    for _ in range(2):
-        weights = rows.T @ rows / sd_rad**2 + np.diag([0.0, _LEVER_SD_M**-2])
-        found = np.linalg.solve(
-            weights, rows.T @ aside / sd_rad**2 + [0.0, _LEVER_M * _LEVER_SD_M**-2]
-        )
-        sd_rad = max(_TRAVEL_SD_RAD, float(np.sqrt(np.mean((aside - rows @ found) ** 2))))
-    yaw_sd_rad = float(np.sqrt(np.linalg.inv(weights)[0, 0]))
-    return TurnedBy(float(found[0]), yaw_sd_rad) if yaw_sd_rad < _TURNED_MAX_SD_RAD else None
 
 
 def read_tum(path: Path, limits: Limits = DEFAULT_LIMITS) -> Trajectory:
