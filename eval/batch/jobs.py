@@ -280,6 +280,7 @@ def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: s
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "worker": signature(),
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+        "status": str(failed.exit_status),
         "error": str(failed.error),
     }
     text = "".join(f"{name:10}{value}\n" for name, value in lines.items())

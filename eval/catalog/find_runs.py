@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.eval.batch.merge import is_merged
-from crosscue.eval.runs.folder import MANIFEST, RunFolder
+from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder
 from crosscue.replay.base import RunError, UnreadableRunError, UsageError, read_at_most
 
-METRICS: Final = "metrics.json"
-"""What a folder of pooled scores holds, which has tables, too."""
-DEPTH: Final = 4
+from .query.local import LocalRuns, is_cut_short
+
 LIST_BYTES: Final = 64 << 20
 
 
@@ -51,11 +50,12 @@ def _expanded(text: str) -> Iterator[Path]:
 
 
 def _in_folder(folder: Path) -> Iterator[Path]:
-    if _is_run(folder) or not folder.is_dir():
+    if not folder.is_dir() or _is_run({entry.name for entry in _listed(folder)}):
         # What is wrong with it, if anything, is reported when it is opened.
         yield folder
         return
-    found = list(_below(folder, DEPTH))
+    below = ((folder / one.run, one.file) for one in LocalRuns(folder).find())
+    found = [run for run, file in below if not (_is_merged(run) or _is_bare(run, file))]
     if not found:
         raise UnreadableRunError(
             f"{folder}: neither a run folder nor a folder of some; replay first"
@@ -63,25 +63,21 @@ def _in_folder(folder: Path) -> Iterator[Path]:
     yield from found
 
 
-def _below(folder: Path, depth: int) -> Iterator[Path]:
+def _listed(folder: Path) -> list[Path]:
     try:
-        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+        return list(folder.iterdir())
     except OSError as error:
         raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
-    for entry in entries:
-        if _is_run(entry):
-            if not _is_merged(entry):
-                yield entry
-        elif depth > 1 and entry.is_dir() and not entry.is_symlink():
-            yield from _below(entry, depth - 1)
 
 
-def _is_run(folder: Path) -> bool:
-    """Does it hold what a run writes? Cut short it must be reported, not passed over."""
-    if folder.joinpath(MANIFEST).exists():
-        return True
-    is_scored = folder.joinpath(METRICS).exists()
-    return not is_scored and next(folder.glob("*.parquet"), None) is not None
+def _is_run(names: set[str]) -> bool:
+    """Does a folder with these files hold a run? Cut short it must be reported, not passed over."""
+    return MANIFEST in names or is_cut_short(names)
+
+
+def _is_bare(folder: Path, file: str) -> bool:
+    """Did a run fail before it left anything but the reason? Batches and catalogs report those."""
+    return file == FAILURE and {entry.name for entry in _listed(folder)} <= {FAILURE, LOCK}
 
 
 def _is_merged(folder: Path) -> bool:

@@ -54,8 +54,10 @@ class Catalog:
 
     @property
     def runs(self) -> tuple[Path, ...]:
-        """Folders of all runs, sorted."""
-        return tuple(self._places.path(run) for run in sorted(self._listed("run")))
+        """Folders of all runs that did not fail, sorted."""
+        named = zip(self._listed("run"), self._listed("outcome"), strict=True)
+        done = sorted(run for run, outcome in named if outcome != "failed")
+        return tuple(self._places.path(run) for run in done)
 
     def query(self, sql: str) -> pa.Table:
         """The rows that a query selects; ``schema`` lists what can be asked for.
@@ -92,7 +94,8 @@ class Catalog:
                 whose column ``run`` names them, in whose order they come, each once.
 
         Raises:
-            UsageError: As ``query``; the result has no column ``run``.
+            UsageError: As ``query``; the result has no column ``run``; the runs lie on a store,
+                where they have no folder: ``query`` reads their tables there.
         """
         sql = query
         if not database.is_statement(query):

@@ -40,9 +40,12 @@ INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
     "runs": {
         **_RUN,
         "name": Column("VARCHAR", "last part of the path"),
-        "outcome": Column("VARCHAR", "whole, or losses where rows were dropped"),
-        "exit_status": Column("INTEGER", "0, or 3 where rows were dropped"),
-        "stage": Column("VARCHAR", "estimate, or detect where nothing has been estimated"),
+        "outcome": Column("VARCHAR", "whole, losses where rows were dropped, or failed"),
+        "exit_status": Column("INTEGER", "0; 3 where rows were dropped; of a failed run its own"),
+        "error": Column("VARCHAR", "why the last attempt failed; null where it did not"),
+        "stage": Column(
+            "VARCHAR", "estimate; detect where nothing has been estimated; null of failed"
+        ),
         "identity": Column("VARCHAR", "of the drive's logs, 64 hex digits: pairs runs of a drive"),
         "logs": Column("VARCHAR[]", "names of the drive's logs"),
         "is_simulated": Column("BOOLEAN", "whether a log is simulated"),

@@ -179,12 +179,12 @@ def _entries(whole: Mapping[str, Found], unreadable: Mapping[str, str]) -> pa.Ta
 
 
 def _read_run(runs: Runs, found: Found) -> RunRows | None:
-    manifest = runs.read(found.run, "manifest.json")
-    if len(manifest) > MAX_BYTES:
-        raise ValueError(f"manifest.json: over {MAX_BYTES >> 20} MiB; replay again")
+    head = runs.read(found.run, found.file)
+    if len(head) > MAX_BYTES:
+        raise ValueError(f"{found.file}: over {MAX_BYTES >> 20} MiB; replay again")
     files = runs.files(found.run)
     name = found.run.rpartition("/")[2] if found.run != "." else Path(runs.name).resolve().name
-    return rows_of(found, name, manifest, files, lambda file: runs.read(found.run, file))
+    return rows_of(found, name, head, files, lambda file: runs.read(found.run, file))
 
 
 def _why(error: Exception) -> str:

@@ -7,16 +7,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from crosscue.eval.runs.folder import INPUT, MANIFEST, TAGS
+from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, TAGS
 from crosscue.replay.base import UnreadableRunError
 
 if TYPE_CHECKING:
     import pyarrow.fs
 
 DEPTH: Final = 6
-"""Of folders below the catalog's."""
+"""Folders that runs lie below the one that is searched, at most; of a store, too."""
 SCORED: Final = "metrics.json"
 SCORE: Final = "score"
+BESIDE: Final = (TAGS, FAILURE)
+"""Files of a run that are no tables."""
 
 Stamp: TypeAlias = tuple[int, int, int, int]
 CUT_SHORT: Final[Stamp] = (0, 0, 0, 0)
@@ -28,12 +30,14 @@ class Found(NamedTuple):
     Attributes:
         run: Its path from the folder that was searched, with slashes; ``.`` for that itself.
         stamp: Another one shows that something has changed; ``CUT_SHORT`` without a manifest.
-        made_ns: When the manifest was written, as time since 1970.
+        made_ns: When the manifest was written, or the attempt failed, as time since 1970.
+        file: What says what became of it: the manifest, or of a failed run its log.
     """
 
     run: str
     stamp: Stamp
     made_ns: int
+    file: str = MANIFEST
 
 
 class LocalRuns:
@@ -66,14 +70,14 @@ class LocalRuns:
             yield from _below(str(self.folder), "", DEPTH)
 
     def files(self, run: str) -> list[str]:
-        """Names of a run's tables, those of its score after them, and of its tags.
+        """Names of a run's tables, those of its score after them, of its tags and failure.
 
         Raises:
             OSError: It cannot be listed.
         """
         folder = self.folder / run
         names = sorted(os.listdir(folder))  # noqa: PTH208 (there may be 100,000)
-        tables = [name for name in names if name.endswith(".parquet") or name == TAGS]
+        tables = [name for name in names if name.endswith(".parquet") or name in BESIDE]
         if SCORE in names and (folder / SCORE).is_dir():
             scored = sorted(os.listdir(folder / SCORE))  # noqa: PTH208
             tables += [f"{SCORE}/{name}" for name in scored if name.endswith(".parquet")]
@@ -109,8 +113,14 @@ def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
             entries = [entry for entry in listed if not entry.name.startswith(".")]
     except OSError as error:
         raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
-    if prefix and is_cut_short({entry.name for entry in entries}):
+    names = {entry.name for entry in entries}
+    if prefix and FAILURE in names:
+        made_ns = _time(f"{folder}/{FAILURE}")
+        yield Found(prefix[:-1], (made_ns, 0, _time(folder), 0), made_ns, FAILURE)
+    elif prefix and is_cut_short(names):
         yield Found(prefix[:-1], CUT_SHORT, 0)
+        return
+    if not depth:
         return
     for entry in sorted(entries, key=lambda entry: entry.name):
         if not entry.is_dir():
@@ -118,7 +128,7 @@ def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
         found = _found(entry.path, prefix + entry.name)
         if found is not None:
             yield found
-        elif depth > 1 and not entry.is_symlink():
+        elif not entry.is_symlink():
             yield from _below(entry.path, f"{prefix}{entry.name}/", depth - 1)
 
 

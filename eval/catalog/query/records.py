@@ -13,6 +13,7 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from crosscue.eval.runs.folder import (
+    FAILURE,
     FORMAT_VERSION,
     MANIFEST,
     TAGS,
@@ -27,7 +28,7 @@ from crosscue.eval.runs.tags import parse_tags
 from crosscue.replay.base import json_tree, one_line
 from crosscue.replay.files.identity import identity_of_all
 
-from .local import Found
+from .local import BESIDE, Found
 
 Row: TypeAlias = dict[str, Any]
 M = TypeVar("M", bound=BaseModel)
@@ -94,36 +95,40 @@ class RunRows:
 
 
 def rows_of(
-    found: Found, name: str, manifest: bytes, files: Sequence[str], read: Callable[[str], bytes]
+    found: Found, name: str, head: bytes, files: Sequence[str], read: Callable[[str], bytes]
 ) -> RunRows | None:
-    """The rows of one run; None for a folder that was merged of runs, or holds a decoded log.
+    """The rows of one run; None for a folder that holds none, such as one of merged tables.
 
     Args:
         found: The run.
         name: Of its folder.
-        manifest: Content of ``manifest.json``.
-        files: Of its tables, of its score's, and of its tags, from its folder.
+        head: Content of ``manifest.json``, or of a failed run's ``failure.log``.
+        files: Of its tables, of its score's, of its tags and failure, from its folder.
         read: Reads one of them.
 
     Raises:
         ValueError: The manifest or the tags are damaged or of another version.
         OSError: A file cannot be read.
     """
-    head = _read(_Head, manifest)
-    if head.format_version != FORMAT_VERSION:
+    tags = parse_tags(read(TAGS)) if TAGS in files else {}
+    if found.file == FAILURE:
+        row = _failed_row(found, name, head, tags)
+        return None if row is None else RunRows(row)
+    kind = _read(_Head, head)
+    if kind.format_version != FORMAT_VERSION:
         raise ValueError(
-            f"{MANIFEST}: format {head.format_version!r}, this crosscue reads {FORMAT_VERSION}; "
+            f"{MANIFEST}: format {kind.format_version!r}, this crosscue reads {FORMAT_VERSION}; "
             "replay again"
         )
-    if head.stage in NOT_A_RUN:
+    if kind.stage in NOT_A_RUN:
         return None
-    said = _read(_Manifest, manifest)
-    detect = _read(_Detect, manifest) if said.stage == "detect" else said.detect
-    tags = parse_tags(read(TAGS)) if TAGS in files else {}
+    said = _read(_Manifest, head)
+    detect = _read(_Detect, head) if said.stage == "detect" else said.detect
     results = _results(read(JUDGED)) if JUDGED in files else []
     run = found.run
+    failure = _failure(read(FAILURE)) if FAILURE in files else {}
     return RunRows(
-        _run_row(found, name, said, detect, files, tags, results),
+        _run_row(found, name, said, detect, files, tags, results) | {"error": failure.get("error")},
         _approaches(run, said, results, tags),
         _dropped(run, said.account),
     )
@@ -175,9 +180,7 @@ def _run_row(
         "conditions": sorted({tag for one in results for tag in one["conditions"]}),
         "start_ns": segments[0].start_ns if segments else None,
         "end_ns": segments[-1].end_ns if segments else None,
-        "made_at": _EPOCH + timedelta(microseconds=found.made_ns // 1000)
-        if found.made_ns
-        else None,
+        "made_at": _made_at(found),
         "seconds": said.timings.seconds,
         "travelled_m": None if said.pose is None else said.pose.travelled_m,
         "frames": None if detect is None else detect.counts.frames,
@@ -188,7 +191,41 @@ def _run_row(
         "rows_skipped": sum(n for one in lines for n in one.skipped.values()),
         "rows_dropped": sum(n for one in lines for n in one.dropped.values()),
         "notices": list(said.notices),
-        "tables": [file for file in files if file != TAGS],
+        "tables": [file for file in files if file not in BESIDE],
+    }
+
+
+def _made_at(found: Found) -> datetime | None:
+    made_us = found.made_ns // 1000
+    return _EPOCH + timedelta(microseconds=made_us) if made_us else None
+
+
+def _failure(content: bytes) -> dict[str, str]:
+    """What the head of a ``failure.log`` says; nothing where it is no log of ours."""
+    head, _, _ = content.decode("utf-8", "replace").partition("\n\n")
+    said = {line[:10].rstrip(): line[10:] for line in head.splitlines()}
+    return said if {"drive", "error"} <= said.keys() else {}
+
+
+def _failed_row(found: Found, name: str, content: bytes, tags: Mapping[str, str]) -> Row | None:
+    """Of a run that failed, where nothing but the reason is known."""
+    said = _failure(content)
+    if not said:
+        return None
+    status = said.get("status", "")
+    versions = dict(one.partition(" ")[::2] for one in said.get("versions", "").split(", "))
+    return {
+        "run": found.run,
+        "name": name,
+        "outcome": "failed",
+        "exit_status": int(status) if status.isdecimal() else None,
+        "error": said["error"],
+        "crosscue": versions.get("crosscue"),
+        "crosscue_commit": versions.get("crosscue_commit"),
+        "tags": list(tags.items()),
+        "made_at": _made_at(found),
+        "is_scored": False,
+        "tables": [],
     }
 
 

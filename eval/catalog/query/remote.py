@@ -11,10 +11,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from crosscue.eval.runs.folder import MANIFEST, TAGS
+from crosscue.eval.runs.folder import FAILURE, MANIFEST
 from crosscue.replay.base import UnreadableRunError, UsageError, one_line
 
-from .local import CUT_SHORT, SCORE, Found, Stamp, is_cut_short
+from .local import BESIDE, CUT_SHORT, DEPTH, SCORE, Found, Stamp, is_cut_short
 
 if TYPE_CHECKING:
     import pyarrow.fs
@@ -64,18 +64,25 @@ class RemoteRuns:
         for folder in sorted(self._objects, key=lambda name: [*name.split("/")]):
             names = self._objects[folder]
             is_inside = any(_is_below(folder, run) for run in found[-1:])
-            if is_inside or any(part.startswith(".") and part != "." for part in folder.split("/")):
+            if (
+                is_inside
+                or folder.count("/") >= DEPTH
+                or any(part.startswith(".") and part != "." for part in folder.split("/"))
+            ):
                 continue
             if MANIFEST in names:
                 found.append(folder)
-                yield Found(folder, self._stamp(folder), _time_ns(names[MANIFEST]))
+                yield Found(folder, self._stamp(folder, MANIFEST), _time_ns(names[MANIFEST]))
+            elif folder != "." and FAILURE in names:
+                made_ns = _time_ns(names[FAILURE])
+                yield Found(folder, self._stamp(folder, FAILURE), made_ns, FAILURE)
             elif folder != "." and is_cut_short({*names}):
                 found.append(folder)
                 yield Found(folder, CUT_SHORT, 0)
 
     def files(self, run: str) -> list[str]:
-        """Names of a run's tables, those of its score after them, and of its tags."""
-        own = [name for name in self._objects[run] if name.endswith(".parquet") or name == TAGS]
+        """Names of a run's tables, those of its score after them, of its tags and failure."""
+        own = [name for name in self._objects[run] if name.endswith(".parquet") or name in BESIDE]
         scored = self._objects.get(_joined(run, SCORE), {})
         return sorted(own) + [
             f"{SCORE}/{name}" for name in sorted(scored) if name.endswith(".parquet")
@@ -120,12 +127,12 @@ class RemoteRuns:
 
         return pyarrow.fs.PyFileSystem(Ranged(self._system))
 
-    def _stamp(self, run: str) -> Stamp:
+    def _stamp(self, run: str, head: str) -> Stamp:
         own = self._objects[run]
-        others = {name: info for name, info in own.items() if name != MANIFEST}
+        others = {name: info for name, info in own.items() if name != head}
         scored = self._objects.get(_joined(run, SCORE), {})
-        size = int(own[MANIFEST].get("size") or 0)
-        return (_digest({MANIFEST: own[MANIFEST]}), size, _digest(others), _digest(scored))
+        size = int(own[head].get("size") or 0)
+        return (_digest({head: own[head]}), size, _digest(others), _digest(scored))
 
     def _asked(self, ask: Callable[[], T]) -> T:
         """What a store answers; each store's library has errors of its own."""

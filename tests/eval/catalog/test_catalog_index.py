@@ -4,13 +4,17 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 import crosscue
+from crosscue.eval.batch.jobs import Job, attempt
+from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.catalog.query import index, records
 from crosscue.eval.catalog.query.index import NAME
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.replay.base import UnreadableRunError
 from crosscue.replay.files.partial_file import PartialFile
 from support.catalog_runs import add_run, change, runs_below, scene, seen
 
@@ -78,6 +82,53 @@ def test_a_deleted_run_goes(runs: Path, read: list[str]) -> None:
     assert read == []
     assert len(found.runs) == 3
     assert found.query("select count(*) as n from approaches").to_pylist() == [{"n": 3}]
+
+
+def fails(job: Job) -> NoReturn:
+    raise UnreadableRunError(f"{job.logs[0]}: no log; check the path")
+
+
+def test_a_failed_run_is_a_row_with_its_status_and_reason(runs: Path, read: list[str]) -> None:
+    log = runs.parent / "drive.mcap"
+    log.touch()
+    attempt(fails, Job("sunday", (str(log),), runs / "a/sunday", ""))
+    # One whose earlier run still stands, and what only looks like a failure.
+    attempt(fails, Job("monday", (str(log),), runs / "a/monday", ""))
+    (runs / "b/failure.log").write_text("the coffee machine is out of order\n")
+
+    found = crosscue.catalog(runs)
+
+    rows = found.query("select run, outcome, exit_status, error from runs order by run").to_pylist()
+    monday, sunday, *others = (tuple(row.values()) for row in rows)
+    why = f"{log}: no log; check the path"
+    assert sunday == ("a/sunday", "failed", 4, why)
+    assert monday == ("a/monday", "whole", 0, why)
+    assert {row[1:] for row in others} == {("whole", 0, None)}
+    assert not found.left_out
+    assert runs / "a/sunday" not in found.runs
+    assert found.select("outcome = 'failed'") == (runs / "a/sunday",)
+    read.clear()
+    assert crosscue.catalog(runs).query("select count(*) as n from runs").to_pylist() == [{"n": 5}]
+    assert read == []
+    # Done at last, it is a run like the others.
+    add_run(runs / "a/sunday", "sunday")
+    (runs / "a/sunday/failure.log").unlink()
+    assert crosscue.catalog(runs).select("outcome = 'failed'") == ()
+
+
+def test_commands_and_catalog_find_the_same_runs_equally_deep(runs: Path) -> None:
+    deep = runs / "1/2/3/4/5"
+    add_run(deep / "friday", "friday")
+    add_run(deep / "6/deeper", "deeper")
+    (deep / "cut").mkdir()
+    (deep / "cut/input.json").touch()
+
+    found = crosscue.catalog(runs)
+
+    there = {*found.runs, *(runs / run for run in found.left_out)}
+    assert {*runs_of([str(runs)])} == there
+    assert {deep / "friday", deep / "cut"} < there
+    assert deep / "6/deeper" not in there
 
 
 def test_a_run_that_cannot_be_read_is_not_read_again(runs: Path, read: list[str]) -> None:
