@@ -14,7 +14,7 @@ from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.scoring.boxes.reliability import reliability
 from crosscue.eval.scoring.intervals import Interval, wilson
 
-from .threshold import best_bound, fewest_detections, round_between, threshold_for
+from .threshold import best_bound, fewest_detections, lower_bound, round_between, threshold_for
 
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
 CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
@@ -48,6 +48,7 @@ class HeldOut:
         of: All above the threshold.
         labels: Boxes to be found.
         interval: Of the precision, 95 %, as if detections were independent.
+        bound: Of it too, one-sided, with the confidence of the fit: what is shown of it.
         error_before: Expected calibration error of the network's scores.
         error_after: Of the calibrated ones.
         detections: That both are made of.
@@ -57,6 +58,7 @@ class HeldOut:
     of: int
     labels: int
     interval: Interval
+    bound: float
     error_before: float
     error_after: float
     detections: int
@@ -147,7 +149,7 @@ def fit_class(
         right,
         scores,
         found.bound,
-        _held_out(held_out, scores),
+        _held_out(held_out, scores, confidence),
         tuple(notes),
     )
 
@@ -173,7 +175,7 @@ def _why_none(judged: Judged, precision: float, confidence: float) -> str:
     return f"no threshold reaches {precision:g}: the best is surely above {best:.3f} only"
 
 
-def _held_out(judged: Judged, by: ClassScores) -> HeldOut:
+def _held_out(judged: Judged, by: ClassScores, confidence: float) -> HeldOut:
     after = _applied(by.calibration, judged.scores)
     sure = after > (by.threshold or 0.0)
     right, of = int((judged.is_right & sure).sum()), int(sure.sum())
@@ -182,6 +184,7 @@ def _held_out(judged: Judged, by: ClassScores) -> HeldOut:
         of,
         judged.labels,
         wilson(right, of),
+        lower_bound(right, of, confidence),
         reliability("", judged.scores, judged.is_right).error,
         reliability("", after, judged.is_right).error,
         len(after),

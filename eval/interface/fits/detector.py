@@ -105,6 +105,11 @@ def _class_lines(one: ClassFit, precision: float) -> list[str]:
             f"{held.interval.high:.3f}; {held.right:,} of {held.of:,}), recall {held.recall:.3f} "
             f"({held.right:,} of {held.labels:,})"
         )
+        is_shown = "is" if held.bound >= precision else "is not"
+        lines.append(
+            f"              precision at least {held.bound:.3f} with {CONFIDENCE:.0%} confidence: "
+            f"{precision:g} {is_shown} shown"
+        )
         lines.append(
             f"              calibration error {held.error_before:.3f} before, "
             f"{held.error_after:.3f} after, {held.detections:,} detections"
