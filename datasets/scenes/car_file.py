@@ -7,21 +7,10 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
 from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.datasets.simulated.drive import (
-    GYRO_SD_RADPS,
-    RATE_HZ,
-    DriveSettings,
-    slip_per_sqrt_m,
-)
 
 from .mobileye import MOUNTING
 
-START_SD_M: Final = 0.1
-START_HEADING_SD_RAD: Final = 0.01
-"""How well a calibrated car knows where its drive begins."""
 STOP_SIGN_M: Final = (0.71690, 2.79455)
 """Range is focal length times the first over the height in pixels, plus the second.
 
@@ -51,34 +40,6 @@ def vehicle_text(
         stop_sign=[round(stop[0] * camera.focal, 3), stop[1]],
         traffic_light=[round(light[0] * camera.focal, 3), light[1]],
     )
-
-
-def with_fitted_noise(text: str, seed: int, way_m: float) -> str:
-    """The file's text with the noise that the simulator really has, so that NEES is near 1.
-
-    The published study keeps the default noise, an uncalibrated car's. Start pose and gyro bias are
-    as well known as after a calibration: the start is off by what its s.d. says.
-    """
-    import tomlkit
-
-    rng = np.random.default_rng([seed, 11])
-    east_m, north_m = rng.normal(0.0, START_SD_M, 2)
-    off_rad = rng.normal(0.0, START_HEADING_SD_RAD)
-    document, settings = tomlkit.parse(text), DriveSettings(seed=seed)
-    document["odometry"].update(
-        slip_per_sqrt_m=round(slip_per_sqrt_m(way_m, settings.top_speed_mps), 4),
-        gyro_bias_radps=settings.gyro_bias_radps,
-        gyro_noise_rad_per_sqrt_s=GYRO_SD_RADPS / RATE_HZ**0.5,
-    )
-    start = document["start"]
-    start.update(
-        x_m=round(float(east_m), 4),
-        y_m=round(float(north_m), 4),
-        position_sd_m=START_SD_M,
-        heading_rad=round(float(start["heading_rad"]) + float(off_rad), 6),
-        heading_sd_rad=START_HEADING_SD_RAD,
-    )
-    return tomlkit.dumps(document)
 
 
 VEHICLE: Final = """\

@@ -18,7 +18,14 @@ from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
-from crosscue.datasets.simulated.drive import START_NS, DriveSettings, TrueMotion, dbc_path, sense
+from crosscue.datasets.simulated.drive import (
+    START_NS,
+    DriveSettings,
+    TrueMotion,
+    dbc_path,
+    sense,
+    with_simulated_noise,
+)
 from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
@@ -160,6 +167,7 @@ def write_scene(
     *,
     overwrite: bool = False,
     imager: Imager = PHOTOGRAPHS,
+    is_calibrated: bool = True,
 ) -> SceneFiles:
     """Simulate a run and write its files into ``folder``.
 
@@ -168,6 +176,8 @@ def write_scene(
         settings: The run.
         overwrite: Replace the same drive.
         imager: What its camera records.
+        is_calibrated: The vehicle file states the simulator's own noise; else, as in the published
+            study, that of any car.
 
     Raises:
         OutputError: A file is there already, or cannot be written.
@@ -184,7 +194,7 @@ def write_scene(
         for block in record.blocks():
             writer.write(block)
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
-    write_text(folder / "vehicle.toml", record.vehicle_text())
+    write_text(folder / "vehicle.toml", record.vehicle_text(is_calibrated=is_calibrated))
     write_text(folder / MADE_OF, strict_json(made_of([], _settings_of(settings, imager))) + "\n")
     return SceneFiles(
         log,
@@ -294,15 +304,15 @@ class _Record:
             to_end = to_start + self.layout.end_m
             self._ranges.append(f"{t_ns},0,{to_start:.4f},{to_end:.4f}")
 
-    def vehicle_text(self) -> str:
+    def vehicle_text(self, *, is_calibrated: bool) -> str:
         """The vehicle file that fits."""
-        camera = self.settings.camera
-        return vehicle_text(
-            camera,
+        text = vehicle_text(
+            self.settings.camera,
             mounting_yaw_rad=self._car.mounting_yaw_rad,
             declination_rad=self._car.declination_rad,
             heading_rad=self._heading_rad,
         )
+        return with_simulated_noise(text, self._car, self._motion) if is_calibrated else text
 
     def write_truth(self, folder: Path) -> Path:
         """Truth, objects, trajectory and ranges."""

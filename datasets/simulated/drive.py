@@ -34,6 +34,9 @@ SLIP_SD: Final = 0.004
 SLIP_TIME_S: Final = 2.0
 GYRO_SD_RADPS: Final = 0.004
 """Of a reading, besides the bias."""
+START_SD_M: Final = 0.1
+START_HEADING_SD_RAD: Final = 0.01
+"""How well a calibrated car knows where its drive begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +191,34 @@ def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
         motion.t_ns[tenth],
         _magnetometer(motion.heading_rad[tenth], settings, rng),
     )
+
+
+def with_simulated_noise(text: str, settings: DriveSettings, motion: TrueMotion) -> str:
+    """A vehicle file's text with the noise that these readings really have, so that NEES is honest.
+
+    The file is that of a car that has just been calibrated: it knows its gyro's bias, and where the
+    drive begins but for an error that its standard deviation states.
+    """
+    import tomlkit
+
+    east_m, north_m, off = np.random.default_rng([settings.seed, 11]).normal(0.0, 1.0, 3)
+    way_m = float(np.hypot(np.diff(motion.x_m), np.diff(motion.y_m)).sum())
+    document = tomlkit.parse(text)
+    document["odometry"].update(
+        slip_per_sqrt_m=round(slip_per_sqrt_m(way_m, float(motion.speed_mps.max())), 4),
+        scale_sd=round(TYRE_SD / 2**0.5, 4),
+        gyro_bias_radps=settings.gyro_bias_radps,
+        gyro_noise_rad_per_sqrt_s=GYRO_SD_RADPS / RATE_HZ**0.5,
+    )
+    start = document["start"]
+    start.update(
+        x_m=round(START_SD_M * float(east_m), 4),
+        y_m=round(START_SD_M * float(north_m), 4),
+        position_sd_m=START_SD_M,
+        heading_rad=round(float(start["heading_rad"]) + START_HEADING_SD_RAD * float(off), 6),
+        heading_sd_rad=START_HEADING_SD_RAD,
+    )
+    return tomlkit.dumps(document)
 
 
 def slip_per_sqrt_m(way_m: float, speed_mps: float) -> float:

@@ -14,7 +14,15 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.base import Ledger, write_text
 from crosscue.replay.write.convert import LogWriter
 
-from .drive import DriveSettings, TrueMotion, dbc_path, drive, sense, vehicle_text
+from .drive import (
+    DriveSettings,
+    TrueMotion,
+    dbc_path,
+    drive,
+    sense,
+    vehicle_text,
+    with_simulated_noise,
+)
 from .sensor_blocks import BUS, GYRO, MAGNETOMETER, sensor_blocks
 
 SOURCE: Final = "simulated by crosscue, exact"
@@ -55,7 +63,8 @@ def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = Fals
         for block in sensor_blocks(sensed, settings.seed):
             writer.write(block)
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
-    write_text(folder / "vehicle.toml", vehicle_text(settings, "simulated_car.dbc"))
+    car = vehicle_text(settings, "simulated_car.dbc")
+    write_text(folder / "vehicle.toml", with_simulated_noise(car, settings, motion))
     return DriveFiles(
         log,
         folder / "vehicle.toml",

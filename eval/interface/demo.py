@@ -16,8 +16,6 @@ from crosscue.replay.base import CrosscueError, UsageError, write_text
 
 REAL: Final = "pandaset_002"
 MODEL: Final = "yolox-nano"
-WAY_M: Final = 100.0
-"""About how long a simulated approach is."""
 FOLLOWED: Final = """
 # Cars are followed on the road over several frames, not in pairs of frames as the source has it.
 [cars]
@@ -173,17 +171,14 @@ def _simulated(
 ) -> KnownDrive:
     """A drive as of ``simulate_approach`` in ``folder/drive``, for the embedded networks.
 
-    Its vehicle file states the simulator's own noise, so that the pose knows how wrong it is, and
-    has cars followed on the road: of the published pairs most are wrong there.
+    Its vehicle file has cars followed on the road: of the published pairs most are wrong there.
     """
-    from crosscue.datasets.scenes.car_file import with_fitted_noise
     from crosscue.detectors.registry import EMBEDDED
 
     files = simulate_approach(
         folder / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
     )
-    fitted = with_fitted_noise(files.vehicle.read_text("utf-8"), seed, WAY_M)
-    write_text(files.vehicle, fitted + FOLLOWED)
+    write_text(files.vehicle, files.vehicle.read_text("utf-8") + FOLLOWED)
     return KnownDrive(files.log, files.vehicle, files.truth, "", tuple(EMBEDDED.split(",")))
 
 

@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from textwrap import wrap
 from typing import Final
 
+import numpy as np
+
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.gates import GateResult
-from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, Mean, Proportion
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, Mean, Proportion, mean
 from crosscue.eval.scoring.metric_values import MetricValue
 from crosscue.eval.scoring.pose.score import Errors, PlaneMounting, PoseScore
 from crosscue.eval.scoring.scene.approaches import ApproachScore
@@ -255,6 +257,23 @@ def pose_summary(result: PoseScore) -> str:
     lines += ["", *_nees_lines(result)]
     lost = "never lost" if result.lost_at_m is None else f"lost after {result.lost_at_m:.0f} m"
     lines.append(f"2-sigma ellipse at the end: {result.major_axis_m:.1f} m long; {lost}")
+    return "\n".join(lines)
+
+
+def poses_summary(poses: Sequence[PoseScore]) -> str:
+    """The pose of several drives, with intervals over drives; NEES where its frame is defined."""
+    drives = np.arange(len(poses))
+    lost = sum(one.lost_at_m is not None for one in poses)
+    lines = [_line("pose", f"{len(poses)} drives, {lost} lost; means over drives (95 %)")]
+    for name, unit, values in (
+        ("APE, rms", " m", [one.ape["none"].translation_m.rmse for one in poses]),
+        ("NEES of x, y", ", 2 is honest", [one.nees_xy.mean for one in poses]),
+        ("NEES of x, y, heading", ", 3 is honest", [one.nees_xyh.mean for one in poses]),
+    ):
+        found = mean(np.array(values), drives)
+        ends = TOO_FEW if math.isnan(found.low) else f"{found.low:.2f} to {found.high:.2f}"
+        if found.of:
+            lines.append(_line("", f"{name:22} {found.value:.2f} ({ends}){unit}"))
     return "\n".join(lines)
 
 

@@ -294,11 +294,14 @@ def _digests(log: LogRow) -> Iterator[str]:
 def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:
     drives = np.arange(len(poses))
     rmse = np.array([one.ape["none"].translation_m.rmse for one in poses.values()], np.float64)
-    ends = np.array([one.nees_xyh.mean for one in poses.values()], np.float64)
+    nees = {
+        name: np.array([getattr(one, name).mean for one in poses.values()], np.float64)
+        for name in ("nees_xy", "nees_xyh")
+    }
     return {
         "drives": len(poses),
         "ape_rmse_m": asdict(intervals.mean(rmse, drives)),
-        "nees_xyh": asdict(intervals.mean(ends, drives)),
+        **{name: asdict(intervals.mean(values, drives)) for name, values in nees.items()},
         "lost": sum(one.lost_at_m is not None for one in poses.values()),
         "by_drive": {name: asdict(one) for name, one in poses.items()},
     }

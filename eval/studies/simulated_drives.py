@@ -72,7 +72,8 @@ class Work:
         made_by = folder / MADE_BY
         if not made_by.exists() or made_by.read_text(encoding="utf-8") != key:
             made_by.unlink(missing_ok=True)
-            write_scene(folder, self.scenes[name], overwrite=True, imager=self.imager)
+            scene = self.scenes[name]
+            write_scene(folder, scene, overwrite=True, imager=self.imager, is_calibrated=False)
             write_text(made_by, key)
         return folder
 

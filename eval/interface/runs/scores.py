@@ -18,7 +18,13 @@ from crosscue.eval.interface.runs.score import (
     write_files,
 )
 from crosscue.eval.report.junit import write_junit
-from crosscue.eval.report.summary import gate_lines, pose_summary, reported_line, summary
+from crosscue.eval.report.summary import (
+    gate_lines,
+    pose_summary,
+    poses_summary,
+    reported_line,
+    summary,
+)
 from crosscue.eval.runs.folder import account_lines, locked
 from crosscue.eval.scoring.drives import Scores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER
@@ -125,7 +131,9 @@ def _lines_together(found: ScoredRuns) -> list[str]:
         lines.append(reported_line("twice", text))
     ones = _ones(found)
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
-    return [*lines, *_account(found), "", *_scores(found, why)]
+    lines += [*_account(found), "", *_scores(found, why)]
+    poses = [one.pose for one in ones if one.pose is not None]
+    return [*lines, "", poses_summary(poses)] if poses else lines
 
 
 def _account(found: ScoredRuns) -> list[str]:

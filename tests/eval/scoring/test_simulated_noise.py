@@ -4,12 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from crosscue.datasets.scenes.car_file import with_fitted_noise
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.report.summary import poses_summary
 from crosscue.eval.runs.folder import create
 from crosscue.eval.scoring.consistency import mean_band
+from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
@@ -18,17 +19,19 @@ from crosscue.replay.vehicle.vehicle import load
 DRIVES = 4
 
 
-def test_simulated_drives_are_as_wrong_as_their_noise_says(tmp_path: Path) -> None:
-    nees = []
+def test_simulated_drives_are_as_wrong_as_their_vehicle_files_say(tmp_path: Path) -> None:
+    poses = []
     for seed in range(DRIVES):
-        settings = DriveSettings(seed=seed, blocks=1, block_m=70.0)
-        files = write_drive(tmp_path / str(seed), settings)
-        text = files.vehicle.read_text("utf-8")
-        files.vehicle.write_text(with_fitted_noise(text, seed, files.metres))
+        files = write_drive(tmp_path / str(seed), DriveSettings(seed=seed, blocks=1, block_m=70.0))
         with open_log(files.log) as log:
             run = create(tmp_path / f"run {seed}", overwrite=False)
             found = replay_drive([log], load(files.vehicle), run, EVERYTHING).run
-        nees.append(score_pose(found, files.truth).nees_xyh.mean)
+        poses.append(score_pose(found, files.truth))
 
     low, high = mean_band(3, DRIVES)
-    assert low < np.mean(nees) < high
+    assert low < np.mean([one.nees_xyh.mean for one in poses]) < high
+    text = poses_summary(poses)
+    assert "4 drives, 0 lost" in text
+    assert "NEES of x, y, heading" in text
+    assert TOO_FEW not in text
+    assert TOO_FEW in poses_summary(poses[:3])
