@@ -118,7 +118,7 @@ def tables_of(scores: LayoutScores) -> list[Table]:
     return found
 
 
-DIFFERENCE_HEAD: Final = ("left out or compared", "Brier", "log score", "false a drive")
+DIFFERENCE_HEAD: Final = ("left out or compared", "Brier", "by it", "log score", "false a drive")
 
 
 def _score_row(name: str, one: LayoutScore) -> tuple[str, ...]:
@@ -127,8 +127,15 @@ def _score_row(name: str, one: LayoutScore) -> tuple[str, ...]:
 
 
 def _difference_row(name: str, one: LayoutDifference) -> tuple[str, ...]:
-    values = (one.brier, one.log_score, one.false_features)
-    return (name, *(text(value, signed=True) for value in values))
+    brier, *others = (
+        text(value, signed=True) for value in (one.brier, one.log_score, one.false_features)
+    )
+    return (name, brier, verdict(one.brier), *others)
+
+
+def verdict(less: Mean) -> str:
+    """What a difference of scores shows: undecided where its interval holds zero or is missing."""
+    return "better" if less.high < 0.0 else "worse" if less.low > 0.0 else "undecided"
 
 
 def text(value: Mean, digits: int = 3, *, signed: bool = False) -> str:

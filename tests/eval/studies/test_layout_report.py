@@ -1,12 +1,15 @@
 """The page and the tables of the study of layouts."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from crosscue.eval.scoring.intervals import Mean
 from crosscue.eval.scoring.truth import FEATURES
-from crosscue.eval.studies.layouts.report import tables_of, write_layout_study
+from crosscue.eval.studies.layouts.report import tables_of, verdict, write_layout_study
 from crosscue.eval.studies.layouts.score import (
     DriveBelief,
     LayoutScores,
@@ -51,6 +54,21 @@ def test_every_table_has_as_many_entries_in_each_row_as_columns() -> None:
     for table in tables_of(scores()):
         assert {len(row) for row in table.rows} == {len(table.head)}
         assert table.as_text().startswith(table.heading)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (-0.2, -0.1, "better"),
+        (0.1, 0.2, "worse"),
+        (-0.1, 0.2, "undecided"),
+        (math.nan, math.nan, "undecided"),
+    ],
+)
+def test_a_difference_is_decided_only_by_an_interval_without_zero(
+    low: float, high: float, said: str
+) -> None:
+    assert verdict(Mean((low + high) / 2.0, low, high, 10, 5)) == said
 
 
 def test_files_say_that_all_is_simulated_and_how_to_do_it_again(tmp_path: Path) -> None:
