@@ -168,7 +168,7 @@ def _put(
     canvas: Map,
     where: NDArray[np.bool_] | None,
     rgb: tuple[int, int, int],
-    light: NDArray[np.float32],
+    light: NDArray[np.floating],
     grain: int,
 ) -> None:
     """Colour times light, everywhere or where it is wanted; ``light`` is repeated like a tile."""
