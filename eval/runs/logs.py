@@ -35,7 +35,7 @@ from crosscue.replay.base import (
     versions,
 )
 from crosscue.replay.files.identity import identity_of, identity_of_all, identity_of_log
-from crosscue.replay.files.log_identity import Identity, as_row, of_row
+from crosscue.replay.files.log_identity import as_row, of_row
 from crosscue.replay.files.made_of import SIMULATED, difference
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote.logs import RangedLog, version_of
@@ -256,9 +256,3 @@ def settings_changed(run: RunFolder, vehicle: Vehicle) -> dict[str, Any] | None:
     settings.pop("files", None)
     settings["files"] = files_named_in(settings)
     return {**there, "settings": settings}
-
-
-def identity_in(run: RunFolder) -> Identity | None:
-    """Which logs the run is made of, where it says so."""
-    there = _read(run)
-    return None if there is None else of_row(there["identity"])

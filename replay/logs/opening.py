@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import cast
@@ -54,17 +54,6 @@ def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:
         ) from None
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path and the disk") from None
-
-
-@contextmanager
-def open_logs(
-    paths: Sequence[Path | str], limits: Limits = DEFAULT_LIMITS
-) -> Iterator[tuple[Log, ...]]:
-    """Several logs of one drive, open as long as the ``with`` block lasts; as ``open_log``."""
-    with ExitStack() as stack:
-        logs = tuple(stack.enter_context(open_log(path, limits)) for path in paths)
-        with unless_damaged(logs):
-            yield logs
 
 
 @contextmanager

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+import crosscue
+from crosscue.eval.interface.logs import log as interface
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, Log, LogError
-from crosscue.replay.logs import opening
-from crosscue.replay.logs.opening import open_logs
 from support.memory_log import MemoryLog
 
 
@@ -24,37 +24,37 @@ class Opened:
             raise LogError("broken: not a log")
         closed = self.closed
 
-        class Told(MemoryLog):
+        class Remembered(MemoryLog):
             def close(self) -> None:
                 closed.append(str(self.path))
 
-        return Told((), (), Path(path))
+        return Remembered((), (), Path(path))
 
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
     made = Opened()
-    monkeypatch.setattr(opening, "open_log", made)
+    monkeypatch.setattr(interface, "open_one", made)
     return made
 
 
 def test_logs_come_in_the_order_asked_for_and_are_closed_at_the_end(opened: Opened) -> None:
-    with open_logs(["a", "b"]) as logs:
-        assert [str(one.path) for one in logs] == ["a", "b"]
+    with crosscue.open("a", "b") as drive:
+        assert [str(one.path) for one in drive.logs] == ["a", "b"]
         assert opened.closed == []
 
     assert sorted(opened.closed) == ["a", "b"]
 
 
 def test_when_one_cannot_be_opened_those_before_it_are_closed(opened: Opened) -> None:
-    with pytest.raises(LogError, match="broken"), open_logs(["a", "broken", "c"]):
+    with pytest.raises(LogError, match="broken"), crosscue.open("a", "broken", "c"):
         pytest.fail("it was opened")
 
     assert opened.closed == ["a"]
 
 
 def test_when_the_work_fails_all_are_closed(opened: Opened) -> None:
-    with pytest.raises(ZeroDivisionError), open_logs(["a", "b"]):
+    with pytest.raises(ZeroDivisionError), crosscue.open("a", "b"):
         raise ZeroDivisionError
 
     assert sorted(opened.closed) == ["a", "b"]

@@ -58,7 +58,7 @@ def make_atlas(rng: Generator) -> Atlas:
     for name in WIDTH_M:
         atlas.add(name, sign(name))
     for i in range(4):
-        atlas.add(f"leaves_{i}", leaves(rng, needles=False))
+        atlas.add(f"leaves_{i}", leaves(rng))
     for i in range(8):
         atlas.add(f"front_{i}", front(rng, is_shop=i >= 5))
     for i in range(3):
@@ -80,7 +80,7 @@ def smooth_noise(rng: Generator, size: int, cells: int) -> NDArray[np.float64]:
     )
 
 
-def leaves(rng: Generator, *, needles: bool, size: int = 128) -> Rgba:
+def leaves(rng: Generator, size: int = 128) -> Rgba:
     """A bunch of leaves: many small ellipses, dark ones first, on nothing."""
     import cv2
 

@@ -277,13 +277,11 @@ class Placed:
         pixels: Shape (H, W, 3), uint8, blue green red; scaled, cut and padded.
         scale: From the given pixels to the scaled ones, along x and y.
         corner_px: Column and row of the network's first pixel in the scaled picture.
-        inner_px: Width and height without padding.
     """
 
     pixels: Bytes
     scale: tuple[float, float]
     corner_px: tuple[int, int]
-    inner_px: tuple[int, int]
 
 
 def place(pixels: Bytes, plan: Plan) -> Placed:
@@ -303,7 +301,7 @@ def place(pixels: Bytes, plan: Plan) -> Placed:
     padded = np.empty((_whole(size[1]), _whole(size[0]), 3), np.uint8)
     padded[: size[1], : size[0]] = scaled
     padded[size[1] :] = padded[: size[1], size[0] :] = _PAD
-    return Placed(padded, scale, (0, round(first * scale[1])), size)
+    return Placed(padded, scale, (0, round(first * scale[1])))
 
 
 def _whole(side: int) -> int:

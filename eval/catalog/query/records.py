@@ -47,11 +47,6 @@ class _Timings(BaseModel):
     seconds: float
 
 
-class _Detector(BaseModel):
-    name: str
-    identity: str
-
-
 class _Counts(BaseModel):
     frames: int
 

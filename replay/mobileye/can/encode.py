@@ -84,27 +84,6 @@ def encode_tables(
     return _frames(sent, bus)
 
 
-def encode_burst(
-    image_ns: int,
-    objects: Table,
-    settings: MobileyeSettings = DEFAULTS,
-    *,
-    latency_ns: int = LATENCY_NS,
-) -> Block:
-    """The frames of one image: a status frame, then A, B and C of each obstacle that is sent.
-
-    Args:
-        image_ns: When the image was grabbed.
-        objects: Columns as the table ``obstacles``; ``x_m`` and ``y_m`` from the rear axle are
-            wanted, the rest is optional.
-        settings: As for ``encode_tables``.
-        latency_ns: From the image to the status frame.
-    """
-    times = np.array([image_ns], dtype=np.int64)
-    objects = Table({**objects.columns, "t_ns": np.full(len(objects), image_ns, dtype=np.int64)})
-    return encode_tables(bursts_of(times, objects, settings, latency_ns=latency_ns), settings)
-
-
 def bursts_of(
     image_ns: Int64s,
     objects: Table,

@@ -20,7 +20,7 @@ time and burst -1. Tables other than status and obstacles have burst -1 througho
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 import numpy as np
@@ -51,20 +51,6 @@ _VARIANT_OF: Final[Mapping[str, str]] = {
     "sign": "basic",
 }
 """The only variant whose fields the messages have."""
-
-
-def tables_from_ros(
-    blocks: Iterable[Block],
-    types: Mapping[str, str],
-    ledger: Ledger,
-    settings: MobileyeSettings = DEFAULTS,
-    bus: str = "ros",
-) -> Iterator[Block]:
-    """All tables of a bag; see ``RosMobileye``."""
-    reader = RosMobileye(bus, types, ledger, settings)
-    for block in blocks:
-        yield from reader(block)
-    yield from reader.flush()
 
 
 class RosMobileye:

@@ -13,9 +13,8 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
-from crosscue.eval.runs.folder import open_run
-from crosscue.eval.runs.logs import identity_in
 from crosscue.eval.runs.manifest import FORMAT_VERSION
+from crosscue.replay.files.log_identity import of_row
 from support.trees import tree
 
 pytestmark = pytest.mark.slow
@@ -54,8 +53,7 @@ def test_resume_of_another_log_or_setting_is_refused_and_touches_nothing(
     keep = tmp_path / "keep"
     assert _replay(drives / "D-0", keep) == 0
     before = _bytes(keep)
-    theirs = identity_in(open_run(keep))
-    assert theirs is not None
+    theirs = of_row(json.loads((keep / "input.json").read_text())["identity"])
 
     assert _replay(drives / "D-1", keep, "--resume") == 2
     said = capsys.readouterr().err

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.can.encode import FRAME_NS, bursts_of, encode_burst, encode_tables
+from crosscue.replay.mobileye.can.encode import FRAME_NS, LATENCY_NS, bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
@@ -20,6 +20,19 @@ from support.mobileye_frames import MS, block_of, random_drive, random_words, va
 
 MOUNTED = MobileyeSettings(mounting=Mounting(1.85, -0.1, 0.02))
 STRAIGHT = MobileyeSettings(mounting=Mounting(1.85, -0.1))
+
+
+def encode_burst(
+    image_ns: int,
+    objects: Table,
+    settings: MobileyeSettings,
+    *,
+    latency_ns: int = LATENCY_NS,
+) -> Block:
+    """The frames of one image: a status frame, then A, B and C of each obstacle that is sent."""
+    times = np.array([image_ns], dtype=np.int64)
+    objects = Table({**objects.columns, "t_ns": np.full(len(objects), image_ns, dtype=np.int64)})
+    return encode_tables(bursts_of(times, objects, settings, latency_ns=latency_ns), settings)
 
 
 def decode(block: Block, how: MobileyeSettings) -> list[Block]:

@@ -16,7 +16,7 @@ from crosscue.replay.decode import decoder_for
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import layout
-from crosscue.replay.mobileye.ros.reader import RosMobileye, tables_from_ros
+from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.ros.sign import VOTES_WANTED
 from crosscue.replay.mobileye.settings import LaneSign, MobileyeSettings
 from support.mobileye_frames import (
@@ -54,7 +54,9 @@ def from_bag(
     blocks: Sequence[Block], how: MobileyeSettings = AS_ON_WIRE
 ) -> tuple[dict[str, Table], Ledger]:
     ledger = Ledger("log")
-    return tables_of(list(tables_from_ros(blocks, TOPIC_TYPES, ledger, how))), ledger
+    reader = RosMobileye("ros", TOPIC_TYPES, ledger, how)
+    tables = [table for block in blocks for table in reader(block)]
+    return tables_of([*tables, *reader.flush()]), ledger
 
 
 def by_time(table: Table) -> Table:
