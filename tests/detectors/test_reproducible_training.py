@@ -16,15 +16,18 @@ from crosscue.detectors.weights_file import serialised
 from support.mask_rcnn import write_bars
 from support.pictures import picture
 
-RUN = "from crosscue.eval.cli import main; main()"
-
-
-def _trained(folder: Path, argv: list[str], hash_seed: int) -> bytes:
-    output = folder / "out.safetensors"
-    command = [sys.executable, "-c", RUN, *argv, "-o", str(output), "-q"]
-    env = os.environ | {"PYTHONHASHSEED": str(hash_seed)}
-    subprocess.run(command, cwd=folder, env=env, check=True, timeout=300)
-    return output.read_bytes()
+ROAD = "road --data set --steps 2 --batch 2 --width 128"
+MASKS = (
+    "mask-rcnn --data bars/coco.json --images bars/images --classes car --steps 2 --batch 2 "
+    "--width 128 --window 96 64"
+)
+RUN = f"""
+from crosscue.eval.cli import run
+for line in ({ROAD!r}, {MASKS!r}):
+    words = line.split()
+    output = f"{{words[0]}}.safetensors"
+    assert run(["train", *words, "--device", "cpu", "--threads", "2", "-o", output, "-q"]) == 0
+"""
 
 
 def _road_set(folder: Path, numbers: list[int]) -> None:
@@ -38,66 +41,27 @@ def _road_set(folder: Path, numbers: list[int]) -> None:
         (folder / "set" / "masks" / f"{number}.png").write_bytes(mask)
 
 
-@pytest.mark.slow
-def test_two_trainings_of_the_road_network_are_the_same_bytes(tmp_path: Path) -> None:
-    argv = [
-        "train",
-        "road",
-        "--data",
-        "set",
-        "--steps",
-        "2",
-        "--batch",
-        "2",
-        "--width",
-        "128",
-        "--device",
-        "cpu",
-        "--threads",
-        "2",
-    ]
-    found = []
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two processes, each of which trained both networks."""
+    made = []
     for hash_seed, numbers in ((1, [0, 1, 2, 3]), (2, [3, 1, 0, 2])):
-        folder = tmp_path / str(hash_seed)
+        folder = tmp_path_factory.mktemp("trained")
         _road_set(folder, numbers)
-        found.append(_trained(folder, argv, hash_seed))
-
-    assert found[0] == found[1]
+        write_bars(folder / "bars", 4)
+        env = os.environ | {"PYTHONHASHSEED": str(hash_seed)}
+        command = [sys.executable, "-c", RUN]
+        subprocess.run(command, cwd=folder, env=env, check=True, timeout=300)
+        made.append(folder)
+    return made
 
 
 @pytest.mark.slow
-def test_two_trainings_of_mask_rcnn_are_the_same_bytes(tmp_path: Path) -> None:
-    argv = [
-        "train",
-        "mask-rcnn",
-        "--data",
-        "set/coco.json",
-        "--images",
-        "set/images",
-        "--classes",
-        "car",
-        "--steps",
-        "2",
-        "--batch",
-        "2",
-        "--width",
-        "128",
-        "--window",
-        "96",
-        "64",
-        "--device",
-        "cpu",
-        "--threads",
-        "2",
-    ]
-    found = []
-    for hash_seed in (1, 2):
-        folder = tmp_path / str(hash_seed)
-        folder.mkdir()
-        write_bars(folder / "set", 4)
-        found.append(_trained(folder, argv, hash_seed))
+@pytest.mark.parametrize("network", ["road", "mask-rcnn"])
+def test_two_trainings_are_the_same_bytes(folders: list[Path], network: str) -> None:
+    one, other = (folder.joinpath(f"{network}.safetensors").read_bytes() for folder in folders)
 
-    assert found[0] == found[1]
+    assert one == other
 
 
 def test_words_are_written_in_one_order() -> None:

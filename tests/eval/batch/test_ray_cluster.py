@@ -1,40 +1,56 @@
-"""Joining a Ray cluster takes nothing over and reports nobody."""
+"""A Ray cluster takes nothing over, reports nobody, and does what one process does.
 
+One cluster on this machine serves all tests that need one: starting it takes longer than they do.
+"""
+
+import os
 import signal
 import socket
 import sys
+from collections.abc import Iterator
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from crosscue.eval.batch.jobs import exit_status_of, in_turn, run_many
 from crosscue.eval.batch.ray_cluster import LOCAL, joined
+from crosscue.eval.batch.ray_jobs import OnRay
+from crosscue.eval.studies.town import work
+from crosscue.eval.studies.town.settings import LandmarkStudy
+from crosscue.eval.studies.town.work import WorkerError, assemble, chunks_of, run
+from crosscue.localization.town.settings import City, Drive
 from crosscue.replay.base import CrosscueError, UsageError
+from support.drive_work import letters, made_jobs
+from support.trees import tree
 
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
+WORDS = ("plain", "dies once", "damaged", "loss", "dies", "last")
+STUDY = LandmarkStudy(
+    drives=2,
+    drive=Drive(city=City(largest_km2=2.0)),
+    densities_per_km2=(0.5,),
+    detection_rates=(0.6,),
+    points=(),
+)
 
 
-@pytest.mark.slow
-@needs_ray
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_ray_neither_reports_its_use_nor_takes_sigterm_and_is_left(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
-    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    before = signal.getsignal(signal.SIGTERM)
-
-    with joined(LOCAL, 1) as ray:
-        from ray._common.usage import usage_lib
-
-        assert not usage_lib.usage_stats_enabled()
-        assert ray.cluster_resources()["CPU"] == 1.0
-        assert signal.getsignal(signal.SIGTERM) is before
-        with joined("auto") as again:
-            assert again is ray
-        assert ray.is_initialized()
-
-    assert not ray.is_initialized()
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Joined, and left at the end."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
+        patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        before = signal.getsignal(signal.SIGTERM)
+        with joined(LOCAL, 2) as ray:
+            assert signal.getsignal(signal.SIGTERM) is before
+            yield ray
+        assert not ray.is_initialized()
 
 
 @needs_ray
@@ -59,3 +75,60 @@ def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(UsageError, match=r"pip install 'crosscue\[ray\]'"), joined(LOCAL):
         pass
+
+
+@pytest.mark.slow
+@needs_ray
+def test_it_does_not_report_its_use_and_is_joined_once(cluster: Any) -> None:
+    from ray._common.usage import usage_lib
+
+    assert not usage_lib.usage_stats_enabled()
+    assert cluster.cluster_resources()["CPU"] == 2.0
+    with joined("auto") as again:
+        assert again is cluster
+    assert cluster.is_initialized()
+
+
+@pytest.mark.slow
+@needs_ray
+def test_drives_are_those_of_one_process_though_workers_die(
+    cluster: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    jobs = made_jobs(tmp_path, WORDS, "ray")
+
+    results = run_many(jobs, letters, OnRay(LOCAL, workers=2, attempts=2))
+
+    assert [done.job for done in results] == jobs
+    whole = [WORDS[i] for i, done in enumerate(results) if done.error is None]
+    assert whole == ["plain", "dies once", "loss", "last"]
+    assert "cut; copy it again" in str(results[2].error)
+    assert "drive4: its worker died (WorkerCrashedError" in str(results[4].error)
+    assert [done.attempts for done in results] == [1, 2, 1, 1, 2, 1]
+    assert exit_status_of(results) == 3
+    pids = {done.result.pid for done in results if done.result is not None}
+    assert os.getpid() not in pids
+    assert {done.result.threads for done in results if done.result is not None} == {"1"}
+
+    here = [job for job in made_jobs(tmp_path, WORDS, "here") if job.name != "drive4"]
+    run_many(here, letters, in_turn)
+    there = [job for job in jobs if job.name != "drive4"]
+    assert [tree(job.run) for job in there] == [tree(job.run) for job in here]
+    assert all(tree(job.run) or job.name == "drive2" for job in here)
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.slow
+@needs_ray
+def test_a_study_has_the_bytes_of_threads_and_reports_dead_workers(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chunks = chunks_of(STUDY.cases(), STUDY.drives, STUDY.seed)
+    for name, address in (("ray", LOCAL), ("threads", None)):
+        list(run(chunks, tmp_path / name, 1, ray_address=address))
+        assemble(chunks, tmp_path / name)
+    rays, threads = (tmp_path / name / "drives.parquet" for name in ("ray", "threads"))
+    assert rays.read_bytes() == threads.read_bytes()
+
+    monkeypatch.setattr(work, "_drive_chunk", lambda chunk: os._exit(1))
+    with pytest.raises(WorkerError, match="worker died"):
+        list(run(chunks, tmp_path / "dead", 1, ray_address=LOCAL))

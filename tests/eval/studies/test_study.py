@@ -15,7 +15,6 @@ import pytest
 from pydantic import ValidationError
 
 from crosscue.eval import cli
-from crosscue.eval.batch.ray_cluster import joined
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.studies.intervals import (
     fraction_of,
@@ -239,25 +238,6 @@ def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="other settings"):
         list(drive_study(other, tmp_path, 1))
     list(drive_study(other, tmp_path, 1, overwrite=True))
-
-
-@pytest.mark.slow
-def test_ray_gives_the_same_bytes_and_reports_of_dead_workers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("ray")
-    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
-    with joined("local", 1):  # one cluster for both
-        list(run(chunks, tmp_path / "ray", 1, ray_address="local"))
-        assemble(chunks, tmp_path / "ray")
-        clean = driven(SMALL, tmp_path / "threads")
-        rays, threads = (folder / "drives.parquet" for folder in (tmp_path / "ray", clean))
-        assert rays.read_bytes() == threads.read_bytes()
-
-        monkeypatch.setattr(work, "_drive_chunk", lambda chunk: os._exit(1))
-        with pytest.raises(WorkerError, match="worker died"):
-            list(run(chunks, tmp_path / "dead", 1, ray_address="local"))
 
 
 @pytest.mark.parametrize(
