@@ -39,7 +39,7 @@ residual_sd_m = 6.0
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated drive with small pictures, and a run over it."""
     folder = tmp_path_factory.mktemp("drive")
-    write_scene(folder, SceneSettings("A", camera=Camera(width_px=320, height_px=180)))
+    write_scene(folder, SceneSettings("A", camera=Camera(width_px=192, height_px=108)))
     text = (folder / "vehicle.toml").read_text()
     text = text[: text.index("[camera]")] if "[ranges" in text else text
     (folder / "vehicle.toml").write_text(text + DETECTORS.format(objects=folder / "objects.json"))

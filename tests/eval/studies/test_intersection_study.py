@@ -19,7 +19,7 @@ from crosscue.replay.vehicle.vehicle import load as load_vehicle
 
 pytestmark = pytest.mark.slow
 
-ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "320", "--detectors", "oracle")
+ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "192", "--detectors", "oracle")
 
 
 def _with_oracle(path: Path) -> Vehicle:
