@@ -237,7 +237,7 @@ def test_a_look_from_the_same_place_says_nothing_new_where_errors_fade() -> None
 
 def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> None:
     rng = np.random.default_rng(3)
-    fade_m, sd_m, runs = 3.0, 1.7, 1500
+    fade_m, sd_m, runs = 3.0, 1.7, 600
     rho = math.exp(-1.0 / fade_m)
     nees: dict[float, list[float]] = {fade_m: [], 0.0: []}
     for _ in range(runs):

@@ -30,7 +30,7 @@ def test_a_process_that_has_read_a_table_ends_well(tmp_path: Path) -> None:
         pa.table(columns), tmp_path / "many.parquet", row_group_size=200, write_page_checksum=True
     )
 
-    for _ in range(10):
+    for _ in range(6):
         command = [sys.executable, "-c", READS, str(tmp_path)]
         run = subprocess.run(command, capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stderr

@@ -22,7 +22,7 @@ from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.replay.base import RunError
-from support import faults
+from support import faults, scenes
 from support.trees import tree
 
 pytestmark = pytest.mark.slow
@@ -40,7 +40,9 @@ class Drive:
 
     def __init__(self, folder: Path) -> None:
         camera = Camera(width_px=192, height_px=108)
-        write_scene(folder, SceneSettings("C", camera=camera))
+        with pytest.MonkeyPatch.context() as patch:
+            scenes.shorten(patch, pictures=75)
+            write_scene(folder, SceneSettings("C", camera=camera))
         self.folder = folder
         self.vehicle = folder / "vehicle.toml"
         self.vehicle.write_text(
@@ -54,7 +56,7 @@ class Drive:
         assert {"manifest.json", "pose.parquet", "belief.parquet"} <= set(self.whole)
 
     def replay(self, run: Path, *more: str) -> list[str]:
-        """The command line: three seconds of the drive."""
+        """The command line: two seconds of the drive."""
         return [
             "replay",
             str(self.folder / "drive.mcap"),
@@ -67,7 +69,7 @@ class Drive:
             "--from",
             "4",
             "--to",
-            "7",
+            "6",
             *more,
         ]
 
@@ -113,7 +115,7 @@ def test_killed_anywhere_a_second_start_gives_the_same_bytes(drive: Drive, tmp_p
     count = len(faults.operations(run, faults.CHANGES, argv))
     assert count > 30
 
-    for operation in _some(8, count, seed=1):
+    for operation in _some(5, count, seed=1):
         shutil.rmtree(run)
         ended = faults.killed_before(run, operation, argv)
         assert ended.status == -signal.SIGKILL
@@ -132,7 +134,7 @@ def test_killed_while_it_replaces_another_run(drive: Drive, tmp_path: Path) -> N
     run.joinpath("manifest.json").write_text(text.replace("crosscue simulated car", "earlier"))
     count = len(faults.operations(run, faults.CHANGES, argv))
 
-    for operation in _some(4, count, seed=2):
+    for operation in _some(3, count, seed=2):
         shutil.rmtree(run)
         shutil.copytree(drive.folder / "whole", run)
         run.joinpath("manifest.json").write_text(text.replace("simulated car", "earlier car"))
@@ -156,7 +158,7 @@ def test_an_estimate_killed_midway_is_never_taken_for_whole(drive: Drive, tmp_pa
     replaced = tree(run)
     assert replaced != drive.whole
 
-    for operation in _some(5, count, seed=3):
+    for operation in _some(3, count, seed=3):
         shutil.rmtree(run)
         shutil.copytree(drive.folder / "whole", run)
         assert faults.killed_before(run, operation, argv).status == -signal.SIGKILL
@@ -173,7 +175,7 @@ def test_a_write_that_fails_anywhere_leaves_nothing_half(
     argv = drive.replay(run)
     count = len(faults.operations(run, faults.WRITES, argv))
 
-    for operation in _some(6, count, seed=4):
+    for operation in _some(4, count, seed=4):
         shutil.rmtree(run, ignore_errors=True)
         ended = faults.failing_from(run, operation, argv, once=once)
         _is_text(ended)

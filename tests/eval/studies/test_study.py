@@ -198,7 +198,7 @@ def test_the_like_for_like_figure_comes_first_and_says_how_the_subset_was_chosen
 
 
 def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
-    study = RangeStudy(drives=200)
+    study = RangeStudy(drives=100)
     found = {
         (round(one.slip_per_sqrt_m, 4), round(one.compass_interval_m, 3)): one
         for one in drive_choices(study)

@@ -165,12 +165,12 @@ def nees(done: Advance, truth: Truth) -> float:
     )
 
 
-SEEDS = 50
+SEEDS = 24
 
 
 @pytest.mark.slow
 def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
-    """NEES of the last pose and NIS of all landmarks, seeds 0 to 49."""
+    """NEES of the last pose and NIS of all landmarks, seeds 0 to 23."""
     runs = [run(tmp_path, seed) for seed in range(SEEDS)]
 
     low, high = mean_band(3, SEEDS)
