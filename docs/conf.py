@@ -1,7 +1,10 @@
 """Sphinx settings; ``make docs`` builds the site with warnings as errors."""
 
+import atexit
+import os
 import shutil
 import sys
+import tempfile
 from importlib.metadata import version as installed
 from pathlib import Path
 
@@ -11,6 +14,11 @@ shutil.rmtree(HERE / "notebooks", ignore_errors=True)
 shutil.copytree(HERE.parent / "notebooks", HERE / "notebooks")
 
 sys.path.insert(0, str(HERE / "extensions"))
+
+# Notebooks about the same drive share what detectors found, in no cache of the user's.
+CACHE = tempfile.mkdtemp()
+os.environ["XDG_CACHE_HOME"] = CACHE
+atexit.register(shutil.rmtree, CACHE, ignore_errors=True)
 
 project = "crosscue"
 author = "the crosscue developers"
