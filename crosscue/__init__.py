@@ -17,7 +17,7 @@ _LINKED: Final = ("replay", "detectors", "fusion", "localization", "datasets", "
 
 
 def _broken_links(folder: Path) -> list[str]:
-    """Names of linked packages that are no folders here."""
+    """Names of linked packages that are not folders here."""
     return [name for name in _LINKED if not (folder / name).is_dir()]
 
 

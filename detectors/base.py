@@ -86,7 +86,7 @@ class Detections:
     min_scores: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up, and numbers that are none.
+        """Refuse columns that do not line up, and values that are not finite.
 
         Raises:
             ValueError: Naming the column, the shape wanted and the shape given.

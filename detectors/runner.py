@@ -74,7 +74,7 @@ class Runner:
         cache: Asked first.
         camera: Topic.
         depth_bits: Of 16-bit pictures.
-        on_skip: Reported the time and reason of each picture that cannot be decoded.
+        on_skip: Called with the time and reason of each picture that cannot be decoded.
         light_labels: Labels of traffic lights, whose lenses are examined.
         counts: Grow as it works.
     """
@@ -91,7 +91,7 @@ class Runner:
         """Results of a block's pictures, in order; those that do not decode are left out.
 
         Raises:
-            UsageError: A detector gave another number of results than it was given frames.
+            UsageError: A detector returned more or fewer results than frames.
             CrosscueError: A detector failed.
         """
         if not isinstance(block.rows, Images):

@@ -13,7 +13,7 @@ class SignRange:
     """The range that one detected sign or light reports.
 
     Attributes:
-        reference: What it stands at.
+        reference: Whether it is at the start or the end.
         range_m: From the rear axle to there.
         var_m2: How sure that is.
     """

@@ -3,7 +3,7 @@
 For real drives, where one false frame in eighty is usual. A detection speaks if
 
 * the cue was positive in at least k of the last n frames in which it was looked for; a picture seen
-  before is no new frame;
+  before is not a new frame;
 * the intersection is not known to be further away than the cue was ever validated.
 
 Then it sends its published message (eq. 18), once a frame however many things it counts, since one

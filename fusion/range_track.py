@@ -33,7 +33,7 @@ class RangeTrack(NamedTuple):
 
     Attributes:
         belief: None before measurements enough have agreed, and after it was dropped.
-        rival: What measurements say that agree among themselves but are no belief: the first
+        rival: What measurements say that agree among themselves but are not a belief: the first
             ones, or refused ones.
         rival_seen: How many of them in a row.
         unseen_m: Way gone since the last measurement that was taken, or waits to be.
@@ -127,7 +127,7 @@ def follow(
 ) -> tuple[RangeTrack, Verdict]:
     """Take up a range that somebody else has weighed from all observations so far.
 
-    Its errors are those of the one before, but for what is new, so it is no independent
+    Its errors are those of the one before, but for what is new, so it is not an independent
     measurement: one after the other would make the belief far too sure. It is one (eq. 10 to 12)
     whose gain follows the way gone, ``1 - exp(-way / take_up_m)``, so that a correction smaller
     than ``take_up_m`` never makes the range grow while the car goes on, and nothing changes while

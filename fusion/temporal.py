@@ -8,14 +8,14 @@ what is believed of the intersection itself, and it is withdrawn with it.
   them. An intersection that is passed leaves the state, one comes into reach every ``spacing_m``.
 * *Cues.* Given the state a cue is a Markov chain with two values, positive or not. Its transitions
   depend on the features that it speaks of and on the distance. A cue that nothing looked for says
-  nothing, and its chain begins again. Cues are heard once a step (of way, or of time where the car
-  stands), so that the result does not depend on the frame rate.
-* *Ranges.* A sign's range is Gaussian about the distance, or stray and uniform. What is taken for a
-  sign where no intersection is stands at some place too, and its ranges agree as well; so that
-  state has a distance as well, and ranges alone say where, not whether.
+  nothing, and its chain begins again. Cues are evaluated once a step (of distance, or of time
+  where the car stands), so that the result does not depend on the frame rate.
+* *Ranges.* A sign's range is Gaussian about the distance, or stray and uniform. A false
+  sign, where no intersection is, has a fixed place too, and its ranges agree with one another; so
+  that state has a distance as well, and ranges alone say where, not whether.
 
 What is reported is the posterior, but for a *lapse*: a place may be unlike all that were learned
-from, and then what is usual stands. Both shares obey the same bounds.
+from, and then the prior holds. Both probabilities obey the same bounds.
 
 With likelihoods raised to one exponent (cues repeat one another), the posterior is
 ``p(x | now) ~ L(now | x)^a sum p(x | x') p(x' | before)``: the forward recursion (Rabiner, *A

@@ -43,7 +43,7 @@ class CompassSettings:
     declination_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no rotation, no correction or no number.
+        """Refuse what is not a rotation, a correction or a number.
 
         Raises:
             ValueError: Naming the field.

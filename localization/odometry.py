@@ -194,7 +194,8 @@ class OdometryCounts:
         turn_dropped: Of those, dropped for any of the three reasons.
         intervals: Increments made.
         gaps: Increments longer than the settings allow.
-        turn_missing: Increments whose turn signal had a gap, so that wheels gave the heading.
+        turn_missing: Increments whose turn signal had a gap, so that the heading came from the
+            wheels.
     """
 
     rows: int = 0

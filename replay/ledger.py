@@ -108,7 +108,7 @@ class Ledger:
         integrity: In plain words, which checksums were verified, or that the format has none.
         accounts: By topic name; the empty name holds what cannot be attributed.
         details: The first ``DETAILS_KEPT`` single skips and losses.
-        notices: Plain sentences about the log that are no loss (no index, clock reset, ...).
+        notices: Plain sentences about the log that are not a loss (no index, clock reset, ...).
     """
 
     log: str

@@ -28,7 +28,7 @@ def versions() -> dict[str, str]:
 def versions_and_commit() -> dict[str, str]:
     """The same for a manifest: with the commit of crosscue, where it is known.
 
-    It is no part of ``versions``, which decide whether a run can be resumed.
+    It is not part of ``versions``, which decide whether a run can be resumed.
     """
     found = commit(Path(__file__).resolve().parents[1])
     return versions() if found is None else {**versions(), "crosscue_commit": found}

@@ -9,7 +9,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 SELF_CONTAINED = {"variable_recruitment"}
-"""Of what is no part of the toolkit: they need nothing of it."""
+"""Of what is not part of the toolkit: they need nothing of it."""
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 

@@ -11,8 +11,8 @@ Intrinsics are those of ``calib/SEQ.txt`` or of ``calib_cam_to_cam.txt`` in the 
 drive's day. Labels of the tracking set (``label_02/SEQ.txt``) become objects of the truth; a raw
 drive's tracklets are not read.
 
-All of the box's numbers come from one filter: ``ins_speed`` is no wheel speed, and ``gnss`` is no
-raw fix.
+All of the box's numbers come from one filter: ``ins_speed`` is not a wheel speed, and ``gnss`` is
+no raw fix.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class Packets:
 
 
 def parse(line: str | bytes) -> tuple[float, ...] | str:
-    """The thirty numbers of one line, or why it is no packet."""
+    """The thirty numbers of one line, or why it is not a packet."""
     parts: Sequence[str | bytes] = line[:LINE_BYTES].split()
     if len(parts) != len(COLUMNS):
         return f"{len(parts)} numbers; expected {len(COLUMNS)}"

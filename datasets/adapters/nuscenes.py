@@ -224,7 +224,7 @@ def matrix_of(row: Row, scene: Scene) -> tuple[float, float, float]:
     """Focal length and optical center of a ``calibrated_sensor`` row.
 
     Raises:
-        LogFormatError: They are no numbers of pixels.
+        LogFormatError: They are not numbers of pixels.
     """
     try:
         matrix = np.array(row["camera_intrinsic"], np.float64)

@@ -7,7 +7,7 @@ and annotations are not read: as published, annotations are pickles, and a pickl
 is read. Intrinsics go into ``crosscue vehicle init``.
 
 Topics: one per camera; ``odometry`` (forward speed and yaw rate of the car, from the front camera's
-poses, so it is no wheel speed and as good as the poses are); ``gnss``.
+poses, so it is not a wheel speed and as good as the poses are); ``gnss``.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def fetch(
     Args:
         known: The recording.
         given: A folder that holds it; no network is used.
-        on_progress: Reported the file, and the bytes of the whole recording that are there.
+        on_progress: Called with the file, and the bytes of the whole recording that are there.
         environment: For the variables named above.
 
     Returns:

@@ -1,7 +1,7 @@
 """Intersections as plans: the eight of Table 6, and any number of others from seeds.
 
-Layouts ``M`` are mixed: thirteen kinds in turn, five of which are no intersection at all, so that
-every feature of an intersection has positives and negatives in any thirteen in a row.
+Layouts ``M`` are mixed: thirteen kinds in turn, five of which are not an intersection at all, so
+that every feature of an intersection has positives and negatives in any thirteen in a row.
 
 Local frame: x ahead along the approach road, y to the left, zero on the approach road's middle line
 where the intersection starts (stop line, and stop sign if there is one). The crossroad's near kerb
@@ -93,7 +93,7 @@ class Layout:
     def features(self) -> dict[str, bool]:
         """What is true of it, as far as that can be said.
 
-        Where no intersection is, one can turn nowhere; a road that runs on is no direction of
+        Where no intersection is, one can turn nowhere; a road that runs on is not a direction of
         travel to choose, so straight is left out, and so is the side to which a road bends.
         """
         if self.is_intersection:

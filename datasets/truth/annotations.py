@@ -27,7 +27,7 @@ OTHER_THINGS: Final = frozenset(
     {"person", "pedestrian", "bicycle", "car", "motorcycle", "bus", "train", "truck", "van",
      "vehicle", "rider", "trailer"}
 )  # fmt: skip
-"""Labels of things on a road that are no cue by themselves."""
+"""Labels of things on a road that are not a cue by themselves."""
 SLACK_PX: Final = 1.0
 """Boxes may lie so far outside: tools round differently."""
 FAR: Final = 0.4
@@ -45,7 +45,7 @@ class Thing:
         visible: Share that nothing hides, or None.
         track: The same number in several pictures is the same thing; None unknown.
         segmentation: COCO's polygons or runs, or None.
-        place: Where it stands in its file, for errors.
+        place: Where it is in its file, for errors.
         range_m: From the camera, or None where the file does not say.
         score: Of a detector, for a box that nobody has confirmed yet.
     """
@@ -255,7 +255,7 @@ def meanings(
     *,
     any_thing: bool = False,
 ) -> dict[str, str | None]:
-    """From label to cue; None for things that are no cue.
+    """From label to cue; None for things that are not a cue.
 
     Args:
         annotations: With labels.

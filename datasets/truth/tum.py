@@ -47,7 +47,7 @@ class Trajectory:
     quat_wxyz: Floats
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up or are no poses.
+        """Refuse columns that do not line up or are not poses.
 
         Raises:
             ValueError: Naming the column, what is wanted and what is given.
@@ -96,7 +96,7 @@ def read_tum(path: Path, limits: Limits = DEFAULT_LIMITS) -> Trajectory:
     Raises:
         LogError: Not there or not readable.
         LogTooLargeError: Larger than one chunk may be.
-        LogFormatError: A line is no pose or goes back in time; its number is reported.
+        LogFormatError: A line is not a pose or goes back in time; its number is reported.
     """
     try:
         size = path.stat().st_size

@@ -174,7 +174,7 @@ class ModelCard(Settings):
         meanings = set(map(self.meaning, range(len(classes))))
         others = [name for name in self.scores if name not in meanings]
         if others:
-            raise ValueError(f"scores: {others[0]!r} is no label of its classes")
+            raise ValueError(f"scores: {others[0]!r} is not a label of its classes")
         return self
 
     @model_validator(mode="after")
@@ -214,7 +214,9 @@ def read_card(path: Path) -> ModelCard:
     try:
         content = read_at_most(path, MAX_CARD_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: over {MAX_CARD_BYTES // MIB} MiB; this is no model card")
+            raise VehicleError(
+                f"{path}: over {MAX_CARD_BYTES // MIB} MiB; this is not a model card"
+            )
         text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"

@@ -42,7 +42,7 @@ def fetch(
     Args:
         name: As ``crosscue model list`` prints it.
         given: A file, or a folder with the files, to take them from; no network is used.
-        on_progress: Reported of each piece.
+        on_progress: Called after each piece.
         environment: For the variables named above.
 
     Raises:

@@ -135,7 +135,7 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
         size_px: Width and height to run at, where the file leaves them open.
 
     Raises:
-        UsageError: The network does not run at that size, or the size is no sensible one.
+        UsageError: The network does not run at that size, or the size is not a sensible one.
     """
     if all(isinstance(side, int) for out in model.outputs for side in out.shape):
         return model

@@ -35,7 +35,7 @@ class Candidates:
 
     Attributes:
         unit: What is counted: detections with the cue's labels, or frames with road in its region.
-        setting: Where the threshold stands in the vehicle file; None where it has none.
+        setting: Where the threshold is set in the vehicle file; None where it has none.
         threshold: Only a higher score counts; the lowest, where detectors differ.
         seen: How many there were.
         used: How many became the cue or the range.

@@ -218,7 +218,7 @@ def class_numbers(values: Floats, count: int) -> Int64s:
     """Class numbers that came as floating-point values or integers, checked.
 
     Raises:
-        ValueError: One that is no index of ``count`` classes.
+        ValueError: One that is not an index of ``count`` classes.
     """
     bad = len(values) - int(np.isfinite(values).sum())
     if bad:

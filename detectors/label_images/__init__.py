@@ -122,7 +122,7 @@ class LabelledRoad:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """None: road is no object."""
+        """None: road is not an object."""
         return ()
 
     @property

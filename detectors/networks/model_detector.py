@@ -105,7 +105,7 @@ class RoadModel:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """None: road is no object."""
+        """None: road is not an object."""
         return ()
 
     @property

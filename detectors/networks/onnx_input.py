@@ -17,10 +17,10 @@ _FIXED: Final = {1: 8, 5: 4}
 
 
 def input_shape(content: bytes) -> tuple[int | None, ...] | None:
-    """Sizes of the first input that is no weight, None for one left open; None where not reported.
+    """Sizes of the first input other than a weight, None for an open one; None if not reported.
 
     Raises:
-        ValueError: The bytes are no protobuf.
+        ValueError: The bytes are not protobuf.
     """
     for graph in _parts(memoryview(content), _GRAPH):
         weights = {

@@ -135,7 +135,7 @@ def _residual_of(
 
 
 def _inliers(off: Floats) -> NDArray[np.bool_]:
-    """Which residuals are no outliers, by the scale of the typical one."""
+    """Which residuals are not outliers, by the scale of the typical one."""
     away = np.abs(off - np.median(off))
     return np.asarray(away <= OUTLIER_SIGMAS * 1.4826 * np.median(away), np.bool_)
 

@@ -1,6 +1,6 @@
 """Which way a traffic light faces, from its picture: a lit lens is seen only from the front.
 
-A housing seen from behind or from the side is dark all over, and is no signal for this car. The
+A housing seen from behind or from the side is dark all over, and is not a signal for this car. The
 rule is plain image processing: inside the box, the largest spot of a signal's colour, bright,
 saturated, round, and about as large as a lens should be. One frame proves little (lamps flicker,
 hoods hide them), so that a light faces the car or does not is said of a track, over many frames.

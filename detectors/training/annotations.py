@@ -107,7 +107,9 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
     """
     tree = _tree(path)
     if not folder.is_dir():
-        raise AnnotationError(f"{folder}: no folder; give the one with the images of {path.name}")
+        raise AnnotationError(
+            f"{folder}: not a folder; give the one with the images of {path.name}"
+        )
     left_out: Counter[str] = Counter()
     names = {row["id"]: row["name"] for row in _rows(tree, "categories", path) if "id" in row}
     if not set(classes) & set(names.values()):
@@ -148,7 +150,7 @@ def _tree(path: Path) -> Mapping[str, Any]:
     except OSError as error:
         raise AnnotationError(f"{path}: {error.strerror}; expected a COCO file") from None
     except ValueError as error:
-        raise AnnotationError(f"{path}: no JSON ({error}); expected a COCO file") from None
+        raise AnnotationError(f"{path}: not JSON ({error}); expected a COCO file") from None
     if not isinstance(tree, dict):
         raise AnnotationError(f"{path}: expected a COCO file: images, annotations and categories")
     return tree

@@ -111,7 +111,7 @@ def run_job(
         SchemaError: The state to go on from is damaged.
         UsageError: The state to go on from is of another training.
         VehicleError: The network to start from does not fit.
-        CrosscueError: The losses are no numbers any more.
+        CrosscueError: The losses are not numbers any more.
     """
     if not (resume and job.state_path.exists()):
         _check_place(job, overwrite)

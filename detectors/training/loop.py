@@ -28,7 +28,7 @@ from .samples import Sample, Sampler
 STATE_KEY: Final = "crosscue_training"
 GRADIENT_LIMIT: Final = 5.0
 BAD_STEPS: Final = 20
-"""So many losses in a row that are no numbers end the training."""
+"""So many losses in a row that are not numbers end the training."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class Training:
 
         Raises:
             LogError: A picture cannot be read.
-            CrosscueError: The losses are no numbers any more.
+            CrosscueError: The losses are not numbers any more.
         """
         schedule = self.schedule
         first, last = self.done * schedule.batch, schedule.steps * schedule.batch

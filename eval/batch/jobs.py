@@ -2,9 +2,9 @@
 
 A drive is a ``Job``: its logs, its run folder and a fingerprint of every setting. Engines work
 through jobs: ``in_turn`` in this process, ``processes.Processes`` on this machine's cores,
-``ray_jobs.OnRay`` on a Ray cluster. What has been done stands in a ``journal`` beside the run
+``ray_jobs.OnRay`` on a Ray cluster. What has been done is recorded in a ``journal`` beside the run
 folders, written before and after each drive, so that a second start does only what is missing,
-however the first one ended. Why a drive failed stands in ``failure.log`` in its run folder.
+however the first one ended. Why a drive failed is recorded in ``failure.log`` in its run folder.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Done(Generic[R]):
         job: The job.
         exit_status: As the command would have ended for this drive alone.
         error: One line, or None.
-        result: What the work gave back; None after an error, and for an earlier run.
+        result: What the work returned; None after an error, and for an earlier run.
         seconds: Wall time of the last attempt.
         attempts: How often it was begun; 0 for an earlier run.
         losses: Met where no account is kept, see ``replay.losses``; the process that asked warns
@@ -157,7 +157,7 @@ def run_many(
             run folder itself and writes its manifest last.
         engine: Where to work.
         overwrite: Replace run folders that hold a run of other logs or settings.
-        on_progress: Reported about once a second.
+        on_progress: Called about once a second.
 
     Returns:
         One for each job, in the order of ``jobs``.

@@ -2,7 +2,7 @@
 
 An entry is written when a drive is begun and again when it ends. In between the worker touches it
 every few seconds, so that anyone who sees the folder, on whatever machine, knows it is alive. The
-time of an end is that of the file: no clock stands in it.
+time of an end is that of the file: it contains no clock.
 """
 
 from __future__ import annotations

@@ -96,7 +96,7 @@ class OnRay:
 
 
 def _taken(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
-    """What a task gave, or how its worker died."""
+    """What a task returned, or how its worker died."""
     try:
         done: Done[Any] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:

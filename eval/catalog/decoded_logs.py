@@ -183,7 +183,7 @@ def decode_tables(
                 table.write()
         rows = {f"{table.name}.parquet": table.rows for table in tables.values()}
         if not any(rows.values()):
-            raise empty_result("no topic gave a row for a table", logs, selection)
+            raise empty_result("no topic yielded a row for a table", logs, selection)
         made = account(reading_of(ledgers))
         write_skipped(new, ledgers, made.reading, timeline=timeline)
         content = DecodeManifest(

@@ -38,7 +38,7 @@ class RunRows:
 
 
 def belief_around(rows: RunRows, failure: Failure) -> Markup | None:
-    """Probabilities from 6 s before the moment to 6 s behind it; None for a run without belief."""
+    """Probabilities from 6 s before the moment to 6 s after it; None for a run without belief."""
     if rows.belief is None:
         return None
     t_s = _seconds(rows.belief["t_ns"].to_numpy(), failure.t_ns)

@@ -42,7 +42,7 @@ CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 
 @dataclass(slots=True)
 class Annotated:
-    """What runs and truths gave.
+    """What runs and their truth teach.
 
     Attributes:
         approaches: To learn from.
@@ -135,7 +135,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
 def _meant(
     t_ns: Int64s, truth: Truth
 ) -> tuple[NDArray[np.bool_], dict[str, bool] | None, str, str]:
-    """Which frames count, what is true, which intersection, and what the approach was."""
+    """Which frames count, true features, the intersection, and where the approach led."""
     shared = [((t_ns >= a.start_ns) & (t_ns < a.enter_ns)).sum() for a in truth.approaches]
     if shared and max(shared) > 0:
         one = truth.approaches[int(np.argmax(shared))]
@@ -158,7 +158,7 @@ def _whole(column: object) -> Int64s:
 
 
 def _ways(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> Floats:
-    """Way gone up to each of the sorted times, forwards or back, reckoned where unknown."""
+    """Distance travelled, either way, up to each sorted time; estimated where unknown."""
     odometer = odometer_of(run)
     gone, total, last_ns = np.empty(len(t_ns)), 0.0, None
     for i, now_ns in enumerate(t_ns.tolist()):

@@ -179,7 +179,7 @@ def check_vehicle(
 
     Raises:
         VehicleError: The vehicle file does not fit the drive.
-        UsageError: A span that cannot be, or an output that is no page or picture.
+        UsageError: A span that cannot be, or an output that is not a page or picture.
         OutputError: The file exists, or cannot be written.
         EmptyResultError: Nothing in those seconds: no signal and no picture.
     """

@@ -1,4 +1,4 @@
-"""From a drive's camera to detections, road shares and cues in a run folder."""
+"""From a drive's camera to detections, fractions of road and cues in a run folder."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def detect_into(
         choices: Detectors, in order.
         cache: File with results of earlier runs, or None for none.
         draw: How many pictures to write at most, with detections drawn, spread over the drive.
-        on_frames: Reported how many frames are done, and of how many where the log declares it.
+        on_frames: Called with how many frames are done, and of how many where the log declares it.
         timeline: The drive's time segments, if they have been found already.
 
     Raises:

@@ -126,7 +126,7 @@ def estimate_into(
     if Signal.WHEEL_SPEEDS in silent:
         raise empty_result(silent[Signal.WHEEL_SPEEDS], logs, selection)
     if not tally.rows and found is None and landmarks is None:
-        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they gave no pose")
+        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they yielded no pose")
         what = f"no detector has run over a camera, and of the wheel speeds: {why}"
         raise empty_result(what, logs, selection)
     scene = None if found is None else _scene(run, vehicle, found, reading)

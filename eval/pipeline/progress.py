@@ -25,7 +25,7 @@ def report_time(on_time: OnTime, timeline: Timeline, t_ns: int) -> None:
 
 
 OnFrames = Callable[[int, int | None], None]
-"""Reported how many frames are done, and of how many where that is known."""
+"""Called with how many frames are done, and of how many where that is known."""
 
 
 def no_progress(_done: int, _of: int | None) -> None:

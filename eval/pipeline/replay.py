@@ -50,7 +50,7 @@ class Detecting:
         cache: File with results of earlier runs, or None for none.
         draw: How many pictures to write with detections drawn.
         resume: Keep detections of an earlier start that would come out the same.
-        on_frames: Reported how many frames are done, and of how many where that is known.
+        on_frames: Called with how many frames are done, and of how many where that is known.
     """
 
     choices: tuple[Choice, ...]

@@ -38,7 +38,7 @@ class Tracked:
 
     Attributes:
         name: Of the run.
-        metrics: By name; those that are no number are left out.
+        metrics: By name; those that are not a number are left out.
         tags: By name.
         files: Artifacts.
     """

@@ -16,7 +16,7 @@ class CandidateRow(Record):
     unit: Literal["detections", "frames"]
     """Detections with one of the cue's labels, or frames with road in its region."""
     setting: str | None
-    """Where the threshold stands in the vehicle file; None where it has none."""
+    """Where the threshold is set in the vehicle file; None where it has none."""
     threshold: float | None
     """Only a higher score, or fraction of road, counts."""
     seen: int

@@ -220,7 +220,7 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
     """An empty run folder.
 
     Raises:
-        RunError: It exists and is not empty, or is no folder, and ``overwrite`` is not given.
+        RunError: It exists and is not empty, or is not a folder, and ``overwrite`` is not given.
         OutputError: It cannot be made.
     """
     try:
@@ -369,10 +369,10 @@ def open_run(
         limits: What its logs are read with.
 
     Raises:
-        RunError: As ``RunFolder.manifest``; ``logs`` is no folder.
+        RunError: As ``RunFolder.manifest``; ``logs`` is not a folder.
     """
     if logs is not None and not logs.is_dir():
-        raise UnreadableRunError(f"{logs}: no folder; give the one that the logs have moved to")
+        raise UnreadableRunError(f"{logs}: not a folder; give the one that the logs have moved to")
     run = RunFolder(path, logs, without_images, limits)
     run.manifest()
     return run

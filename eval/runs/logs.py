@@ -226,7 +226,7 @@ def files_named_in(settings: object) -> dict[str, str]:
     A name alone would not show that a file was edited.
     """
     if isinstance(settings, str):
-        # Longer texts are no names, and some systems fail on them.
+        # Longer texts are not names, and some systems fail on them.
         is_file = "/" in settings and len(settings) < 4096 and Path(settings).is_file()
         return {settings: version_of(settings)} if is_file else {}
     if isinstance(settings, Mapping):

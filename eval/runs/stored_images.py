@@ -136,7 +136,7 @@ def read_pictures(
 
     Args:
         camera: Where they lie.
-        on_pictures: Reported of blocks of ``Images`` with times as in the run's tables.
+        on_pictures: Called with blocks of ``Images`` with times as in the run's tables.
         span_ns: Those of this time, and some before and behind it; None for all.
 
     Raises:

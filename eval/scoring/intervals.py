@@ -2,7 +2,7 @@
 
 Wilson's interval (E. B. Wilson, JASA 22, 1927) takes every count as independent. Frames of one
 drive are not: a sign missed in one frame is missed in the next. So wherever several drives or
-approaches are merged, an interval over whole clusters stands beside it. Trust the wider one.
+approaches are merged, an interval over whole clusters is shown beside it. Trust the wider one.
 
 Resampling clusters covers too little for few of them: 82 to 88 % of five to eight, where 95 % is
 stated. Here the variance is the jackknife's over clusters (MacKinnon, Nielsen, Webb, *Fast and

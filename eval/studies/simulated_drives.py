@@ -103,7 +103,7 @@ def run_drives(
         scenes: Drives, in the order in which they are done.
         detectors: Comma-separated, as ``replay`` takes them.
         engine: Where to work.
-        on_progress: Reported about once a second.
+        on_progress: Called about once a second.
         vehicle: A vehicle file to replay with; each drive's own, if left out.
         imager: What cameras record.
 

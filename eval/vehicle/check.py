@@ -229,7 +229,7 @@ def _rows(
             float(known.min() * scale) if len(known) else math.nan,
             float(known.max() * scale) if len(known) else math.nan,
             unit,
-            # Rate and range stand in columns of their own.
+            # Rate and range have columns of their own.
             ", ".join(verdict.facts[2:]),
             wrong,
         )

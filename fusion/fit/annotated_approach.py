@@ -28,7 +28,7 @@ class AnnotatedApproach:
         is_established: Shape (N,): its presence was, by earlier frames.
         counts: From cue to shape (N,): how many, or ``NOT_LOOKED``.
         features: Which are there, and which are not; one not named is not known.
-        place: Which intersection; drives up to the same one are no new evidence about others.
+        place: Which intersection; drives up to the same one are not new evidence about others.
     """
 
     way_m: NDArray[np.float64]

@@ -2,8 +2,8 @@
 
 * A cue's *fade* reports how many independent observations an approach holds; see ``fade_fit``.
 * A *rate* is the fraction of positive observations where a feature is there, and where it is not,
-  near and far. Each look weighs what it is worth as an independent one, and each place the same: a
-  thousand examines three crossroads say little of a fourth. Both shares are pulled towards their
+  near and far. Each frame is weighted by how independent it is, and each place equally: a
+  thousand frames at three crossroads say little about a fourth. Both rates are pulled towards their
   common one as if by one more place there (Laplace's rule with the pooled rate for a prior), so
   that few places say that there is no difference.
 * A feature's *exponent* is the factor on all its log odds, at most 1, that makes its log score over
@@ -40,10 +40,10 @@ class Side(NamedTuple):
     """One side of a rate.
 
     Attributes:
-        rates: Fraction of positive examines each place that has any.
-        frames: Looks as they are.
-        looks: What they are worth as independent ones.
-        hits: Likewise of the positive ones.
+        rates: Fraction of positive frames at each place that has any.
+        frames: Number of frames.
+        looks: How many independent observations they are worth.
+        hits: The same for positive frames.
     """
 
     rates: tuple[float, ...]

@@ -133,7 +133,7 @@ def fit_compass(
     if n < settings.min_readings:
         raise VehicleError(
             f"compass: {n} of {len(t_ns)} readings are finite and have a reference heading, "
-            f"{settings.min_readings} are wanted; take a longer drive"
+            f"{settings.min_readings} are required; take a longer drive"
         )
     if reference_rad is None:
         return _fit_alone(field_t, usable, given, settings)
@@ -235,7 +235,7 @@ def _missing(
 
 
 def _short(covered_deg: int, wanted_deg: float) -> str:
-    return f"headings cover {covered_deg} of 360 degrees, {wanted_deg:.0f} are wanted"
+    return f"headings cover {covered_deg} of 360 degrees, {wanted_deg:.0f} are required"
 
 
 def _fitted_yaw(field_t: Floats, reference_rad: Floats, given: CompassSettings) -> CompassSettings:

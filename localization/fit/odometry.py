@@ -44,9 +44,9 @@ NO_INFORMATION_SD: Final = 1e5
 WITHOUT_EFFECT: Final = 1e3
 """Parameters with a larger s.d. in those units had no effect on the drive."""
 REACH: Final = 4.5
-"""So many times what is plausible away from the given value is the furthest that is tried."""
+"""Max distance from the given value that is tried, in units of what is plausible."""
 ROUNDS: Final = 8
-"""At most so often do fitting and noise take turns."""
+"""Max number of alternations between fit and noise."""
 SETTLED: Final = 0.05
 """Noise that changes by a smaller fraction has settled."""
 MIN_FIXES: Final = 15
@@ -119,7 +119,7 @@ class OdometryFit:
         fix_sd_m: S.d. of the positions, by the residuals.
         residual_rms: Of the whitened residuals; 1 is right.
         fixes: Used.
-        outliers: Of those, further off than one good position in a thousand is.
+        outliers: How many of those are farther off than 99.9 % of good positions.
     """
 
     source: str

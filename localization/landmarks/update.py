@@ -43,7 +43,7 @@ class LandmarkSettings:
     """How landmarks are searched for and weighed.
 
     Attributes:
-        min_score: Matches with a lower score are none; ``crosscue fit landmarks`` chooses it.
+        min_score: Matches with a lower score are ignored; ``crosscue fit landmarks`` chooses it.
         sigmas: Size of the search ellipse.
         max_candidates: Compare with no more landmarks than these, the nearest.
         gate_nis: Refuse a match whose normalised innovation squared is larger; None accepts all.
@@ -280,7 +280,7 @@ class LandmarkSearch:
                 return None
             if here.score >= FALLEN_SHARE * peak.score:
                 return None
-            # What is left of this landmark leaves the view and is no new peak.
+            # What is left of this landmark leaves the view and is not a new peak.
             here = here._replace(score=math.inf)
         self._peak = here
         return None if peak is None or math.isinf(peak.score) else peak
@@ -312,7 +312,7 @@ class LandmarkSearch:
         """How far the camera has moved since the peak.
 
         From way and heading, not from the two estimated positions: what the filter corrected
-        meanwhile is no motion.
+        meanwhile is not motion.
         """
         heading = float(belief.mean[HEADING])
         turned = wrap(heading - peak.heading_rad)

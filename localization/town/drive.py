@@ -84,7 +84,7 @@ CITY_STREAM: Final = np.uint64(1)
 PLACE_STREAM: Final = np.uint64(2)
 SENSOR_STREAM: Final = np.uint64(3)
 NO_CITY: Final = -1.0
-"""In place of an outcome: the settings gave a city without intersections."""
+"""In place of an outcome: the settings yield a city without intersections."""
 STEP_FIELDS: Final = 16
 EVENT_FIELDS: Final = 6
 GOAL_SET, LANDMARK_SET, LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED = range(5)
@@ -205,7 +205,7 @@ class Log(NamedTuple):
         steps: Shape (S, 16): true x, y, heading, speed; left and right wheel's path as read;
             compass, NaN where none was read; then the filter's x, y, heading and their covariance
             xx, xy, xh, yy, yh, hh.
-        events: Shape (E, 6): step, kind, x, y of goal or landmark, x, y that a landmark gave.
+        events: Shape (E, 6): step, kind, x, y of goal or landmark, x, y measured by a landmark.
         noted: Shape (1,): events so far.
     """
 
@@ -625,7 +625,7 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
         Shape (N, 22): the fields of ``Result``.
 
     Raises:
-        ValueError: The settings gave a city without intersections.
+        ValueError: The settings yield a city without intersections.
     """
     rows = np.empty((len(seeds), FIELDS))
     kept(drive_each)(parameters_of(settings), seeds, rows, no_log())

@@ -77,7 +77,7 @@ class Sensors(Section):
     encoder_step_m: Positive = 0.02
     """Path of a wheel per encoder count; readings are off by up to half of it."""
     landmark_sd_m: Positive = 5.0
-    """S.d., in x and y, of the position that a recognised landmark gives."""
+    """S.d., in x and y, of the position that a recognised landmark yields."""
     landmark_gate_nis: Positive = 13.8
     """Refuse a landmark whose normalised innovation squared is larger (0.1 % of the right ones)."""
     detection_rate: Proportion = 1.0

@@ -82,7 +82,7 @@ def make_streets(stream: Stream, p: Parameters) -> Streets:
     gates = _gates_of(ways, columns)
     reach = _largest_part(gates, columns)
     inside = reach != 0
-    # Nobody can come to what is not connected with the rest; its streets are no streets.
+    # Nobody can come to what is not connected with the rest; its streets are not streets.
     for node in range(size):
         if not inside[node]:
             ways[node] = 0

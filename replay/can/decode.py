@@ -111,7 +111,7 @@ class BusDecoder:
         Args:
             database: The messages of this bus.
             bus: Topic of the frames, and first part of the topics of the rows given.
-            ledger: Reported of every frame that is not decoded; the reader has counted those found.
+            ledger: Records every frame that is not decoded; the reader has counted those found.
             wanted: Message names, or (message, signal) pairs; None for everything.
             settings: How strictly and by what means.
             elsewhere: 11-bit identifiers that another decoder of this bus reads and accounts for;
@@ -211,7 +211,7 @@ class BusDecoder:
             self._account_rare(frames, grouped, log_ns)
 
     def _account_rare(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
-        """Count the frames of asked-for messages that do not fit, and those that are no data."""
+        """Count the frames of asked-for messages that do not fit, and those that are not data."""
         number, ids, is_data = grouped.number, frames.arbitration_id, frames.kind == DATA
         is_plain_unknown = (number == 0) & ~frames.is_extended & (ids < STANDARD_IDS)
         rows = np.flatnonzero(

@@ -39,7 +39,7 @@ class PacketDecoder:
 
         Args:
             topic: Of the packets.
-            ledger: Reported of packets that become no picture.
+            ledger: Records packets from which no picture could be decoded.
         """
         self._topic = topic
         self._ledger = ledger

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 SHORT: Final = 8
-"""Hex digits that stand in a run's name."""
+"""Hex digits in a run's name."""
 
 
 @dataclass(frozen=True, slots=True)

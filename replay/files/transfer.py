@@ -93,7 +93,7 @@ def download(
         place: Where it goes; ``NAME.part`` beside it until it is whole.
         owner: What it belongs to, for errors.
         otherwise: What else can be done, for errors: ``give it with --weights FILE``.
-        on_progress: Reported of each piece.
+        on_progress: Called after each piece.
 
     Raises:
         CrosscueError: It cannot be had, or is another file.

@@ -86,7 +86,7 @@ class Field:
 
     @property
     def raw_range(self) -> tuple[int, int]:
-        """Smallest and largest raw number that is no sign of a missing value by itself."""
+        """Smallest and largest raw number that is not a sign of a missing value by itself."""
         lowest, highest = 0, (1 << self.bits) - 1
         if self.signed:
             lowest, highest = -(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1

@@ -33,7 +33,7 @@ class MobileyeStream:
 
         Args:
             bus: Topic of the bus; for messages any name.
-            ledger: Reported of what could not be used.
+            ledger: Records what could not be used.
             section: The vehicle file's.
             types: Of the topics with messages, from their names.
             is_shared_bus: The car's own signals are read from the same bus.

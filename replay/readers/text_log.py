@@ -24,7 +24,7 @@ from crosscue.replay.base import (
 )
 
 MAX_LINE: Final = 4096
-"""Characters of a line; a longer one is no row of numbers, and memory stays bounded."""
+"""Characters of a line; a longer one is not a row of numbers, and memory stays bounded."""
 Row: TypeAlias = tuple[int, *tuple[float, ...]]
 """Time in nanoseconds of the log's clock, and a number for each column."""
 
@@ -39,7 +39,7 @@ class TextLog(Closing):
         topic: What the topic is called.
         columns: Names of the columns after the time, each with its unit at the end.
         row_of: From a line to its row. A ``ValueError`` drops the line and reports it. Empty lines
-            are no rows.
+            are not rows.
     """
 
     path: Path

@@ -101,7 +101,7 @@ def default_store() -> Store:
     """As the environment says: ``CROSSCUE_STORE`` and ``CROSSCUE_STORE_GIB``.
 
     Raises:
-        UsageError: The limit is no positive number.
+        UsageError: The limit is not a positive number.
     """
     home = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
     folder = os.environ.get(STORE_VARIABLE) or str(Path(home, "crosscue", "logs"))
@@ -139,7 +139,7 @@ class Fetched(Closing):
         return self._hold is None
 
     def close(self) -> None:
-        """Let it go; it stays in the store until the room is needed."""
+        """Let it go; it stays in the store until its space is needed."""
         if self._hold is not None:
             os.close(self._hold)
             self._hold = None
@@ -453,7 +453,7 @@ class RemoteFiles:
 
 
 def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile | None:
-    """The object by ranges; None if it is no single object of known size."""
+    """The object by ranges; None if it is not a single object of known size."""
     info = _guarded(url, lambda: system.info(address))
     if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
         return None

@@ -29,7 +29,7 @@ class CanSignals:
 
         Args:
             bus: Its topic.
-            ledger: Reported of what could not be used.
+            ledger: Records what could not be used.
             vehicle: Names the signals.
             signals: What this bus carries, a Mobileye's among them where it is on the same bus.
 

@@ -231,7 +231,7 @@ def pictures_of(
         number: Of the log in the drive.
         topic: Of the camera.
         vehicle: The vehicle file.
-        ledger: Reported of what could not be used.
+        ledger: Records what could not be used.
         selection: Which part of the log to read; its topics do not count.
     """
     planned = Plan((Source(number, topic, ()),), {})

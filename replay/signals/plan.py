@@ -142,7 +142,7 @@ def _plan_heading(planner: _Planner) -> None:
 
 
 def _plan_mobileye(planner: _Planner) -> None:
-    """From the bus that the vehicle file names, else from messages; a log without is no error."""
+    """From the bus that the vehicle file names, else from messages; may be missing in a log."""
     bus = planner.vehicle.mobileye.bus
     on_bus = [(log, topic) for log, topic in planner.topics if topic.name == bus]
     if on_bus and role_of(on_bus[0][1]) is Role.CAN:

@@ -131,7 +131,7 @@ def scan(
     Args:
         logs: All logs of the drive, open.
         planned: Which topics will be used.
-        vehicle: Limits stand under ``[time]``.
+        vehicle: Limits are under ``[time]``.
         selections: What will be read of each log.
         wheels: For each log, what reads the wheel speeds off its blocks.
         known: An earlier timeline of these logs: its shifts are kept, so that tables of both go

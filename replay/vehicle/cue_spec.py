@@ -38,8 +38,8 @@ class CueSpec:
         label: Detector label that it counts, if it is fixed.
         settings: Prefix of its labels and score under ``[cues]`` of the vehicle file, if any.
         colour: In recordings: red, green, blue.
-        seen_frames: Where persistence counts, it must be positive in so many ...
-        of_frames: ... of the last so many frames in which it was looked for.
+        seen_frames: Where persistence counts, it must be positive in this many ...
+        of_frames: ... of this many most recent frames in which it was searched for.
         within_m: Where persistence counts, it says nothing of an intersection further away: the
             source's runs begin 100 m before theirs, so no cue was validated beyond.
         fade_m: Way over which its errors resemble each other, if it is about a standing thing.

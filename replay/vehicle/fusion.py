@@ -99,12 +99,12 @@ class CueEntry(Section):
     dissents: bool = False
     """Near the intersection its absence speaks against what it supports."""
     seen_frames: Annotated[int, Field(ge=1)] = 3
-    """With ``kind = "persistent"`` it is believed once positive in so many ..."""
+    """With ``kind = "persistent"``, a cue counts once it was positive in this many ..."""
     of_frames: Annotated[int, Field(ge=1, le=1000)] = 5
-    """... of the last so many frames in which it was looked for."""
+    """... of this many most recent frames in which it was searched for."""
     within_m: Positive = 100.0
-    """With ``kind = "persistent"`` it says nothing of an intersection known to be further away:
-    no further was it ever validated. An unknown range limits nothing."""
+    """With ``kind = "persistent"`` it says nothing about an intersection known to be farther
+    away, since it was never validated there. An unknown range limits nothing."""
     fade: Fade = Fade(way_m=10.0)
     """With ``kind = "persistent"``: over what its errors become independent."""
     use: bool = True
@@ -183,24 +183,25 @@ class Fusion(Section):
     """What a cue that dissents sends near the intersection when it is not detected."""
     dissent_within_m: NotNegative = 20.0
     dissent_every_m: NotNegative = 0.1
-    """Only once the car has gone so far since it last did: a car that stands sees nothing new."""
+    """Min distance travelled between two such messages: a car that stands sees nothing new."""
     reference: Literal["start", "end"] = "start"
-    """Which range dissent and the cues past the intersection go by, where both are known."""
+    """Which range applies to dissent and to cues past the intersection, where both are known."""
     length_m: NotNegative = 15.0
     """From the start of an intersection to its end, where only the start is known."""
     closes_behind_m: NotNegative = 2.0
-    """An approach ends once the intersection is so far behind the rear axle."""
+    """An approach ends once the intersection is this far behind the rear axle."""
     stale_after_m: Positive = 60.0
     """Or once the car has gone this far without any evidence."""
     stale_unranged_m: Positive = 30.0
-    """So far where no sign has reported a range."""
+    """The same where no sign has reported a range."""
     longest_m: Positive = 100.0
     """Evidence from further before an intersection is not about it; the source's runs are as long.
-    Without a range an approach ends after so far."""
+    Without a range an approach ends after this distance."""
     turned_rad: Positive = 0.8
-    """Without a range ahead, an approach ends once the car has turned so much in some 25 m."""
+    """Without a range ahead, an approach ends once the car has turned this much within about 25
+    m."""
     rest_m: NotNegative = 10.0
-    """For so long after a passed intersection only a sign with a range opens an approach."""
+    """Over this distance after an intersection, only a sign with a range opens an approach."""
     features: Annotated[dict[Name, FeatureEntry], Field(validate_default=True)] = Field(
         default_factory=dict
     )

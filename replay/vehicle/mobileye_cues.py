@@ -9,7 +9,7 @@ class Past(Section):
     """When lane lines and vehicles count as past the intersection."""
 
     intersection_length_m: Positive = 16.0
-    """From its start to its end; the end lies so far beyond a start where only that is known."""
+    """From its start to its end, where only the start is known."""
     lane_reach_m: Positive = 5.0
     """A lane line must reach this far past the end of the intersection."""
     lane_within_y_m: Positive = 8.0
@@ -25,8 +25,8 @@ class Past(Section):
     vehicle_types: tuple[int, ...] = (0, 1, 2)
     """Cars, trucks, motorcycles, standing or moving; without 3 and 4, pedestrians and bicycles."""
     vehicle_age_frames: NotNegative = 2.0
-    """A vehicle must have been seen in so many pictures of the device."""
+    """Min number of the device's images in which a vehicle was seen."""
     max_age_s: Positive = 0.5
     """What the device said longer ago is forgotten; the cues are then neutral."""
     settles_s: NotNegative = 0.03
-    """An image's burst on the bus is whole so long after its first frame."""
+    """Time from the first frame of an image's burst on the bus until the burst is complete."""

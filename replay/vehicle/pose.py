@@ -56,7 +56,8 @@ class Odometry(Section):
     use_front_wheels: bool = False
     wheel_step_mps: NotNegative = 0.0028
     slip_per_sqrt_m: NotNegative = 0.3
-    """A wheel radius off by one per cent, as an uncalibrated car's, is 10 m after 1 km: so much."""
+    """The default covers a wheel radius that is off by 1 %, as on an uncalibrated car: 10 m per
+    km."""
     scale_sd: NotNegative = 0.01
     """The same as what it is, a fraction of every distance: over the 20 m by which a range comes
     from motion, ``slip_per_sqrt_m`` would be seven times too much."""
@@ -65,12 +66,13 @@ class Odometry(Section):
     yaw_rate_scale: Positive = 1.0
     gyro_bias_radps: Finite = 0.0
     gyro_noise_rad_per_sqrt_s: NotNegative = 0.005
-    """A bias of 0.0006 rad/s, left in, is 2 degrees after a minute: so much."""
+    """The default covers a bias of 0.0006 rad/s that was not removed: 2 degrees in a minute."""
     steering_ratio: Positive = 15.0
     steering_offset_rad: Finite = 0.0
     steering_noise_rad_sqrt_m: NotNegative = 0.01
     wheel_turn_rad_per_sqrt_m: NotNegative = 0.03
-    """Tyres that differ by 0.3 % turn the pose 0.2 rad in 100 m: so much, where wheels turn it."""
+    """The default covers tyres that differ by 0.3 %: 0.2 rad in 100 m, where wheels turn the
+    pose."""
     turn_per_turn: NotNegative = 0.0
     turn_rad_per_sqrt_rad: NotNegative = 0.0
     """S.d. of the heading after one radian of turning."""
@@ -103,7 +105,7 @@ class Gnss(Section):
     interval_s: NotNegative = 1.0
     """With ``fuse``, time between two positions that count: a receiver's errors last."""
     gate_nis: Positive = 13.8
-    """With ``fuse``, refuse a position further off: one good one in a thousand is."""
+    """With ``fuse``, refuse a position farther off, as one good position in a thousand is."""
 
 
 class Start(Section):

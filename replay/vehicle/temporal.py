@@ -18,27 +18,27 @@ ByDistance = Annotated[tuple[Probability, ...], Field(min_length=1)]
 class CueChain(Section):
     """How a cue behaves where some features are there and others are not.
 
-    Probabilities stand by distance, nearest first, as ``Temporal.edges_m`` divides it; a single
-    one where no intersection is ahead.
+    Probabilities are listed by distance, nearest first, in the bins of ``Temporal.edges_m``; there
+    is a single one where no intersection is ahead.
     """
 
     cue: Name
     there: tuple[Name, ...] = ()
-    """Features that are there; with none at all, here and below, no intersection is ahead."""
+    """Features that are present; if this and ``missing`` are empty, no intersection is ahead."""
     missing: tuple[Name, ...] = ()
-    """Features that are not."""
+    """Features that are absent."""
     first: ByDistance
-    """Positive, where it was not looked for in the step before."""
+    """Probability of a positive where it was not searched for in the step before."""
     stays: ByDistance
-    """Positive after a step in which it was."""
+    """Probability of a positive after a positive step."""
     appears: ByDistance
-    """Positive after a step in which it was not."""
+    """Probability of a positive after a negative step."""
 
     @model_validator(mode="after")
     def _line_up(self) -> Self:
         if not len(self.first) == len(self.stays) == len(self.appears):
             raise PydanticCustomError(
-                "temporal", "first, stays, appears: expected as many entries each"
+                "temporal", "first, stays, appears: expected equal numbers of entries"
             )
         return self
 
@@ -47,29 +47,30 @@ class Temporal(Section):
     """What ``crosscue fit temporal`` has learned."""
 
     ahead: Probability
-    """An intersection lies within reach where a drive begins."""
+    """Probability that an intersection is within reach where a drive begins."""
     ways: dict[str, Probability]
-    """From features that an intersection has besides being one, joined by ``+`` (``none`` for a
-    dead end), to how often: ``{ "left+right" = 0.2, ... }``; the rest are taken for impossible."""
+    """From the ways that an intersection offers, joined by ``+`` (``none`` for a dead end), to how
+    often it does: ``{ "left+right" = 0.2, ... }``; other combinations count as impossible."""
     edges_m: Annotated[tuple[float, ...], Field(min_length=2)]
-    """Borders of the distances that cues depend on, rising; the last is how far one can see."""
+    """Edges of the bins of distance, rising; the last is the visibility range."""
     chains: tuple[CueChain, ...]
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    """On all cues' likelihoods: given the state they still repeat one another."""
+    """Exponent of all cues' likelihoods, since cues are correlated even given the state."""
     lapse: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.0
-    """A place is unlike all others so often; cues say nothing there, and what is usual stands."""
+    """Probability that a place is unlike all others; cues say nothing there, and the prior
+    holds."""
     stray: Probability = 0.05
-    """A sign's range has nothing to do with the intersection so often."""
+    """Probability that a sign's range has nothing to do with the intersection."""
     step_m: Positive = 1.5
-    """A cue is heard again after so far ..."""
+    """A cue is evaluated again after this distance ..."""
     step_s: Positive = 0.5
-    """... or so long."""
+    """... or this time."""
     spacing_m: Positive = 150.0
-    """Intersections come into reach once in so far."""
+    """Mean distance between intersections."""
     cell_m: Positive = 2.0
     """Width of the cells of distance."""
     behind_m: NotNegative = 4.0
-    """An intersection is passed once it is so far behind."""
+    """An intersection is passed once it is this far behind."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:

@@ -4,7 +4,7 @@ TOML, versioned, checked with pydantic. Unknown keys, wrong units and missing ro
 the line in the file and a suggestion. Units stand last in every name (SI); frames are ISO 8855 /
 REP-103: x forward, y left, heading counter-clockwise. Every default is written to the manifest.
 
-The table of cues, which the file is checked against, is handed on with it.
+The table of cues, which the file is checked against, is exported with it.
 """
 
 from __future__ import annotations
@@ -161,12 +161,12 @@ class Regions(Section):
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
     right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
     aside_m: tuple[Positive, Positive] = (12.0, 20.0)
-    """On the ground the side roads are looked for so far to the side: beyond three lanes beside
-    the ego vehicle's, and no further than a camera sees near by."""
+    """On the ground: lateral span in which side roads are searched, beyond three lanes beside the
+    ego lane and no farther than a camera sees nearby."""
     beyond_m: tuple[Positive, Positive] = (6.0, 26.0)
-    """The road straight ahead, so far beyond the intersection's end."""
+    """On the ground: span beyond the intersection's end in which the road ahead is searched."""
     half_width_m: Positive = 2.0
-    """And so far to either side of the ego vehicle's way."""
+    """Half the width of that region, centered on the ego vehicle's path."""
     min_rows: Positive = 6.0
     """A region that spans fewer rows of the segmentation is not seen: where a road ends, the
     embedded network's mask runs on for up to five."""
@@ -181,7 +181,7 @@ class Regions(Section):
 
 
 class OwnCue(Section):
-    """A cue of one's own: so many detections with one of these labels and a higher score."""
+    """A cue of your own: it counts detections with one of these labels and a higher score."""
 
     labels: Annotated[tuple[str, ...], Field(min_length=1)]
     score: Proportion = 0.5
@@ -206,7 +206,7 @@ class Cues(Section):
     road_fraction: Proportion = 0.2
     """More road than this in a region is a cue (eq. 14)."""
     own: dict[Name, OwnCue] = Field(default_factory=dict)
-    """By name; what each says of an intersection stands under [fusion.cues]."""
+    """By name; what each says about an intersection is declared under [fusion.cues]."""
 
     @field_validator("own")
     @classmethod
@@ -228,7 +228,7 @@ class Cars(Section):
     score: Proportion | None = None
     """As ``cues.stop_sign_score``; the source's network has the source's 0.95."""
     length_per_height: Positive = 2.0
-    """Only cars seen from the side: longer than so many times their height."""
+    """Only cars seen from the side: min ratio of their length to their height."""
     area_change: Proportion = 0.03
     """The same car in two frames: mask areas differ by less."""
     position_change: Proportion = 0.05
@@ -236,26 +236,25 @@ class Cars(Section):
     still_change: Proportion = 0.002
     """A car that moved by less than this fraction of the width, both ways, stood."""
     slope: NotNegative = 0.25
-    """Horizontal motion: less than so many pixels down or up for one to the side."""
+    """Horizontal motion: max vertical pixels per horizontal pixel."""
     max_gap_s: Positive = 0.5
     """Frames further apart are not compared."""
     min_frames: Annotated[int, Field(ge=3)] = 3
-    """With ``kind = "tracks"`` a car is judged once seen in so many frames."""
+    """With ``kind = "tracks"``: min number of frames with a car before it is judged."""
     max_frames: Annotated[int, Field(ge=3, le=100)] = 10
-    """And by the newest so many."""
+    """Number of most recent frames by which it is judged."""
     within_m: Positive = 100.0
-    """Cars that are further away by their height are not judged; nearer ones are where their motion
-    is sure."""
+    """Cars farther away, by their height, are not judged; nearer ones are judged where their motion
+    is certain."""
     crossing_mps: Positive = 2.0
     """A car that crosses moves sideways by more; a parked one surely moves by less. One past the
     intersection comes or goes by more."""
     past_within_m: Positive = 120.0
-    """Oncoming and outgoing cars past the intersection are looked for so far ahead by their
-    height ..."""
+    """Oncoming and outgoing cars past the intersection: max distance ahead, by their height."""
     past_aside_m: Positive = 12.0
-    """... and so far to either side of the ego vehicle's way: three lanes beside its own."""
+    """Max distance of these cars to either side of the ego path: three lanes beside its own."""
     past_frames: Annotated[int, Field(ge=3, le=100)] = 30
-    """And judged by the newest so many frames."""
+    """Number of most recent frames by which these cars are judged."""
 
 
 class RangeCurve(Section):
@@ -276,15 +275,15 @@ class Ranges(Section):
     stop_sign: RangeCurve | None = None
     traffic_light: RangeCurve | None = None
     light_setback_m: Finite = 3.0
-    """With ``motion``: lights that face the ego vehicle from across the crossing stand so far
-    behind its end, on poles at the far corners, and those seen from behind as far before its start;
-    a fitted curve knows this from its pairs."""
+    """With ``motion``: distance from the intersection's end to the lights that face the ego vehicle
+    from the far corners, and from lights seen from behind to its start; a fitted curve includes
+    it."""
     light_setback_sd_m: NotNegative = 2.0
-    """How much that differs from one intersection to another."""
+    """Standard deviation of that distance from one intersection to another."""
 
 
 class DetectorSection(Section):
-    """A detector of one's own naming."""
+    """A detector under a name of your choice."""
 
     kind: str = "model"
     """A detector's name, or ``module:factory``."""
@@ -298,20 +297,21 @@ class Landmarks(Section):
     """Camera pictures against a landmark database; ``crosscue fit landmarks`` writes min_score."""
 
     matcher: str = "orb"
-    """``orb``, ``orb-essential``, or ``module:factory`` of one's own."""
+    """``orb``, ``orb-essential``, or your own ``module:factory``."""
     min_score: NotNegative = 20.0
-    """Matches with a lower score are none."""
+    """Matches with a lower score are ignored."""
     sigmas: Annotated[float, Field(gt=0.0, le=4.0)] = 2.0
-    """Compare with landmarks inside the ellipse of so many."""
+    """Compare with landmarks inside this many standard deviations of the position."""
     max_candidates: Annotated[int, Field(ge=1)] = 50
     gate_nis: Positive | None = 13.8
-    """Refuse matches whose normalised innovation squared is larger (one good one in a thousand)."""
+    """Refuse matches whose normalised innovation squared is larger (as for one correct match in a
+    thousand)."""
     interval_m: NotNegative = 1.0
-    """Look again once the car has gone this far."""
+    """Compare again once the car has travelled this far ..."""
     interval_s: NotNegative = 0.1
-    """And after this long."""
+    """... and this much time has passed."""
     revisit_m: NotNegative = 100.0
-    """A landmark counts again once the car has gone this far: its error stays the same."""
+    """A landmark is used again once the car has travelled this far, since its error repeats."""
 
 
 class Vehicle(Section):
@@ -381,7 +381,7 @@ class Vehicle(Section):
         return () if cue.label is None else SAME_SIGN.get(cue.label, (cue.label,))
 
     def threshold_of(self, cue: CueSpec) -> tuple[str | None, float | None]:
-        """Where a cue's least score stands in the file, and the score if one is given there.
+        """Where a cue's min score is set in the file, and the score if one is set there.
 
         Without a place every score counts; without a score the detector's threshold holds.
         """
@@ -411,7 +411,7 @@ def load(path: Path) -> Vehicle:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise VehicleError(f"{path}: over {MAX_BYTES // MIB} MiB; this is no vehicle file")
+            raise VehicleError(f"{path}: over {MAX_BYTES // MIB} MiB; this is not a vehicle file")
         text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"

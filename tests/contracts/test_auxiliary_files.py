@@ -181,9 +181,9 @@ NAMED_IN_THE_VEHICLE_FILE: Final[dict[str, str]] = {
 WRITTEN: Final = {"--output", "--junit", "--cache", "--figure", "--sheet"}
 """Options whose file is made if it is missing."""
 NO_FILES: Final = {"LAYOUT", "SQL"}
-"""Arguments that are no files."""
+"""Arguments that are not files."""
 ANY_BYTES: Final = {"seal", "model fetch", "completion"}
-"""Their arguments are no files that could be of another kind."""
+"""Their arguments are not files that could be of another kind."""
 MADE: Final = {("landmarks add", "DB")}
 """Made where it is missing or empty."""
 FOLDERS: Final = {
@@ -205,7 +205,7 @@ DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
 
 
 def _named_files() -> set[tuple[str, str]]:
-    """Arguments, options whose value is a path and that are no output, and networks' names."""
+    """Arguments, options whose value is a path and that are not an output, and networks' names."""
     found = set()
     for name in cli.COMMANDS:
         _, parser = cli.parser_of(name)

@@ -42,7 +42,7 @@ def test_a_part_past_the_end_names_what_found_no_rows(
         capsys, out, command, drive.log, "--vehicle", drive.vehicle, "-o", out, "--from", "100000"
     )
 
-    assert "wheel speeds" in said if command == "replay" else "no topic gave a row" in said
+    assert "wheel speeds" in said if command == "replay" else "no topic yielded a row" in said
     assert "/can (" in said
     assert "--from" in said
 

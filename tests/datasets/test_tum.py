@@ -1,4 +1,4 @@
-"""TUM files: what is written is what is read, and what is no pose is refused by line."""
+"""TUM files: what is written is what is read, and what is not a pose is refused by line."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def test_the_rates_of_a_chain_come_back(learned: Temporal) -> None:
 
 
 def test_ways_and_presence_are_counted_once_for_each_place(learned: Temporal) -> None:
-    # 24 places: 8 with a left road, 8 without, 8 that are no intersection.
+    # 24 places: 8 with a left road, 8 without, 8 that are not an intersection.
     assert learned.ahead == pytest.approx(17.0 / 26.0, abs=1e-4)
     assert learned.ways == pytest.approx({"left": 0.5, "none": 0.5})
 

@@ -171,8 +171,8 @@ def test_a_straight_drive_shows_the_mounting_alone_and_says_so() -> None:
 
     assert fit.observable == (MOUNTING,)
     reasons = dict(fit.not_observable)
-    assert reasons["hard iron"] == "headings cover 10 of 360 degrees, 180 are wanted"
-    assert reasons["soft iron"] == "headings cover 10 of 360 degrees, 300 are wanted"
+    assert reasons["hard iron"] == "headings cover 10 of 360 degrees, 180 are required"
+    assert reasons["soft iron"] == "headings cover 10 of 360 degrees, 300 are required"
     assert set(reasons) >= {"declination", "hard iron, upward part"}
     assert fit.settings.hard_iron_t == given.hard_iron_t
     assert fit.settings.soft_iron == given.soft_iron

@@ -1,6 +1,6 @@
 """The track over columns: equal to the filter's functions, whole in windows, errors as claimed.
 
-All drives here are simulated, with the very noise that the filter is reported of.
+All drives here are simulated, with exactly the noise that the filter assumes.
 """
 
 from __future__ import annotations

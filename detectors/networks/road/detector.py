@@ -61,7 +61,7 @@ class RoadNetworkDetector:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """None: road is no object."""
+        """None: road is not an object."""
         return ()
 
     @property

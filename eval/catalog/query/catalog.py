@@ -185,14 +185,14 @@ def catalog(place: Path | str) -> Catalog:
             as ``s3://bucket/runs``, of which only what a query needs is fetched.
 
     Raises:
-        RunError: It is no folder, holds no run, or cannot be listed.
+        RunError: It is not a folder, holds no run, or cannot be listed.
     """
     if is_remote(place) and not str(place).startswith("file://"):
         places: Runs = RemoteRuns(str(place))
     else:
         folder = Path(str(place).removeprefix("file://"))
         if not folder.is_dir():
-            raise UnreadableRunError(f"{folder}: no folder; give a folder of runs")
+            raise UnreadableRunError(f"{folder}: not a folder; give a folder of runs")
         places = LocalRuns(folder)
     return Catalog(places, open_index(places))
 

@@ -18,7 +18,7 @@ DEPTH: Final = 6
 SCORED: Final = "metrics.json"
 SCORE: Final = "score"
 BESIDE: Final = (TAGS, FAILURE)
-"""Files of a run that are no tables."""
+"""Files of a run that are not tables."""
 
 Stamp: TypeAlias = tuple[int, int, int, int]
 CUT_SHORT: Final[Stamp] = (0, 0, 0, 0)

@@ -196,7 +196,7 @@ def _made_at(found: Found) -> datetime | None:
 
 
 def _failure(content: bytes) -> dict[str, str]:
-    """What the head of a ``failure.log`` says; nothing where it is no log of ours."""
+    """What the head of a ``failure.log`` says; nothing where it is not a log of ours."""
     head, _, _ = content.decode("utf-8", "replace").partition("\n\n")
     said = {line[:10].rstrip(): line[10:] for line in head.splitlines()}
     return said if {"drive", "error"} <= said.keys() else {}

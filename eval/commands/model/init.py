@@ -1,8 +1,8 @@
 """Write a model card for an ONNX or OpenVINO file, or for weights of a network of torchvision's.
 
 The layout of the outputs, or the network, is recognised from names, shapes and metadata. What the
-file does not say stands in the card as an assumption to check; where several fit, they are listed.
-Weights are a state_dict (.pth, .pt) or safetensors: tensors, without code.
+file does not say is listed in the card as an assumption to check; where several fit, they are
+listed. Weights are a state_dict (.pth, .pt) or safetensors: tensors, without code.
 
 example:
   crosscue model init my.onnx --picture street.jpg

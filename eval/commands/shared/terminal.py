@@ -1,7 +1,7 @@
 """What commands share: options, how results are printed, and one line of progress.
 
 The line says how much is done, how fast, and how long still. rich draws it, on stderr, and removes
-it at the end; where stderr is no terminal, or with ``--quiet``, rich is not imported.
+it at the end; where stderr is not a terminal, or with ``--quiet``, rich is not imported.
 """
 
 from __future__ import annotations

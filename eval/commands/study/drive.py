@@ -1,6 +1,6 @@
 """One simulated drive to look at: picture, log that crosscue replay reads, run, Rerun recording.
 
-The seed of any drive of a study stands in its drives.parquet; with the same settings it is the same
+The seed of any drive of a study is in its drives.parquet; with the same settings it is the same
 drive.
 
 examples:

@@ -6,7 +6,7 @@ those of an export (--export) by the export, which may be of many drives: each g
 below DIR, and DIR/coco.json has all of them, to train with.
 
 A label that is a cue's name ("stop sign", "parked_left") says that the cue is there, and pictures
-annotated without it that it is not; --map says what other labels mean. Approaches are no part of
+annotated without it that it is not; --map says what other labels mean. Approaches are not part of
 such files: write them into the truth file by hand (see crosscue truth schema), and --add leaves
 them as they are. Cues of your own are those that the vehicle file has under [cues.own].
 

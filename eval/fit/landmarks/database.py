@@ -38,7 +38,7 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_POINTS: Final = 20
-"""Pictures with fewer points (a blank wall, the dark) are no landmarks."""
+"""Pictures with fewer points (a blank wall, the dark) are not landmarks."""
 MAX_GAP_NS: Final = 500_000_000
 MAX_COORDINATE_BYTES: Final = 256 << 20
 

@@ -24,7 +24,7 @@ from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at
 MAX_PAIRS: Final = 1_000_000
 MAX_PAIR_BYTES: Final = 256 * MIB
 SAME_TURN_RAD: Final = math.pi / 4
-"""Pictures taken in directions further apart are no pair of either kind when they are near."""
+"""Pictures taken in directions further apart are not a pair of either kind when they are near."""
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
 
 

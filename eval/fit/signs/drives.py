@@ -34,12 +34,12 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[La
     """All annotated pictures of a drive's folder, in the order of the log.
 
     Raises:
-        AnnotationError: The folder is no drive's, or has no annotated objects with times.
+        AnnotationError: The folder is not a drive's, or has no annotated objects with times.
         LogError: The log cannot be read, or has no camera.
     """
     drives = drives_of([str(folder)])
     if len(drives.drives) != 1 or len(drives.drives[0].logs) != 1:
-        raise AnnotationError(f"{folder}: holds not one log; give the folder of one drive")
+        raise AnnotationError(f"{folder}: expected exactly one log; give the folder of one drive")
     return _pictures(drives.drives[0], _boxes(folder / OBJECTS_FILE), limits)
 
 

@@ -262,7 +262,7 @@ class LogTopic:
         """Its rows as a table, a column for each field; all of it is held in memory.
 
         Columns ``log_t_ns``, ``publish_ns`` and ``header_ns`` are nanoseconds, the latter two where
-        every row has them. What became of every row stands in the table's metadata
+        every row has them. What became of every row is in the table's metadata
         (``table.schema.metadata[b"crosscue"]``, JSON); rows that are dropped or cannot be decoded
         are warned of, too.
 

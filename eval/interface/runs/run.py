@@ -122,7 +122,7 @@ def open_run(
         limits: What its logs are read with.
 
     Raises:
-        RunError: It is no run, damaged, of another version, or holds many drives merged.
+        RunError: It is not a run, damaged, of another version, or holds many drives merged.
     """
     moved = None if logs is None else Path(logs)
     folder = open_folder(Path(path), moved, without_images=without_images, limits=limits)

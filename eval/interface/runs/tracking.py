@@ -92,7 +92,7 @@ class MlflowSink:
 
 
 LEFT_OUT = ("truth", "settings", "format", "account")
-"""Parts of ``metrics.json`` that are no scores."""
+"""Parts of ``metrics.json`` that are not scores."""
 
 
 def open_mlflow(uri: str, experiment: str = "crosscue") -> MlflowSink:

@@ -75,7 +75,7 @@ def run_study_drive(
 ) -> StudyDrive:
     """Simulate one drive of a study, write its log, replay, score, draw and record it.
 
-    The seed of any drive of a study stands in its ``drives.parquet``.
+    The seed of any drive of a study is in its ``drives.parquet``.
 
     Args:
         folder: Gets log, truth, picture and run.

@@ -76,7 +76,7 @@ def estimate_scene(
         without: Cues to leave out as if nothing had looked for them, with the ranges they give.
         on_time: Called with the seconds done, and those there are.
         timeline: Where the drive has gaps; beyond a long one everything starts over.
-        on_restart: Reported the drive time from which on a new start counts.
+        on_restart: Called with the drive time from which on a new start counts.
 
     Raises:
         RunError: A table is missing or damaged.

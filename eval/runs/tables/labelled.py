@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def labelled(schema: pa.Schema) -> pa.Schema:
-    """A table's columns with those two behind them."""
+    """A table's columns with those two appended."""
     import pyarrow as pa
 
     return schema.append(pa.field("segment", pa.int32())).append(pa.field("log_t_ns", pa.int64()))

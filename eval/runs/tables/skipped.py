@@ -61,7 +61,7 @@ def write_skipped(
     with TableSink(run, "skipped", labelled(skipped_schema())) as sink:
         for log in reading:
             for topic, account in log.topics.items():
-                # What both stages have met stands in either's rows, a camera's in the first's.
+                # What both stages have met is in the rows of each, a camera's in the first's.
                 for rest in (rows, earlier) if topic == UNATTRIBUTED else (earlier, rows):
                     mine = [r for r in rest if (r["log"], r["topic"]) == (log.log, topic)]
                     if mine:

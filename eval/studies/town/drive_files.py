@@ -2,7 +2,7 @@
 
 CAN with the rear wheels' speeds, a magnetometer, and, where there are landmarks, a camera that sees
 a made-up wall at each landmark passed, with a landmark database beside. A landmark passed unnoticed
-shows a wall that the database does not hold. Truth stands in ``truth.json``.
+shows a wall that the database does not hold. Truth is in ``truth.json``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Range runs have no landmark, landmark runs at most one at a time. Each run becomes a log, a vehicle
 file and a truth file; what is reported comes from the replay of the log and its score, as it would
-for recorded runs. Goals reached stand in the drive itself, because a log does not hold them: the
+for recorded runs. Goals reached are kept in the drive itself, because a log does not hold them: the
 navigator on board knew them.
 """
 

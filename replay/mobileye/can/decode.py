@@ -168,7 +168,7 @@ class MobileyeDecoder:
 
         Args:
             bus: Topic of the frames; tables are called ``BUS/mobileye/TABLE``.
-            ledger: Reported of every frame not used; the reader has counted those found.
+            ledger: Records every frame not used; the reader has counted those found.
             settings: How to read this device.
         """
         self._bus = bus

@@ -1,6 +1,6 @@
 """Tables to the frames of a Mobileye: the decoder's inverse, for simulated drives and tests.
 
-Values are rounded to the wire's steps. What a field does outside its range stands in the layout
+Values are rounded to the wire's steps. What a field does outside its range is in the layout
 table: most refuse, some clip, and an obstacle too far away is not sent at all.
 """
 

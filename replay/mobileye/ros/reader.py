@@ -68,7 +68,7 @@ class RosMobileye:
         Args:
             bus: First part of the tables' names, ``BUS/mobileye/TABLE``.
             types: From topic to message type, as the log spells it; other topics are left alone.
-            ledger: Reported, under the topic's name, of messages not used.
+            ledger: Records, under the topic's name, messages not used.
             settings: Mounting, slots and the lanes' sign.
         """
         self._bus = bus

@@ -90,7 +90,7 @@ def chain_of(
         is_resumed: What came before is lost, so the first object may begin anywhere.
         is_end: No more bytes follow.
         size_max: Largest object to wait for.
-        tally: Reported about damage.
+        tally: Records damage.
         place: Where the stream lies in the file, in words.
     """
     at = _signatures(stream)

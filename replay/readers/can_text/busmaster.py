@@ -1,6 +1,6 @@
 """BUSMASTER logs: ``22:20:14:992 Rx 0 0000021A s 8 FE 36 12 FE 69 05 07 AD``.
 
-Times are times of day and begin again at midnight; the date and the time mode stand in the
+Times are times of day and begin again at midnight; the date and the time mode are in the
 header. The file states no time zone, so its clock is taken as UTC, with a notice.
 """
 

@@ -2,7 +2,7 @@
 
 A ``Dialect`` knows one format. Its ``fast`` takes the lines of a chunk that follow the common
 pattern, as columns; every other line that is not blank goes through ``slow``, which says what it
-is: a frame, a line that is no frame, a mark such as a header, or damage. So each line ends up
+is: a frame, a line that is not a frame, a mark such as a header, or damage. So each line ends up
 used, skipped or lost.
 """
 
@@ -68,7 +68,7 @@ class Frame(NamedTuple):
 
 
 class Other(NamedTuple):
-    """A good line that is no frame: counted under its reason, and under its bus if it has one."""
+    """A good line that is not a frame: counted by its reason, and by its bus if it has one."""
 
     reason: str
     t_ns: int | None = None
@@ -115,7 +115,7 @@ class Met:
     Attributes:
         rows: Its frames, by line.
         odd: Frames that ``slow`` found, with their lines.
-        others: Lines that are no frame.
+        others: Lines that are not a frame.
         damaged: Lines that nobody can read, ascending.
         marks: Header lines.
         first_number: Number of the chunk's first line in the file.

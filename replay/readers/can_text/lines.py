@@ -207,7 +207,7 @@ def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[Fie
 
 
 def _bitmap(words: Words, at: Int64s) -> Words:
-    """Bit k says whether character ``at + k`` is no gap, for the next 48 characters."""
+    """Bit k says whether character ``at + k`` is not a gap, for the next 48 characters."""
     bits = np.zeros(len(at), np.uint64)
     for k in range(_BITMAP_WORDS):
         eight = ((_word_bits(words[at + 8 * k]) >> _SEVEN) * _TO_BITS) >> _FIFTY_SIX
@@ -221,7 +221,7 @@ def skip_gap(lines: Lines, at: Int64s, limit: Int64s) -> Int64s:
 
 
 def _word_bits(word: Words) -> Words:
-    """The high bit of every character that is no gap."""
+    """The high bit of every character that is not a gap."""
     bits: Words = (((word & ~_HIGHS) + _TO_HIGH) | word) & _HIGHS
     return bits
 

@@ -114,7 +114,7 @@ class Declarations:
         """Would ``found`` give another meaning to a number that already has one?
 
         Raises:
-            BrokenRecordError: It is no schema or channel.
+            BrokenRecordError: It is not a schema or channel.
         """
         if (found.opcode, found.content) in self._seen:
             return False
@@ -128,7 +128,7 @@ class Declarations:
         """From here on ``found`` holds.
 
         Raises:
-            BrokenRecordError: It is no schema or channel.
+            BrokenRecordError: It is not a schema or channel.
         """
         key = (found.opcode, found.content)
         if key in self._seen:

@@ -9,7 +9,7 @@ can know which: those that are structurally sound are given, and the account is 
 damaged bytes reading goes on at the next chunk that proves itself, or at the next records that are
 plausible in a row.
 
-Channels become topics as ``mcap_topics`` says. A publish time that is no int64 counts as not
+Channels become topics as ``mcap_topics`` says. A publish time that is not an int64 counts as not
 available and becomes the log time, as the format writes it.
 """
 

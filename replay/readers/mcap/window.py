@@ -138,7 +138,7 @@ def _doubt(segment: Segment, summary: Summary) -> str:
 
 
 def _in_time(chunks: ChunkTable, selection: Selection) -> NDArray[np.bool_]:
-    """Which chunks may hold messages of the time asked for, or with times that are none."""
+    """Which chunks may hold messages of the time asked for, or with impossible times."""
     asked = np.ones(len(chunks), dtype=np.bool_)
     if selection.start_ns is not None:
         asked &= chunks.end >= np.uint64(min(max(selection.start_ns, 0), 1 << 63))

@@ -412,7 +412,7 @@ def _next_confirmed(raw: bytes, at: int, entries: Entries | None) -> int | None:
 
 
 def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
-    """Without an index: the next offset at which messages stand in a row.
+    """Without an index: the next offset at which several messages follow one another.
 
     The message that led to ``at`` may have a damaged length, so the search begins within it.
     """

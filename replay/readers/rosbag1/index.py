@@ -54,7 +54,7 @@ class ChunkUnit:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Bytes that are no record.
+    """Bytes that are not a record.
 
     Attributes:
         at: First of them.

@@ -3,7 +3,7 @@
 Outside chunks nothing but its own length says where a record ends. A message there is believed if
 it leads to another record, to one whose head is damaged but still recognisable, or to the file's
 end. Behind damage, reading goes on at the next chunk that the index names, or at the first records
-before it that stand in a row and are plausible: kinds, sizes, known connections, near times.
+before it that follow one another and are plausible: kinds, sizes, known connections, near times.
 """
 
 from __future__ import annotations

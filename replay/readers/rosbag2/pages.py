@@ -42,7 +42,7 @@ _ROOM: Final = 256
 """Zeros behind the last page, so that a cell that runs over its page can be examined."""
 _VARINT_BYTES: Final = 9
 _INTEGER_BYTES: Final = np.array([-1, 1, 2, 3, 4, 6, 8, -1, 0, 0] + [-1] * 246, np.int64)
-"""Size of an integer by its serial type; -1 if the type is no integer."""
+"""Size of an integer by its serial type; -1 if the type is not an integer."""
 _ONE: Final = 9
 """Serial type of the integer 1, which takes no bytes."""
 _FIRST_BLOB: Final = 12
@@ -278,7 +278,7 @@ class _Pages:
         return cells.span(0, upto), upto == whole and bool(is_leaf.all())
 
     def _local(self, total: Int64s) -> Int64s:
-        """Bytes of each row that stand in its leaf page."""
+        """Bytes of each row that are in its leaf page."""
         usable = self._usable
         least = (usable - 12) * 32 // 255 - 23
         part = least + (total - least) % (usable - 4)

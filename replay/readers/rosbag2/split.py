@@ -145,7 +145,7 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
         while part := source.read(_READ_BYTES):
             if shutil.disk_usage(plain.parent).free < _ROOM_BYTES:
                 raise LogError(
-                    f"{packed}: no room to unpack it in {plain.parent.parent} after {written} "
+                    f"{packed}: no space to unpack it in {plain.parent.parent} after {written} "
                     "bytes; set TMPDIR to a larger disk"
                 )
             try:

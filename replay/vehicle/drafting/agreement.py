@@ -193,7 +193,7 @@ def judge_steering(
         return found
     as_turn = of_steering(series, 1, speed, grid)
     scaleless = [replace(one, has_scale=False) for one in references]
-    # A steering wheel off its middle is no contradiction; what it must do is follow the turns.
+    # A steering wheel off its middle is not a contradiction; what it must do is follow the turns.
     return _judged(found, as_turn.turned_rad, scaleless, math.inf)
 
 

@@ -1,4 +1,4 @@
-"""Regions on the ground: a wide road of one's own is no side road; what is too far is not seen."""
+"""Regions on the ground: the ego road is not a side road; regions too far away are not seen."""
 
 from __future__ import annotations
 

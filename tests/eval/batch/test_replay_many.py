@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short drives, one that is no recording, and a folder of notes."""
+    """Two short drives, one that is not a recording, and a folder of notes."""
     folder = tmp_path_factory.mktemp("drives")
     for name, seed in (("monday", 1), ("tuesday", 2)):
         write_drive(folder / name, DriveSettings(seed=seed))

@@ -195,7 +195,7 @@ def test_a_damaged_table_costs_its_run_that_table_only(tmp_path: Path) -> None:
 def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UnreadableRunError, match="neither a run folder nor a folder of some"):
         crosscue.catalog(tmp_path)
-    with pytest.raises(UnreadableRunError, match="no folder; give a folder of runs"):
+    with pytest.raises(UnreadableRunError, match="not a folder; give a folder of runs"):
         crosscue.catalog(tmp_path / "gone")
 
 

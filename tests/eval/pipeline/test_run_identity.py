@@ -27,7 +27,7 @@ REFUSAL: str = f"format 1, this crosscue reads {FORMAT_VERSION}: replay again"
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Some short drives, one of which is no recording."""
+    """Some short drives, one of which is not a recording."""
     folder = tmp_path_factory.mktemp("place") / "drives"
     for i in range(DRIVES):
         write_drive(folder / f"D-{i}", DriveSettings(seed=i, block_m=40.0))

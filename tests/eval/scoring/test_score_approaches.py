@@ -333,7 +333,7 @@ def test_missing_numbers_are_left_out_and_counted_everywhere() -> None:
     assert judged.rows_not_numbers == 1
     assert score_belief(judge_belief(broken, truth()))["intersection"].left_out["not a number"] == 1
     assert score_range(judge_range(broken, truth()))["start"].left_out == {"not a number": 37}
-    # A range that is not a number is no range.
+    # A range that is not a number is not a range.
     assert judged.results[0].why_not_detected == "no range"
 
 

@@ -99,7 +99,7 @@ def test_a_shifted_truth_is_an_error_that_alignment_takes_away(tmp_path: Path) -
 
     result = score_pose(_run(tmp_path / "run"), _truth(tmp_path / "truth", moved))
 
-    # Height is no part of a pose in the plane.
+    # Height is not part of a pose in the plane.
     assert result.ape["none"].translation_m.rmse == pytest.approx(5.0, abs=1e-2)
     assert result.ape["origin"].translation_m.rmse < 1e-2
     assert result.ape["yaw"].translation_m.rmse < 1e-2

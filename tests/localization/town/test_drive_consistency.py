@@ -1,7 +1,7 @@
 """The simulator's filter is as wrong as it says: NEES and NIS in their chi-square bands.
 
-Here the wheels' encoders are fine enough to be no source of error, because the filter does not know
-of their steps. docs/studies.md reports where the filter is overconfident, and by how much.
+Here the wheels' encoders are fine enough to be not a source of error, because the filter does not
+know of their steps. docs/studies.md reports where the filter is overconfident, and by how much.
 """
 
 import math

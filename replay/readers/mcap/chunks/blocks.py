@@ -59,7 +59,7 @@ class Giver:
 
         Args:
             rows: Messages and definitions of a chunk or a run, whose bytes are right.
-            checks: Reported of definitions that cannot be read.
+            checks: Records definitions that cannot be read.
             at: Where in the file the chunk or run begins.
         """
         begin = 0

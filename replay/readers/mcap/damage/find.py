@@ -93,7 +93,7 @@ def _candidates(window: Bytes, most: int) -> list[int]:
 
 
 def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
-    """Do the lengths of what stands at ``at``, taken for a chunk, agree with each other?"""
+    """Do the lengths of what is at ``at``, taken for a chunk, agree with each other?"""
     raw = file.peek(at, MAX_HEAD)
     length = PREFIX.unpack_from(raw)[1]
     try:

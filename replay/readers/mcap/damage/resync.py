@@ -151,7 +151,7 @@ class Resync:
         return bool(self.plausible.messages(head)[0])
 
     def continues(self, at: int, links: int = LINKS) -> bool:
-        """Do ``links`` plausible records stand at ``at``, or fewer up to where something begins?"""
+        """Do ``links`` plausible records follow ``at``, or fewer up to where something begins?"""
         for _ in range(links):
             if self._is_anchor(at):
                 return True
