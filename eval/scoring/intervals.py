@@ -162,19 +162,19 @@ def share_by_cluster(
     Where all clusters agree nothing shows how alike rows of one cluster are: each cluster counts as
     one row then.
     """
-    from scipy.special import ndtri
-
     found = _spread(is_right.astype(np.float64), clusters)
-    if found is None:
-        return UNKNOWN
-    if found.sd == 0.0:
-        return _wilson(found.mean, found.clusters, float(ndtri(0.5 + 0.5 * confidence)))
-    rows = min(found.mean * (1.0 - found.mean) / found.sd**2, float(len(is_right)))
-    return _wilson(found.mean, rows, found.quantile(confidence))
+    return UNKNOWN if found is None else found.within_0_and_1(len(is_right), confidence)
 
 
-class _Spread(NamedTuple):
-    """Attributes: ``equal_clusters``: so many clusters of equal size would do as well."""
+class Spread(NamedTuple):
+    """What clusters say of a mean, or of a number like one.
+
+    Attributes:
+        mean: Over rows.
+        sd: Its standard deviation.
+        clusters: How many.
+        equal_clusters: So many clusters of equal size would do as well.
+    """
 
     mean: float
     sd: float
@@ -182,12 +182,22 @@ class _Spread(NamedTuple):
     equal_clusters: float
 
     def quantile(self, confidence: float) -> float:
+        """Of Student's t."""
         from scipy.special import stdtrit
 
         return float(stdtrit(max(self.equal_clusters - 1.0, 1.0), 0.5 + 0.5 * confidence))
 
+    def within_0_and_1(self, rows: float, confidence: float = CONFIDENCE) -> Interval:
+        """Wilson's interval of the effective number of rows, which are at most ``rows``."""
+        from scipy.special import ndtri
 
-def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> _Spread | None:
+        if self.sd == 0.0:
+            return _wilson(self.mean, self.clusters, float(ndtri(0.5 + 0.5 * confidence)))
+        effective = min(self.mean * (1.0 - self.mean) / self.sd**2, rows)
+        return _wilson(self.mean, effective, self.quantile(confidence))
+
+
+def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Spread | None:
     """Mean over rows and its standard deviation by the jackknife; None for too few clusters."""
     names, which = np.unique(clusters, return_inverse=True)
     n = len(names)
@@ -198,4 +208,4 @@ def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> _Spread
     whole = float(total.sum() / rows.sum())
     without = (total.sum() - total) / (rows.sum() - rows)
     sd = math.sqrt((n - 1) / n * float(((without - whole) ** 2).sum()))
-    return _Spread(whole, sd, n, float(rows.sum() ** 2 / (rows**2).sum()))
+    return Spread(whole, sd, n, float(rows.sum() ** 2 / (rows**2).sum()))

@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar="S",
-        help="resample images within so many seconds together (default: 1)",
+        help="count images within so many seconds as one (default: 1)",
     )
     parser.add_argument(
         "--draw", type=int, default=8, metavar="N", help="draw the N worst images (default: 8)"

@@ -17,6 +17,7 @@ from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
 from crosscue.eval.scoring.boxes.reliability import Reliability, reliability
 from crosscue.eval.scoring.boxes.scores import SEED, Measured, PartScore, score_parts
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Limits,
@@ -44,7 +45,7 @@ class DetectorScore:
         labels: As they were read.
         scores: Of each class and part.
         calibration: Of each class.
-        block_s: Pictures within so many seconds were resampled together.
+        block_s: Pictures within so many seconds counted as one block.
         report: The page that shows it.
     """
 
@@ -137,7 +138,9 @@ class DetectorScore:
             if one.detections
         ]
         together = f"in stretches of {self.block_s:g} s" if self.block_s > 0.0 else "each alone"
-        lines.append(f"intervals  95 %, images drawn again {together}, seed {SEED}")
+        lines.append(f"intervals  95 %, images counted {together}, seed {SEED}")
+        if any(np.isnan(one.ap50.low) and one.labels for one in self.scores):
+            lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS} such stretches or images, no intervals")
         lines.append(f"written to {visible(str(self.report))}")
         return "\n".join(lines)
 
@@ -206,7 +209,7 @@ def score_detector(
         meanings: From a class of the labels or of the detector to the class that it counts as;
             empty for one that is neither to be found nor wrong.
         overlap: That makes a detection right, for precision, recall and calibration.
-        block_s: Pictures within so many seconds are resampled together, for they show the same.
+        block_s: Pictures within so many seconds count as one block, for they show the same.
         draw: So many of the worst pictures.
         logs: Where the run's logs have moved to, if they have.
         without_images: Draw none; the logs may be gone.

@@ -1,9 +1,11 @@
 """Average precision, precision and recall of detections, with intervals over pictures.
 
 Average precision is COCO's: the mean of the precision's upper envelope at 101 recalls, over the
-overlaps 0.5 to 0.95 (AP) or at 0.5 (AP50). Intervals are bootstraps: pictures are drawn again with
-replacement (Davison and Hinkley, *Bootstrap Methods*, 1997), those that were taken close in time
-together, since they show the same objects.
+overlaps 0.5 to 0.95 (AP) or at 0.5 (AP50). Pictures that were taken close in time show the same
+objects, so whole blocks of them count as independent. The standard deviation of AP is that of the
+bootstrap over blocks (Davison and Hinkley, *Bootstrap Methods*, 1997), that of precision and recall
+the jackknife's. Intervals are those of ``crosscue.eval.scoring.intervals``: percentiles of a
+bootstrap cover too little for few blocks.
 """
 
 from __future__ import annotations
@@ -16,14 +18,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.intervals import MIN_CLUSTERS, UNKNOWN, Interval
+from crosscue.eval.scoring.intervals import (
+    MIN_CLUSTERS,
+    UNKNOWN,
+    Interval,
+    Spread,
+    share_by_cluster,
+)
 
 from .matching import ALL, OVERLAPS, RANGES, SIZES, Boxes, Matched, Part, match
 
 RECALLS: Final = np.linspace(0.0, 1.0, 101)
 ROUNDS: Final = 1000
 SEED: Final = 0
-TAIL_PERCENT: Final = 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +99,7 @@ def score_parts(
     scores = []
     for part in (ALL, *SIZES, *(RANGES if has_range else ())):
         rows = [
-            _Row.of(match(truth, found, k, part, np.append(OVERLAPS, overlap)), weights)
+            _Row.of(match(truth, found, k, part, np.append(OVERLAPS, overlap)), blocks, weights)
             for k in range(len(classes))
         ]
         some = [
@@ -125,13 +132,14 @@ def drawn(blocks: NDArray[np.int64], seed: int, rounds: int = ROUNDS) -> NDArray
     return np.asarray(times[:, which], np.float64)
 
 
-def interval_of(values: NDArray[np.float64]) -> Interval:
-    """Where 95 % of the finite ones are."""
-    kept = values[np.isfinite(values)]
-    if not len(kept):
+def interval_of(value: float, rounds: NDArray[np.float64], blocks: int) -> Interval:
+    """The 95 % interval of a number from 0 to 1, by what it is in rounds of drawn blocks."""
+    kept = rounds[np.isfinite(rounds)]
+    if blocks < MIN_CLUSTERS or not len(kept) or not math.isfinite(value):
         return UNKNOWN
-    low, high = np.percentile(kept, [TAIL_PERCENT, 100.0 - TAIL_PERCENT])
-    return Interval(float(low), float(high))
+    # Blocks drawn from so few vary less than new ones would.
+    sd = float(kept.std()) * math.sqrt(blocks / (blocks - 1))
+    return Spread(value, sd, blocks, blocks).within_0_and_1(math.inf)
 
 
 def average_precision(
@@ -169,14 +177,16 @@ class _Row:
     """One class in one part, with the values of every round of the bootstrap."""
 
     matched: Matched
-    weights: NDArray[np.float64] | None
+    blocks: NDArray[np.int64]
     ap: NDArray[np.float64]
     ap50: NDArray[np.float64]
     ap_rounds: NDArray[np.float64]
     ap50_rounds: NDArray[np.float64]
 
     @classmethod
-    def of(cls, matched: Matched, weights: NDArray[np.float64] | None) -> _Row:
+    def of(
+        cls, matched: Matched, blocks: NDArray[np.int64], weights: NDArray[np.float64] | None
+    ) -> _Row:
         steps = range(len(OVERLAPS))
         each = np.stack([average_precision(matched, step) for step in steps])
         rounds = (
@@ -184,7 +194,7 @@ class _Row:
             if weights is None
             else np.stack([average_precision(matched, step, weights) for step in steps])
         )
-        return cls(matched, weights, each.mean(axis=0), each[0], rounds.mean(axis=0), rounds[0])
+        return cls(matched, blocks, each.mean(axis=0), each[0], rounds.mean(axis=0), rounds[0])
 
     @property
     def labels(self) -> int:
@@ -201,10 +211,10 @@ class _Row:
             len(right),
             len(wrong),
             threshold,
-            _measured(float(self.ap[0]), self.ap_rounds),
-            _measured(float(self.ap50[0]), self.ap50_rounds),
-            _fraction_of(right, np.concatenate([right, wrong]), self.weights),
-            _fraction_of(right, self.matched.labels, self.weights),
+            _measured(float(self.ap[0]), self.ap_rounds, self.blocks),
+            _measured(float(self.ap50[0]), self.ap50_rounds, self.blocks),
+            _fraction_of(right, wrong, self.blocks),
+            _fraction_of(right, _less(self.matched.labels, right), self.blocks),
         )
 
 
@@ -213,7 +223,8 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
 
     def over(name: str) -> Measured:
         rounds = np.stack([getattr(row, f"{name}_rounds") for row in rows]).mean(axis=0)
-        return _measured(float(np.mean([getattr(row, name)[0] for row in rows])), rounds)
+        value = float(np.mean([getattr(row, name)[0] for row in rows]))
+        return _measured(value, rounds, rows[0].blocks)
 
     return PartScore(
         "all",
@@ -229,17 +240,23 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
     )
 
 
-def _measured(value: float, rounds: NDArray[np.float64]) -> Measured:
-    return Measured(value, *interval_of(rounds))
+def _measured(value: float, rounds: NDArray[np.float64], blocks: NDArray[np.int64]) -> Measured:
+    return Measured(value, *interval_of(value, rounds, len(np.unique(blocks))))
+
+
+def _less(of: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pictures of labels that were not found: of all, less of those that were."""
+    n = int(max(of.max(initial=-1), right.max(initial=-1))) + 1
+    left = np.bincount(of, minlength=n) - np.bincount(right, minlength=n)
+    return np.repeat(np.arange(n), np.maximum(left, 0))
 
 
 def _fraction_of(
-    right: NDArray[np.int64], of: NDArray[np.int64], weights: NDArray[np.float64] | None
+    right: NDArray[np.int64], wrong: NDArray[np.int64], blocks: NDArray[np.int64]
 ) -> Measured:
-    """Pictures of what is right, of those of everything."""
-    value = len(right) / len(of) if len(of) else math.nan
-    if weights is None or not len(of):
-        return Measured(value, math.nan, math.nan)
-    total = weights[:, of].sum(axis=1)
-    rounds = weights[:, right].sum(axis=1) / np.where(total > 0.0, total, math.nan)
-    return _measured(value, rounds)
+    """From the pictures of what is right, and of what is not."""
+    is_right = np.repeat([True, False], [len(right), len(wrong)])
+    if not len(is_right):
+        return _UNKNOWN
+    ends = share_by_cluster(is_right, blocks[np.concatenate([right, wrong])])
+    return Measured(len(right) / len(is_right), *ends)
