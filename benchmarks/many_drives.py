@@ -2,8 +2,9 @@
 
     python benchmarks/many_drives.py [--rounds 5] [--tiny 204] [--drives 4] [--minutes 1.5]
 
-First tiny drives (a run folder with one table each), so that nothing but the engine counts: a plain
-loop, our engines with their journal, and ``concurrent.futures`` as the peer, all in rotation. Then
+First tiny drives (a run folder with eight small tables each), so that nothing but the engine and
+the merging counts: a plain loop, our engines with their journal, also with everything merged, and
+``concurrent.futures`` as the peer, all in rotation. Then
 ``crosscue replay`` of simulated town drives with a camera, its detections cached, with one worker
 and with two. Last the merging of tables, beside reading them all and writing one.
 """
@@ -32,7 +33,7 @@ import pyarrow.parquet as pq
 from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.eval import cli
 from crosscue.eval.batch.jobs import Job, in_turn, run_many
-from crosscue.eval.batch.merge import merge_runs
+from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.batch.processes import Processes
 from crosscue.eval.runs.folder import RunFolder, clear, create, locked, open_run, write_manifest
 from crosscue.eval.runs.tables.parquet import TableSink
@@ -42,6 +43,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.manifests import estimated
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
+TABLES = ("pose", "belief", "range", "cues", "detections", "road", "frames", "skipped")
 DETECTOR = """
 [detectors.busy]
 kind = "estimate:build"
@@ -60,8 +62,9 @@ def tiny(job: Job) -> Written:
     run = create(job.run, overwrite=True)
     with locked(run):
         clear(run)
-        with TableSink(run, "pose", SCHEMA) as sink:
-            sink.write({"t_ns": np.arange(1000)})
+        for name in TABLES:
+            with TableSink(run, name, SCHEMA) as sink:
+                sink.write({"t_ns": np.arange(1000)})
         write_manifest(run, estimated())
     return Written()
 
@@ -80,6 +83,13 @@ def loop(jobs: Sequence[Job]) -> None:
         tiny(job)
 
 
+def merged(jobs: Sequence[Job]) -> None:
+    """As ``replay`` of many drives does it."""
+    run_many(jobs, tiny, Processes(1))
+    runs, failures = gathered([jobs[0].run.parent])
+    merge_runs(runs, create(jobs[0].run.parent.parent / "merged", overwrite=True), failures)
+
+
 def peer(workers: int) -> Callable[[Sequence[Job]], None]:
     def work(jobs: Sequence[Job]) -> None:
         fresh = multiprocessing.get_context("spawn")
@@ -95,6 +105,7 @@ def engines(folder: Path, rounds: int, drives: int) -> None:
         "plain loop": loop,
         "ours, in turn": lambda jobs: run_many(jobs, tiny, in_turn),
         "ours, 1 process": lambda jobs: run_many(jobs, tiny, Processes(1)),
+        "ours, 1, and merged": merged,
         "ours, 2 processes": lambda jobs: run_many(jobs, tiny, Processes(2)),
         "concurrent.futures, 1": peer(1),
         "concurrent.futures, 2": peer(2),
@@ -110,13 +121,17 @@ def engines(folder: Path, rounds: int, drives: int) -> None:
                 spent[way, n].append(time.perf_counter() - began)
                 used[way, n].append(cpu_s() - began_cpu)
     base = (median(spent["plain loop", many]) - median(spent["plain loop", few])) / (many - few)
+    bare = (median(used["plain loop", many]) - median(used["plain loop", few])) / (many - few)
     print(f"tiny drives: to begin, and for each of {many - few} more\n")
-    print("engine                  begin s   ms/drive   of plain loop   CPU ms/drive")
+    print("engine                  begin s   ms/drive   of plain loop   CPU ms/drive   overhead")
     for way in ways:
         begin, whole = median(spent[way, few]), median(spent[way, many])
         each = (whole - begin) / (many - few)
         cpu = (median(used[way, many]) - median(used[way, few])) / (many - few)
-        print(f"{way:22} {begin:8.2f} {each * 1e3:10.2f} {each / base:15.2f} {cpu * 1e3:14.2f}")
+        print(
+            f"{way:22} {begin:8.2f} {each * 1e3:10.2f} {each / base:15.2f} {cpu * 1e3:14.2f} "
+            f"{(cpu - bare) * 1e3:10.2f}"
+        )
     jobs = tiny_jobs(folder, many)
     run_many(jobs, tiny, in_turn)
     began = time.perf_counter()

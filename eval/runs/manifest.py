@@ -6,7 +6,9 @@ One record for each stage that can finish a run folder. ``RunFolder.manifest`` r
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
@@ -33,12 +35,18 @@ def _vehicle(given: object) -> object:
     if not isinstance(given, dict):
         return given
     try:
-        return Vehicle.model_validate(tuples(given))
+        return _vehicle_of(json.dumps(given))
     except ValidationError as error:
         place, why = _first_of(error)
         raise PydanticCustomError(
             "settings", "{place}: {why}", {"place": place, "why": why}
         ) from None
+
+
+@lru_cache(maxsize=64)
+def _vehicle_of(text: str) -> Vehicle:
+    """Most runs of a fleet share their settings, and checking them takes longer than all else."""
+    return Vehicle.model_validate(tuples(json_tree(text)))
 
 
 Settings = Annotated[Vehicle, BeforeValidator(_vehicle)]

@@ -5,6 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import lru_cache
+
+from crosscue.replay.base import json_tree
 
 
 def settings_sha256(settings: object, detectors: object, selection: object) -> str:
@@ -12,8 +15,14 @@ def settings_sha256(settings: object, detectors: object, selection: object) -> s
 
     Files count by their names alone: the same drive replayed in another place is the same run.
     """
-    made_with = _without_places([settings, detectors, selection])
-    return hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()
+    return _sha256_of(json.dumps([settings, detectors, selection], sort_keys=True))
+
+
+@lru_cache(maxsize=256)
+def _sha256_of(made_with: str) -> str:
+    """Of many runs few differ in what they were made with."""
+    plain = _without_places(json_tree(made_with))
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def _without_places(value: object) -> object:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from functools import lru_cache
 from typing import Any, Final, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -25,7 +24,7 @@ from crosscue.eval.runs.folder import (
 )
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tags import parse_tags
-from crosscue.replay.base import json_tree, one_line
+from crosscue.replay.base import one_line
 from crosscue.replay.files.identity import identity_of_all
 
 from .local import BESIDE, Found
@@ -170,7 +169,9 @@ def _run_row(
             for one in (() if detect is None else detect.detectors)
         ],
         "settings": sys.intern(json.dumps(said.settings, sort_keys=True)),
-        "settings_sha256": _settings_sha256(_made_with(said, detect)),
+        "settings_sha256": settings_sha256(
+            said.settings, None if detect is None else list(detect.detectors), said.selection
+        ),
         "tags": list(tags.items()),
         "conditions": sorted({tag for one in results for tag in one["conditions"]}),
         "start_ns": segments[0].start_ns if segments else None,
@@ -234,17 +235,6 @@ def _read(model: type[M], content: bytes) -> M:
         raise ValueError(
             f"{MANIFEST}: unreadable ({where}{first['msg'].lower()}); replay again"
         ) from None
-
-
-def _made_with(said: _Manifest, detect: _Detect | None) -> str:
-    detectors = None if detect is None else list(detect.detectors)
-    return json.dumps([said.settings, detectors, said.selection], sort_keys=True)
-
-
-@lru_cache(maxsize=256)
-def _settings_sha256(made_with: str) -> str:
-    """As in the manifest of merged runs; few runs differ in what they were made with."""
-    return settings_sha256(*json_tree(made_with))
 
 
 def _approaches(

@@ -91,7 +91,7 @@ class TableFolder:
                 opened(path) as handle,
                 pq.ParquetFile(handle, page_checksum_verification=True) as file,
             ):
-                yield from file.iter_batches(rows, columns=columns)
+                yield from file.iter_batches(rows, columns=columns, use_threads=False)
         except FileNotFoundError:
             raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
         except (OSError, pa.ArrowException) as error:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,16 @@ def test_a_corrected_box_comes_back_with_its_time_and_is_trained_and_fitted_with
     fitted = crosscue.fit_detector(worst.parent / "run", drive.objects, detector="finder")
     assert [one.name for one in fitted.classes] == ["car"]
     assert fitted.fitted_to + fitted.held_out == len(objects.pictures)
+    # And one step of training with the same file.
+    settings = crosscue.MaskRcnnTrainingSettings(
+        data=found.coco, images=found.images, classes=("car",), steps=1, batch=1, check_images=1
+    )
+    small = replace(settings, width_px=SIZE[0], window_px=(64, 64), device="cpu")
+    said: list[str] = []
+    trained = crosscue.train_mask_rcnn(small, tmp_path / "net.safetensors", on_line=said.append)
+    assert trained.path.stat().st_size > 0
+    counts = [re.search(r"(\d+) pictures, \d+ of (\d+) objects", line) for line in said[:2]]
+    assert [sum(int(one[n]) for one in counts if one) for n in (1, 2)] == [len(was)] * 2
 
 
 def test_a_picture_without_its_cue_says_that_the_cue_is_not_there(
@@ -140,8 +152,6 @@ def test_a_folder_that_is_no_export_and_a_format_that_is_none_are_refused(
 
 
 def test_a_run_that_is_gone_is_left_out_with_its_reason(worst: Path, tmp_path: Path) -> None:
-    from dataclasses import replace
-
     from crosscue.eval.failures.record import read_failures
 
     here: tuple[Failure, ...] = read_failures(worst)
