@@ -340,7 +340,7 @@ def recall(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, i
 
 
 def on_nothing(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, int]:
-    """How many boxes above 0.5 lie on no vehicle's projected box at all; of how many."""
+    """How many boxes above 0.5 are on no vehicle's projected box at all; of how many."""
     alone = total = 0
     for picture, one in zip(pictures, found, strict=True):
         for box in one.boxes[one.scores > FALSE_SCORE]:

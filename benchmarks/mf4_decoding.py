@@ -118,7 +118,7 @@ def compared(log: Path, dbc: Path) -> int:
 
 
 def ford_logs(folder: Path) -> list[Path]:
-    """The Ford frames many times over: as they lie on a logger's card, and finalized."""
+    """The Ford frames many times over: as they are on a logger's card, and finalized."""
     import asammdf
     import can
 

@@ -85,7 +85,7 @@ def check_reader(
 def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) -> None:
     """Check that a detector keeps the contract on black, white and noisy frames.
 
-    It returns one result for each frame, in order, with the frame's time and size; boxes lie in the
+    It returns one result for each frame, in order, with the frame's time and size; boxes are in the
     picture and scores in 0 to 1; every label is one of its ``labels``, where it has any; frames
     stay as they were; the same frames give the same result, one by one or together; and its
     identity is the same when it is built again.

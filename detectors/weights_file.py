@@ -1,7 +1,7 @@
 """Weights and their description as one safetensors file, with a sum by which damage is seen.
 
 Safetensors has no checksum: a flipped bit would be another network. The sum is over description
-and weights, and lies in the file's own header; files that came with crosscue are known whole.
+and weights, and is in the file's own header; files that came with crosscue are known whole.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class CueNode:
         dissents: Near the intersection its absence speaks against what it supports.
         seen_frames: Where persistence counts: believed once positive in so many frames ...
         of_frames: ... of the last so many.
-        within_m: Likewise: says nothing of an intersection known to be further away.
+        within_m: Likewise: says nothing about an intersection known to be further away.
         fade: Likewise: over what its errors become independent.
     """
 

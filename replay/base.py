@@ -210,7 +210,7 @@ class Log(Protocol):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         ...
 
     @property

@@ -8,7 +8,7 @@ For every topic: ``in file = used + skipped (by reason) + dropped (by reason)``.
 * *dropped*: rows that must have been in the file (a declared count, a damaged chunk whose index
   says what it held, a cut record) but could not be read.
 
-A loss whose extent nobody can know (a cut file without statistics) is a ``Loss`` with count None:
+A loss whose extent cannot be known (a cut file without statistics) is a ``Loss`` with count None:
 the log is then not whole, and the summary says "at least".
 """
 
@@ -160,7 +160,7 @@ class Ledger:
         detail: str = "",
         t_ns: int | None = None,
     ) -> None:
-        """Rows that were in the file and could not be read; ``count`` None if nobody can know."""
+        """Rows of the file that could not be read; ``count`` is None where it is unknown."""
         if count == 0:
             return
         account = self.topic(topic)

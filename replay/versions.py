@@ -51,7 +51,7 @@ def _head(folder: Path) -> str:
     """What HEAD of a checkout is; its files are read, as git need not be installed."""
     git = folder / ".git"
     if git.is_file():
-        # A worktree: its own folder lies inside that of the repository.
+        # A worktree: its own folder is inside that of the repository.
         git = folder / git.read_text().removeprefix("gitdir:").strip()
     head = (git / "HEAD").read_text().strip()
     if not head.startswith("ref:"):

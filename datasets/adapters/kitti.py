@@ -76,7 +76,7 @@ TOPICS: Final[dict[str, tuple[str, Callable[[Packets], Table]]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Oxts:
-    """The box's packets as they lie on disk: one file each, or one line each of one file.
+    """The box's packets as they are on disk: one file each, or one line each of one file.
 
     Attributes:
         files: One file a packet, and times; for a single file, times of its lines.

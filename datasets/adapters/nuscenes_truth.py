@@ -172,7 +172,7 @@ def _key_frames(tables: SceneTables) -> Iterator[tuple[Row, _Camera]]:
 def _box_px(
     xyz_m: Floats, size_m: Floats, turn: Rotation, camera: _Camera
 ) -> tuple[float, float, float, float] | None:
-    """Around the corners in the picture; None where one lies beside or behind the camera."""
+    """Around the corners in the picture; None where one is beside or behind the camera."""
     width, length, height = size_m
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     corners = xyz_m + turn.apply(0.5 * signs * np.array([length, width, height]))

@@ -135,7 +135,7 @@ def _projected(
 
 
 def _visible(seen: list[_Seen]) -> Iterator[tuple[_Seen, float]]:
-    """Each box with the fraction of it that lies in the picture and no nearer one hides."""
+    """Each box with the fraction of it that is in the picture and no nearer one hides."""
     import cv2
 
     hidden = np.zeros(SIZE_PX[::-1], np.uint8)

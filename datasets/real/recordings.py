@@ -59,7 +59,7 @@ class Recording(Settings):
     url: Annotated[str, Field(pattern="^https?://")]
     """The folder with its files, at one commit."""
     folders: tuple[str, ...]
-    """Where it may lie below a folder given with ``--data``, or below ``$CROSSCUE_DATA``."""
+    """Where it may be below a folder given with ``--data``, or below ``$CROSSCUE_DATA``."""
     files: Annotated[tuple[RecordedFile, ...], Field(min_length=1)]
 
     @property

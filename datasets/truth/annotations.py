@@ -304,7 +304,7 @@ def _there_are(names: Sequence[str]) -> str:
 
 
 def check_boxes(annotations: Annotations) -> None:
-    """Refuse boxes without area, or that lie outside their picture.
+    """Refuse boxes without area, or that are outside their picture.
 
     Raises:
         SchemaError: With the first one's place.

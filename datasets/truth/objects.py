@@ -39,7 +39,7 @@ class Objects:
         self.images.append(row)
 
     def add(self, label: str, box_px: tuple[float, float, float, float], **more: object) -> None:
-        """A box, x0, y0, x1, y1, in the last picture; what lies outside is cut off.
+        """A box, x0, y0, x1, y1, in the last picture; what is outside is cut off.
 
         Args:
             label: COCO's name where COCO has the class.

@@ -78,7 +78,7 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
 class Features(Section):
-    """Where one may drive on from an intersection; null where nobody knows, which is not scored."""
+    """Where one may drive on from an intersection; null where unknown, which is not scored."""
 
     left: bool | None
     right: bool | None

@@ -184,12 +184,12 @@ def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
 
 
 def count_oncoming(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
-    """Cars past the intersection that come towards the ego vehicle; None where nobody knows."""
+    """Cars past the intersection that come towards the ego vehicle; None where unknown."""
     past = None if pairs.judged is None else pairs.judged.past
     return None if past is None else past.oncoming
 
 
 def count_outgoing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
-    """Cars past the intersection that go away; None where nobody knows."""
+    """Cars past the intersection that go away; None where unknown."""
     past = None if pairs.judged is None else pairs.judged.past
     return None if past is None else past.outgoing

@@ -50,7 +50,7 @@ class CuePass:
 
         Args:
             frame: What was found in it.
-            ego: The ego vehicle's motion since the frame before; None where nobody knows.
+            ego: The ego vehicle's motion since the frame before; None where unknown.
             place: Where the intersection is believed to be, if that is known.
         """
         counts: dict[str, int] = {}

@@ -27,7 +27,7 @@ def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int | None:
 
 @lru_cache(maxsize=64)
 def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels whose centres lie in a polygon, shape (h, w), by the even-odd rule."""
+    """The pixels whose centres are in a polygon, shape (h, w), by the even-odd rule."""
     height, width = shape
     y, x = np.mgrid[0:height, 0:width]
     x, y = (x + 0.5) / width, (y + 0.5) / height

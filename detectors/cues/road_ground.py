@@ -8,7 +8,7 @@ is projected with the camera's mounting and intrinsics; the ground is level.
 
 A region is **not seen**, which says nothing for or against a road,
 
-* where no range is known, or the region lies at or behind the camera;
+* where no range is known, or the region is at or behind the camera;
 * where its place on the ground is unsure by more than the margin to the intersection's ends: the
   range's standard deviation and what the camera's pitch does to a distance ``D``,
   ``D**2 * pitch_sd_rad / z_m``;
@@ -87,7 +87,7 @@ def outlines(
 
 
 def _outline(one: Rectangle, ground: GroundPlane) -> NDArray[np.float64] | None:
-    """Corners in the picture; None where one of them lies beside or behind the camera."""
+    """Corners in the picture; None where one of them is beside or behind the camera."""
     if one[0] - ground.position_m[0] < NEAREST_M:
         return None
     corners = ground.project(_corners(one))
@@ -128,7 +128,7 @@ def _fraction(
 
 
 def _inside(polygon: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The pixels whose centres lie in a convex polygon, shape (h, w)."""
+    """The pixels whose centres are in a convex polygon, shape (h, w)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
     signs: list[NDArray[np.float64]] = []
     for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):

@@ -26,7 +26,7 @@ from .weights import Weights
 
 Array = NDArray[np.generic]
 _EXTERNAL: Final = b"\x0a\x08location"
-"""How a protobuf spells the key of a tensor that lies in another file."""
+"""How a protobuf spells the key of a tensor that is in another file."""
 
 
 class Network(Protocol):

@@ -14,7 +14,7 @@ from crosscue.detectors.decoders.base import Array, Size
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a picture lies in a network's input: input = picture * scale + offset, x and y.
+    """Where a picture is in a network's input: input = picture * scale + offset, x and y.
 
     Attributes:
         scale: Along x and y.
@@ -60,7 +60,7 @@ def place(picture: Size, want: Input) -> Placement:
 
 
 def prepared(pixels: NDArray[np.uint8], want: Input) -> tuple[Array, Placement]:
-    """A picture (H, W, 3) as a network's input with its batch axis, and where it lies there."""
+    """A picture (H, W, 3) as a network's input with its batch axis, and where it is there."""
     height, width = pixels.shape[:2]
     placement = place((width, height), want)
     if want.fit == "network":

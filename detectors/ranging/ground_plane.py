@@ -104,7 +104,7 @@ class GroundPlane:
     def seen_at(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where directions in the car's axes, shape (N, 3), lie in the picture, shape (N, 2).
 
-        NaN for what lies beside or behind the camera.
+        NaN for what is beside or behind the camera.
         """
         forward, left, up = (directions @ self.to_car).T
         forward = np.where(forward > 0.0, forward, np.nan)

@@ -54,7 +54,7 @@ OTHER_MAKE: Final = 2.0
 MIN_SAID: Final = 0.25
 """Motion has said something once it is worth this fraction of what the standard sizes say."""
 MIN_SEEN: Final = 5
-"""A light seen less often says nothing of the others' make."""
+"""A light seen less often says nothing about the others' make."""
 STRAIGHT_RAD: Final = 0.15
 """Heights follow the way only while the car goes straight; after such a turn they start over."""
 

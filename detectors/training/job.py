@@ -45,7 +45,7 @@ class Job:
         plan: Of the network.
         schedule: How long and how fast.
         window: Of samples.
-        output: The checkpoint; its curve and state lie beside it.
+        output: The checkpoint; its curve and state are beside it.
         check_every: Steps between validations.
         check_pictures: At most so many pictures in those; the last one takes all.
         device: As the detector's setting.

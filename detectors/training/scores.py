@@ -156,6 +156,6 @@ def _answers(
 
 
 def _is_unmasked(picture: LabelledPicture, label: int, box_px: Floats) -> bool:
-    """Whether a detection lies on an object of its class that has no mask to compare with."""
+    """Whether a detection is on an object of its class that has no mask to compare with."""
     bare = [one.box_px for one in picture.objects if one.label == label and one.mask is None]
     return bool(bare) and bool((overlaps(box_px, np.array(bare)) >= HALF).any())

@@ -76,8 +76,8 @@ class DriveInput:
         name: A readable stem and 8 hex digits of the logs' identity, whatever else is in the
             batch; letters, digits and ``._+=@-`` only.
         logs: Paths or URLs, as given, sorted by name: their order changes nothing.
-        vehicle: The vehicle file that lies beside its logs, if any.
-        truth: The truth that lies beside its logs, if any.
+        vehicle: The vehicle file that is beside its logs, if any.
+        truth: The truth that is beside its logs, if any.
     """
 
     name: str
@@ -87,7 +87,7 @@ class DriveInput:
 
     @property
     def identity(self) -> str:
-        """Of its logs, wherever they lie."""
+        """Of its logs, wherever they are."""
         return self.name[-SHORT:]
 
 

@@ -133,7 +133,7 @@ class Progress:
 
 
 class State(StrEnum):
-    """What lies in a job's run folder."""
+    """What is in a job's run folder."""
 
     MISSING = "nothing there"
     CUT_SHORT = "cut short"

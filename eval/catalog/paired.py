@@ -60,7 +60,7 @@ class PairedMetric:
             six drives.
         more_drives: How many more drives, as varied as these, would decide in 80 % of comparisons
             whether a difference as large as this one is real; 0 where it is decided or zero,
-            None where nobody can know.
+            None where it cannot be known.
         allowed: How much worse it may be.
         verdict: Of the second run.
     """

@@ -97,7 +97,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
     """Add one run's approaches.
 
     Raises:
-        RunError: A table is missing or damaged, or nothing of the run lies in the truth's time.
+        RunError: A table is missing or damaged, or nothing of the run is in the truth's time.
     """
     run.refuse_set_back("fit messages")
     belief = run.table("belief", ["t_ns", "approach", "established"])

@@ -98,7 +98,7 @@ class DriveFit:
         sources: By what turns the pose; that of the vehicle file first.
         not_fitted: What could not be fitted, and why.
         settings: With the values of all sources.
-        nees_band: The mean NEES of one drive lies in here with 95 %, if the claims are right.
+        nees_band: The mean NEES of one drive is in here with 95 %, if the claims are right.
     """
 
     log: str

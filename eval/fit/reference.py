@@ -21,7 +21,7 @@ GeodeticOrigin: TypeAlias = tuple[float, float, float]
 SPACING_NS: Final = 1_000_000_000
 """Positions nearer to each other say little more: their errors last."""
 TRUTH_SD_M: Final = 0.3
-"""Where a truth file says nothing of its own quality; the fit finds out."""
+"""Where a truth file says nothing about its own quality; the fit finds out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

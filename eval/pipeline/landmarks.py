@@ -116,7 +116,7 @@ class LandmarkStage:
         return found
 
     def cross_gap(self) -> None:
-        """What was in view before a gap in time says nothing of where the car is after it."""
+        """What was in view before a gap in time says nothing about where the car is after it."""
         self.search.cross_gap()
 
     def take_sightings(self) -> list[Sighting]:

@@ -1,6 +1,6 @@
 """A run as a Rerun recording, laid out without a click.
 
-Everything lies on one timeline, the log's time; columns are sent in bulk, pictures pass through as
+Everything is on one timeline, the log's time; columns are sent in bulk, pictures pass through as
 stored. ``save`` is all there is to call.
 """
 

@@ -60,7 +60,7 @@ def _draw(
 
 
 def _broken(poses: ScoredPoses, *columns: Floats) -> tuple[Floats, ...]:
-    """Columns with a missing value wherever a gap of the drive lies between two rows."""
+    """Columns with a missing value wherever a gap of the drive is between two rows."""
     rows = broken_at(poses.gaps, poses.t_ns)
     return tuple(np.insert(np.asarray(one, np.float64), rows, np.nan) for one in columns)
 

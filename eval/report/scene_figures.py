@@ -174,7 +174,7 @@ def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[NDArray[np.int64], ND
 
 
 def _between_rows(gaps: Sequence[Gap], t_ns: NDArray[np.int64]) -> list[tuple[Gap, int]]:
-    """Gaps that lie between two rows, each with the row after it."""
+    """Gaps that are between two rows, each with the row after it."""
     return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
 
 
@@ -269,7 +269,7 @@ def draw_range(
     nearest = min(float(one.true_m.min()) for one in rows)
     near = min(0.0, nearest) if nearest < WIDEST_BIN_M else nearest - WIDEST_BIN_M / 2.0
     if few:
-        # A band that fills the panel says nothing of how wide it is.
+        # A band that fills the panel says nothing about how wide it is.
         two_sd = np.concatenate([2.0 * np.sqrt(one.var_m2) for one in rows])
         most = max(most, float(np.percentile(two_sd, 90.0)) * 1.15)
     above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-most, most))

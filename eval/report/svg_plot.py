@@ -89,7 +89,7 @@ class Drawing:
     def text(
         self, x: float, y: float, text: str, style: str = "tick", anchor: str = "middle"
     ) -> None:
-        """A line of text whose baseline lies at y."""
+        """A line of text whose baseline is at y."""
         self._parts.append(
             f'<text x="{_n(x)}" y="{_n(y)}" class="{style}" text-anchor="{anchor}">'
             f"{escape(text)}</text>"

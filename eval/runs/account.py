@@ -50,7 +50,7 @@ class Counts(Record):
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Reasons for which a number that nobody can know was dropped."""
+        """Reasons for which a number that cannot be known was dropped."""
         return ()
 
 
@@ -58,7 +58,7 @@ class Line(Counts):
     """One stream of a stage of one drive."""
 
     dropped_unknown: tuple[str, ...] = ()
-    """Reasons for which a number that nobody can know was dropped."""
+    """Reasons for which a number that cannot be known was dropped."""
 
     @property
     def unknown(self) -> tuple[str, ...]:

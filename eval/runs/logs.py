@@ -102,7 +102,7 @@ def place_of(run: RunFolder, said: LogRow) -> Path | str:
         said: The log's row in the manifest.
 
     Raises:
-        RunError: It is gone, or another log lies there.
+        RunError: It is gone, or another log is there.
     """
     where, wanted = said.path, said.identity
     if is_remote(where):

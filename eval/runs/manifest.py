@@ -27,7 +27,7 @@ from .record import Record
 
 FORMAT_VERSION: Final = 5
 OWN_FRAME: Final = "no start heading and no compass: the map's x axis points where the car did"
-"""The notice of a run whose poses lie in a frame of its own, turned against any other."""
+"""The notice of a run whose poses are in a frame of its own, turned against any other."""
 
 
 def _vehicle(given: object) -> object:

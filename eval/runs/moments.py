@@ -41,7 +41,7 @@ def moment_ns(run: TableFolder, text: str) -> int:
     """The moment that ``12.3`` (seconds from the first frame) or ``17...ns`` means.
 
     Raises:
-        UsageError: It is neither, or lies outside the run.
+        UsageError: It is neither, or is outside the run.
     """
     first, last = span_ns(run)
     if re.fullmatch(r"[0-9]{1,19}ns", text):

@@ -61,7 +61,7 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
     """The camera; None where the run's logs have none, or several and no line says which.
 
     Raises:
-        RunError: The manifest cannot be read; its log is gone, or another lies in its place.
+        RunError: The manifest cannot be read; its log is gone, or another is in its place.
         LogError: The log cannot be opened.
     """
     if run.without_images:
@@ -135,7 +135,7 @@ def read_pictures(
     """Give every block of pictures to ``on_pictures``, and warn of what was dropped.
 
     Args:
-        camera: Where they lie.
+        camera: Where they are.
         on_pictures: Called with blocks of ``Images`` with times as in the run's tables.
         span_ns: Those of this time, and some before and behind it; None for all.
 

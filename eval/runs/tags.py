@@ -1,6 +1,6 @@
 """Tags of a run: words that its users set on it, such as ``weather=rain``.
 
-They lie in a file of their own, so that what a run is made of and what it found stay the same bytes
+They are in a file of their own, so that what a run is made of and what it found stay the same bytes
 whatever it is called.
 """
 

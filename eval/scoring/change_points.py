@@ -81,7 +81,7 @@ def change_points(results: Mapping[str, Results]) -> dict[str, tuple[ChangePoint
 
 
 def _confirmed(points: Sequence[ChangePoint], one: Results) -> tuple[ChangePoint, ...]:
-    """Those that still stand between their neighbors: a first split may lie beside the change."""
+    """Those that still stand between their neighbors: a first split may be beside the change."""
     edges = [0, *(point.at for point in points), one.values.shape[1]]
     kept = []
     for i, point in enumerate(points):

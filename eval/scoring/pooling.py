@@ -69,7 +69,7 @@ def first_reasons(
 def distance_bins(
     distance_m: NDArray[np.float64], borders_m: Sequence[float]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Which rows lie in which half-open bin; every row lies in exactly one."""
+    """Which rows are in which half-open bin; every row is in exactly one."""
     found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
     for low, high in pairwise(borders_m):
         found[f"{low:g}-{high:g}"] = (distance_m >= low) & (distance_m < high)

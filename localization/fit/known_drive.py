@@ -65,7 +65,7 @@ class KnownDrive:
         fixes: Fixes,
         lever_m: tuple[float, float],
     ) -> None:
-        """Take the positions that lie within the odometry.
+        """Take the positions that are within the odometry.
 
         Args:
             wheels: The drive's wheel speeds.

@@ -112,7 +112,7 @@ def _tail(stream: Stream) -> tuple[float, Stream]:
 
 
 def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Right edges of the layers, shape (257,), and how much of each lies inside the next, (256,).
+    """Right edges of the layers, shape (257,), and how much of each is inside the next, (256,).
 
     All layers have the same area; the first holds the tail's.
     """

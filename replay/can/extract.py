@@ -1,7 +1,7 @@
 """Bits of many payloads at once into columns, with NumPy.
 
 A payload is read as 64-bit words: word ``k`` holds bytes ``8 k`` to ``8 k + 7``, as the number
-that they make in the signal's byte order. A signal lies in one word, or in one and the next.
+that they make in the signal's byte order. A signal is in one word, or in one and the next.
 Signals that lie alike (same word, byte order and kind) are taken out together, as one array of
 shape (signals, rows), since a call into NumPy costs more than the work on a few hundred rows.
 """

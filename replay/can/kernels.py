@@ -167,7 +167,7 @@ def to_floats(
         for r in range(n):
             out[r] = np.float64(np.int64(raw[r]) >> np.int64(drop)) * scale + offset
     elif kind in (SINGLE, SINGLE_SCALED):
-        # The bits lie in the upper half of each little-endian word.
+        # The bits are in the upper half of each little-endian word.
         singles = raw.view(np.float32)[1::2]
         for r in range(n):
             single = np.float64(singles[r])

@@ -123,7 +123,7 @@ def _checksum(body: bytes) -> bytes:
 
 @cache
 def _made_by() -> str | None:
-    """A hash of the code that makes layouts, with cantools' version; None if nobody can tell."""
+    """A hash of the code that makes layouts, with cantools' version; None if it cannot be known."""
     code = blake2b(digest_size=16)
     try:
         for name in _MADE_BY:

@@ -32,7 +32,7 @@ class DatabaseText:
     """One file as text.
 
     Attributes:
-        path: Where it lies.
+        path: Where it is.
         text: Decoded, with the line ends of the file.
         notices: What was doubtful about its encoding.
     """

@@ -29,7 +29,7 @@ JUMP_WINDOW_NS: Final = 2_000_000_000
 _JUMP_OVER_WAIT: Final = 6
 _SHARP_ROWS: Final = 4
 _ROWS_BESIDE: Final = 16
-"""Rows that must lie on either side of a jump; fewer cannot distinguish it from a ramp."""
+"""Rows that must be on either side of a jump; fewer cannot distinguish it from a ramp."""
 _SHORTEST_SIDE_NS: Final = 100_000_000
 _WINDOW_ROWS: Final = (_ROWS_BESIDE, 8192)
 _ENVELOPE_BINS: Final = 1024

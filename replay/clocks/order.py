@@ -1,6 +1,6 @@
 """The order of one clock's stamps: duplicates, late rows, resets, periods.
 
-Rows arrive in stored order. A row is *late* when its stamp lies below one seen before; a run of
+Rows arrive in stored order. A row is *late* when its stamp is below one seen before; a run of
 late rows is a stretch. A step back is a *reset* (the clock was set back, or started again) when the
 stamps then go on from there: no later step within ``LOOK_AHEAD`` rows leaps back by half as much.
 Late rows do leap back. Two resets within ``LOOK_AHEAD`` rows count as one.

@@ -9,7 +9,7 @@ clock, else the publish time when it does, else the log time. A clock agrees whe
 
 * at least 99 % of the rows carry it, and it moves;
 * it was never set back, never jumps, and at most 1 % of its rows are late;
-* it lies within one second of the log clock, and drifts less than 1000 ppm from it.
+* it is within one second of the log clock, and drifts less than 1000 ppm from it.
 
 A publish time that always equals the log time says nothing and is passed over.
 
@@ -60,7 +60,7 @@ class StampReport:
         reset_steps: The first of these.
         late_rows: Rows stamped below an earlier row, resets aside.
         late_stretches: Runs of such rows.
-        worst_late_ns: How far the latest of them lies below.
+        worst_late_ns: How far the latest of them is below.
         median_period_ns: Median step between sorted stamps.
         is_steady: Nine of ten steps are below 2.5 median periods: not a stream of bursts.
         gap_over_ns: What counts as a gap: over 5 median periods, or, where the topic is not steady,

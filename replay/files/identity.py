@@ -7,7 +7,7 @@ longer than its part is hashed in parts: of a file with an index at its end, as 
 ROS 1 bags have, 64 KiB from the head, 64 KiB from the tail, and the index, up to 64 MiB; of others
 a quarter of the part from the head, a quarter from the tail, the rest as 32 blocks spread
 evenly between them. So a log of 100 GB costs milliseconds, and the same log has the same identity
-wherever it lies, on a disk or at a URL, and however old it looks.
+wherever it is, on a disk or at a URL, and however old it looks.
 
 Files that readers consult beside a log belong to it: time files of pictures and videos, SQLite's
 journals. Hidden files and what other commands put beside a log (``vehicle.toml``, ``truth.json``,
@@ -201,7 +201,7 @@ def _beside(place: Path) -> list[Path]:
 
 
 def _names_beside(name: str, is_there: Callable[[str], bool]) -> list[str]:
-    """What lies beside a file and belongs to it: journals, and the time file of a video."""
+    """What is beside a file and belongs to it: journals, and the time file of a video."""
     from .time_file_names import times_of_video
 
     times = times_of_video(name) if PurePosixPath(name).suffix.lower() in _videos() else ()

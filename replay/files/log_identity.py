@@ -1,4 +1,4 @@
-"""What a log is known by wherever it lies; ``identity`` computes it."""
+"""What a log is known by wherever it is; ``identity`` computes it."""
 
 from __future__ import annotations
 

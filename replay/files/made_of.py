@@ -23,7 +23,7 @@ NOTHING: Final[Mapping[str, Any]] = {}
 
 
 def made_of(inputs: Sequence[Path], settings: Mapping[str, object]) -> dict[str, Any]:
-    """For a file beside the result: equal for equal inputs and settings, wherever they lie.
+    """For a file beside the result: equal for equal inputs and settings, wherever they are.
 
     Raises:
         LogError: An input is not there or cannot be read.

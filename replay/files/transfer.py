@@ -1,6 +1,6 @@
 """A file of a known SHA-256 from a server or from this machine, checked before it is kept.
 
-A transfer that was cut goes on where it stopped: what has come so far lies beside the place of the
+A transfer that was cut goes on where it stopped: what has come so far is beside the place of the
 whole file, as ``NAME.part``.
 """
 

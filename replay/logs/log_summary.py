@@ -78,7 +78,7 @@ class TopicSummary:
         used: Rows handed on and understood.
         skipped: Rows found and not used, by reason.
         dropped: Rows that were in the file and could not be read, by reason.
-        dropped_unknown: Reasons of losses whose extent nobody can know.
+        dropped_unknown: Reasons of losses whose extent cannot be known.
         rate_hz: Mean rate on the clock that is used, or None.
         clocks: Its clocks, or None where no row was read.
         can_ids: For a CAN bus: its most frequent identifiers.

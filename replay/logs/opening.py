@@ -1,4 +1,4 @@
-"""One way to open any recording: by its suffix, by what lies in its folder, by its URL."""
+"""One way to open any recording: by its suffix, by what is in its folder, by its URL."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from crosscue.replay.formats import FORMATS, format_of, known_formats
 
 
 def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
-    """Open any recording by its suffix or, for a folder, by what lies in it.
+    """Open any recording by its suffix or, for a folder, by what is in it.
 
     A text with ``://`` is a URL: see ``remote``. Of a log with a seal beside
     it, what is read is held against the seal, see ``sealed_log``.

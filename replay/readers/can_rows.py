@@ -204,7 +204,7 @@ def blocks_by_bus(
 
 
 def in_time(log_ns: Int64s, selection: Selection) -> NDArray[np.bool_] | None:
-    """Which times lie in the half-open span asked for; None for all of them."""
+    """Which times are in the half-open span asked for; None for all of them."""
     inside: NDArray[np.bool_] | None = None
     if selection.start_ns is not None:
         inside = log_ns >= selection.start_ns

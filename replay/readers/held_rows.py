@@ -28,7 +28,7 @@ NO_PARTNER: Final = "a row without its time, or a time without its row"
 
 
 class Loss(NamedTuple):
-    """Rows that could not be understood; ``rows`` is None where nobody can know how many."""
+    """Rows that could not be understood; ``rows`` is None where it cannot be known how many."""
 
     reason: str
     rows: int | None

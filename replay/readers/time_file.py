@@ -51,7 +51,7 @@ class TimeFile:
     """What a time file says.
 
     Attributes:
-        path: Where it lies.
+        path: Where it is.
         t_ns: Shape (N,), int64; empty where only a rate is given.
         names: N file names without folders, or None where lines hold times only.
         period: Nanoseconds between pictures where only a rate is given, else None.

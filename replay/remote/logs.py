@@ -241,7 +241,7 @@ class RemoteLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies on this machine."""
+        """Where it is on this machine."""
         return self._log.path
 
     @property
@@ -308,7 +308,7 @@ class RangedLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies on this machine: all of it is fetched for this."""
+        """Where it is on this machine: all of it is fetched for this."""
         return self._fetched("its file was asked for").path
 
     @property
@@ -417,7 +417,7 @@ class RemoteFiles:
     """A remote log's files as its store lists them; none of them is fetched by looking at it.
 
     Attributes:
-        sizes: Bytes by the file's name in the log, as it would lie on this machine.
+        sizes: Bytes by the file's name in the log, as it would be on this machine.
     """
 
     def __init__(self, url: str) -> None:

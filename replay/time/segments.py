@@ -47,7 +47,7 @@ class Segment:
         log_start_ns: ``start_ns`` on the log's own clock.
         log_end_ns: ``end_ns`` on the log's own clock.
         cause: Why it begins.
-        gap_ns: From the last wheel speed before it to its first; None where nobody can know.
+        gap_ns: From the last wheel speed before it to its first; None where it cannot be known.
         by_ns: How far the clock was set, negative; 0 for other causes.
         breaks_odometry: Whether the wheel speeds are interrupted.
     """

@@ -40,7 +40,7 @@ class CueSpec:
         colour: In recordings: red, green, blue.
         seen_frames: Where persistence counts, it must be positive in this many ...
         of_frames: ... of this many most recent frames in which it was searched for.
-        within_m: Where persistence counts, it says nothing of an intersection further away: the
+        within_m: Where persistence counts, it says nothing about an intersection further away: the
             source's runs begin 100 m before theirs, so no cue was validated beyond.
         fade_m: Way over which its errors resemble each other, if it is about a standing thing.
         fade_s: Time likewise, for what moves by itself; then it replaces ``fade_m``.

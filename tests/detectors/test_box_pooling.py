@@ -1,4 +1,4 @@
-"""Boxes cut out of a pyramid: as torchvision cuts them, wherever they lie."""
+"""Boxes cut out of a pyramid: as torchvision cuts them, wherever they are."""
 
 from __future__ import annotations
 

@@ -498,7 +498,7 @@ def test_what_is_of_no_wanted_class_is_looked_at_too_but_not_learnt_as_one(tmp_p
 
     samples = [sampler(number) for number in range(40)]
 
-    # The two bars lie in the left and the right half, too far apart for one window.
+    # The two bars are in the left and the right half, too far apart for one window.
     assert len(labelled.pictures[0].decoys_px) == 1
     is_bright = [bool((one.pixels[0] > 1.0).sum() > 200) for one in samples]
     has_car = [len(one.labels) > 0 for one in samples]

@@ -1,4 +1,4 @@
-"""The identity of a log: one for each log, wherever it lies, and cheap for a large one."""
+"""The identity of a log: one for each log, wherever it is, and cheap for a large one."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Blocks:
         """Write one block.
 
         Returns:
-            Where it lies.
+            Where it is.
         """
         self.content += bytes(-len(self.content) % 8)
         at = len(self.content)

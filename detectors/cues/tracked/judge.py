@@ -2,7 +2,7 @@
 
 * **Cross traffic** moves steadily across the ego vehicle's heading, significantly so.
 * **Parked** is a car that surely stands, seen from the side, with a nose that most frames agree on,
-  at an intersection whose distance is known: a car in a lot before it says nothing of its roads.
+  at an intersection whose distance is known: a car in a lot before it says nothing about its roads.
 * **Oncoming and outgoing** cars move steadily along the ego vehicle's heading past the end of the
   intersection: where they drive, a road goes on. The source hears of such vehicles from a Mobileye
   (``far_side``). A camera knows a car's distance only by its height, to 15 %, so a car is past the
@@ -109,7 +109,7 @@ def judge(
 def cars_past(
     cars: Sequence[CarMotion], camera: Camera, settings: Cars, place: Place | None
 ) -> Ways | None:
-    """Cars that come and go past the end of the intersection; None where nobody knows it.
+    """Cars that come and go past the end of the intersection; None where unknown.
 
     Args:
         cars: Those followed, by ``CarTracks.longer``.

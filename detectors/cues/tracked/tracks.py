@@ -179,7 +179,7 @@ class CarTracks:
         """Cars that are where they were on their way to first; new cars begin a track.
 
         What is left after that is looked for where a standing car must be now. A box that is not
-        sure only carries on a track, where it lies on the car's way: the score of a far or half
+        sure only carries on a track, where it is on the car's way: the score of a far or half
         hidden car falls below the threshold in every other frame.
         """
         used: set[int] = set()

@@ -346,7 +346,7 @@ def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int])
     )
     rim = np.pad(mask, 1)
     step = np.maximum(box_px[2:] - box_px[:2], 1e-6) / mask.shape[::-1]
-    # Pixel middles in the mask's grid, whose own first middle lies at 1 because of the rim.
+    # Pixel middles in the mask's grid, whose own first middle is at 1 because of the rim.
     columns = (np.arange(x0, x1) + 0.5 - box_px[0]) / step[0] + 0.5
     rows = (np.arange(y0, y1) + 0.5 - box_px[1]) / step[1] + 0.5
     grid = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))

@@ -94,7 +94,7 @@ class Catalog:
                 whose column ``run`` names them, in whose order they come, each once.
 
         Raises:
-            UsageError: As ``query``; the result has no column ``run``; the runs lie on a store,
+            UsageError: As ``query``; the result has no column ``run``; the runs are on a store,
                 where they have no folder: ``query`` reads their tables there.
         """
         sql = query

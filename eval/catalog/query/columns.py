@@ -103,7 +103,7 @@ INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
         "stage": Column("VARCHAR", "reading, detecting or estimating"),
         "stream": Column("VARCHAR", "topic, camera or input"),
         "reason": Column("VARCHAR", "why"),
-        "rows": Column("BIGINT", "how many; null where nobody can know"),
+        "rows": Column("BIGINT", "how many; null where it cannot be known"),
     },
     "left_out": {
         **_RUN,
@@ -183,7 +183,7 @@ FILES: Final[Mapping[str, str]] = {
     "cue_frames": "score/cue_frames.parquet",
     "curves": "score/curves.parquet",
 }
-"""Where a table lies in a run, if not under its own name."""
+"""Where a table is in a run, if not under its own name."""
 VIEWS: Final[Mapping[str, str]] = {
     "scores": "select run, metric, kind, total, rows, case kind when 'sum' then total "
     "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "

@@ -66,7 +66,7 @@ class Runs(Protocol):
         ...
 
     def place(self, run: str, file: str) -> str:
-        """Where a file lies in ``filesystem``."""
+        """Where a file is in ``filesystem``."""
         ...
 
     def path(self, run: str) -> Path:
@@ -102,7 +102,7 @@ def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of:
     """The rows of all runs as they are now; the index is brought up to date.
 
     Args:
-        runs: Where they lie.
+        runs: Where they are.
         on_run: Called with how many changed runs are read, and how many have to be.
 
     Raises:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pyarrow.fs
 
 DEPTH: Final = 6
-"""Folders that runs lie below the one that is searched, at most; of a store, too."""
+"""Folders that runs are below the one that is searched, at most; of a store, too."""
 SCORED: Final = "metrics.json"
 SCORE: Final = "score"
 BESIDE: Final = (TAGS, FAILURE)
@@ -92,7 +92,7 @@ class LocalRuns:
         return (self.folder / run / file).read_bytes()
 
     def place(self, run: str, file: str) -> str:
-        """Where a file lies in ``filesystem``."""
+        """Where a file is in ``filesystem``."""
         return str(self.folder / run / file)
 
     def path(self, run: str) -> Path:

@@ -1,4 +1,4 @@
-"""Tables that lie in the runs: one data set over the Parquet files of all runs.
+"""Tables that are in the runs: one data set over the Parquet files of all runs.
 
 Arrow reads them, with page checksums verified, and only the columns and row groups that are asked
 for; the run is a column that every file has one value of, so files of other runs are not opened.
@@ -24,7 +24,7 @@ ONLY_RUN: Final = {"run": OWN["cues"]["run"]}
 
 
 def file_of(table: str) -> str:
-    """Where a table lies in a run."""
+    """Where a table is in a run."""
     return FILES.get(table, f"{table}.parquet")
 
 
@@ -50,7 +50,7 @@ class Parts:
         Args:
             table: Its name.
             runs: By run, the path of its file in the file system.
-            filesystem: Where they lie.
+            filesystem: Where they are.
         """
         import pyarrow as pa
         import pyarrow.dataset as ds

@@ -32,7 +32,7 @@ class RemoteRuns:
     """The runs below a URL."""
 
     home: Final = None
-    """Nothing is written to a store: its index lies in the cache."""
+    """Nothing is written to a store: its index is in the cache."""
 
     def __init__(self, url: str) -> None:
         """Find the store.
@@ -102,7 +102,7 @@ class RemoteRuns:
             raise OSError(one_line(error)) from None
 
     def place(self, run: str, file: str) -> str:
-        """Where a file lies in ``filesystem``."""
+        """Where a file is in ``filesystem``."""
         return f"{self._root}/{file}" if run == "." else f"{self._root}/{run}/{file}"
 
     def path(self, run: str) -> Path:

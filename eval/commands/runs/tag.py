@@ -1,6 +1,6 @@
 """Set tags of runs, remove them, or list them.
 
-A tag is a key and a value, such as weather=rain. It lies in tags.json of the run, is a column of
+A tag is a key and a value, such as weather=rain. It is in tags.json of the run, is a column of
 crosscue query, and stays when the run is made again. Without KEY=VALUE and --remove, tags are
 listed.
 

@@ -3,7 +3,7 @@
 The bound is Clopper and Pearson's (Biometrika 26, 1934), one-sided. Since the threshold is chosen
 by looking at the same detections, each of ``TRIED`` candidates is held to a part of the allowed
 risk (Bonferroni), so that with the stated confidence no candidate that passes is less precise than
-asked for. Candidates are fixed by how many detections lie above them, never by which are right.
+asked for. Candidates are fixed by how many detections are above them, never by which are right.
 
 The bound takes detections as independent. Those of neighbouring frames are not: a bound from one
 short drive says little of other drives.

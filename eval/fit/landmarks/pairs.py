@@ -95,7 +95,7 @@ def pairs_of_drive(
         matcher: Scores.
         every_m: Distance between frames that are taken.
         near_m: Same place below, and looking the same way.
-        far_m: Another place above; what lies between is not judged.
+        far_m: Another place above; what is between is not judged.
         max_per_frame: Landmarks compared with one frame: all near ones first, then far ones drawn
             with a fixed seed.
         ledgers: Of all logs; pictures that do not decode are dropped in the camera's.

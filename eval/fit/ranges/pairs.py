@@ -27,7 +27,7 @@ LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "
 REFERENCES: Final[Mapping[str, str]] = {"stop_sign": "start_m", "traffic_light": "end_m"}
 """A stop sign measures the start of the intersection, a light its end."""
 MIN_VISIBLE: Final = 0.9
-"""The height of an object that something hides says nothing of its range."""
+"""The height of an object that something hides says nothing about its range."""
 NEAREST_NS: Final = 20_000_000
 """A detection belongs to the true range of a picture this near in time."""
 

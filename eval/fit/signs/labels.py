@@ -57,7 +57,7 @@ def _text(path: Path) -> str:
 
 
 def _of_coco(text: str, path: Path) -> list[Labelled]:
-    """Pictures lie beside the file or in a folder ``images`` beside it."""
+    """Pictures are beside the file or in a folder ``images`` beside it."""
     found = []
     for image, boxes in coco_boxes(text, path):
         try:

@@ -230,7 +230,7 @@ def score_run(
 
     Raises:
         SchemaError: The truth does not fit the run.
-        UsageError: No truth is given and none lies beside the log.
+        UsageError: No truth is given and none is beside the log.
     """
     of = run_given(run)
     settings = settings_given(threshold, detection)

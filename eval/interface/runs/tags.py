@@ -41,7 +41,7 @@ def tag_runs(
 ) -> TaggedRuns:
     """Set and remove tags of runs; without either, read them.
 
-    They lie in ``tags.json`` of each run and stay when it is made again. Nothing else in the run
+    They are in ``tags.json`` of each run and stay when it is made again. Nothing else in the run
     depends on them.
 
     Args:

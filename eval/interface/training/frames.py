@@ -19,7 +19,7 @@ class TrainingFrames:
     """Pictures with their annotations; printed in a line.
 
     Attributes:
-        coco: The annotations; the pictures lie in ``images`` beside it.
+        coco: The annotations; the pictures are in ``images`` beside it.
         pictures: How many.
         objects: How many are annotated in them.
     """

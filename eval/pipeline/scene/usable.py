@@ -14,7 +14,7 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, Vehicle
 
 BORDER_PX: Final = 2.0
-"""A sign that reaches the picture's edge is cut, so its height says nothing of its distance."""
+"""A sign that reaches the picture's edge is cut, so its height says nothing about its distance."""
 
 Source = Literal["curve", "motion"]
 NO_HEIGHT: Final = "no height"

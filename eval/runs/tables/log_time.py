@@ -85,7 +85,7 @@ def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
 
 
 def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
-    """Which moments of the log's clock lie in more than one segment, shape (N,)."""
+    """Which moments of the log's clock are in more than one segment, shape (N,)."""
     inside = np.zeros(len(log_ns), np.int64)
     for one in timeline.segments if timeline.was_set_back else ():
         inside += (log_ns >= one.log_start_ns) & (log_ns <= one.log_end_ns)

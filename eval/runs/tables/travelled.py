@@ -95,7 +95,7 @@ class Odometer:
         return Way(distance, var, turn, covered, assumed, assumed_m)
 
     def skip_to(self, t_ns: int) -> None:
-        """Leave out all odometry before ``t_ns``, and all of a gap that it lies in."""
+        """Leave out all odometry before ``t_ns``, and all of a gap that it is in."""
         self.until(t_ns)
         row = self._peek()
         if row is not None and row.is_gap and row.start_ns < t_ns:

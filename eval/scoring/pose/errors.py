@@ -102,7 +102,7 @@ class NeesSummary:
         rows: With a covariance that can be inverted.
         rows_singular: Without; left out.
         mean: NEES on average.
-        band_low: The mean lies above this with 97.5 %, ...
+        band_low: The mean is above this with 97.5 %, ...
         band_high: ... and below this with 97.5 %, if the claims are right.
         fraction_inside_95: Of rows inside their own 95 % region; should be 0.95.
     """

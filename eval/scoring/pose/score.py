@@ -151,7 +151,7 @@ class ScoredPoses:
         return self.shown_s(self.t_ns)
 
     def shown_s(self, t_ns: Int64s) -> Floats:
-        """Where moments lie on a chart: seconds, long gaps shortened so that the rest is seen."""
+        """Where moments are on a chart: seconds, long gaps shortened so that the rest is seen."""
         first_ns, last_ns = int(self.t_ns[0]), int(self.t_ns[-1])
         inside = [one for one in self.gaps if first_ns <= one.middle_ns <= last_ns]
         lengths = [one.end_ns - one.start_ns for one in inside]
@@ -258,7 +258,7 @@ def _paired(
 
 
 def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]:
-    """Which true poses lie within the run's time.
+    """Which true poses are within the run's time.
 
     Raises:
         SchemaError: None does, so the truth belongs to another log or clock.
@@ -346,7 +346,7 @@ def at_truths_point(
 
 
 def map_shift(vehicle: Vehicle, truth: Truth) -> tuple[float, float]:
-    """Where the zero of a run's map lies in the truth's; both point east, at most some km apart."""
+    """Where the zero of a run's map is in the truth's; both point east, at most some km apart."""
     of_run, of_truth = vehicle.start.map_origin, truth.origin
     if of_run is None or of_truth is None:
         return 0.0, 0.0

@@ -106,7 +106,7 @@ class ApproachesJudged:
         curves: One for each that the run has.
         extra: Approaches of the run that meet no true one, within the truth's time.
         extra_detected: Those of them that said 'intersection' above the threshold.
-        not_judged: Approaches of the run that lie outside the truth's time.
+        not_judged: Approaches of the run that are outside the truth's time.
         rows_not_numbers: Belief rows with a missing probability; left out.
     """
 

@@ -1,4 +1,4 @@
-"""Is a simulated drive's filter as wrong as it says? A measure for errors that lie on an arc."""
+"""Is a simulated drive's filter as wrong as it says? A measure for errors that are on an arc."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def run(
 
     Args:
         chunks: From ``chunks_of``.
-        folder: Of the study; finished chunks lie in its folder ``chunks``.
+        folder: Of the study; finished chunks are in its folder ``chunks``.
         workers: Threads on this machine, or cores of a local Ray cluster.
         ray_address: Of a Ray cluster that drives instead; ``local`` starts one here.
         drive: What drives.

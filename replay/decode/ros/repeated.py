@@ -29,7 +29,7 @@ LAYOUTS_KEPT: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where everything lies in a message, counted from its first byte.
+    """Where everything is in a message, counted from its first byte.
 
     Attributes:
         raw: The message that it was taken from, or the part of it before the bytes at its end.

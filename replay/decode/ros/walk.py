@@ -40,7 +40,7 @@ class Refused:
 
 @dataclass(slots=True, eq=False)
 class Found:
-    """Where everything lies in N messages of one byte order.
+    """Where everything is in N messages of one byte order.
 
     Attributes:
         buffer: All bytes.

@@ -8,7 +8,7 @@ nothing of units, signs or codes for no value. What could be checked, and what i
   ever have the same sign, a notice says so.
 * Lanes: on the wire they are positive to the right, yet two public programs draw the messages'
   polynomials unturned in a frame with y to the left. So ``ros_lane_sign = "auto"`` examines which
-  side the left and the right lane lie on, and says what it found.
+  side the left and the right lane are on, and says what it found.
 * ``Lane`` (0x737), reference points and signs: nothing to check by; taken as on the wire.
 * Codes for no value are recognised by their value on the wire (length 31.5 m, radar 255.9375 m).
 * ``next_lka_lanes`` does not say which lane a message is: ``index`` is -1, ``side`` by its place.

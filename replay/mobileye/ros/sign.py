@@ -1,4 +1,4 @@
-"""Which way lanes in ROS messages are positive, found from the sides they must lie on."""
+"""Which way lanes in ROS messages are positive, found from the sides they must be on."""
 
 from __future__ import annotations
 

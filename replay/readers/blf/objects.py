@@ -91,7 +91,7 @@ def chain_of(
         is_end: No more bytes follow.
         size_max: Largest object to wait for.
         tally: Records damage.
-        place: Where the stream lies in the file, in words.
+        place: Where the stream is in the file, in words.
     """
     at = _signatures(stream)
     words = _u32(stream)
@@ -240,7 +240,7 @@ def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: st
         start: From ``chain_of``.
         start_ns: Log time of the recording's start.
         tally: Counts everything.
-        place: Where the stream lies in the file, in words.
+        place: Where the stream is in the file, in words.
     """
     if not len(start):
         return NO_ROWS

@@ -110,7 +110,7 @@ class BlfLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         return self._path
 
     @property

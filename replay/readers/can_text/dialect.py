@@ -77,7 +77,7 @@ class Other(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """A line that nobody can read.
+    """A line that cannot be read.
 
     ``taints`` says that the line before may have been cut off by the same damage.
     """
@@ -116,7 +116,7 @@ class Met:
         rows: Its frames, by line.
         odd: Frames that ``slow`` found, with their lines.
         others: Lines that are not a frame.
-        damaged: Lines that nobody can read, ascending.
+        damaged: Lines that cannot be read, ascending.
         marks: Header lines.
         first_number: Number of the chunk's first line in the file.
         done: The line after the chunk's last.
@@ -212,7 +212,7 @@ class TextCanLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         return self._path
 
     @property

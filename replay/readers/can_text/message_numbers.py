@@ -105,7 +105,7 @@ class MessageNumbers:
         elif not self._fill(first, last):
             self._backward += 1
             _note(self._back_places, f"line {line}: {first} after {self._last}")
-            # Another recording begins, or a part comes again: nobody knows what lies between.
+            # Another recording begins, or a part comes again: nobody knows what is between.
             self._settle_gaps()
             self._highest = last
         self._highest = max(self._highest, last)
@@ -124,7 +124,7 @@ class MessageNumbers:
             self._missing += stop - start
 
     def _fill(self, first: int, last: int) -> bool:
-        """Close the gap that the run lies in; False where a number of it was met before."""
+        """Close the gap that the run is in; False where a number of it was met before."""
         for k, (start, stop) in enumerate(self._gaps):
             if start <= first < stop:
                 rest = [(start, first), (last + 1, stop)]

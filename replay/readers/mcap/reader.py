@@ -43,7 +43,7 @@ class McapLog(Closing):
         """Find the topics.
 
         Args:
-            path: Where it lies.
+            path: Where it is.
             limits: Sizes above which nothing is read.
             file: Its bytes, if they do not come from ``path``.
 
@@ -63,7 +63,7 @@ class McapLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         return self._path
 
     @property

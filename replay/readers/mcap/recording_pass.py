@@ -172,7 +172,7 @@ class SegmentPass:
         return None
 
     def _windowed(self, window: Window) -> Iterator[Block]:
-        """Blocks of the chunks that the index names, and of whatever lies outside chunks."""
+        """Blocks of the chunks that the index names, and of whatever is outside chunks."""
         if self._segment.data_crc:
             # Only all bytes together have this checksum.
             self._checks.sections_unread += 1

@@ -53,7 +53,7 @@ MESSAGE_HEAD: Final = np.dtype(
         ("publish", "<u8"),
     ]
 )
-"""The first 31 bytes of a message record, as they lie in the file."""
+"""The first 31 bytes of a message record, as they are in the file."""
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
 _INDEX_HEAD: Final = struct.Struct("<HI")

@@ -1,7 +1,7 @@
 """Which bytes of a recording hold a part of it, by the summary's index of chunks alone.
 
 A summary with a checksum, whose counts add up and whose chunks lie side by side, is trusted: chunks
-outside the time asked for, or without a topic asked for, are not touched. What lies between the
+outside the time asked for, or without a topic asked for, are not touched. What is between the
 chunks it names is walked through, so that messages outside chunks are found. A summary without a
 checksum is trusted for times only, where its chunks follow each other in time: a wrong time then
 stands out, or is that of a chunk next to those asked for, which are examined too.
@@ -58,7 +58,7 @@ class Window:
         return list(zip(begin[filled].tolist(), end[filled].tolist(), strict=True))
 
     def items(self, file: ByteFile, limits: Limits) -> Iterator[Item]:
-        """What lies in those ranges, in the order of the file."""
+        """What is in those ranges, in the order of the file."""
         for begin, end in self.ranges():
             yield from self._walk(begin, end, file, limits)
 

@@ -61,7 +61,7 @@ class Found:
 
 
 class CanLayout:
-    """Where the fields of one kind of frame lie in its records.
+    """Where the fields of one kind of frame are in its records.
 
     Attributes:
         variable: Its payloads' channel, where they have variable length.

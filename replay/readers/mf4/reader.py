@@ -157,7 +157,7 @@ class Mf4Log(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         return self._path
 
     @property
@@ -381,7 +381,7 @@ class Mf4Log(Closing):
     def _span(
         self, stored: _Stored, source: _Source, selection: Selection
     ) -> tuple[int, int | None]:
-        """The records that may lie in the span of time asked for; all of them without a stop.
+        """The records that may be in the span of time asked for; all of them without a stop.
 
         The first records of chunks are examined by bisection: MDF demands that times ascend.
         """

@@ -23,7 +23,7 @@ from .stream import Stream
 
 _WALK_BYTES: Final = 1 << 20
 _KEPT: Final = 3
-"""Walked pieces that are kept: values lie near the records that they belong to."""
+"""Walked pieces that are kept: values are near the records that they belong to."""
 PATIENCE: Final = 3_000_000
 """Records that the plain loop may take before Numba is worth its import."""
 PADDING: Final = 64

@@ -73,7 +73,7 @@ class Stream:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def hole(self, start: int, stop: int) -> Hole | None:
-        """The first damaged stretch known to lie in these bytes."""
+        """The first damaged stretch known to be in these bytes."""
         for k in range(max(bisect_right(self._starts, start) - 1, 0), len(self._stretches)):
             one = self._stretches[k]
             if one.start >= stop:

@@ -16,7 +16,7 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 _SPAN: Final = 4 << 20
 _WINDOWS_MAX: Final = 64
-"""Stretches of ``_SPAN`` bytes that the values of one block of records may lie in."""
+"""Stretches of ``_SPAN`` bytes that the values of one block of records may be in."""
 
 
 class VariableValues(Protocol):
@@ -70,7 +70,7 @@ class GroupValues:
         """Nothing is read yet.
 
         Args:
-            data: Where they lie.
+            data: Where they are.
             group: Index of their group.
             by_order: The records' offsets were never written: the n-th value is the n-th record's.
         """
@@ -113,7 +113,7 @@ def _nothing(count: int, width: int) -> tuple[Bytes, Int64s]:
 
 
 def _windows(key: Int64s) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
-    """First and last offset of the rows whose values lie near each other, and those rows."""
+    """First and last offset of the rows whose values are near each other, and those rows."""
     rows = np.flatnonzero(key >= 0)
     if not len(rows):
         return

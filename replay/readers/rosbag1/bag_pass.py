@@ -113,7 +113,7 @@ class Roster:
 
 @dataclass(slots=True)
 class _Checked:
-    """How many chunks could be checked, by how, and how many messages lie outside chunks."""
+    """How many chunks could be checked, by how, and how many messages are outside chunks."""
 
     bz2: int = 0
     lz4: int = 0

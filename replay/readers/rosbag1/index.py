@@ -149,7 +149,7 @@ def _chunk_unit(
         if end < file.size and resync.is_head(end):
             entries, after = _index_records(file, end, limits)
             return ChunkUnit(record, end, True, after, entries)
-    # The records of a plain chunk would be taken for such that lie outside of chunks.
+    # The records of a plain chunk would be taken for such that are outside of chunks.
     onward = next_chunk(file, record.body, known) if is_plain else resync.next(record.body)
     stop = file.size if onward is None else onward
     if record.end <= stop and record.u32(b"size") == record.size:

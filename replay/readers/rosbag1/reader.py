@@ -40,7 +40,7 @@ class BagLog(Closing):
         """Open the bag and learn its topics.
 
         Args:
-            path: Where it lies.
+            path: Where it is.
             limits: Sizes above which nothing is read.
             file: Its bytes, if they do not come from ``path``.
 
@@ -64,7 +64,7 @@ class BagLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         return self._path
 
     @property

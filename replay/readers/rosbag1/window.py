@@ -52,7 +52,7 @@ class BagWindow:
         *,
         is_read: bool = True,
     ) -> Iterator[ChunkUnit | Record | Gap]:
-        """What lies in the chunks that are read, or in the others, in the order of the file."""
+        """What is in the chunks that are read, or in the others, in the order of the file."""
         known = [info.at for info in self.infos]
         after = dict(pairwise([*known, self.index_at]))
         for info in self._those(is_read=is_read):

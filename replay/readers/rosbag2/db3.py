@@ -72,7 +72,7 @@ class Db3Log(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Where it is."""
         return self._path
 
     @property

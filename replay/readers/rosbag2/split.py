@@ -44,7 +44,7 @@ class Split:
     """One storage file.
 
     Attributes:
-        path: Where it lies.
+        path: Where it is.
         topics: What it holds.
         range_ns: First and last log time where known.
         fault: Why it cannot be opened, or empty.

@@ -33,7 +33,7 @@ STEERING_OFF_RAD: Final = 4.0 * DEGREE
 TYRES_DIFFER: Final = 0.005
 """Radii of the left and right wheels may differ by such a part."""
 TURNS: Final = 3.0 * DEGREE
-"""A reference that turns by less within all windows says nothing of sign and scale."""
+"""A reference that turns by less within all windows says nothing about sign and scale."""
 FOLLOWS: Final = 0.7
 MIN_WINDOWS: Final = 5
 SURE_WINDOWS: Final = 15

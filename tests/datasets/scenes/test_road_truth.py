@@ -1,4 +1,4 @@
-"""Road pixels of simulated pictures: what lies on the map's road and nothing stands before."""
+"""Road pixels of simulated pictures: what is on the map's road and nothing stands before."""
 
 from __future__ import annotations
 

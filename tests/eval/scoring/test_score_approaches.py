@@ -288,7 +288,7 @@ def test_a_perfectly_calibrated_belief_lies_on_the_diagonal() -> None:
 def test_belief_is_judged_until_the_car_enters_and_the_rest_is_reported() -> None:
     scores = score_belief(judge_belief(good_tables(), good_truth()))
 
-    # Ten steps at 0.5, thirty at 0.95; the last ten lie in the intersection.
+    # Ten steps at 0.5, thirty at 0.95; the last ten are in the intersection.
     one = scores["intersection"]
     assert (one.steps, one.scored, one.left_out) == (50, 40, {"in the intersection": 10})
     assert one.brier.value == pytest.approx((10 * 0.25 + 30 * 0.05**2) / 40)

@@ -85,7 +85,7 @@ def test_a_perfect_run_has_no_error_and_says_what_was_left_out(tmp_path: Path) -
 
     assert result.ape["none"].translation_m.max < 1e-2
     assert result.rpe["100 m"].translation_m.max < 1e-2
-    # Chi-square scores of no error at all lie below their band: claims were too modest.
+    # Chi-square scores of no error at all are below their band: claims were too modest.
     assert result.nees_xyh.mean < 0.01
     covered = result.coverage
     # The first row stands at the end of the first interval, 0.1 s in.

@@ -41,7 +41,7 @@ from support.scoring import (
 
 
 def _one(tmp_path: Path, name: str = "one") -> Path:
-    """A run whose truth lies beside its log."""
+    """A run whose truth is beside its log."""
     truth_folder(tmp_path / name)
     run_folder(tmp_path / name / "run")
     return tmp_path / name / "run"

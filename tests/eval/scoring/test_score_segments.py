@@ -23,7 +23,7 @@ def _replayed(folder: Path, clock: Clock) -> RunFolder:
 
 
 def _ambiguous_rows(run: RunFolder, name: str) -> int:
-    """By hand: rows whose stamp lies in the other segment's time."""
+    """By hand: rows whose stamp is in the other segment's time."""
     timeline = run.drive_manifest().timeline
     table = run.table(name)
     log_ns, numbers = table["log_t_ns"].to_numpy(), table["segment"].to_numpy().astype(np.int64)

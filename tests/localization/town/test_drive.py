@@ -174,7 +174,7 @@ def test_errors_are_as_large_as_the_filter_says(settings: Drive) -> None:
 
 
 def test_a_heading_off_by_five_degrees_is_more_than_a_linear_filter_admits() -> None:
-    """Without a compass the true errors lie on an arc, the filter's ellipse is straight."""
+    """Without a compass the true errors are on an arc, the filter's ellipse is straight."""
     rows = many(Drive(sensors=Sensors(compass_2sigma_deg=None)), 400)
     _, high = mean_band(3, 400)
 

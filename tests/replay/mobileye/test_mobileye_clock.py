@@ -29,7 +29,7 @@ def camera(n: int, period_ms: int = 66, drift: float = 0.0) -> tuple[Int64s, Int
 
 
 def off_by(image_ns: Int64s, truth_ns: Int64s) -> Int64s:
-    """Error beyond the constant that nobody can know."""
+    """Error beyond the constant that cannot be known."""
     error = image_ns - truth_ns
     return error - np.int64(np.median(error))
 

@@ -82,7 +82,7 @@ def test_a_cut_at_any_byte_keeps_all_that_came_before(tmp_path: Path) -> None:
 
         reading = read_back(path)
 
-        # Message indexes lie between the chunks, so this many whole chunks at the least.
+        # Message indexes are between the chunks, so this many whole chunks at the least.
         whole = sum(at >= end + 200 * (k + 1) for k, end in enumerate(ends))
         assert reading.count() >= 5 * whole, at
         assert not reading.ledger.is_whole, at

@@ -1,4 +1,4 @@
-"""ROS 2 bag folders: what lies in the folder counts, not what metadata.yaml says."""
+"""ROS 2 bag folders: what is in the folder counts, not what metadata.yaml says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The signals of a vehicle may lie on several buses, each section naming its own."""
+"""The signals of a vehicle may be on several buses, each section naming its own."""
 
 from __future__ import annotations
 

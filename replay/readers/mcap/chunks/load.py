@@ -57,7 +57,7 @@ class Group:
         chunks: Them.
         begins: Where the records of each begin in ``whole``.
         size: Bytes of all records.
-        whole: Where they lie, from the moment when the first is loaded.
+        whole: Where they are, from the moment when the first is loaded.
         future: The records of each, or what is wrong with them, if another thread loads them.
     """
 

@@ -295,7 +295,7 @@ def _definitions(buffer: NDArray[np.uint8], scan: Scan, end: int) -> tuple[list[
 
 
 def _others(buffer: NDArray[np.uint8], begin: int, end: int) -> tuple[list[Definition], int] | None:
-    """What lies between two indexed messages; None if a message is there or it does not fit."""
+    """What is between two indexed messages; None if a message is there or it does not fit."""
     view, at, ignored = buffer.data, begin, 0
     found: list[Definition] = []
     while at < end:

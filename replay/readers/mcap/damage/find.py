@@ -1,7 +1,7 @@
 """Where a recording goes on after a place where its records cannot be followed.
 
 A chunk is taken for one only if it proves itself: its lengths agree with each other and its records
-match their checksum or, without one, fill it and lie in the time that it declares. Chunks within
+match their checksum or, without one, fill it and are in the time that it declares. Chunks within
 another recording's bytes are not taken: the search ends where another recording begins.
 """
 

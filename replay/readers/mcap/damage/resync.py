@@ -2,7 +2,7 @@
 
 A record is believed only together with those behind it: ``LINKS`` in a row must be plausible, or
 fewer that lead exactly to a place known to begin something else. A message is plausible if its
-channel is known and its log time lies within the recording; a schema or channel, if its fields fill
+channel is known and its log time is within the recording; a schema or channel, if its fields fill
 it exactly.
 """
 
@@ -107,7 +107,7 @@ class Plausible:
 
 
 def _within(log: NDArray[np.uint64], first: int, last: int) -> NDArray[np.bool_]:
-    """Which times lie between two, both included."""
+    """Which times are between two, both included."""
     low, high = np.uint64(max(first, 0)), np.uint64(min(max(last, 0), MOST))
     is_in: NDArray[np.bool_] = (log >= low) & (log <= high)
     return is_in
