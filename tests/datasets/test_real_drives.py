@@ -46,6 +46,7 @@ def test_the_dashcam_s_truth_fits_its_frames(tmp_path: Path) -> None:
     assert run(["truth", "check", str(FOLDER / "us_dashcam"), "--log", str(folder)]) == 0
 
 
+@pytest.mark.slow
 def test_a_minute_and_its_one_picture_are_one_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -544,6 +544,7 @@ def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
     assert facts.recipe["held_out_pictures"] == 600
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layout", "x_m", "category", "label"),
     [

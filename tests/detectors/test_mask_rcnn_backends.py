@@ -139,6 +139,7 @@ def _assert_equal(ours: Detections, theirs: Detections) -> None:
         assert int((mine ^ other).sum()) <= 4 + 0.01 * int(other.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("seed", [0, 7])
 def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed: int) -> None:
@@ -153,6 +154,7 @@ def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed
     assert found > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_places_that_look_empty_are_left_out_as_torchvision_leaves_them_out(backend: str) -> None:
     checkpoint = random_checkpoint(0)
@@ -166,6 +168,7 @@ def test_places_that_look_empty_are_left_out_as_torchvision_leaves_them_out(back
     assert counts[0] > counts[1] > counts[2] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_embedded_network_finds_what_torchvision_finds_with_it(backend: str) -> None:
     checkpoint = checkpoint_named("embedded")

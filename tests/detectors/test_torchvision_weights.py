@@ -70,6 +70,7 @@ FILES: tuple[tuple[ArchitectureName, str], ...] = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("architecture", "file"), FILES)
 def test_boxes_and_masks_are_those_of_torchvision_itself(
     tmp_path: Path, architecture: ArchitectureName, file: str
@@ -97,6 +98,7 @@ def test_boxes_and_masks_are_those_of_torchvision_itself(
     assert any(found.masks) == ("masks" in theirs)
 
 
+@pytest.mark.slow
 def test_weights_whose_normalisation_was_frozen_add_nothing_to_variances(tmp_path: Path) -> None:
     """As torchvision runs its COCO weights, and users' own that were trained further."""
     from torchvision.ops import misc

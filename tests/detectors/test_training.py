@@ -424,6 +424,7 @@ def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
     assert "training" not in reported.out
 
 
+@pytest.mark.slow
 def test_a_network_is_measured_without_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,6 +61,7 @@ def truth_of(files: SceneFiles) -> Any:
     return json.loads((files.log.parent / "objects.json").read_text())
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(files: SceneFiles, tmp_path: Path) -> None:
     again = write_scene(tmp_path / "again", settings())
 

@@ -253,6 +253,7 @@ def windows_of(folder: Path, vehicle: Vehicle) -> list[Window]:
         return list(windows([log], [extractor], [Selection(planned.topics_of(0))], planned))
 
 
+@pytest.mark.slow
 def test_on_a_simulated_drive_lines_and_vehicles_past_it_are_counted(tmp_path: Path) -> None:
     """L303 has a road ahead with cars on it: both cues come up before the car is there."""
     tiny = SceneSettings(layout="L303", camera=replace(Camera(), width_px=192, height_px=108))

@@ -64,6 +64,7 @@ def test_a_car_that_stands_knows_the_size_table_and_no_more() -> None:
     assert found.by_motion < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gone_m", "step_m"), [(0.0, 0.0), (5.0, 0.3), (20.0, 0.3), (40.0, 0.7)])
 def test_the_interval_holds_the_truth_as_often_as_it_says(gone_m: float, step_m: float) -> None:
     rng = np.random.default_rng(7)

@@ -81,6 +81,7 @@ def test_one_drive_shows_what_differs_and_decides_nothing(
     assert "below 6 drives every metric is undecided" in text
 
 
+@pytest.mark.slow
 def test_what_every_drive_shows_is_decided(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -159,6 +159,7 @@ def detected(folder: Path, card: str) -> crosscue.Run:
     )
 
 
+@pytest.mark.slow
 def test_a_fitted_card_makes_cues_as_precise_as_asked(drive: Path) -> None:
     before = crosscue.score_detector(drive / "run", drive / "labels", has_figures=False)
     found = crosscue.fit_detector(drive / "run", drive / "labels", drive / "net_fitted.toml")

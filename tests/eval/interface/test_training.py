@@ -14,6 +14,7 @@ import crosscue
 from crosscue.eval.cli import run
 
 
+@pytest.mark.slow
 def test_training_frames_are_those_of_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

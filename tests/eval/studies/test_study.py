@@ -197,6 +197,7 @@ def test_the_like_for_like_figure_comes_first_and_says_how_the_subset_was_chosen
     assert [row[0] for row in cities.rows] == ["landmark to landmark", "hybrid"]
 
 
+@pytest.mark.slow
 def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
     study = RangeStudy(drives=100)
     found = {
@@ -370,6 +371,7 @@ def test_the_default_compass_interval_is_the_calibrated_one() -> None:
     assert calibrate(default, 2, tolerance=0.01) == default.sensors.compass_interval_m
 
 
+@pytest.mark.slow
 def test_twenty_degrees_is_predicted_from_thirty(tmp_path: Path) -> None:
     """The law r ds D: distances at loss are as the inverse squares of the compass's errors."""
     study = RangeStudy(drives=120, compass_2sigma_deg=(20.0, 30.0))
@@ -385,6 +387,7 @@ def test_twenty_degrees_is_predicted_from_thirty(tmp_path: Path) -> None:
     assert none.lost_after_m.value < 500.0
 
 
+@pytest.mark.slow
 def test_a_simulated_drive_goes_through_its_log(tmp_path: Path) -> None:
     settings = Drive(
         city=City(largest_km2=1.5),
