@@ -1,7 +1,7 @@
 """Plain functions compiled by Numba where millions of steps need it, and only there.
 
 The motion model, the filter and the rules of the simulated town are plain Python functions on
-numbers and arrays. A replay calls them as they are; the Monte Carlo studies call ``compiled(f)``,
+numbers and arrays. A replay calls them as they are; the Monte Carlo studies call ``kept(f)``,
 which compiles ``f`` and every function of ours that it calls. Numba is imported only then.
 """
 

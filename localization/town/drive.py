@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap
-from crosscue.localization.compiled import compiled, kept
+from crosscue.localization.compiled import kept
 from crosscue.localization.navigation import (
     NONE,
     Memory,
@@ -639,7 +639,7 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
 
 def streets_of(settings: settings_of.Drive, seed: int) -> Streets:
     """The streets that a drive with this seed has."""
-    make = compiled(make_streets)
+    make = kept(make_streets)
     with np.errstate(over="ignore"):
         stream = stream_of(np.uint64(seed), CITY_STREAM)
     return make(stream, parameters_of(settings))
