@@ -141,8 +141,8 @@ def fit(
         logs, planned, vehicle, selection, wanted + ([Signal.POSITION] if truth is None else [])
     )
     if (wheels := found.get(Signal.WHEEL_SPEEDS)) is None:
-        why = planned.missing.get(Signal.WHEEL_SPEEDS, "not one row in this part")
-        raise EmptyResultError(f"no wheel speeds: {why}")
+        none = "no wheel speeds: not one row in this part"
+        raise EmptyResultError(planned.missing.get(Signal.WHEEL_SPEEDS, none))
     reference = _reference(
         truth, found.get(Signal.POSITION), gnss.topic.name if gnss else None, vehicle
     )

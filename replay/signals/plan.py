@@ -109,7 +109,8 @@ def _plan_odometry(planner: _Planner) -> None:
             planner.choose(place, Signal.YAW_RATE)
         return
     planner.missing[Signal.WHEEL_SPEEDS] = (
-        "no wheel speeds: name the bus, DBC and signals under [can] in the vehicle file"
+        "no wheel speeds: name the bus, DBC and signals under [can] in the vehicle file, or a "
+        "topic with speeds as topics.odometry"
     )
 
 

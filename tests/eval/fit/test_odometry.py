@@ -9,8 +9,9 @@ import pytest
 import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
-from crosscue.eval import cli
-from crosscue.replay.base import EmptyResultError
+from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
+from crosscue.replay.base import EmptyResultError, UsageError
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 BIAS = 0.002
 
@@ -23,8 +24,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
 
 @pytest.fixture(scope="module")
 def fitted(files: DriveFiles) -> crosscue.FittedOdometry:
-    output = files.vehicle.with_name("fitted.toml")
-    return crosscue.fit_odometry(files.log, files.vehicle, output, truth=files.truth)
+    calibrated = files.vehicle.read_text().splitlines(keepends=True)
+    vehicle, output = (files.vehicle.with_name(f"{name}.toml") for name in ("any", "fitted"))
+    kept = [line for line in calibrated if not line.startswith(("gyro_", "slip_", "scale_sd"))]
+    vehicle.write_text("".join(kept))
+    return crosscue.fit_odometry(files.log, vehicle, output, truth=files.truth)
 
 
 def test_the_bias_of_a_simulated_gyro_is_found(fitted: crosscue.FittedOdometry) -> None:
@@ -64,10 +68,14 @@ def test_a_log_without_positions_names_what_to_do(files: DriveFiles, tmp_path: P
     assert not (tmp_path / "out.toml").exists()
 
 
-def test_an_output_without_a_vehicle_file_is_wrong_usage(
-    files: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["fit", "odometry", str(files.log), "-o", str(tmp_path / "out.toml")]
+def test_without_a_vehicle_file_the_fit_becomes_one(tmp_path: Path) -> None:
+    path = write_fit(None, tmp_path / "out.toml", lambda text: text + "lost_above_m = 50.0\n")
 
-    assert cli.run(argv) == 2
-    assert "give it as --vehicle" in capsys.readouterr().err
+    assert path is not None
+    assert crosscue.load_vehicle(path).lost_above_m == 50.0
+
+
+def test_settings_in_memory_are_no_file_to_write_into(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="needs the vehicle file"):
+        check_output(Vehicle(version=1), tmp_path / "out.toml", overwrite=False)
+    check_output(None, tmp_path / "out.toml", overwrite=False)
