@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
@@ -79,6 +80,27 @@ def test_a_car_is_nowhere_until_a_speed_is_a_number(tmp_path: Path) -> None:
     assert min(table["t_ns"].to_pylist()) > 0
     np.testing.assert_allclose(table["speed_mps"].to_numpy(), 17.0, atol=1e-9)
     assert estimate_manifest(outcome.run).counts.odometry["not_finite"] == 2
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 3.0, 17.0])
+def test_no_row_of_any_table_has_a_speed_that_was_not_driven(
+    tmp_path: Path, speed_mps: float
+) -> None:
+    unknown = wheel_block([-SECOND, -SECOND // 2], [math.nan, math.nan])
+    drive = _drive(0.05, speed_mps=speed_mps)
+    with_a_gap = [unknown, *drive[:10], *drive[30:]]
+
+    run = _replay(tmp_path / "run", with_a_gap).run
+
+    found = {}
+    for file in sorted(run.path.glob("*.parquet")):
+        table = pq.read_table(file)
+        for name in {"speed_mps", "ego_speed_mps"} & {*table.column_names}:
+            speeds = table[name].to_numpy()
+            found[file.stem] = speeds[np.isfinite(speeds)]
+    assert {"pose", "measurements"} <= found.keys()
+    for name, speeds in found.items():
+        np.testing.assert_allclose(speeds, speed_mps, atol=1e-6, err_msg=name)
 
 
 def test_the_mirror_image_drives_the_mirror_image(tmp_path: Path) -> None:
