@@ -57,6 +57,7 @@ from crosscue.replay.base import (
     Ledger,
     Log,
     Selection,
+    Topic,
     VehicleError,
     versions_and_commit,
 )
@@ -168,14 +169,12 @@ def detect_into(
         tables = _Tables(
             run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign, timeline, clock
         )
-
-        def declared() -> int | None:
-            is_whole = selection.start_ns is None and selection.end_ns is None
-            return topic.declared if is_whole else None
-
         with tables:
             extractor.on_pictures = lambda block: _through(
-                runner, block, tables, lambda: on_frames(runner.counts.frames, declared())
+                runner,
+                block,
+                tables,
+                lambda: on_frames(runner.counts.frames, _declared(topic, selection)),
             )
             for block in ledger.handing_on(TimedLog(log, clock).read(ledger, narrowed)):
                 for _ in extractor(block):
@@ -183,10 +182,7 @@ def detect_into(
             for _ in extractor.finish():
                 pass
         if not runner.counts.frames:
-            gone = ledger.topic(topic.name).dropped.total()
-            dropped = f" ({gone:,} are damaged)" if gone else ""
-            what = f"the camera, planned from {topic.name}, found no frames{dropped}"
-            raise empty_result(what, logs, selection)
+            raise empty_result(_no_frames(topic, ledger), logs, selection)
         made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
         write_skipped(run, [ledger], made.reading, timeline=timeline)
         seconds = time.monotonic() - began
@@ -207,19 +203,7 @@ def detect_into(
                 camera=topic.name,
                 camera_log=camera[0],
                 time=time_segments(timeline),
-                detectors=tuple(
-                    DetectorRow(
-                        name=one.name,
-                        identity=one.detector.identity,
-                        kind=choice.kind,
-                        role=tables.roles.get(one.name),
-                        labels=reportable(one.detector),
-                        settings=dict(choice.settings),
-                        min_scores=min_scores_of(one.detector),
-                        calibrated=calibrated_labels(one.detector),
-                    )
-                    for one, choice in zip(named, choices, strict=True)
-                ),
+                detectors=_detector_rows(named, choices, tables),
                 clocks=(clock_rows(extractor.clocks, extractor.watch.reports()),),
                 account=made,
                 counts=DetectCounts(
@@ -244,6 +228,37 @@ def detect_into(
         seconds,
         made,
         timeline.has_gaps,
+    )
+
+
+def _declared(topic: Topic, selection: Selection) -> int | None:
+    """How many frames the log declares in the part asked for; None for a span of time."""
+    is_whole = selection.start_ns is None and selection.end_ns is None
+    return topic.declared if is_whole else None
+
+
+def _no_frames(topic: Topic, ledger: Ledger) -> str:
+    gone = ledger.topic(topic.name).dropped.total()
+    dropped = f" ({gone:,} are damaged)" if gone else ""
+    return f"the camera, planned from {topic.name}, found no frames{dropped}"
+
+
+def _detector_rows(
+    named: Sequence[Named], choices: Sequence[Choice], tables: _Tables
+) -> tuple[DetectorRow, ...]:
+    """The manifest's part on detectors, in order."""
+    return tuple(
+        DetectorRow(
+            name=one.name,
+            identity=one.detector.identity,
+            kind=choice.kind,
+            role=tables.roles.get(one.name),
+            labels=reportable(one.detector),
+            settings=dict(choice.settings),
+            min_scores=min_scores_of(one.detector),
+            calibrated=calibrated_labels(one.detector),
+        )
+        for one, choice in zip(named, choices, strict=True)
     )
 
 

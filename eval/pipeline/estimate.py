@@ -142,20 +142,7 @@ def estimate_into(
     write_skipped(run, reading.ledgers, made.reading, kept, timeline)
     before = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began
-    notices = (
-        *gaps_text(timeline.segments),
-        *_missing(reading.planned),
-        *silent.values(),
-        *_no_camera(landmarks, reading.camera),
-        *_no_mobileye(found, reading.planned),
-        *_no_scene(found, reading),
-        *_of_detecting(found),
-        *stage.notices,
-        *stage.doubts(),
-        *chain.from_iterable(
-            clock_changes(each.clocks, each.watch.reports()) for each in reading.extractors
-        ),
-    )
+    notices = _notices(reading, stage, silent, found, landmarks)
     write_manifest(
         run,
         EstimateManifest(
@@ -170,13 +157,7 @@ def estimate_into(
             account=made,
             counts=EstimateCounts(**stage.counts()),
             time=time_segments(timeline),
-            landmarks=None
-            if landmarks is None
-            else LandmarksUsed(
-                database=relative(landmarks.path, run),
-                landmarks=len(landmarks),
-                sha256=sha256_of(landmarks.path),
-            ),
+            landmarks=None if landmarks is None else _landmarks_used(landmarks, run),
             notices=notices,
             pose=PoseSummary(
                 rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
@@ -200,6 +181,39 @@ def estimate_into(
         detected,
         scene,
         timeline.segments,
+    )
+
+
+def _notices(
+    reading: _Reading,
+    stage: PoseStage,
+    silent: Mapping[Signal, str],
+    found: DetectManifest | None,
+    landmarks: LandmarkDatabase | None,
+) -> tuple[str, ...]:
+    """What a person should know of the run, the gaps first."""
+    return (
+        *gaps_text(reading.timeline.segments),
+        *_missing(reading.planned),
+        *silent.values(),
+        *_no_camera(landmarks, reading.camera),
+        *_no_mobileye(found, reading.planned),
+        *_no_scene(found, reading),
+        *_of_detecting(found),
+        *stage.notices,
+        *stage.doubts(),
+        *chain.from_iterable(
+            clock_changes(each.clocks, each.watch.reports()) for each in reading.extractors
+        ),
+    )
+
+
+def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUsed:
+    """The manifest's part on landmarks."""
+    return LandmarksUsed(
+        database=relative(landmarks.path, run),
+        landmarks=len(landmarks),
+        sha256=sha256_of(landmarks.path),
     )
 
 
