@@ -12,7 +12,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.datasets.scenes.drive import PHOTOGRAPHS, SPARSE_PHOTOGRAPHS, Imager, write_scene
+from crosscue.datasets.scenes.drive import (
+    PHOTOGRAPHS,
+    SPARSE_PHOTOGRAPHS,
+    Imager,
+    refuse_other_drive,
+    write_scene,
+)
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Done, Engine, Job, Progress, fingerprint_of, run_many
@@ -71,8 +77,9 @@ class Work:
         folder, key = self.drives / name, self.made_by[name]
         made_by = folder / MADE_BY
         if not made_by.exists() or made_by.read_text(encoding="utf-8") != key:
-            made_by.unlink(missing_ok=True)
             scene = self.scenes[name]
+            refuse_other_drive(folder, scene, self.imager)
+            made_by.unlink(missing_ok=True)
             write_scene(folder, scene, overwrite=True, imager=self.imager, is_calibrated=False)
             write_text(made_by, key)
         return folder

@@ -91,6 +91,11 @@ def test_a_drive_is_made_again_when_it_is_not_whole_or_what_made_it_has_changed(
     simulate("b")
     assert len(made) == 3
 
+    (tmp_path / "M12-01" / "drive.mcap").touch()  # a drive that nothing says is this one
+    with pytest.raises(UsageError, match="M12-01"):
+        simulate("c")
+    assert (tmp_path / "M12-01" / MADE_BY).read_text(encoding="utf-8") == "b"
+
 
 def test_pictures_are_few_and_end_where_the_intersection_begins() -> None:
     scene = SceneSettings(layout="M0", camera=camera_of_width(64))
