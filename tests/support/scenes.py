@@ -16,6 +16,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.rendering.ground import Ground
 from crosscue.datasets.scenes.rendering.mesh import Mesh
 from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.settings import world_of
 from crosscue.datasets.scenes.world import Thing, World, build
 
 SMALL: Final = Camera(width_px=384, height_px=216)
@@ -31,7 +32,7 @@ def shorten(patch: pytest.MonkeyPatch, pictures: int = 15) -> None:
     """Simulated drives end after so many pictures, and a world is built once."""
     all_times = drive.picture_times
     patch.setattr(drive, "picture_times", lambda *of: all_times(*of)[:pictures])
-    patch.setattr(drive, "world_of", cache(drive.world_of))
+    patch.setattr(drive, "world_of", cache(world_of))
 
 
 def renderer(of: World, camera: Camera = SMALL) -> Renderer:
