@@ -100,10 +100,15 @@ _EXPORTS: Final = {
     "LogTooLargeError": "replay.errors",
     "UnknownFormatError": "replay.errors",
     "SchemaError": "replay.errors",
+    "CanDatabaseError": "replay.errors",
+    "AnnotationError": "replay.errors",
     "VehicleError": "replay.errors",
     "MissingTopicError": "replay.errors",
     "RunError": "replay.errors",
+    "UnreadableRunError": "replay.errors",
     "OutputError": "replay.errors",
+    "StudyFileError": "replay.errors",
+    "WorkerError": "replay.errors",
     "EmptyResultError": "replay.errors",
     "AccountError": "replay.errors",
     "LossWarning": "replay.errors",
@@ -370,6 +375,8 @@ if TYPE_CHECKING:
     from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
     from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
     from crosscue.replay.errors import AccountError as AccountError
+    from crosscue.replay.errors import AnnotationError as AnnotationError
+    from crosscue.replay.errors import CanDatabaseError as CanDatabaseError
     from crosscue.replay.errors import CrosscueError as CrosscueError
     from crosscue.replay.errors import EmptyResultError as EmptyResultError
     from crosscue.replay.errors import LogError as LogError
@@ -380,9 +387,12 @@ if TYPE_CHECKING:
     from crosscue.replay.errors import OutputError as OutputError
     from crosscue.replay.errors import RunError as RunError
     from crosscue.replay.errors import SchemaError as SchemaError
+    from crosscue.replay.errors import StudyFileError as StudyFileError
     from crosscue.replay.errors import UnknownFormatError as UnknownFormatError
+    from crosscue.replay.errors import UnreadableRunError as UnreadableRunError
     from crosscue.replay.errors import UsageError as UsageError
     from crosscue.replay.errors import VehicleError as VehicleError
+    from crosscue.replay.errors import WorkerError as WorkerError
     from crosscue.replay.formats import DataSet as DataSet
     from crosscue.replay.formats import Format as Format
     from crosscue.replay.plugins import PluginWarning as PluginWarning

@@ -52,10 +52,12 @@ from .errors import (
     OutputError,
     RunError,
     SchemaError,
+    StudyFileError,
     UnknownFormatError,
     UnreadableRunError,
     UsageError,
     VehicleError,
+    WorkerError,
     one_line,
 )
 from .files.bounded import PIECE_BYTES, read_at_most
@@ -132,6 +134,7 @@ __all__ = [
     "RunError",
     "SchemaError",
     "Selection",
+    "StudyFileError",
     "Table",
     "Topic",
     "TopicAccount",
@@ -139,6 +142,7 @@ __all__ = [
     "UnreadableRunError",
     "UsageError",
     "VehicleError",
+    "WorkerError",
     "cannot_write",
     "file_sha256",
     "installed",

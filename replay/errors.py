@@ -14,6 +14,8 @@
     * RunError               a run folder is locked, or does not hold what was asked for
         * UnreadableRunError it is missing, damaged or of another version (exit status 4)
     * OutputError            a result cannot be written (disk full, no permission)
+    * StudyFileError         a study file cannot be read or does not fit (exit status 2)
+    * WorkerError            a worker died; finished parts are kept
     * EmptyResultError       nothing of what was asked for is in the logs
     * AccountError           rows in are not rows used, skipped and dropped: a bug of ours
 
@@ -94,6 +96,16 @@ class UnreadableRunError(RunError):
 
 class OutputError(CrosscueError):
     """A result cannot be written."""
+
+
+class StudyFileError(CrosscueError):
+    """A study file cannot be read or does not fit."""
+
+    exit_status = 2
+
+
+class WorkerError(CrosscueError):
+    """A worker died; what was finished is kept."""
 
 
 class EmptyResultError(CrosscueError):

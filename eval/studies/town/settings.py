@@ -20,7 +20,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Drive, Proportion
-from crosscue.replay.base import CrosscueError, read_at_most, toml_tree
+from crosscue.replay.base import StudyFileError, read_at_most, toml_tree
 from crosscue.replay.vehicle.section import Section, tuples
 from crosscue.replay.vehicle.validation_errors import explain
 
@@ -34,12 +34,6 @@ Degrees = Annotated[float, Field(gt=0.0, le=180.0)]
 Density = Annotated[float, Field(ge=0.0, le=100.0)]
 Drives = Annotated[int, Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=1 << 63)]
-
-
-class StudyFileError(CrosscueError):
-    """A study file cannot be read or does not fit."""
-
-    exit_status = 2
 
 
 class Case(NamedTuple):

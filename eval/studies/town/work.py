@@ -29,7 +29,13 @@ from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import CrosscueError, Floats, RunError, UnreadableRunError, UsageError
+from crosscue.replay.base import (
+    Floats,
+    RunError,
+    UnreadableRunError,
+    UsageError,
+    WorkerError,
+)
 
 from .settings import Case
 
@@ -40,10 +46,6 @@ CHUNK_DRIVES: Final = 100
 CHUNKS: Final = "chunks"
 DRIVES: Final = "drives"
 DriveMany = Callable[[Drive, Keys], Floats]
-
-
-class WorkerError(CrosscueError):
-    """A worker died; what was finished is kept."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,9 +19,9 @@ from crosscue.eval.batch.ray_cluster import LOCAL, joined
 from crosscue.eval.batch.ray_jobs import OnRay
 from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.settings import LandmarkStudy
-from crosscue.eval.studies.town.work import WorkerError, assemble, chunks_of, run
+from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.settings import City, Drive
-from crosscue.replay.base import CrosscueError, UsageError
+from crosscue.replay.base import CrosscueError, UsageError, WorkerError
 from support.drive_work import letters, made_jobs
 from support.trees import tree
 

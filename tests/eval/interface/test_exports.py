@@ -13,6 +13,7 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
+from crosscue.replay import errors
 
 ROOT: Final = Path(__file__).parents[3]
 HEAVY: Final = ("torch", "rerun", "ray", "matplotlib", "numba", "pyarrow", "numpy", "pydantic")
@@ -55,6 +56,17 @@ def test_the_reference_pages_list_the_public_names_and_no_others() -> None:
     ]
 
     assert sorted(listed) == sorted(crosscue.__all__)
+
+
+def test_every_error_is_public() -> None:
+    """So the page of errors, whose names the test above compares, lists all of them."""
+    raised = {
+        name
+        for name, one in vars(errors).items()
+        if isinstance(one, type) and issubclass(one, Exception | Warning)
+    }
+
+    assert raised <= {*crosscue.__all__}
 
 
 def test_type_checkers_see_what_is_imported() -> None:

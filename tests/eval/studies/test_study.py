@@ -40,14 +40,13 @@ from crosscue.eval.studies.town.settings import (
     FieldStudy,
     LandmarkStudy,
     RangeStudy,
-    StudyFileError,
     load_study,
 )
 from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, finish_range
-from crosscue.eval.studies.town.work import WorkerError, assemble, chunks_of, run
+from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.drive import Keys, Result, drive_many
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.replay.base import Floats, RunError, UsageError
+from crosscue.replay.base import Floats, RunError, StudyFileError, UsageError, WorkerError
 
 TOWN = Drive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(
