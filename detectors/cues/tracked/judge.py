@@ -8,7 +8,8 @@
   (``far_side``). A camera knows a car's distance only by its height, to 15 %, so a car is past the
   end where that is 86 % probable, its own distance and the intersection's range taken together. One
   whose lower end is behind another car looks lower, hence further away, than it is, and says
-  nothing; one that only stands may be in a lot.
+  nothing, nor does a box narrower than high, which is a part of a car; one that only stands may be
+  in a lot.
 
 A car parked along the street is seen from the side, too, once it is far off the axis: at a bearing
 ``a`` its outline is about ``width + length * tan(a)`` long, that of a car across the street
@@ -36,6 +37,10 @@ limit; most that count are further past it (``PAST_PRECISION`` in the table of c
 COMES_OR_GOES: Final = 2.0
 """Standard deviations of its speed; less is asked than across, since a standing car of another
 height that is taken for a moving one is on that road, too."""
+MIN_LONG: Final = 1.0
+"""Width over height of a car seen from ahead or behind; a sedan has 1.2, a van 1.0. A box that is
+narrower shows a part of a car, often together with what hides the rest, so its height is not the
+car's, and seems to come or go as more of it shows."""
 MAX_SLANT: Final = 0.5
 """Speed across over speed along; what moves at more than 27 degrees to the road turns."""
 
@@ -132,6 +137,7 @@ def along(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
         if car.frames >= settings.min_frames
         and car.is_steady
         and not car.is_hidden
+        and car.long >= MIN_LONG
         and abs(car.bearing) * car.distance_m <= settings.past_aside_m
         and abs(car.ahead_mps) > max(settings.crossing_mps, COMES_OR_GOES * car.ahead_sd_mps)
         and abs(car.right_mps) <= MAX_SLANT * abs(car.ahead_mps)

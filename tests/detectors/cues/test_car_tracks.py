@@ -249,6 +249,20 @@ def test_a_car_aside_shows_by_its_bearing_that_it_comes_sooner_than_by_its_growt
     assert by_bearing.ahead_mps < -2.0 * by_bearing.ahead_sd_mps
 
 
+@pytest.mark.parametrize(("long", "oncoming"), [(1.2, 1), (0.85, 0)])
+def test_a_box_narrower_than_high_is_a_part_of_a_car_and_does_not_come(
+    long: float, oncoming: int
+) -> None:
+    tracks = CarTracks(CAMERA, RULES)
+    for way_m in range(30):
+        height_px = 704.0 * CAR_HEIGHT_M / (80.0 - way_m)
+        half_px = 0.5 * long * height_px
+        box = (640.0 - half_px, 375.0 - height_px, 640.0 + half_px, 375.0)
+        tracks([found(np.array([box]), [0])], Motion(0.0, 0.0, 0.0, PERIOD_S))
+
+    assert cars_past(tracks.longer(), CAMERA, RULES, Place(5.0, 15.0, 1.0)) == Ways(oncoming, 0)
+
+
 @pytest.mark.parametrize("scores", [(0.9, 0.4, 0.4, 0.9), (0.4, 0.4, 0.4, 0.9)])
 def test_an_unsure_box_carries_on_a_car_that_a_sure_one_began(scores: tuple[float, ...]) -> None:
     tracks = CarTracks(CAMERA, RULES)
