@@ -1,4 +1,8 @@
-"""YOLO as Ultralytics lays it out: ``data.yaml``, ``labels/NAME.txt`` and ``images``."""
+"""YOLO as Ultralytics lays it out: ``data.yaml``, ``labels/NAME.txt`` and ``images``.
+
+Parts in folders of their own (``labels/train``) are read too, as FiftyOne and CVAT export them, and
+so is Darknet's ``obj_train_data``, CVAT's "YOLO 1.1".
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from crosscue.replay.base import strict_json, write_text
 
 FILE = "data.yaml"
 LABELS = "labels"
+DARKNET = "obj_*_data"
 
 
 def write_yolo(folder: Path, labels: Annotations) -> Path:
@@ -29,9 +34,9 @@ def write_yolo(folder: Path, labels: Annotations) -> Path:
                 lines.append(" ".join([str(numbers[thing.label]), *map(repr, map(float, box))]))
         place = folder / LABELS / f"{Path(picture.name).stem}.txt"
         write_text(place, "".join(f"{line}\n" for line in lines))
-    # JSON's strings are YAML's.
+    # JSON's strings are YAML's. Without a path, Ultralytics looks for pictures beside the file.
     names = [f"  {number}: {strict_json(name).strip()}" for name, number in numbers.items()]
-    text = ["path: .", "train: images", "val: images", "names:", *names]
+    text = ["train: images", "val: images", "names:", *names]
     write_text(folder / FILE, "\n".join(text) + "\n")
     return folder / FILE
 
@@ -43,10 +48,9 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
         AnnotationError: A file cannot be read, or no size of a picture is known.
     """
     folder = path.parent if path.is_file() else path
-    inside = folder / LABELS
-    found = read_box_labels(inside if inside.is_dir() else folder, "yolo")
+    parts = [read_box_labels(place, "yolo") for place in _label_folders(folder)]
     pictures = []
-    for one in found.pictures:
+    for one in (picture for part in parts for picture in part.pictures):
         stem = Path(one.name).stem
         size = size_of(stem, sizes, path)
         things = []
@@ -55,4 +59,12 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
             in_px = (x0 * size[0], y0 * size[1], x1 * size[0], y1 * size[1])
             things.append(Thing(box.label, in_px, place=one.name))
         pictures.append(Picture(stem, size, None, None, tuple(things)))
-    return Annotations(str(path), found.classes, tuple(pictures))
+    classes = dict.fromkeys(name for part in parts for name in part.classes)
+    return Annotations(str(path), tuple(classes), tuple(pictures))
+
+
+def _label_folders(folder: Path) -> list[Path]:
+    """Where the label files are: everything in ``labels`` or Darknet's folders, else here."""
+    inside = [one for one in (folder / LABELS, *folder.glob(DARKNET)) if one.is_dir()]
+    found = {file.parent for one in inside for file in one.rglob("*.txt")}
+    return sorted(found) or inside or [folder]

@@ -3,7 +3,8 @@
 * COCO: a ``.json`` file. ``iscrowd`` marks regions that are not judged; ``t_ns`` and ``range_m``
   (of an annotation, metres) are used where they are given.
 * YOLO: a folder of ``.txt`` files, ``class x y width height`` in fractions of the picture. Class
-  names come from ``classes.txt``, ``obj.names`` or ``data.yaml`` there or one folder above.
+  names come from ``classes.txt``, ``obj.names``, ``data.yaml`` or ``dataset.yaml`` there or up to
+  two folders above.
 * Pascal VOC: a folder of ``.xml`` files. The first pixel is 1 and the last one belongs to the box;
   objects marked ``difficult`` are not judged.
 * KITTI: a folder of ``.txt`` files with 15 columns. ``DontCare`` regions are not judged; the range
@@ -37,7 +38,7 @@ from .voc import read_voc
 LabelFormat: TypeAlias = Literal["coco", "yolo", "voc", "kitti"]
 FORMATS: Final[tuple[LabelFormat, ...]] = ("coco", "yolo", "voc", "kitti")
 MAX_TEXT_BYTES: Final = 16 * MIB
-NAME_FILES: Final = ("classes.txt", "obj.names", "data.yaml")
+NAME_FILES: Final = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
 DONT_CARE: Final = "DontCare"
 OUTSIDE: Final = "boxes outside the picture, or without area"
 CUT: Final = "boxes cut off at the picture's edge"
@@ -264,14 +265,14 @@ def _yolo(path: Path, files: Sequence[Path], names: Sequence[str]) -> BoxLabels:
 
 
 def _names_of(path: Path) -> tuple[str, ...]:
-    for folder in (path, path.parent):
+    for folder in (path, *path.parents[:2]):
         for name in NAME_FILES:
             file = folder / name
             if file.is_file():
                 return _yaml_names(file) if file.suffix == ".yaml" else tuple(_lines(file))
     raise UsageError(
-        f"{path}: YOLO labels without class names (no {', '.join(NAME_FILES)}); give a file with "
-        "one a line: --class-names FILE"
+        f"{path}: YOLO labels without class names (no {', '.join(NAME_FILES)}); put classes.txt "
+        "with one a line beside them, or give --class-names FILE where a command takes it"
     )
 
 

@@ -116,6 +116,34 @@ def test_the_last_annotation_that_was_not_cancelled_counts(tmp_path: Path) -> No
     assert [thing.label for thing in picture.things] == ["stop sign"]
 
 
+@pytest.mark.parametrize(
+    ("place", "names"),
+    [
+        ("labels/val", {"dataset.yaml": "names: [stop sign, car]\nval: ./images/val/\n"}),
+        ("labels/train", {"data.yaml": "names: {0: stop sign, 1: car}\n", "train.txt": "a.jpg\n"}),
+        ("obj_train_data", {"obj.names": "stop sign\ncar\n", "train.txt": "a.jpg\n"}),
+    ],
+    ids=["FiftyOne", "CVAT, Ultralytics", "CVAT, Darknet"],
+)
+def test_yolo_is_read_in_the_layouts_that_tools_export(
+    place: str, names: dict[str, str], tmp_path: Path
+) -> None:
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / place / "a.txt").write_text("1 0.5 0.5 0.5 0.5\n")
+    for name, text in names.items():
+        (tmp_path / name).write_text(text)
+
+    (picture,) = read_labels(tmp_path, {"a": (100, 80)}).pictures
+    assert [(one.label, one.box_px) for one in picture.things] == [("car", (25, 20, 75, 60))]
+
+
+def test_yolo_pictures_are_named_relative_to_the_file_itself(tmp_path: Path) -> None:
+    """Ultralytics takes a ``path`` to be relative to wherever it was started."""
+    text = LABEL_FORMATS["yolo"].write(tmp_path, labels()).read_text()
+
+    assert [line.split(":")[0] for line in text.splitlines()[:3]] == ["train", "val", "names"]
+
+
 def test_coco_is_what_pycocotools_reads(tmp_path: Path) -> None:
     tools = pytest.importorskip("pycocotools.coco")
     tree = tools.COCO(str(LABEL_FORMATS["coco"].write(tmp_path, labels())))

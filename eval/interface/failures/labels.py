@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -252,8 +253,8 @@ def import_labels(
         limits: What the logs are read with.
 
     Raises:
-        SchemaError: The labels or the export cannot be read, or a picture was not exported or has
-            another size.
+        SchemaError: The labels or the export cannot be read, or a picture was not exported, has
+            another size, or comes twice.
         OutputError: A truth file exists, or cannot be written.
     """
     source, folder, target = Path(annotations), Path(exported), Path(output)
@@ -264,6 +265,9 @@ def import_labels(
     sizes = {stem: (row["width"], row["height"]) for stem, (_, row) in known.items()}
     read = read_labels(source, sizes, kind)
     placed = tuple(_placed(one, known, read.where) for one in read.pictures)
+    for name, count in Counter(one.name for one in placed).items():
+        if count > 1:
+            raise SchemaError(f"{read.where}: {name}: {count} times; expected each picture once")
     settings = vehicle_given(vehicle)
     exported_as = {label: cue for one in drives for label, cue in one["labels"].items()}
     meant = {label: cue for label, cue in exported_as.items() if label in read.labels}

@@ -113,7 +113,7 @@ def test_a_picture_without_its_cue_says_that_the_cue_is_not_there(
     assert drive.cues["stop_sign"] == 0
 
 
-def test_pictures_that_did_not_come_back_are_counted_and_others_refused(
+def test_pictures_that_did_not_come_back_are_counted_and_others_or_doubles_refused(
     exported: Path, tmp_path: Path
 ) -> None:
     tree = json.loads(exported.read_text())
@@ -122,6 +122,12 @@ def test_pictures_that_did_not_come_back_are_counted_and_others_refused(
     (tmp_path / "fewer.json").write_text(json.dumps(tree))
     found = crosscue.import_labels(tmp_path / "fewer.json", exported.parent, tmp_path / "fewer")
     assert found.missing == 1
+
+    tree["images"].append({**tree["images"][0], "id": 999})
+    (tmp_path / "twice.json").write_text(json.dumps(tree))
+    with pytest.raises(SchemaError, match=r"2 times; expected each picture once"):
+        crosscue.import_labels(tmp_path / "twice.json", exported.parent, tmp_path / "twice")
+    tree["images"].pop()
 
     tree["images"][0]["file_name"] = "another.jpg"
     (tmp_path / "other.json").write_text(json.dumps(tree))
