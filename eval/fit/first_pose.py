@@ -104,19 +104,16 @@ def _changed(vehicle: Vehicle, start: dict[str, object]) -> Vehicle:
 
 
 def _numbers(text: str) -> dict[str, object] | None:
-    """The three numbers of ``X,Y,HEADING``; None where it is not three words.
+    """The three numbers of ``X,Y,HEADING``; None for a path.
 
     Raises:
-        UsageError: They are not numbers.
+        UsageError: There are other than three numbers, or they are not finite.
     """
-    words = text.split(",")
-    if len(words) != 3:
+    numbers = [_number(word) for word in text.split(",")]
+    if len(numbers) != 3 and None in numbers:
         return None
-    try:
-        x_m, y_m, degrees = (float(word) for word in words)
-    except ValueError:
-        x_m = y_m = degrees = math.nan
-    if not all(map(math.isfinite, (x_m, y_m, degrees))):
+    x_m, y_m, degrees = numbers if len(numbers) == 3 else (None, None, None)
+    if x_m is None or y_m is None or degrees is None:
         raise UsageError(f"--start {text}: expected X,Y,HEADING in metres and degrees, or a file")
     return {
         "x_m": x_m,
@@ -124,6 +121,14 @@ def _numbers(text: str) -> dict[str, object] | None:
         "heading_rad": math.radians(degrees),
         "source": "given with --start",
     }
+
+
+def _number(word: str) -> float | None:
+    try:
+        number = float(word)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _laid(

@@ -422,9 +422,15 @@ def _with_doubt(
     """Noise that covers, at the end of a drive as long, what the fit leaves uncertain.
 
     A filter without a state for them cannot know that scales and biases stay wrong all drive long.
+    A wrong scale moves a pose by as much as the drive led away from its start, whatever the way
+    there: what turns to the left take, turns to the right return.
     """
     way_m = float(np.abs(steps.distance_m).sum()) * factor
     turned_rad = float(np.abs(steps.turn_rad).sum()) * factor
+    heading_rad = np.cumsum(steps.turn_rad)
+    along = steps.distance_m * np.exp(1j * heading_rad)
+    away_m = float(np.abs(np.cumsum(along)).max(initial=0.0)) * factor
+    off_rad = float(np.abs(heading_rad).max(initial=0.0)) * factor
     ratio, base = settings.steering_ratio, settings.wheelbase_m or 1.0
     scales = (
         sd.get("yaw_rate_scale", 0.0),
@@ -433,7 +439,7 @@ def _with_doubt(
         sd.get("track_width_m", 0.0) / settings.track_width_m,
     )
     more = {
-        "slip_per_sqrt_m": sd.get("wheel_scale", 0.0) * math.sqrt(way_m),
+        "slip_per_sqrt_m": sd.get("wheel_scale", 0.0) * _per_sqrt(away_m, way_m),
         "gyro_noise_rad_per_sqrt_s": math.hypot(
             sd.get("gyro_bias_radps", 0.0), 0.5 * sd.get(DRIFT, 0.0) * seconds
         )
@@ -442,12 +448,17 @@ def _with_doubt(
         "wheel_turn_rad_per_sqrt_m": sd.get("right_wheel_scale", 0.0)
         / settings.track_width_m
         * math.sqrt(way_m),
-        "turn_rad_per_sqrt_rad": math.hypot(*scales) * math.sqrt(turned_rad),
+        "turn_rad_per_sqrt_rad": math.hypot(*scales) * _per_sqrt(off_rad, turned_rad),
     }
     return _changed(
         settings,
         {name: math.hypot(getattr(settings, name), doubt) for name, doubt in more.items()},
     )
+
+
+def _per_sqrt(reach: float, way: float) -> float:
+    """The density of a random walk that spreads as far as ``reach`` on a way as long."""
+    return reach / math.sqrt(way) if way > 0.0 else 0.0
 
 
 def _changed(settings: OdometrySettings, values: Values) -> OdometrySettings:

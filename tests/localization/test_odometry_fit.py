@@ -96,6 +96,22 @@ def test_errors_of_what_was_not_fitted_are_as_large_as_claimed(
     assert 0.05 < nees.mean() < 7.4  # 95 % of a chi-square with two degrees of freedom
 
 
+def test_the_claimed_error_is_about_what_the_uncertain_parameters_would_cause(
+    turning: tuple[KnownDrive, OdometryFit],
+) -> None:
+    found, fit = turning
+    claimed = found.follow(fit.start, found.steps(fit.settings))
+    caused_m2 = 0.0
+    for one in fit.fitted:
+        if hasattr(CAR, one.parameter):
+            off = replace(fit.settings, **{one.parameter: one.value + one.sd})
+            moved = found.follow(fit.start, found.steps(off)).xy_m - claimed.xy_m
+            caused_m2 += float(np.mean(np.sum(moved**2, axis=1)))
+    claimed_m2 = float(np.mean(np.trace(claimed.cov_m2, axis1=1, axis2=2)))
+
+    assert 0.5 < np.sqrt(claimed_m2 / caused_m2) < 3.0
+
+
 def straight(seconds: float = 60.0) -> Truth:
     rng = np.random.default_rng(seed=1)
     there = drive(rng, seconds=seconds)

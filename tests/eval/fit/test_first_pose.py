@@ -132,8 +132,8 @@ def test_three_numbers_are_a_pose() -> None:
     assert start.heading_rad == pytest.approx(math.pi / 2)
 
 
-@pytest.mark.parametrize("text", ["1,2,north", "1,nan,3"])
-def test_three_words_that_are_no_numbers_are_wrong_usage(text: str) -> None:
+@pytest.mark.parametrize("text", ["1,2,north", "1,nan,3", "1,2", "1,2,3,4", "90"])
+def test_other_than_three_finite_numbers_are_wrong_usage(text: str) -> None:
     with pytest.raises(UsageError, match=r"expected X,Y,HEADING in metres and degrees"):
         with_start([driven()], Vehicle(version=1), EVERYTHING, start=text)
 
