@@ -8,11 +8,11 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.localization.compiled import kept
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
 from crosscue.localization.pose_filter import State, at_point, predict, update_position
 from crosscue.localization.start_pose import start_pose
+from crosscue.replay.compiled import kept
 
 Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap
-from crosscue.localization.compiled import kept
 from crosscue.localization.navigation import (
     NONE,
     Memory,
@@ -42,6 +41,7 @@ from crosscue.localization.pose_filter import (
     update,
     update_position,
 )
+from crosscue.replay.compiled import kept
 
 from . import settings as settings_of
 from .parameters import Parameters, parameters_of

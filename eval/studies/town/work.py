@@ -23,7 +23,6 @@ import numpy as np
 from crosscue.eval.batch.ray_cluster import joined
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.localization.compiled import fingerprint
 from crosscue.localization.town import parameters
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
@@ -36,6 +35,7 @@ from crosscue.replay.base import (
     UsageError,
     WorkerError,
 )
+from crosscue.replay.compiled import fingerprint
 
 from .settings import Case
 

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import settings as checked
 from hypothesis import strategies as st
 
-from crosscue.localization.compiled import compiled
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import streets_of
 from crosscue.localization.town.parameters import parameters_of
@@ -27,6 +26,7 @@ from crosscue.localization.town.streets import (
     place_of,
     step_of,
 )
+from crosscue.replay.compiled import compiled
 
 SMALL = Drive(city=City(largest_km2=3.0, one_way_fraction=0.5, dead_end_fraction=0.1))
 

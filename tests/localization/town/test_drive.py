@@ -11,7 +11,6 @@ from pydantic import ValidationError
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization import ekf
-from crosscue.localization.compiled import fingerprint
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import (
     EVENT_FIELDS,
@@ -31,6 +30,7 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
 from crosscue.replay.base import Floats
+from crosscue.replay.compiled import fingerprint
 
 FIELD = {name: i for i, name in enumerate(Result._fields)}
 TOWN = City(largest_km2=3.0)
