@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from crosscue.replay.compiled import kept
 
 Float32s = NDArray[np.float32]
 Float64s = NDArray[np.float64]
@@ -23,6 +25,10 @@ Int64s = NDArray[np.int64]
 NEAR_M: Final = 0.25
 OPAQUE: Final = 110
 MAX_TAPS: Final = 7
+GRAIN_M: Final = 40.0
+"""How far fine grain of the ground is seen."""
+HORIZON: Final = -0.002
+"""A ray that points up less than this meets the ground."""
 
 
 class Kernels(NamedTuple):
@@ -37,13 +43,7 @@ class Kernels(NamedTuple):
 @cache
 def compiled() -> Kernels:
     """Compile, or load what an earlier process compiled."""
-    from numba import njit
-
-    loops: tuple[Callable[..., Any], ...] = (draw, cover, compose, develop)
-    try:
-        return Kernels(*(njit(cache=True, nogil=True)(loop) for loop in loops))
-    except RuntimeError:  # no folder to keep compiled code in
-        return Kernels(*(njit(nogil=True)(loop) for loop in loops))
+    return Kernels(kept(draw), kept(cover), kept(compose), kept(develop))
 
 
 def draw(
@@ -72,142 +72,183 @@ def draw(
     corners (T, 3, 3) world metres, uv (T, 3, 2) texture widths, tint (T, 3) light times albedo,
     shift (3,) added to all corners; places (K, 9, 3): offset, width, height of a texture's levels.
     """
-    high, wide = depth.shape
-    polygon = np.zeros((4, 5))
     eye = np.zeros((3, 5))
+    polygon = np.zeros((4, 5))
+    triangle = np.zeros((3, 5))
     for t in order:
-        ahead = 0
         for k in range(3):
-            x = corners[t, k, 0] + shift[0] - camera_at[0]
-            y = corners[t, k, 1] + shift[1] - camera_at[1]
-            z = corners[t, k, 2] + shift[2] - camera_at[2]
-            for r in range(3):
-                eye[k, r] = eye_axes[r, 0] * x + eye_axes[r, 1] * y + eye_axes[r, 2] * z
+            _to_eye(corners[t, k], shift, eye_axes, camera_at, eye[k])
             eye[k, 3] = uv[t, k, 0]
             eye[k, 4] = uv[t, k, 1]
-            if eye[k, 2] > NEAR_M:
-                ahead += 1
-        if ahead == 0:
-            continue
-        size = 0
-        if ahead == 3:
-            size = 3
-            for k in range(3):
-                for r in range(5):
-                    polygon[k, r] = eye[k, r]
-        else:
-            for k in range(3):
-                after = (k + 1) % 3
-                inside = eye[k, 2] > NEAR_M
-                if inside:
-                    for r in range(5):
-                        polygon[size, r] = eye[k, r]
-                    size += 1
-                if inside != (eye[after, 2] > NEAR_M):
-                    s = (NEAR_M - eye[k, 2]) / (eye[after, 2] - eye[k, 2])
-                    for r in range(5):
-                        polygon[size, r] = eye[k, r] + s * (eye[after, r] - eye[k, r])
-                    size += 1
-        which = texture[t]
-        for fan in range(size - 2):
-            ia = 1.0 / polygon[0, 2]
-            ib = 1.0 / polygon[fan + 1, 2]
-            ic = 1.0 / polygon[fan + 2, 2]
-            xa = focal * polygon[0, 0] * ia + cx
-            ya = focal * polygon[0, 1] * ia + cy
-            xb = focal * polygon[fan + 1, 0] * ib + cx
-            yb = focal * polygon[fan + 1, 1] * ib + cy
-            xc = focal * polygon[fan + 2, 0] * ic + cx
-            yc = focal * polygon[fan + 2, 1] * ic + cy
-            left = min(xa, xb, xc)
-            right = max(xa, xb, xc)
-            top = min(ya, yb, yc)
-            bottom = max(ya, yb, yc)
-            if right < 0 or left >= wide or bottom < 0 or top >= high:
+        size = _clip(eye, polygon)
+        for fan in range(1, size - 1):
+            triangle[0] = polygon[0]
+            triangle[1] = polygon[fan]
+            triangle[2] = polygon[fan + 1]
+            _fill(
+                triangle,
+                texture[t],
+                tint[t],
+                instance[t],
+                focal,
+                cx,
+                cy,
+                haze_per_m,
+                haze,
+                atlas,
+                places,
+                depth,
+                colour,
+                owner,
+            )
+
+
+def _to_eye(
+    corner: Float32s, shift: Float32s, eye_axes: Float64s, camera_at: Float64s, eye: Float64s
+) -> None:
+    """A corner in camera axes, into the first three of ``eye``."""
+    x = corner[0] + shift[0] - camera_at[0]
+    y = corner[1] + shift[1] - camera_at[1]
+    z = corner[2] + shift[2] - camera_at[2]
+    for r in range(3):
+        eye[r] = eye_axes[r, 0] * x + eye_axes[r, 1] * y + eye_axes[r, 2] * z
+
+
+def _clip(eye: Float64s, polygon: Float64s) -> int:
+    """The part of a triangle ahead of the near plane, as 0, 3 or 4 corners."""
+    size = 0
+    for k in range(3):
+        after = (k + 1) % 3
+        inside = eye[k, 2] > NEAR_M
+        if inside:
+            polygon[size] = eye[k]
+            size += 1
+        if inside != (eye[after, 2] > NEAR_M):
+            s = (NEAR_M - eye[k, 2]) / (eye[after, 2] - eye[k, 2])
+            polygon[size] = eye[k] + s * (eye[after] - eye[k])
+            size += 1
+    return size
+
+
+def _fill(
+    triangle: Float64s,
+    which: int,
+    tint: Float32s,
+    instance: int,
+    focal: float,
+    cx: float,
+    cy: float,
+    haze_per_m: float,
+    haze: Float64s,
+    atlas: Bytes,
+    places: Int64s,
+    depth: Float32s,
+    colour: Bytes,
+    owner: NDArray[np.int16],
+) -> None:
+    """One triangle (3, 5) of x, y, z, u, v ahead of the camera; texture ``which``, none below 0."""
+    high, wide = depth.shape
+    ia, ib, ic = 1.0 / triangle[0, 2], 1.0 / triangle[1, 2], 1.0 / triangle[2, 2]
+    xa, ya = focal * triangle[0, 0] * ia + cx, focal * triangle[0, 1] * ia + cy
+    xb, yb = focal * triangle[1, 0] * ib + cx, focal * triangle[1, 1] * ib + cy
+    xc, yc = focal * triangle[2, 0] * ic + cx, focal * triangle[2, 1] * ic + cy
+    left, right = min(xa, xb, xc), max(xa, xb, xc)
+    top, bottom = min(ya, yb, yc), max(ya, yb, yc)
+    if right < 0 or left >= wide or bottom < 0 or top >= high:
+        return
+    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+    if abs(area) < 1e-9:
+        return
+    # 1/z, u/z and v/z are linear over the picture: value = p + q (x - xa) + r (y - ya).
+    ua, ub, uc = triangle[0, 3] * ia, triangle[1, 3] * ib, triangle[2, 3] * ic
+    va, vb, vc = triangle[0, 4] * ia, triangle[1, 4] * ib, triangle[2, 4] * ic
+    qi = ((ib - ia) * (yc - ya) - (ic - ia) * (yb - ya)) / area
+    ri = ((ic - ia) * (xb - xa) - (ib - ia) * (xc - xa)) / area
+    qu = ((ub - ua) * (yc - ya) - (uc - ua) * (yb - ya)) / area
+    ru = ((uc - ua) * (xb - xa) - (ub - ua) * (xc - xa)) / area
+    qv = ((vb - va) * (yc - ya) - (vc - va) * (yb - ya)) / area
+    rv = ((vc - va) * (xb - xa) - (vb - va) * (xc - xa)) / area
+    level = 0
+    if which >= 0:
+        level = _texture_level(triangle, area, places[which])
+    first = max(0, math.ceil(top - 0.5))
+    last = min(high - 1, math.floor(bottom - 0.5))
+    for row in range(first, last + 1):
+        y = row + 0.5
+        begin, end = _columns(xa, ya, xb, yb, xc, yc, y, wide)
+        for column in range(begin, end):
+            dx = column + 0.5 - xa
+            near = ia + qi * dx + ri * (y - ya)
+            if near <= depth[row, column]:
                 continue
-            area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-            if abs(area) < 1e-9:
-                continue
-            # 1/z, u/z and v/z are linear over the picture: value = p + q (x - xa) + r (y - ya).
-            qi = ((ib - ia) * (yc - ya) - (ic - ia) * (yb - ya)) / area
-            ri = ((ic - ia) * (xb - xa) - (ib - ia) * (xc - xa)) / area
-            ua = polygon[0, 3] * ia
-            ub = polygon[fan + 1, 3] * ib
-            uc = polygon[fan + 2, 3] * ic
-            qu = ((ub - ua) * (yc - ya) - (uc - ua) * (yb - ya)) / area
-            ru = ((uc - ua) * (xb - xa) - (ub - ua) * (xc - xa)) / area
-            va = polygon[0, 4] * ia
-            vb = polygon[fan + 1, 4] * ib
-            vc = polygon[fan + 2, 4] * ic
-            qv = ((vb - va) * (yc - ya) - (vc - va) * (yb - ya)) / area
-            rv = ((vc - va) * (xb - xa) - (vb - va) * (xc - xa)) / area
-            level = 0
+            red = tint[0]
+            green = tint[1]
+            blue = tint[2]
             if which >= 0:
-                u0 = polygon[0, 3] * places[which, 0, 1]
-                u1 = polygon[fan + 1, 3] * places[which, 0, 1]
-                u2 = polygon[fan + 2, 3] * places[which, 0, 1]
-                v0 = polygon[0, 4] * places[which, 0, 2]
-                v1 = polygon[fan + 1, 4] * places[which, 0, 2]
-                v2 = polygon[fan + 2, 4] * places[which, 0, 2]
-                texels = abs((u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0))
-                ratio = texels / abs(area)
-                while ratio > 2.0 and level < 8:
-                    ratio *= 0.25
-                    level += 1
-            first = max(0, math.ceil(top - 0.5))
-            last = min(high - 1, math.floor(bottom - 0.5))
-            for row in range(first, last + 1):
-                y = row + 0.5
-                x0 = 1e9
-                x1 = -1e9
-                if (ya <= y) != (yb <= y):
-                    x = xa + (y - ya) * (xb - xa) / (yb - ya)
-                    x0 = min(x0, x)
-                    x1 = max(x1, x)
-                if (yb <= y) != (yc <= y):
-                    x = xb + (y - yb) * (xc - xb) / (yc - yb)
-                    x0 = min(x0, x)
-                    x1 = max(x1, x)
-                if (yc <= y) != (ya <= y):
-                    x = xc + (y - yc) * (xa - xc) / (ya - yc)
-                    x0 = min(x0, x)
-                    x1 = max(x1, x)
-                begin = max(0, math.ceil(x0 - 0.5))
-                end = min(wide - 1, math.ceil(x1 - 0.5) - 1)
-                for column in range(begin, end + 1):
-                    dx = column + 0.5 - xa
-                    near = ia + qi * dx + ri * (y - ya)
-                    if near <= depth[row, column]:
-                        continue
-                    red = tint[t, 0]
-                    green = tint[t, 1]
-                    blue = tint[t, 2]
-                    if which >= 0:
-                        u = (ua + qu * dx + ru * (y - ya)) / near
-                        v = (va + qv * dx + rv * (y - ya)) / near
-                        w = places[which, level, 1]
-                        h = places[which, level, 2]
-                        tx = min(int((u - math.floor(u)) * w), w - 1)
-                        ty = min(int((v - math.floor(v)) * h), h - 1)
-                        at = places[which, level, 0] + ty * w + tx
-                        if atlas[at, 3] < OPAQUE:
-                            continue
-                        red *= atlas[at, 0]
-                        green *= atlas[at, 1]
-                        blue *= atlas[at, 2]
-                    else:
-                        red *= 255.0
-                        green *= 255.0
-                        blue *= 255.0
-                    hazy = haze_per_m / (haze_per_m + near)
-                    red += hazy * (haze[0] - red)
-                    green += hazy * (haze[1] - green)
-                    blue += hazy * (haze[2] - blue)
-                    depth[row, column] = near
-                    colour[row, column, 0] = min(255.0, max(0.0, red))
-                    colour[row, column, 1] = min(255.0, max(0.0, green))
-                    colour[row, column, 2] = min(255.0, max(0.0, blue))
-                    owner[row, column] = instance[t]
+                u = (ua + qu * dx + ru * (y - ya)) / near
+                v = (va + qv * dx + rv * (y - ya)) / near
+                at = _texel(u, v, places[which, level])
+                if atlas[at, 3] < OPAQUE:
+                    continue
+                red *= atlas[at, 0]
+                green *= atlas[at, 1]
+                blue *= atlas[at, 2]
+            else:
+                red *= 255.0
+                green *= 255.0
+                blue *= 255.0
+            hazy = haze_per_m / (haze_per_m + near)
+            red += hazy * (haze[0] - red)
+            green += hazy * (haze[1] - green)
+            blue += hazy * (haze[2] - blue)
+            depth[row, column] = near
+            colour[row, column, 0] = min(255.0, max(0.0, red))
+            colour[row, column, 1] = min(255.0, max(0.0, green))
+            colour[row, column, 2] = min(255.0, max(0.0, blue))
+            owner[row, column] = instance
+
+
+def _texture_level(triangle: Float64s, area: float, levels: Int64s) -> int:
+    """The level of a texture whose texels are about as large as samples; the first is finest."""
+    wide, high = levels[0, 1], levels[0, 2]
+    u0, u1, u2 = triangle[0, 3] * wide, triangle[1, 3] * wide, triangle[2, 3] * wide
+    v0, v1, v2 = triangle[0, 4] * high, triangle[1, 4] * high, triangle[2, 4] * high
+    texels = abs((u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0))
+    ratio = texels / abs(area)
+    level = 0
+    while ratio > 2.0 and level < 8:
+        ratio *= 0.25
+        level += 1
+    return level
+
+
+def _texel(u: float, v: float, place: Int64s) -> int:
+    """Where in the atlas a repeated texture's colour is."""
+    wide, high = place[1], place[2]
+    x = min(int((u - math.floor(u)) * wide), wide - 1)
+    y = min(int((v - math.floor(v)) * high), high - 1)
+    return int(place[0] + y * wide + x)
+
+
+def _columns(
+    xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, y: float, wide: int
+) -> tuple[int, int]:
+    """The columns, half open, whose middle is in a triangle at height ``y``."""
+    x0 = 1e9
+    x1 = -1e9
+    if (ya <= y) != (yb <= y):
+        x = xa + (y - ya) * (xb - xa) / (yb - ya)
+        x0 = min(x0, x)
+        x1 = max(x1, x)
+    if (yb <= y) != (yc <= y):
+        x = xb + (y - yb) * (xc - xb) / (yc - yb)
+        x0 = min(x0, x)
+        x1 = max(x1, x)
+    if (yc <= y) != (ya <= y):
+        x = xc + (y - yc) * (xa - xc) / (ya - yc)
+        x0 = min(x0, x)
+        x1 = max(x1, x)
+    return max(0, math.ceil(x0 - 0.5)), min(wide, math.ceil(x1 - 0.5))
 
 
 def cover(
@@ -256,18 +297,8 @@ def cover(
         first = max(0, math.ceil(min(py[0], py[1], py[2]) - 0.5))
         last = min(high - 1, math.floor(max(py[0], py[1], py[2]) - 0.5))
         for row in range(first, last + 1):
-            y = row + 0.5
-            x0 = 1e9
-            x1 = -1e9
-            for k in range(3):
-                j = (k + 1) % 3
-                if (py[k] <= y) != (py[j] <= y):
-                    x = px[k] + (y - py[k]) * (px[j] - px[k]) / (py[j] - py[k])
-                    x0 = min(x0, x)
-                    x1 = max(x1, x)
-            begin = max(0, math.ceil(x0 - 0.5))
-            end = min(wide - 1, math.ceil(x1 - 0.5) - 1)
-            for column in range(begin, end + 1):
+            begin, end = _columns(px[0], py[0], px[1], py[1], px[2], py[2], row + 0.5, wide)
+            for column in range(begin, end):
                 if covered[row, column] == 0:
                     covered[row, column] = 1
                     count += 1
@@ -307,131 +338,31 @@ def compose(
     """
     high, wide, _ = picture.shape
     whole = samples * samples
-    sky_high, sky_wide, _ = sky.shape
-    deepest = levels.shape[0] - 1
-    grain_size = grain.shape[0]
     for row in range(high):
         for column in range(wide):
-            red = 0.0
-            green = 0.0
-            blue = 0.0
-            filled = 0
-            owned = -1
-            votes = 0
-            for j in range(samples):
-                for i in range(samples):
-                    r = row * samples + j
-                    c = column * samples + i
-                    if depth[r, c] > 0.0:
-                        filled += 1
-                        red += colour[r, c, 0]
-                        green += colour[r, c, 1]
-                        blue += colour[r, c, 2]
-                        this = owner[r, c]
-                        if this >= 0:
-                            if this == owned:
-                                votes += 1
-                            elif votes == 0:
-                                owned = this
-                                votes = 1
-                            elif whole == 4:
-                                votes -= 1
-            mask[row, column] = -1
-            if owned >= 0:
-                votes = 0
-                for j in range(samples):
-                    for i in range(samples):
-                        r = row * samples + j
-                        c = column * samples + i
-                        if depth[r, c] > 0.0 and owner[r, c] == owned:
-                            votes += 1
-                if 2 * votes >= whole:
-                    mask[row, column] = owned
+            red, green, blue, filled, mask[row, column] = _objects(
+                depth, colour, owner, row * samples, column * samples, samples
+            )
             if filled < whole:
                 dx = (column + 0.5 - cx) / focal
                 dy = (row + 0.5 - cy) / focal
                 wx = world_axes[0, 0] * dx + world_axes[0, 1] * dy + world_axes[0, 2]
                 wy = world_axes[1, 0] * dx + world_axes[1, 1] * dy + world_axes[1, 2]
                 wz = world_axes[2, 0] * dx + world_axes[2, 1] * dy + world_axes[2, 2]
-                length = math.sqrt(wx * wx + wy * wy + wz * wz)
-                up = wz / length
-                back0 = 0.0
-                back1 = 0.0
-                back2 = 0.0
-                if up >= -0.002 or shine > 0.0:
-                    turn = math.atan2(wy, wx) / (2 * math.pi) + 0.5
-                    sx = min(int(turn * sky_wide), sky_wide - 1)
-                    sy = min(int(abs(up) * (sky_high - 1)), sky_high - 1)
-                    back0 = float(sky[sy, sx, 0])
-                    back1 = float(sky[sy, sx, 1])
-                    back2 = float(sky[sy, sx, 2])
-                if up < -0.002:
+                up = wz / math.sqrt(wx * wx + wy * wy + wz * wz)
+                back0, back1, back2 = 0.0, 0.0, 0.0
+                if up >= HORIZON or shine > 0.0:
+                    back0, back1, back2 = _sky(sky, wx, wy, up)
+                if up < HORIZON:
                     reach = -camera_at[2] / wz
                     gx = (camera_at[0] + reach * wx - ground_x0) * texels_per_m
                     gy = (camera_at[1] + reach * wy - ground_y0) * texels_per_m
                     across = reach / focal * texels_per_m
-                    flat = math.sqrt(wx * wx + wy * wy)
-                    along = across / (-up)
-                    taps = min(MAX_TAPS, max(1, int(min(along / across, 1.5 * along) + 0.5)))
-                    texel = max(across, along / taps)
-                    level = 0
-                    while texel > 1.5 and level < deepest:
-                        texel *= 0.5
-                        level += 1
-                    shrink = 1.0 / (1 << level)
-                    w = levels[level, 1]
-                    h = levels[level, 2]
-                    stepx = along * wx / flat / taps
-                    stepy = along * wy / flat / taps
-                    g0 = 0.0
-                    g1 = 0.0
-                    g2 = 0.0
-                    g3 = 0.0
-                    for tap in range(taps):
-                        off = tap - 0.5 * (taps - 1)
-                        px = (gx + off * stepx) * shrink - 0.5
-                        py = (gy + off * stepy) * shrink - 0.5
-                        px = min(max(px, 0.0), w - 1.001)
-                        py = min(max(py, 0.0), h - 1.001)
-                        ix = int(px)
-                        iy = int(py)
-                        fx = px - ix
-                        fy = py - iy
-                        at = levels[level, 0] + iy * w + ix
-                        a = (1 - fx) * (1 - fy)
-                        b = fx * (1 - fy)
-                        c2 = (1 - fx) * fy
-                        d = fx * fy
-                        g0 += (
-                            a * ground[at, 0]
-                            + b * ground[at + 1, 0]
-                            + c2 * ground[at + w, 0]
-                            + d * ground[at + w + 1, 0]
-                        )
-                        g1 += (
-                            a * ground[at, 1]
-                            + b * ground[at + 1, 1]
-                            + c2 * ground[at + w, 1]
-                            + d * ground[at + w + 1, 1]
-                        )
-                        g2 += (
-                            a * ground[at, 2]
-                            + b * ground[at + 1, 2]
-                            + c2 * ground[at + w, 2]
-                            + d * ground[at + w + 1, 2]
-                        )
-                        g3 += ground[at, 3]
-                    g0 /= taps
-                    g1 /= taps
-                    g2 /= taps
-                    g3 /= taps
+                    g0, g1, g2, g3 = _ground(ground, levels, gx, gy, across, wx, wy, up)
                     bright = shadow[row, column] / 255.0
-                    if reach < 40.0:
-                        # Fine grain, 2 cm a texel, fading with distance.
-                        nx = int((camera_at[0] + reach * wx) * 50.0) % grain_size
-                        ny = int((camera_at[1] + reach * wy) * 50.0) % grain_size
-                        fade = min(1.0, 8.0 / reach) * (1.0 - reach / 40.0)
-                        bright *= 1.0 + fade * g3 / 255.0 * (grain[ny, nx] - 128.0) / 230.0
+                    if reach < GRAIN_M:
+                        x, y = camera_at[0] + reach * wx, camera_at[1] + reach * wy
+                        bright *= _grain(grain, x, y, reach, g3)
                     g0 *= light[0] * bright
                     g1 *= light[1] * bright
                     g2 *= light[2] * bright
@@ -451,6 +382,117 @@ def compose(
             picture[row, column, 0] = min(255.0, max(0.0, red / whole + 0.5))
             picture[row, column, 1] = min(255.0, max(0.0, green / whole + 0.5))
             picture[row, column, 2] = min(255.0, max(0.0, blue / whole + 0.5))
+
+
+def _objects(
+    depth: Float32s, colour: Bytes, owner: NDArray[np.int16], top: int, left: int, samples: int
+) -> tuple[float, float, float, int, int]:
+    """One pixel's samples: their colours added, how many are filled, and the pixel's object.
+
+    The object covers at least half of the pixel; -1 for none.
+    """
+    whole = samples * samples
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    filled = 0
+    owned = -1
+    votes = 0
+    for r in range(top, top + samples):
+        for c in range(left, left + samples):
+            if depth[r, c] > 0.0:
+                filled += 1
+                red += colour[r, c, 0]
+                green += colour[r, c, 1]
+                blue += colour[r, c, 2]
+                this = int(owner[r, c])
+                if this >= 0:
+                    if this == owned:
+                        votes += 1
+                    elif votes == 0:
+                        owned = this
+                        votes = 1
+                    elif whole == 4:
+                        votes -= 1
+    if owned >= 0:
+        votes = 0
+        for r in range(top, top + samples):
+            for c in range(left, left + samples):
+                if depth[r, c] > 0.0 and owner[r, c] == owned:
+                    votes += 1
+        if 2 * votes < whole:
+            owned = -1
+    return red, green, blue, filled, owned
+
+
+def _sky(sky: Bytes, wx: float, wy: float, up: float) -> tuple[float, float, float]:
+    """The sky where a ray meets it, or where it would after a mirror on the ground."""
+    high, wide, _ = sky.shape
+    turn = math.atan2(wy, wx) / (2 * math.pi) + 0.5
+    x = min(int(turn * wide), wide - 1)
+    y = min(int(abs(up) * (high - 1)), high - 1)
+    return float(sky[y, x, 0]), float(sky[y, x, 1]), float(sky[y, x, 2])
+
+
+def _ground(
+    ground: Bytes,
+    levels: Int64s,
+    gx: float,
+    gy: float,
+    across: float,
+    wx: float,
+    wy: float,
+    up: float,
+) -> tuple[float, float, float, float]:
+    """Colour and strength of the grain around texel (gx, gy), averaged along the ray.
+
+    across: width of the pixel in texels. A pixel is longer along the ray than across, so several
+    places are averaged.
+    """
+    flat = math.sqrt(wx * wx + wy * wy)
+    along = across / (-up)
+    taps = min(MAX_TAPS, max(1, int(min(along / across, 1.5 * along) + 0.5)))
+    texel = max(across, along / taps)
+    level = 0
+    while texel > 1.5 and level < levels.shape[0] - 1:
+        texel *= 0.5
+        level += 1
+    shrink = 1.0 / (1 << level)
+    w = levels[level, 1]
+    h = levels[level, 2]
+    stepx = along * wx / flat / taps
+    stepy = along * wy / flat / taps
+    g0, g1, g2, g3 = 0.0, 0.0, 0.0, 0.0
+    for tap in range(taps):
+        off = tap - 0.5 * (taps - 1)
+        px = min(max((gx + off * stepx) * shrink - 0.5, 0.0), w - 1.001)
+        py = min(max((gy + off * stepy) * shrink - 0.5, 0.0), h - 1.001)
+        ix = int(px)
+        iy = int(py)
+        at = levels[level, 0] + iy * w + ix
+        g0 += _between(ground, at, w, 0, px - ix, py - iy)
+        g1 += _between(ground, at, w, 1, px - ix, py - iy)
+        g2 += _between(ground, at, w, 2, px - ix, py - iy)
+        g3 += ground[at, 3]
+    return g0 / taps, g1 / taps, g2 / taps, g3 / taps
+
+
+def _between(ground: Bytes, at: int, wide: int, k: int, fx: float, fy: float) -> float:
+    """Channel ``k`` between four texels, the first at ``at``, by bilinear interpolation."""
+    return float(
+        (1 - fx) * (1 - fy) * ground[at, k]
+        + fx * (1 - fy) * ground[at + 1, k]
+        + (1 - fx) * fy * ground[at + wide, k]
+        + fx * fy * ground[at + wide + 1, k]
+    )
+
+
+def _grain(grain: Bytes, x_m: float, y_m: float, reach: float, strength: float) -> float:
+    """How much brighter fine grain makes the ground: 2 cm a texel, fading with distance."""
+    size = grain.shape[0]
+    fade = min(1.0, 8.0 / reach) * (1.0 - reach / GRAIN_M)
+    dark = (grain[int(y_m * 50.0) % size, int(x_m * 50.0) % size] - 128.0) / 230.0
+    return float(1.0 + fade * strength / 255.0 * dark)
 
 
 def develop(
