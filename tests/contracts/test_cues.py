@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
+from rerun.chunk import RrdReader
 
+import crosscue
 from crosscue.datasets.scenes.cues import SIMULATED
 from crosscue.datasets.truth.truth import json_schema
-from crosscue.detectors.base import Detections
+from crosscue.detectors.base import Detections, Found, Frame
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Seen
 from crosscue.detectors.cues.rules import rule_of
@@ -28,6 +31,7 @@ from crosscue.replay.vehicle.cue_table import CUES, groups
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.testing import check_cue
+from support.gap_drive import Clock, GreyNumber, write_drive
 from support.scoring import (
     cue_table,
     frame_table,
@@ -107,6 +111,65 @@ def test_cues_of_a_group_share_its_row_of_table_5() -> None:
 
 def test_no_simulator_function_is_left_of_a_cue_that_is_gone() -> None:
     assert [*SIMULATED] == [*CUES]
+
+
+class SeesZebras(GreyNumber):
+    """A zebra crossing beside the drive's stop sign, whose range makes an approach."""
+
+    def _one(self, frame: Frame) -> Found:
+        found = super()._one(frame)
+        assert isinstance(found, Detections)
+        if not len(found):
+            return found
+        return replace(
+            found,
+            boxes_px=np.concatenate([found.boxes_px, [[10.0, 60.0, 90.0, 80.0]]]),
+            scores=np.ones(2),
+            labels=(*found.labels, "zebra"),
+            masks=(b"", b""),
+        )
+
+
+def test_a_dummy_cue_goes_from_pixels_to_tables_scores_report_and_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(CUES, DUMMY.name, DUMMY)
+    log = write_drive(tmp_path, Clock(), seconds=6)
+    with (tmp_path / "car.toml").open("a") as vehicle:
+        vehicle.write('[fusion]\nkind = "source"\n')
+    stated = (tmp_path / "truth.json").read_text()
+    (tmp_path / "truth.json").write_text(stated.replace('"cue": "stop_sign"', '"cue": "zebra"'))
+
+    run = crosscue.replay_drive(
+        log, tmp_path / "run", tmp_path / "car.toml", [f"{__name__}:SeesZebras"]
+    )
+    scored = crosscue.score_run(run, tmp_path / "truth.json", has_figures=False)
+    recording = crosscue.save_recording(run, tmp_path / "zebra.rrd")
+
+    rows = run["cues"].filter(pc.equal(run["cues"]["cue"], "zebra")).to_pylist()
+    counts = [row["count"] for row in rows if row["count"]]
+    assert counts == [2] * 34  # the last of them where the truth ends
+    assert run.belief["straight"].to_pylist()[-1] > 0.6
+    (score,) = [row for row in scored.cues.to_pylist() if row["cue"] == "zebra"]
+    assert (score["precision"], score["precision_of"]) == (1.0, 33)
+    assert "<td>zebra</td>" in scored.report.read_text()
+    assert _static(recording, "/cues/zebra", "colors") == [[int.from_bytes((1, 2, 3, 255))]]
+
+
+def _static(recording: Path, entity: str, component: str) -> list[object]:
+    """What a recording says of an entity for all times."""
+    batches = [
+        chunk.to_record_batch()
+        for chunk in RrdReader(recording).stream()
+        if chunk.entity_path == entity and chunk.is_static
+    ]
+    return [
+        cell
+        for batch in batches
+        for name in batch.schema.names
+        if name.endswith(component)
+        for cell in batch[name].to_pylist()
+    ]
 
 
 def test_a_dummy_cue_is_one_row_and_one_function(
