@@ -19,7 +19,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Generic, Protocol, TypeAlias, TypeVar
 
-from crosscue.eval.runs.folder import FAILURE, MANIFEST, RunFolder, signature
+from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder, is_alive, signature
 from crosscue.replay.base import (
     CrosscueError,
     RunError,
@@ -34,7 +34,7 @@ from crosscue.replay.base import (
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
 
-from .journal import beating, error_of, read_entry, write_entry, write_plan
+from .journal import STALE_S, beating, error_of, read_entry, silent_s, write_entry, write_plan
 
 
 class Result(Protocol):
@@ -249,6 +249,11 @@ def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
 
 
 def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Done[R]:
+    try:
+        _check_free(job)
+    except (CrosscueError, OSError) as error:
+        # The drive is another's, and so is its entry.
+        return Done(job, *reported_error(error))
     inputs: dict[str, object] | None = None
     try:
         inputs = _inputs(job)
@@ -263,6 +268,28 @@ def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Don
         record_failure(failed, inputs, traceback.format_exc())
         return failed
     return Done(job, status, None, result)
+
+
+def _check_free(job: Job) -> None:
+    """Refuse a drive that a worker of another machine is at; take over from one that has died.
+
+    Its process cannot be seen from here, but while it lives it touches its entry.
+
+    Raises:
+        RunError: It was heard of lately.
+    """
+    worker, lock = str((read_entry(job.run) or {}).get("worker", "")), job.run / LOCK
+    if not worker or is_alive(worker) is not None or not lock.exists():
+        return
+    silent = silent_s(job.run)
+    if silent <= STALE_S:
+        pid, host = worker.split(" ")[:2]
+        raise RunError(
+            f"{job.run}: process {pid} on {host} is writing it; wait, or if it is gone start again "
+            f"in {STALE_S - silent:.0f} s"
+        )
+    if lock.read_text() == worker:
+        lock.unlink()
 
 
 def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: str) -> None:

@@ -21,6 +21,8 @@ JOURNAL: Final = ".drives"
 PLANS: Final = "plans"
 FORMAT_VERSION: Final = 2
 BEAT_S: Final = 10.0
+STALE_S: Final = 12.0 * BEAT_S
+"""A worker of another machine that has been silent so long is taken for dead."""
 
 
 def entry_path(run: Path) -> Path:

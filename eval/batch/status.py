@@ -12,12 +12,10 @@ from typing import Final
 from crosscue.eval.runs.folder import FAILURE, MANIFEST, is_alive
 from crosscue.replay.base import UnreadableRunError
 
-from .journal import BEAT_S, has_journal, names_in, read_entry, silent_s, started_s
+from .journal import STALE_S, has_journal, names_in, read_entry, silent_s, started_s
 
 MERGED: Final = "merged"
 """What the merged run is called among those that it was made of."""
-STALE_S: Final = 12.0 * BEAT_S
-"""A worker of another machine that has been silent so long is taken for dead."""
 WINDOW_S: Final = 3600.0
 """The rate is that of the last hour, or since the start."""
 NO_RUN: Final = "no run yet"
@@ -42,12 +40,14 @@ class DriveStatus:
         state: ``stale``: begun by a worker that is gone. ``waiting``: not begun yet.
         silent_s: Since its worker was last heard of, or since it ended; infinite if never.
         error: Why it failed, or None.
+        host: Machine of the worker that began it and has not ended it; empty without.
     """
 
     run: Path
     state: DriveState
     silent_s: float
     error: str | None = None
+    host: str = ""
 
     @property
     def log(self) -> Path | None:
@@ -98,9 +98,11 @@ def drive_status(run: Path) -> DriveStatus:
         return DriveStatus(run, DriveState.FAILED, silent, entry["error"])
     if "manifest" in entry:
         return DriveStatus(run, DriveState.DONE if is_whole else DriveState.STALE, silent)
-    alive = is_alive(str(entry.get("worker", "")))
+    worker = str(entry.get("worker", ""))
+    alive = is_alive(worker)
     is_running = silent <= STALE_S if alive is None else alive
-    return DriveStatus(run, DriveState.RUNNING if is_running else DriveState.STALE, silent)
+    state = DriveState.RUNNING if is_running else DriveState.STALE
+    return DriveStatus(run, state, silent, host="".join(worker.split(" ")[1:2]))
 
 
 def pace_of(drives: Sequence[DriveStatus], folder: Path) -> Pace:

@@ -50,6 +50,7 @@ class BatchStatus:
                     "run": str(one.run),
                     "state": one.state.value,
                     "silent_s": one.silent_s,
+                    "host": one.host,
                     "error": one.error,
                     "log": None if one.log is None else str(one.log),
                 }
@@ -64,7 +65,8 @@ class BatchStatus:
                 lines.append(f"failed    {one.run.name}: {one.error}")
                 lines += [] if one.log is None else [f"          {one.log}"]
             elif one.state is DriveState.STALE:
-                lines.append(f"stale     {one.run.name}: its worker is gone; replay again")
+                where = f" on {one.host}" if one.host else ""
+                lines.append(f"stale     {one.run.name}: its worker{where} is gone, {_heard(one)}")
         total = len(self.drives)
         counted = (f"{self.count(state)} {state}" for state in DriveState)
         lines.append(f"drives    {total}: {', '.join(counted)}")
@@ -74,6 +76,12 @@ class BatchStatus:
         if math.isfinite(self.pace.left_s):
             lines.append(f"time left {_duration(self.pace.left_s)}")
         return "\n".join(map(visible, lines))
+
+
+def _heard(one: DriveStatus) -> str:
+    """When a stale drive's worker was last heard of, and what to do."""
+    when = f"last heard of {_duration(one.silent_s)} ago; " if math.isfinite(one.silent_s) else ""
+    return f"{when}replay again"
 
 
 def _duration(seconds: float) -> str:

@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from crosscue.eval.batch.journal import entry_path, error_of, write_entry, write
 from crosscue.eval.batch.merge import gathered
 from crosscue.eval.batch.status import DriveState, drives_of_folder, pace_of
 from crosscue.eval.cli import run
-from crosscue.eval.runs.folder import FAILURE, signature
+from crosscue.eval.runs.folder import FAILURE, LOCK, signature
 from crosscue.replay.base import UnreadableRunError
 from support.drive_work import letters, made_jobs
 
@@ -87,7 +88,29 @@ def test_a_worker_that_is_gone_leaves_a_stale_drive(
     monkeypatch.setattr(status, "STALE_S", 60.0)
     os.utime(entry_path(later), (1.0e9, 1.0e9))
     assert states(folder)["later"] == "stale"
+    assert "later: its worker on another-machine is gone, last heard of" in repr(
+        crosscue.batch_status(folder)
+    )
     assert run(["status", str(folder), "-q"]) == 3
+
+
+def test_a_drive_whose_worker_died_on_another_machine_is_begun_again(tmp_path: Path) -> None:
+    (job,) = made_jobs(tmp_path, ["plain"])
+    dead = "4711 another-machine boot 99"
+    job.run.mkdir(parents=True)
+
+    def left_behind(entry_s: float) -> str | None:
+        """Its error, where it was begun so many seconds since 1970 and left its lock."""
+        write_entry(job.run, {"inputs": None, "worker": dead})
+        os.utime(entry_path(job.run), (entry_s, entry_s))
+        job.run.joinpath(LOCK).write_text(dead)
+        (done,) = run_many([job], letters, in_turn)
+        return done.error
+
+    assert "process 4711 on another-machine is writing it" in str(left_behind(time.time()))
+    assert states(tmp_path / "runs") == {"drive0": "running"}
+    assert left_behind(1.0e9) is None
+    assert states(tmp_path / "runs") == {"drive0": "done"}
 
 
 def test_drives_without_a_run_are_merged_as_failures_whatever_the_order(
