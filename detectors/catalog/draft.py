@@ -14,7 +14,7 @@ from crosscue.detectors.decoders.base import Guess, Interface, static
 from crosscue.replay.errors import UsageError
 
 from .class_names import COCO_80, COCO_90, meaning_of
-from .recognise import DEFAULT_SIDE_PX, size_in
+from .recognise import size_in
 
 _LINE: Final = 100
 _NOTHING: Final = ("background", "bg")
@@ -145,7 +145,7 @@ def _input(
     elif width is not None and height is not None:
         certain.append(f"its input is {width} x {height}")
     else:
-        width, height = size_in(model.metadata) or (DEFAULT_SIDE_PX, DEFAULT_SIDE_PX)
+        width, height = size_in(model.metadata) or guess.usual_size_px
         assumed.append(f"its size is open; {width} x {height} (--size WxH)")
     usual.pop("layout", None)
     if "colour" in usual and not model.class_names:

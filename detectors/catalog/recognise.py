@@ -11,7 +11,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.detectors.decoders.base import Guess, Interface, Tensor, kind_of, static
+from crosscue.detectors.decoders.base import (
+    GRID_STRIDES,
+    Guess,
+    Interface,
+    Tensor,
+    cell_count,
+    kind_of,
+    static,
+)
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.backends import Network, load_network
 from crosscue.detectors.networks.openvino import import_openvino
@@ -27,8 +35,14 @@ DEFAULT_SIDE_PX: Final = 640
 """Of a network that takes pictures of any size and names none."""
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
 """Of one input that a file declares: the largest picture that a card may name."""
+_MANY_CLASSES: Final = 10_000
+"""Where the shapes leave open how many a network has."""
 SENSIBLE_FRACTION: Final = 0.99
 """Of boxes that a network finds in noise, where their layout is read rightly."""
+_ONNX_INTEGERS: Final = frozenset((6, 7))
+"""int32 and int64 as ONNX numbers them."""
+SPREAD_FRACTION: Final = 0.5
+"""Of the input's sides: candidates of every cell lie all over a picture, read rightly."""
 _REFUSED: Final = {
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",
@@ -78,8 +92,9 @@ def _of_onnx(content: bytes, path: Path) -> Interface:
 
 
 def _tensor(value: Any) -> Tensor:
-    sides = value.type.tensor_type.shape.dim
-    return Tensor(value.name, tuple(side.dim_value or side.dim_param or None for side in sides))
+    declared = value.type.tensor_type
+    shape = tuple(side.dim_value or side.dim_param or None for side in declared.shape.dim)
+    return Tensor(value.name, shape, declared.elem_type in _ONNX_INTEGERS)
 
 
 def _of_openvino(content: bytes, path: Path) -> Interface:
@@ -92,7 +107,8 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
     def tensor(port: Any) -> Tensor:
         names = sorted(port.get_names())
         sides = (side.get_length() if side.is_static else None for side in port.partial_shape)
-        return Tensor(names[0] if names else "output0", tuple(sides))
+        is_integer = port.element_type.get_type_name() in ("i32", "i64")
+        return Tensor(names[0] if names else "output0", tuple(sides), is_integer)
 
     return Interface(
         tuple(tensor(port) for port in model.inputs),
@@ -165,7 +181,7 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
         ) from None
     return Interface(
         (Tensor(given.name, shape), *model.inputs[1:]),
-        tuple(Tensor(out.name, outputs[out.name].shape) for out in model.outputs),
+        tuple(Tensor(out.name, outputs[out.name].shape, out.is_integer) for out in model.outputs),
         model.metadata,
         model.class_names,
     )
@@ -202,22 +218,32 @@ def plausible(path: Path, model: Interface, found: list[Guess]) -> list[Guess]:
 
 def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
-    if height is None or width is None or guess.class_count is None:
+    if height is None or width is None:
         return True
     given = Input.model_validate(
         {"width_px": width, "height_px": height, **dict(guess.input or {})}
     )
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    classes = tuple(str(i) for i in range(guess.class_count))
+    classes = tuple(str(i) for i in range(guess.class_count or _MANY_CLASSES))
     decoder = next(one for one in DECODERS if kind_of(one) == guess.settings["kind"])
     output = decoder.model_validate({**guess.settings, "classes": classes, "score": 0.0})
     try:
         found = output.candidates(network(prepared(noise, given)[0]), (width, height))
     except ValueError:
         return False
-    sides = found.boxes_px[:, 2:] - found.boxes_px[:, :2]
-    is_sensible = (sides >= 0.0) & (sides <= 4.0 * np.array([width, height]))
-    return bool(is_sensible.mean() > SENSIBLE_FRACTION)
+    size = np.array([width, height])
+    # Exports with built-in suppression fill up with zeros.
+    boxes_px = found.boxes_px[found.boxes_px.any(axis=1)]
+    sides = boxes_px[:, 2:] - boxes_px[:, :2]
+    is_sensible = (sides >= 0.0) & (sides <= 4.0 * size)
+    if len(boxes_px) and is_sensible.mean() <= SENSIBLE_FRACTION:
+        return False
+    cells = cell_count((width, height), GRID_STRIDES)
+    if len(found) not in (cells, 3 * cells):
+        return True
+    centers = (found.boxes_px[:, 2:] + found.boxes_px[:, :2]) / 2.0
+    low, high = np.percentile(centers, (5, 95), axis=0)
+    return bool((high - low > SPREAD_FRACTION * size).all())
 
 
 def guesses(model: Interface) -> list[Guess]:

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, TypeAlias, get_args
+from typing import Final, Protocol, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,7 @@ class Tensor:
 
     name: str
     shape: tuple[int | str | None, ...]
+    is_integer: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +89,7 @@ class Guess:
         assumptions: What nothing in the file says.
         input: Keys of the card's ``[input]`` that networks of this layout usually have.
         network: Keys of the card's ``[network]``, for tensors alone.
+        usual_size_px: Width and height to run at, where the file leaves them open.
     """
 
     settings: Mapping[str, object]
@@ -96,6 +98,7 @@ class Guess:
     assumptions: tuple[str, ...] = ()
     input: Mapping[str, object] | None = None
     network: Mapping[str, object] | None = None
+    usual_size_px: tuple[int, int] = (640, 640)
 
 
 class BoxOutput(Settings):
@@ -183,6 +186,10 @@ def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
     """A declared size as a number; None where it is open or has no such axis."""
     size = shape[axis] if -len(shape) <= axis < len(shape) else None
     return size if isinstance(size, int) else None
+
+
+GRID_STRIDES: Final = (8, 16, 32)
+"""Of the grids of YOLO networks and of YOLOX."""
 
 
 def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False) -> int:

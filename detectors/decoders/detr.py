@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,25 @@ from .base import (
     Size,
     Tensor,
     best_class,
+    class_numbers,
     from_centers,
     named,
     rows_of,
     sigmoid,
     static,
 )
+
+_MAX_QUERIES: Final = 1000
+_SELECTED_COLUMNS: Final = 6
+_COCO_COLUMNS_OF_DETR: Final = 92
+_RF_DETR_NAMES: Final = ("dets", "labels")
+_IMAGENET: Final = {
+    "mean": tuple(255 * mean for mean in (0.485, 0.456, 0.406)),
+    "scale": tuple(1 / (255 * deviation) for deviation in (0.229, 0.224, 0.225)),
+}
+"""Red, green, blue: mean and deviation that networks trained from ImageNet's weights expect."""
+ULTRALYTICS_HEAD: Final = "RTDETRDecoder"
+"""Of the RT-DETR that Ultralytics exports, in its metadata since 8.4."""
 
 
 class DetrOutput(BoxOutput):
@@ -35,11 +48,17 @@ class DetrOutput(BoxOutput):
     """The output with the classes."""
     activation: Literal["sigmoid", "softmax", "none"] = "sigmoid"
     """From logits to scores. With softmax, the class after the listed ones means "no object"."""
+    is_selected: bool = False
+    """Behind each box are the score and number of its best class, instead of all logits."""
     first_class: int = 0
     """Column of the first listed class; 1 where column 0 is not used, as in COCO's numbering."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+        if self.is_selected:
+            rows = rows_of(named(outputs, self.boxes, "boxes"), 6, "box, score, class")
+            numbers = class_numbers(rows[:, 5] - self.first_class, len(self.classes))
+            return Candidates(_in_pixels(rows[:, :4], size_px), rows[:, 4], numbers)
         count = self.first_class + len(self.classes) + (self.activation == "softmax")
         if self.boxes == self.logits:
             both = rows_of(named(outputs, self.boxes, "boxes"), 4 + count, "boxes and classes")
@@ -49,7 +68,7 @@ class DetrOutput(BoxOutput):
             logits = rows_of(named(outputs, self.logits, "logits"), count, "classes")
         scores = self._scores(logits)[:, self.first_class : self.first_class + len(self.classes)]
         best, classes = best_class(scores)
-        return Candidates(from_centers(boxes) * np.tile(size_px, 2), best, classes)
+        return Candidates(_in_pixels(boxes, size_px), best, classes)
 
     def _scores(self, logits: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.activation == "none":
@@ -71,35 +90,71 @@ class DetrOutput(BoxOutput):
         if boxes is None or logits is None or len(tables) != 2:
             return None
         columns = static(logits.shape, 2)
+        settings = {"kind": "detr", "boxes": boxes.name, "logits": logits.name, "overlap": 1.0}
+        why = f"{boxes.name} has 4 columns, {logits.name} the classes of the same queries"
+        are_fractions = "boxes are center and size in fractions"
+        if columns == _COCO_COLUMNS_OF_DETR:
+            return Guess(
+                {**settings, "activation": "softmax", "first_class": 1},
+                columns - 2,
+                (why,),
+                (
+                    f"{columns} columns are COCO's 90 between an unused one and no object, as "
+                    "of the first DETR: softmax, and pixels with ImageNet's mean",
+                    are_fractions,
+                ),
+                {**picture, **_IMAGENET},
+            )
+        is_rf_detr = (boxes.name, logits.name) == _RF_DETR_NAMES
         return Guess(
-            {"kind": "detr", "boxes": boxes.name, "logits": logits.name, "overlap": 1.0},
+            settings,
             columns,
-            (f"{boxes.name} has 4 columns, {logits.name} the classes of the same queries",),
+            (why,),
             (
                 "logits become scores by the logistic function (RT-DETR, RF-DETR); the first DETR "
                 'has activation = "softmax"',
-                "boxes are center and size in fractions",
-                "pixels are scaled to 0..1, without a mean",
+                are_fractions,
+                "outputs named as RF-DETR's: pixels with ImageNet's mean and deviation"
+                if is_rf_detr
+                else "pixels are scaled to 0..1, without a mean",
             ),
-            picture,
+            {**picture, **_IMAGENET} if is_rf_detr else picture,
         )
+
+
+def _in_pixels(boxes: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]:
+    pixels: NDArray[np.float64] = from_centers(boxes) * np.tile(size_px, 2)
+    return pixels
 
 
 def _of_one(output: Tensor, model: Interface, picture: dict[str, object]) -> Guess | None:
     """Ultralytics' RT-DETR: boxes and scores side by side, few queries, scores already."""
     rows, columns = static(output.shape, 1), static(output.shape, 2)
     names = len(model.class_names)
-    if rows is None or rows > 1000 or columns is None or columns < 5 or columns != names + 4:
+    settings = {
+        "kind": "detr",
+        "boxes": output.name,
+        "logits": output.name,
+        "activation": "none",
+        "overlap": 1.0,
+    }
+    if rows is None or rows > _MAX_QUERIES or columns is None or columns < 5:
+        return None
+    is_known = model.metadata.get("head") == ULTRALYTICS_HEAD
+    if columns == _SELECTED_COLUMNS and (is_known or not model.metadata):
+        why = f"rows of {columns}: box, score, class"
+        return Guess(
+            {**settings, "is_selected": True},
+            names or None,
+            (why, f"its head is {ULTRALYTICS_HEAD}") if is_known else (why,),
+            () if is_known else ("boxes are center and size in fractions",),
+            picture,
+        )
+    if columns != names + 4:
         return None
     return Guess(
-        {
-            "kind": "detr",
-            "boxes": output.name,
-            "logits": output.name,
-            "activation": "none",
-            "overlap": 1.0,
-        },
-        columns - 4,
+        settings,
+        names,
         (f"rows of {columns}: 4 and the {names} classes of its metadata, {rows} queries",),
         ("boxes are center and size in fractions, scores are scores already",),
         picture,

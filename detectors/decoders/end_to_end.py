@@ -20,6 +20,7 @@ from .base import (
     rows_of,
     static,
 )
+from .detr import ULTRALYTICS_HEAD
 from .yolo import PICTURE, PrototypeMasks, prototype_output, prototypes_of
 
 
@@ -52,7 +53,8 @@ class EndToEndOutput(BoxOutput):
         prototypes = prototype_output(model)
         columns = 6 + (prototypes[1] if prototypes else 0)
         output = next((o for o in model.outputs if len(o.shape) == 3), None)
-        if output is None or static(output.shape, 2) != columns:
+        is_detr = model.metadata.get("head") == ULTRALYTICS_HEAD
+        if output is None or static(output.shape, 2) != columns or is_detr:
             return None
         settings: dict[str, object] = {"kind": "end-to-end", "name": output.name, "overlap": 1.0}
         if prototypes:

@@ -20,7 +20,11 @@ from .base import (
     Tensor,
     class_numbers,
     named,
+    static,
 )
+
+_USUAL_SIZE_PX: Final = (1333, 800)
+"""To which torchvision's networks scale a picture themselves; at this size nothing is left."""
 
 
 class TorchvisionOutput(BoxOutput):
@@ -61,32 +65,54 @@ class TorchvisionOutput(BoxOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        boxes, labels, scores, masks = (_one(model, name) for name in _NAMES)
-        if boxes is None or labels is None or scores is None:
+        named_outputs = _by_name(model)
+        found = named_outputs or _by_shape(model)
+        if found is None:
             return None
-        settings: dict[str, object] = {"kind": "torchvision", "overlap": 1.0}
-        if masks is not None:
-            settings["masks"] = masks.name
+        settings: dict[str, object] = {
+            "kind": "torchvision",
+            "overlap": 1.0,
+            **{key: out.name for key, out in found.items() if key == "masks" or out.name != key},
+        }
         is_single = len(model.inputs[0].shape) == 3
         return Guess(
             settings,
             len(model.class_names) or None,
-            ("its outputs are called boxes, labels and scores",),
+            (
+                "its outputs are called boxes, labels and scores"
+                if named_outputs
+                else "outputs of N x 4, N integers and N scores: boxes, labels, scores",
+            ),
             ("class 0 is the background, the classes start at 1",),
             {
                 "colour": "rgb",
-                "fit": "stretch",
+                "fit": "letterbox",
                 "scale": (1 / 255,) * 3,
                 "layout": "chw" if is_single else "nchw",
             },
+            usual_size_px=_USUAL_SIZE_PX,
         )
 
 
-_NAMES: Final = ("boxes", "labels", "scores", "masks")
+def _by_name(model: Interface) -> dict[str, Tensor] | None:
+    """The outputs by the keys of torchvision's results, where an export names them so."""
+    found = {out.name: out for out in model.outputs if out.name in ("boxes", "labels", "scores")}
+    if len(found) < 3:
+        return None
+    return found | {out.name: out for out in model.outputs if out.name == "masks"}
 
 
-def _one(model: Interface, name: str) -> Tensor | None:
-    return next((out for out in model.outputs if out.name == name), None)
+def _by_shape(model: Interface) -> dict[str, Tensor] | None:
+    """The same outputs under other names: an export that names none numbers them."""
+    kinds = {
+        "boxes": [o for o in model.outputs if len(o.shape) == 2 and static(o.shape, 1) == 4],
+        "labels": [o for o in model.outputs if len(o.shape) == 1 and o.is_integer],
+        "scores": [o for o in model.outputs if len(o.shape) == 1 and not o.is_integer],
+        "masks": [o for o in model.outputs if len(o.shape) == 4],
+    }
+    found = {key: outputs[0] for key, outputs in kinds.items() if outputs}
+    is_whole = len(found) == len(model.outputs) and {"boxes", "labels", "scores"} <= {*found}
+    return found if is_whole else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    GRID_STRIDES,
     Array,
     BoxOutput,
     Candidates,
@@ -27,6 +28,7 @@ from .base import (
 )
 
 PICTURE: Final = {"colour": "rgb", "fit": "letterbox-center", "scale": (1 / 255,) * 3}
+YOLOX_PICTURE: Final = {"colour": "bgr", "fit": "letterbox"}
 _COEFFICIENTS: Final = 32
 
 
@@ -64,8 +66,17 @@ class YoloV5Output(BoxOutput):
         if names and names != columns - 5:
             return None
         why = f"rows of {columns}: 5 and {columns - 5} classes"
+        settings = {"kind": "yolov5", "name": output.name}
+        if rows is not None and rows == cells and not names:
+            return Guess(
+                settings,
+                columns - 5,
+                (why, f"{rows} rows are the cells of strides 8, 16, 32"),
+                ("boxes are in input pixels, as YOLOX exports with --decode_in_inference",),
+                YOLOX_PICTURE,
+            )
         return Guess(
-            {"kind": "yolov5", "name": output.name},
+            settings,
             columns - 5,
             (why, *((f"its metadata names {names} classes",) if names else ())),
             () if names else ("boxes are in input pixels, with an objectness",),
@@ -184,7 +195,7 @@ def _columns(output: Array, rows: int) -> NDArray[np.float64]:
 def _cells(model: Interface) -> int | None:
     """Cells of the strides 8, 16 and 32, where the file fixes its input's size."""
     height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
-    return cell_count((width, height), (8, 16, 32)) if width and height else None
+    return cell_count((width, height), GRID_STRIDES) if width and height else None
 
 
 def _transposed(model: Interface) -> tuple[str, int] | None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    GRID_STRIDES,
     BoxOutput,
     Candidates,
     Guess,
@@ -21,8 +22,7 @@ from .base import (
     named,
     static,
 )
-
-_STRIDES = (8, 16, 32)
+from .yolo import YOLOX_PICTURE
 
 
 class YoloxOutput(BoxOutput):
@@ -31,7 +31,7 @@ class YoloxOutput(BoxOutput):
     kind: Literal["yolox"]
     name: str | None = None
     """Which of the outputs; the only one, if left out."""
-    strides: tuple[int, ...] = _STRIDES
+    strides: tuple[int, ...] = GRID_STRIDES
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -63,12 +63,12 @@ class YoloxOutput(BoxOutput):
         height, width = static(given, -2), static(given, -1)
         if columns is None or columns < 6 or rows is None or width is None or height is None:
             return None
-        if rows != cell_count((width, height), _STRIDES):
+        if rows != cell_count((width, height), GRID_STRIDES):
             return None
         return Guess(
             {"kind": "yolox"},
             columns - 5,
             (f"{rows} rows are the cells of strides 8, 16, 32 at {width} x {height}",),
             ("rows are relative to their cells, as YOLOX exports without --decode_in_inference",),
-            {"colour": "bgr", "fit": "letterbox"},
+            YOLOX_PICTURE,
         )

@@ -79,7 +79,8 @@ def load_network(
         )
     if suffix == ".onnx" and _EXTERNAL in weights.content:
         raise VehicleError(
-            f"{weights.name}: keeps tensors in other files, which no hash covers; save it whole"
+            f"{weights.name}: keeps tensors in other files, which no hash covers; save it whole, "
+            "torch.onnx.export with external_data=False"
         )
     if backend is not None and backend not in able:
         raise VehicleError(f"{weights.name}: {backend} does not run it; one of: {', '.join(able)}")

@@ -24,9 +24,6 @@ PAGE = Path(__file__).parents[2] / "docs" / "howto" / "networks.md"
 HOME = Path("datasets") / "real" / "pandaset_002"
 """Where the page has the vehicle file and the truth of its drive."""
 FRAMES = 3
-TWO_FIT = ("yolox",)
-"""A network that answers noise as it answers pictures leaves two layouts, and the page says what
-to do then."""
 
 
 def commands() -> list[str]:
@@ -76,13 +73,12 @@ def followed(
 ) -> tuple[int, int, int]:
     """Run the page's commands for a file of weights; its stop sign cue: right, of, frames."""
     monkeypatch.chdir(place)
-    chosen = ["--kind", kind] if kind in TWO_FIT else []
     lines = commands()
     assert len(lines) == 5
     for line in lines:
         asked = line.replace("my.onnx", weights).removeprefix("crosscue ").split()
         more = {
-            "model init": ["--overwrite", *chosen],
+            "model init": ["--overwrite"],
             "replay PANDASET": ["--overwrite", "--no-cache"],
             "view run": ["--overwrite"],
         }

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         type=Path,
         metavar="FILE.jpg",
-        help="the picture with what was found (default: beside the picture, .found.jpg)",
+        help="the picture with what was found (default: CARD.PICTURE.found.jpg)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -48,7 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--size", metavar="WxH", help="run at this size, such as 1280x736, where it allows any"
     )
     parser.add_argument(
-        "--picture", type=Path, metavar="FILE", help="draw what it finds beside this picture"
+        "--picture",
+        type=Path,
+        metavar="FILE",
+        help="draw what it finds in this picture, beside the card",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

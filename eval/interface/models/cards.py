@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from crosscue.datasets.truth.box_labels import class_names_given
 from crosscue.detectors.base import Detections, Detector, Frame
@@ -26,6 +27,10 @@ from crosscue.replay.base import (
     write_bytes,
     write_text,
 )
+
+_TASKS: Final = ("detect", "segment")
+"""Of those that Ultralytics writes into its exports, the ones that are read."""
+_MAX_TASK_CHARACTERS: Final = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -116,7 +121,8 @@ def draft_card(
         kind: Layout of its outputs, or torchvision's name of the network, where several fit.
         class_names: In the order of its outputs, or a file with one a line, where it has none.
         size_px: Width and height of its input, or as text, ``1280x736``, where it allows any.
-        picture: What the network finds in it is drawn beside it, as ``.found.jpg``.
+        picture: What the network finds in it is drawn beside the card, as
+            ``CARD.PICTURE.found.jpg``.
         overwrite: Replace a card that is there.
 
     Raises:
@@ -150,7 +156,7 @@ def draft_card(
     # What is wrong with the picture is reported before a card is written.
     _pixels_of(seen)
     _try(place, written)
-    found = _look(build(card=str(place)), seen, drawing := _drawing(seen))
+    found = _look(build(card=str(place)), seen, drawing := _drawing(place, seen))
     return CardDraft(place, written, drawing, None if found is None else len(found))
 
 
@@ -162,7 +168,8 @@ def check_card(
     Args:
         model: A name in the catalog, or a card's file name, which ends in ``.toml``.
         picture: Run it on this JPEG, PNG or WebP file, and draw what it finds.
-        output: The drawing; beside the picture, as ``.found.jpg``, if left out.
+        output: The drawing; if left out, ``CARD.PICTURE.found.jpg`` beside the card, or in the
+            current folder for a model of the catalog.
 
     Raises:
         UsageError: The catalog has no such model.
@@ -175,7 +182,8 @@ def check_card(
     if picture is None:
         return CardCheck(card, detector.identity)
     seen = Path(picture)
-    drawing = _drawing(seen) if output is None else Path(output)
+    place = card if Path(str(model)).suffix == ".toml" else Path(card.name)
+    drawing = _drawing(place, seen) if output is None else Path(output)
     found = _look(detector, seen, drawing)
     counts = None if found is None else dict(Counter(found.labels))
     return CardCheck(card, detector.identity, drawing, counts)
@@ -195,6 +203,12 @@ def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
     if len(found) == 1:
         return found[0]
     if not found:
+        task = model.metadata.get("task", "detect")[:_MAX_TASK_CHARACTERS]
+        if task not in _TASKS:
+            raise UsageError(
+                f"{path}: its metadata says it is for {task!r}; expected one of "
+                f"{', '.join(_TASKS)}; export a network that finds boxes"
+            )
         outputs = ", ".join(f"{out.name} {_shape(out.shape)}" for out in model.outputs)
         asked = "" if kind is None else f" as {kind}"
         raise UsageError(
@@ -216,8 +230,9 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _drawing(picture: Path) -> Path:
-    return picture.with_suffix(".found.jpg")
+def _drawing(card: Path, picture: Path) -> Path:
+    """Never beside the picture: its folder may be a log, and every image in it a frame."""
+    return card.with_name(f"{card.stem}.{picture.stem}.found.jpg")
 
 
 def _try(place: Path, written: Draft) -> None:

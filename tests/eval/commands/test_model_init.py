@@ -9,11 +9,15 @@ import numpy as np
 import onnx
 import pytest
 
+import crosscue
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.recognise import class_names
+from crosscue.detectors.decoders.detr import DetrOutput
+from crosscue.detectors.decoders.torchvision_export import TorchvisionOutput
 from crosscue.eval.cli import run
 from support.data import shared
 from support.onnx_models import Array, bright_box_model, constant_model
+from support.pictures import picture
 
 ULTRALYTICS = {"names": "{0: 'person', 1: 'car', 2: 'stop-sign'}", "imgsz": "[64, 128]"}
 
@@ -61,6 +65,140 @@ def _file(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
     path = folder / "my.onnx"
     path.write_bytes(model.SerializeToString())
     return path
+
+
+def test_a_rt_detr_of_selected_boxes_is_known_by_its_head(tmp_path: Path) -> None:
+    """Ultralytics 8.4 writes rows as of an end-to-end export, and means fractions."""
+    metadata = {**ULTRALYTICS, "head": "RTDETRDecoder", "task": "detect"}
+
+    assert run(["model", "init", str(_file(tmp_path, "end-to-end", metadata))]) == 0
+
+    output = read_card(tmp_path / "my.toml").output
+    assert isinstance(output, DetrOutput)
+    assert output.is_selected
+    rows = np.array([[[0.5, 0.5, 0.25, 0.5, 0.8, 2.0]]])
+    found = output.candidates({"output0": rows}, (128, 64))
+    np.testing.assert_allclose(found.boxes_px, [[48.0, 16.0, 80.0, 48.0]])
+    assert (found.scores[0], found.classes[0]) == (0.8, 2)
+
+
+@pytest.mark.parametrize(
+    ("row", "kind"),
+    [((30.0, 10.0, 50.0, 40.0, 0.8, 2.0), "end-to-end"), ((0.5, 0.5, 0.3, 0.4, 0.8, 2.0), "detr")],
+)
+def test_rows_without_metadata_are_known_by_their_sizes(
+    tmp_path: Path, row: tuple[float, ...], kind: str
+) -> None:
+    rows = np.tile(np.array(row, np.float32), (1, 300, 1))
+    path = tmp_path / "my.onnx"
+    path.write_bytes(constant_model((1, 3, 64, 128), {"output0": rows}))
+
+    crosscue.draft_card(path, class_names=["person", "car", "stop sign"])
+
+    assert read_card(tmp_path / "my.toml").output.kind == kind
+
+
+def test_torchvision_is_known_without_names_of_its_outputs(tmp_path: Path) -> None:
+    """torch.onnx numbers the outputs that a user does not name."""
+    outputs = {"1042": _rows(2, 4), "1043": np.ones(2, np.int64), "1044": _rows(2)}
+    path = tmp_path / "my.onnx"
+    path.write_bytes(constant_model((3, 64, 128), outputs))
+
+    crosscue.draft_card(path, class_names=["person"])
+
+    output = read_card(tmp_path / "my.toml").output
+    assert isinstance(output, TorchvisionOutput)
+    assert (output.boxes, output.labels, output.scores) == ("1042", "1043", "1044")
+
+
+def test_an_open_size_of_torchvision_keeps_the_proportions_of_a_street(tmp_path: Path) -> None:
+    model = onnx.load_model_from_string(
+        constant_model(
+            (3, 64, 128), {"boxes": _rows(0, 4), "labels": np.ones(0, np.int64), "scores": _rows(0)}
+        )
+    )
+    for axis in (1, 2):
+        model.graph.input[0].type.tensor_type.shape.dim[axis].dim_param = "open"
+    path = tmp_path / "my.onnx"
+    path.write_bytes(model.SerializeToString())
+
+    crosscue.draft_card(path, class_names=["person"])
+
+    given = read_card(tmp_path / "my.toml").input
+    assert (given.width_px, given.height_px, given.fit) == (1333, 800, "letterbox")
+
+
+@pytest.mark.parametrize(
+    ("names", "columns", "activation", "is_normalised"),
+    [
+        (("logits", "pred_boxes"), 80, "sigmoid", False),
+        (("logits", "pred_boxes"), 92, "softmax", True),
+        (("labels", "dets"), 91, "sigmoid", True),
+    ],
+    ids=("RT-DETR", "DETR", "RF-DETR"),
+)
+def test_members_of_the_detr_family_are_told_apart(
+    tmp_path: Path, names: tuple[str, str], columns: int, activation: str, is_normalised: bool
+) -> None:
+    path = tmp_path / "my.onnx"
+    outputs = {names[0]: _rows(1, 50, columns), names[1]: _rows(1, 50, 4)}
+    path.write_bytes(constant_model((1, 3, 64, 128), outputs))
+
+    crosscue.draft_card(path)
+
+    card = read_card(tmp_path / "my.toml")
+    assert isinstance(card.output, DetrOutput)
+    assert card.output.activation == activation
+    assert (card.input.mean != (0.0, 0.0, 0.0)) == is_normalised
+    number = card.output.classes.index("stop sign") + card.output.first_class
+    assert number == (11 if columns == 80 else 13)
+
+
+def test_a_yolox_with_decoded_boxes_keeps_its_colours(tmp_path: Path) -> None:
+    """One row a cell, as of YOLOX; the networks with three anchors a cell take other pictures."""
+    for rows, colour, scale in ((168, "bgr", 1.0), (504, "rgb", 1 / 255)):
+        path = tmp_path / "my.onnx"
+        path.write_bytes(constant_model((1, 3, 64, 128), {"output": _rows(1, rows, 85)}))
+
+        crosscue.draft_card(path, kind="yolov5", overwrite=True)
+
+        given = read_card(tmp_path / "my.toml").input
+        assert (given.colour, given.scale) == (colour, (scale,) * 3)
+
+
+def test_a_network_for_another_task_is_said_to_be_one(tmp_path: Path) -> None:
+    path = tmp_path / "my.onnx"
+    model = onnx.load_model_from_string(
+        constant_model((1, 3, 64, 128), {"output0": _rows(1, 56, 168)})
+    )
+    onnx.helper.set_model_props(model, {"names": "{0: 'person'}", "task": "pose"})
+    path.write_bytes(model.SerializeToString())
+
+    with pytest.raises(crosscue.UsageError, match="for 'pose'; expected one of detect, segment"):
+        crosscue.draft_card(path)
+
+
+def test_a_folder_of_images_gets_no_drawing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is a log, and every image in it a frame."""
+    log, home = tmp_path / "log", tmp_path / "home"
+    for folder in (log, home):
+        folder.mkdir()
+    (log / "00.jpg").write_bytes(picture(0, ".jpg"))
+    (home / "net.onnx").write_bytes(bright_box_model())
+    monkeypatch.chdir(home)
+
+    crosscue.draft_card("net.onnx", class_names=["a"], size_px=(96, 64), picture=log / "00.jpg")
+    checked = crosscue.check_card("net.toml", log / "00.jpg")
+
+    assert checked.picture == Path("net.00.found.jpg")
+    assert [path.name for path in log.iterdir()] == ["00.jpg"]
+    assert sorted(path.name for path in home.iterdir()) == [
+        "net.00.found.jpg",
+        "net.onnx",
+        "net.toml",
+    ]
 
 
 @pytest.mark.parametrize("kind", LAYOUTS)
@@ -117,8 +255,8 @@ def test_sizes_that_a_file_leaves_open_are_found_by_running_it(
 
 
 def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One row a cell, all zero: YOLOX's offsets, or boxes without size."""
-    model = constant_model((1, 3, 64, 128), {"output": _rows(1, 168, 85)})
+    """One row a cell, and boxes that are wrong by either layout."""
+    model = constant_model((1, 3, 64, 128), {"output": np.full((1, 168, 85), 20.0, np.float32)})
     path = tmp_path / "my.onnx"
     path.write_bytes(model)
 
@@ -145,7 +283,7 @@ def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
     assert run(["model", "init", str(path), *args]) == 0
 
     assert "yolox; the network runs with it" in capsys.readouterr().out
-    assert (tmp_path / "street.found.jpg").stat().st_size > 10_000
+    assert (tmp_path / "yolox.street.found.jpg").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
