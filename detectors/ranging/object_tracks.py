@@ -239,7 +239,7 @@ class Track:
         )
 
     def _forget(self) -> None:
-        """What heights said so far fits no straight way; the last estimate stands until seen."""
+        """What heights said so far fits no straight road; the last estimate stands until seen."""
         self._way_m, self._height_px, self._merged = [self._at_m], [self.height_px], 0
         self._way_var_m2 = self._turned_rad = 0.0
 

@@ -1,7 +1,7 @@
 """Replay a drive up to an intersection from its pictures, score it, show it.
 
-The drive is simulated from a seed on this machine, and nothing is downloaded; that takes a few
-minutes on two cores, most of them for the pictures and the networks. With --real it is 8 s of San
+The drive is simulated from a seed on this machine, and nothing is downloaded; it takes a few
+minutes on two cores, mostly for the pictures and the networks. With --real, it is 8 s of San
 Francisco: PandaSet's sequence 002 (Scale AI and Hesai, CC BY 4.0, 20.8 MB) with the network
 yolox-nano (3.7 MB, Apache-2.0), both fetched once and checked, and annotated by us.
 

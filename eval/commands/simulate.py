@@ -1,7 +1,7 @@
-"""Simulate drives up to intersections: log with camera, CAN, Mobileye and compass, truth beside.
+"""Simulate drives up to intersections: a log with camera, CAN, Mobileye and compass, and its truth.
 
-Layouts A to H are those of the published study; L0, L1, ... are others, from seeds, for training.
-The same names and seeds give the same bytes.
+Layouts A to H are those of the published study; L0, L1, ... are random ones, for training. The same
+names and seeds yield the same bytes.
 
 examples:
   crosscue simulate A --run 3 -o drives

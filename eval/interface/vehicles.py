@@ -58,7 +58,7 @@ def draft_vehicle(
     """Write a first vehicle file from what a drive holds.
 
     Wheel speeds, yaw rate and steering are chosen by how well signals agree with GNSS and with each
-    other; pitch and yaw of the camera, if not given, by pictures of a straight way.
+    other; pitch and yaw of the camera, if not given, by pictures of a straight road.
 
     Args:
         log: The drive, or its path.
@@ -213,7 +213,7 @@ def _given(
 
 
 def _mounting(examined: Examined, given: Mounting) -> Mounting:
-    """What was given, and what pictures of a straight way show."""
+    """What was given, and what pictures of a straight road show."""
     camera = camera_of(examined.logs)
     if camera is None:
         return given

@@ -86,7 +86,7 @@ def estimate_mounting(
             None,
             None,
             len(found),
-            f"pitch and yaw not estimated: {len(found)} pairs of pictures of a straight way, of "
+            f"pitch and yaw not estimated: {len(found)} pairs of pictures of a straight road, of "
             f"{seen} examined, {bends} in bends; expected {MIN_PAIRS} or more",
         )
     return Estimate(
@@ -102,7 +102,7 @@ def _measured(angles_rad: Floats) -> Measured:
     return Measured(
         median,
         f"ESTIMATED: {median / DEGREE:.2f} deg, the vanishing point of {len(angles_rad)} pairs of "
-        f"pictures on a straight way, s.d. of one {spread / DEGREE:.2f} deg",
+        f"pictures on a straight road, s.d. of one {spread / DEGREE:.2f} deg",
     )
 
 

@@ -1,6 +1,6 @@
 """Write failures as a static site that needs no server: pictures, belief curves, filters.
 
-RUN is what crosscue failures takes, or a table that it wrote. Open index.html in a browser. Each
+RUN is as in crosscue failures, or a table that it wrote. Open index.html in a browser. Each
 failure shows its picture with boxes, masks and regions, the belief around it, and the command that
 opens Rerun there.
 

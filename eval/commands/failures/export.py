@@ -1,8 +1,8 @@
 """Export the pictures of failures for labelling, with the detections in them as pre-labels.
 
 FAILURES is a table that crosscue failures -o wrote; each frame is exported once, its picture as
-recorded. Names of pictures hold their drive and time, so that crosscue truth import --export finds
-both again. Boxes that nobody has corrected are detections, not labels.
+recorded. File names contain drive and time, from which crosscue truth import --export recovers
+both. Boxes that nobody has corrected are detections, not labels.
 
 examples:
   crosscue failures runs --top 10 -o worst.parquet

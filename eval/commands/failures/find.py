@@ -1,9 +1,9 @@
-"""List what went wrong in runs, worst first: by kind, by what it is about, by cause.
+"""List what went wrong in runs, worst first, by kind, by feature or cue, and by cause.
 
-Five kinds: a feature or cue that is there and was missed; a feature believed only within 8 m of the
-intersection (late); one believed or found that is not there (false); a range outside its own 95 %
-interval; a belief that was decided and then flipped. Without truth only the last is known.
-Severity is in bits; docs/howto/failures.md says how it is computed. --top picks the worst of every
+Five kinds: a feature or cue that exists and was missed; a feature believed only within 8 m of the
+intersection (late); one believed or found that does not exist (false); a range outside its own 95 %
+interval; a belief that was decided and then flipped. Without truth, only the last can be detected.
+Severity is in bits; docs/howto/failures.md explains it. --top picks the worst of every
 cause and run before a second of any.
 
 examples:

@@ -1,7 +1,7 @@
-"""Fit a compass to a drive: mounting, hard and soft iron, as far as the drive shows them.
+"""Fit a compass to a drive: mounting, hard and soft iron, as far as the drive determines them.
 
-The reference is the GNSS course. What a drive cannot show keeps its value and is named: a straight
-drive shows the mounting alone.
+The reference is the GNSS course. Parameters that a drive does not determine keep their value and
+are named: a straight drive determines the mounting alone.
 
 example:
   crosscue fit compass drive.mcap --vehicle car.toml -o car.toml

@@ -1,10 +1,10 @@
 """Fit thresholds and calibrations of a detector to labelled boxes, and write them into its card.
 
-For each class the lowest threshold that reaches the precision asked for, by Clopper and Pearson's
-one-sided 95 % bound, corrected for choosing among eight thresholds; and a calibration, so that a
-score is the fraction of such detections that are right. The last half of each run's images is held
-out and shows the result, unless --test names other runs. A class with too few labelled boxes is
-left as it is, and said.
+Each class gets the lowest threshold that reaches the required precision, by Clopper and Pearson's
+one-sided 95 % bound, corrected for choosing among eight thresholds, and a calibration, so that a
+score is the probability that a detection is correct. The last half of each run's images is held
+out to test the result, unless --test names other runs. A class with too few labelled boxes is
+reported and keeps its values.
 
 Bounds take detections as independent; those of neighbouring images are not. Fit to several drives.
 
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.5,
         metavar="FRACTION",
-        help="last part of each run's images that shows the result (default: 0.5)",
+        help="last part of each run's images, held out to test the result (default: 0.5)",
     )
     parser.add_argument(
         "--test",
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="RUN",
-        help="other runs that show the result",
+        help="other runs to test the result on",
     )
     parser.add_argument(
         "--test-labels",
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="LABELS",
-        help="labelled boxes of each of these",
+        help="labelled boxes of each of them",
     )
     parser.add_argument(
         "--card", type=Path, metavar="CARD.toml", help="the detector's card (default: the run's)"

@@ -1,8 +1,8 @@
-"""Choose the match threshold for a wanted false-match rate, from labelled pictures.
+"""Choose the match threshold for a required false-match rate, from labelled pictures.
 
-Half of the query pictures choose it, the other half yields the rates. Pairs come from a CSV file
-query,known,same (pictures relative to its folder; same is 1 or 0), or from a drive with known poses
-against a database that another drive made.
+It is chosen on half of the query pictures; the rates are measured on the other half. Pairs come
+from a CSV file query,known,same (pictures relative to its folder; same is 1 or 0), or from a drive
+with known poses and a database made from another drive.
 
 example:
   crosscue fit landmarks --pairs pairs.csv --false-match-rate 0.01

@@ -1,9 +1,8 @@
-"""Learn how far each cue is to be believed, from annotated drives, for fusion.kind = "calibrated".
+"""Learn the reliability of each cue from annotated drives, for fusion.kind = "calibrated".
 
 Give finished runs and the truth of each, in the same order. What is learned goes into the vehicle
 file's section [fusion.calibrated]; each line carries its counts. Frames of one approach resemble
-each other, so looks are counted by what they are worth as independent ones, and intervals with
-them.
+each other, so counts and intervals use the effective number of independent frames.
 
 example:
   crosscue fit messages runs/* --truth drives/*/truth.json -o calibrated.toml

@@ -1,7 +1,8 @@
 """Fit odometry to half of a drive and test it on the rest: scales, biases, delays, noise.
 
-The positions are the log's GNSS or, with --truth, a true track. What a drive cannot show keeps its
-value and is named: a straight drive shows neither the gyro's scale nor the steering ratio.
+The positions are the log's GNSS or, with --truth, a true track. Parameters that a drive does not
+determine keep their value and are named: a straight drive determines neither the gyro's scale nor
+the steering ratio.
 
 examples:
   crosscue fit odometry drive.mcap --vehicle car.toml -o car.toml

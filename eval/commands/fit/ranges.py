@@ -1,8 +1,8 @@
 """Fit a curve from an object's height in pixels to its range, with the residual by distance.
 
 Pairs come from a TABLE (CSV or Parquet with height_px and range_m, to the rear axle), from the
-annotated objects of drives (--truth), or from what a run's detectors found (--runs beside --truth).
-All families are fitted; the one with the smallest residual is offered as a section for the vehicle
+annotated objects of drives (--truth), or from a run's detections (--runs beside --truth).
+All families are fitted; the one with the smallest residual is printed as a section for the vehicle
 file. --test measures that curve on other drives.
 
 examples:

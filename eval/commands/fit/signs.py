@@ -1,9 +1,9 @@
-"""Choose the sign detector's threshold for a wanted precision, and measure it elsewhere.
+"""Choose the sign detector's threshold for a required precision, and measure it on other images.
 
 LABELS is a CSV file: picture,label,x0,y0,x1,y1 with one row for each sign (or an empty label for a
 picture without any), a COCO file as crosscue train frames writes it, or the folder of a drive with
-annotated objects. Every second picture chooses the threshold, the others measure it, unless --test
-names other files or drives. --threshold measures a threshold instead of choosing one.
+annotated objects. The threshold is chosen on every second picture and measured on the others,
+unless --test names other files or drives. --threshold measures a threshold instead of choosing one.
 
 examples:
   crosscue fit signs labels.csv --label "do not enter" --kinds "no entry" --precision 0.95

@@ -1,8 +1,8 @@
 """Learn the belief over time from annotated drives, for fusion.kind = "temporal".
 
-Give finished runs and the truth of each, in the same order, drives without an intersection among
-them. What is learned (how each cue behaves from step to step, by distance, where a road is and
-where it is not) goes into the vehicle file's section [fusion.temporal].
+Give finished runs and the truth of each, in the same order, including drives without an
+intersection. The result (how each cue behaves from step to step, by distance, with and without a
+road) goes into the vehicle file's section [fusion.temporal].
 
 example:
   crosscue fit temporal runs/* --truth drives/*/truth.json -o temporal.toml

@@ -1,4 +1,4 @@
-"""Any supported log or data set to MCAP with standard ROS 2 types, message for message.
+"""Convert any supported log or data set to MCAP with standard ROS 2 types, message for message.
 
 examples:
   crosscue convert drive.bag -o drive.mcap
@@ -10,9 +10,9 @@ ROS 2 messages are copied byte for byte and ROS 1 messages transcribed. CAN fram
 can_msgs/msg/Frame (CAN FD: crosscue_msgs/msg/CanFdFrame on TOPIC/fd), pictures
 sensor_msgs/msg/CompressedImage, Image or foxglove_msgs/msg/CompressedVideo, tables the standard
 type that holds all their columns, or else crosscue_msgs/msg/TOPIC with one field a column.
-The written file is read back and its messages counted before the command says that it is done.
-What can be read of a damaged log is written, and the exit status is 3; --salvage prints every
-damaged place, with its bytes where the format has them.
+The written file is read back and its messages are counted before the command reports success.
+The readable part of a damaged log is written, and the exit status is 3; --salvage prints every
+damaged place, with its byte range where the format has one.
 """
 
 from __future__ import annotations

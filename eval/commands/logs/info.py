@@ -1,4 +1,4 @@
-"""What a log holds: topics, counts, rates, gaps, clocks, and what is wrong with it.
+"""Show what a log contains: topics, counts, rates, gaps, clocks, and damage.
 
 examples:
   crosscue info drive.mcap
@@ -6,7 +6,7 @@ examples:
   crosscue info --quick drive.bag      only what the file declares, and whether its end is missing
   crosscue info https://host/drive.mcap --from 60 --to 62
 
-Offset and drift say how the header stamp (else the publish time) runs against the log time.
+Offset and drift compare the header stamp (or else the publish time) with the log time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Keep a hash of each MiB of a log beside it, so that later damage is seen and located.
+"""Write a hash of each MiB of a log beside it, so that later damage is detected and located.
 
 examples:
   crosscue seal drive.bag can0.log        writes drive.bag.seal and can0.log.seal
@@ -6,9 +6,9 @@ examples:
   crosscue seal segment/                  a folder: segment.seal, over all of its files
 
 ROS 1 bags, .db3, candump, ASC and TRC logs, videos and .npy data sets carry no checksum: a flipped
-payload byte cannot be seen. Seal a log once it is known to be right. Every later command that reads
-it checks what it reads and reports the damaged byte ranges. An existing seal that the log differs
-from is not replaced without --overwrite: check first. URLs cannot be sealed.
+payload byte goes unnoticed. Seal a log once it is known to be good. Every later command that reads
+it checks what it reads and reports damaged byte ranges. A seal that no longer matches its log is
+not replaced without --overwrite: check first. URLs cannot be sealed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Check that a model card fits its network, by running it; draw what it finds in a picture.
+"""Check that a model card fits its network by running it, and draw its detections in a picture.
 
 example:
   crosscue model check my.toml --picture street.jpg
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         type=Path,
         metavar="FILE.jpg",
-        help="the picture with what was found (default: CARD.PICTURE.found.jpg)",
+        help="the picture with detections (default: CARD.PICTURE.found.jpg)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

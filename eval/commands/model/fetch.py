@@ -1,6 +1,6 @@
 """Fetch the weights of models of the catalog, checked by their SHA-256 before they are used.
 
-What is already at hand below $CROSSCUE_DATA/weights is taken from there. A transfer that was cut
+Files that exist below $CROSSCUE_DATA/weights are copied from there. An interrupted transfer
 continues where it stopped. $CROSSCUE_MODEL_MIRROR names a server to ask instead of the publisher,
 $CROSSCUE_MODELS the folder to keep them in.
 

@@ -1,7 +1,7 @@
-"""Write a model card for an ONNX or OpenVINO file, or for weights of a network of torchvision's.
+"""Write a model card for an ONNX or OpenVINO file, or for weights of a torchvision network.
 
 The layout of the outputs, or the network, is recognised from names, shapes and metadata. What the
-file does not say is listed in the card as an assumption to check; where several fit, they are
+file leaves open is listed in the card as an assumption to check; where several fit, all are
 listed. Weights are a state_dict (.pth, .pt) or safetensors: tensors, without code.
 
 example:
@@ -42,16 +42,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--class-names",
         type=Path,
         metavar="FILE",
-        help="class names, one a line, where it has none",
+        help="class names, one per line, for a file without them",
     )
     parser.add_argument(
-        "--size", metavar="WxH", help="run at this size, such as 1280x736, where it allows any"
+        "--size", metavar="WxH", help="input size, such as 1280x736, for a network that accepts any"
     )
     parser.add_argument(
         "--picture",
         type=Path,
         metavar="FILE",
-        help="draw what it finds in this picture, beside the card",
+        help="draw its detections in a copy of this picture, beside the card",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -1,4 +1,4 @@
-"""Show a model: what it is, what its classes mean to the cues, what was measured.
+"""Show a model: its origin, what its classes mean to the cues, and its measurements.
 
 example:
   crosscue model show yolox-nano

@@ -1,7 +1,7 @@
-"""Detect: run detectors over a drive's camera; detections, road shares and cues into a run folder.
+"""Run detectors over a drive's camera: detections, road fractions and cues in a run folder.
 
 A detector is a name, one of the vehicle file's [detectors.NAME], a module:factory, or a model card
-(.toml). What was found in a picture is kept by content, so a second run is quick.
+(.toml). Results are cached by the content of each picture, so a second run is quick.
 
 example:
   crosscue detect drive.mcap --vehicle car.toml --detectors yolox.toml,signs -o runs/drive

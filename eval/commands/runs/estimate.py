@@ -1,4 +1,4 @@
-"""Estimate again from what detectors found before: pose, cues, ranges and beliefs of a run.
+"""Estimate pose, cues, ranges and beliefs of a run again, from its stored detections.
 
 No picture is opened, so other settings can be tried in seconds. The run's tables are replaced.
 

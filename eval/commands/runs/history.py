@@ -1,9 +1,9 @@
 """Show each metric of scored runs over commits, versions or tags, and where it changed.
 
 The page needs no network and runs no script: for each metric its value with a 95 % interval under
-each version, and change points marked. A change point is a version from which on the metric differs
-by more than chance, judged drive by drive; a history without any change shows one in at most 5 % of
-cases, over all metrics together. Fewer than six drives decide nothing.
+each version, and change points marked. A change point is a version from which the metric differs by
+more than chance, judged drive by drive; a history without any change shows one in at most 5 % of
+cases, over all metrics together. With fewer than six drives, nothing is decided.
 
 Versions come in the order in which their first run was made. Of several runs of a drive under one
 version the latest counts.

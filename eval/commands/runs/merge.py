@@ -1,8 +1,8 @@
 """Merge the runs of batches into one folder of tables, each row with its drive's name.
 
 The result is a set union: the order does not matter, and a run that is in two batches counts once.
-Two different runs of one name are refused. It is the same, byte for byte, as that of one batch over
-all the drives.
+Two different runs of the same name are refused. One batch over all the drives yields the same
+bytes.
 
 example:
   crosscue merge shards/1 shards/2 -o all

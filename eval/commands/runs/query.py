@@ -1,8 +1,8 @@
-"""Ask all runs below a folder with SQL.
+"""Query all runs below a folder with SQL.
 
 The tables are runs, approaches, cues, scores, belief, range, pose, dropped and every other table
 that runs hold; --schema lists their columns. The SQL is DuckDB's, one SELECT. It is read-only:
-nothing is written and no other file is read, whatever the query says. Runs that cannot be read
+no query can write anything or read any other file. Runs that cannot be read
 are named on stderr, and the exit status is 3.
 
 examples:

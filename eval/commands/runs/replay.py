@@ -1,13 +1,13 @@
 """Replay a drive: run detectors over its camera, estimate pose, cues, ranges and beliefs.
 
-The run folder then holds every table, and a manifest that accounts for every message. What was
-found in a picture is kept by content, so a second run is quick; --resume keeps what an interrupted
+The run folder then holds every table, and a manifest that accounts for every message. Results are
+cached by the content of each picture, so a second run is quick; --resume keeps what an interrupted
 run had finished.
 
 Many drives (a folder of drives, a quoted pattern, @list.txt, or --each) get a run folder each below
 the one given, side by side with --workers or on a Ray cluster with --ray. One that fails does not
-stop the rest, and a second start does only what is missing. --shard divides them over the tasks of
-a scheduler; crosscue status shows how far all have come, and crosscue merge joins what they made.
+stop the rest, and a second start processes only the missing ones. --shard divides them over the
+tasks of a scheduler; crosscue status shows their progress, and crosscue merge joins their results.
 
 examples:
   crosscue replay drive.mcap --vehicle car.toml -o runs/drive

@@ -1,7 +1,7 @@
 """Score runs against truth: metrics, figures, report, gates.
 
 Every run gets metrics.json and figures in RUN/score. Several runs (folders, a folder of runs, a
-quoted pattern, @list.txt) are scored together as well; the pooled result goes to the folder given
+quoted pattern, @list.txt) are also scored together; the pooled result goes to the folder given
 by -o. A run that cannot be scored does not stop the rest. Without --truth, each run's truth is the
 truth.json beside its log.
 

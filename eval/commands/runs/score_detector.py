@@ -6,7 +6,7 @@ file, or a name that is a time in nanoseconds), else by the number that the name
 frame being 0. Frames without labels are not judged.
 
 Prints AP50, AP (COCO), precision and recall above the detector's threshold, by class, size and
-range, and how far scores are probabilities; the page in RUN/score shows the worst images.
+range, and the calibration of scores; the page in RUN/score shows the worst images.
 
 examples:
   crosscue score detector runs/A-01 --labels labels.json

@@ -1,8 +1,8 @@
-"""Show how far batches of drives have come: done, running, failed, stale or waiting.
+"""Show the progress of batches of drives: done, running, failed, stale or waiting.
 
 A drive is stale when its worker is gone: its process has ended, or on another machine has been
 silent for two minutes. Start the same replay again, or replay --retry-failed for failures alone.
-Nothing is written, so it may be asked from any machine that sees the folders. Exit status 3 when a
+Nothing is written, so it can run on any machine that sees the folders. Exit status 3 when a
 drive has failed or is stale.
 
 examples:

@@ -1,7 +1,7 @@
 """Set tags of runs, remove them, or list them.
 
-A tag is a key and a value, such as weather=rain. It is in tags.json of the run, is a column of
-crosscue query, and stays when the run is made again. Without KEY=VALUE and --remove, tags are
+A tag is a key and a value, such as weather=rain. It is kept in the run's tags.json, is a column in
+crosscue query, and stays when the run is repeated. Without KEY=VALUE and --remove, tags are
 listed.
 
 examples:

@@ -1,9 +1,9 @@
-"""A run in Rerun: open its viewer, or write the recording.
+"""Show a run in Rerun, or write the recording.
 
 --at records 6 s around a moment: the viewer plays from 2 s before it, and the moment is marked on
-the time line. (A recording cannot say where Rerun's cursor begins, so it begins there.) --approach
+the time line. (A recording cannot set Rerun's cursor, so it starts at the beginning.) --approach
 records one approach, --only some of the views: cameras, ahead, belief, ranges, cues, map, pose,
-notes. What is left out of a view is not in the recording.
+notes. The recording contains only what is shown.
 
 examples:
   crosscue view runs/drive                    open Rerun's viewer

@@ -22,14 +22,14 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=(),
         metavar="FILE",
-        help="class names, one a line: of YOLO in its order, of VOC and KITTI all there could be",
+        help="class names, one per line: for YOLO in order, for VOC and KITTI all possible",
     )
     parser.add_argument(
         "--map",
         nargs="+",
         default=[],
         metavar="LABEL=NAME",
-        help="class that a label counts as, of the file or the detector; LABEL= for none",
+        help="class that a label of the file or detector counts as; LABEL= for none",
     )
     parser.add_argument(
         "--detector", metavar="NAME", help="name of the detector, where several ran"
@@ -39,7 +39,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.5,
         metavar="IOU",
-        help="min IoU with a label of a right detection (default: 0.5)",
+        help="min IoU of a correct detection with a label (default: 0.5)",
     )
 
 

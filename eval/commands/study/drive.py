@@ -1,7 +1,6 @@
-"""One simulated drive to look at: picture, log that crosscue replay reads, run, Rerun recording.
+"""Simulate one drive to examine: picture, log for crosscue replay, run, Rerun recording.
 
-The seed of any drive of a study is in its drives.parquet; with the same settings it is the same
-drive.
+The seed of each drive of a study is in its drives.parquet; the same settings reproduce the drive.
 
 examples:
   crosscue study drive --seed 7 -o drive

@@ -1,9 +1,9 @@
-"""The field protocol, simulated: successive goals in a 1 km2 town, through logs and the replay.
+"""Simulate the field protocol: successive goals in a 1 km2 town, through logs and the replay.
 
 33 range runs without landmarks and 10 with at most one landmark at a time, 75 minutes each, compass
-at 25 degrees. Every run is a log, a vehicle file and a truth file, replayed and scored by the code
-that takes real ones; each can be examined with crosscue view. An interrupted study continues with
-the runs that are missing. A run takes seconds to a minute.
+at 25 degrees. Every run is a log, a vehicle file and a truth file, replayed and scored by the same
+code as a real drive; view one with crosscue view. An interrupted study continues with the missing
+runs. A run takes seconds to a minute.
 
 examples:
   crosscue study field -o field

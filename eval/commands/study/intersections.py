@@ -1,7 +1,7 @@
-"""The published experiment on simulated drives: distances, cues and beliefs beside the text's.
+"""Repeat the published experiment on simulated drives; distances, cues and beliefs beside its own.
 
 Simulates every drive, replays it from its pixels with the embedded detectors, scores it, and
-writes study.html, study.json and score/metrics.json. A second start does only what is missing.
+writes study.html, study.json and score/metrics.json. A second start does only the missing drives.
 
 example:
   crosscue study intersections -o study --runs 10 --workers 2

@@ -1,7 +1,8 @@
-"""Who reaches the goal? 3 strategies by 5 landmark densities by 5 detection rates by 700 drives.
+"""Measure the success rate of 3 strategies with landmarks: 52,500 simulated drives.
 
-Success against the distance to the goal, range at 80 % success, and how much farther the
-strategies drive, beside the published numbers. An interrupted study continues where it stopped; the
+There are 5 landmark densities by 5 detection rates by 700 drives. Results are success against the
+distance to the goal, range at 80 % success, and how much farther the strategies drive, beside the
+published numbers. An interrupted study continues where it stopped; the
 result is the same on any number of workers.
 
 examples:

@@ -1,9 +1,9 @@
-"""Random layouts, simulated: beliefs fitted on some layouts and tested on the others.
+"""Test beliefs on random simulated layouts: fitted on some, tested on the others.
 
-Thirteen kinds of layouts, five of them without an intersection. Every drive is rendered and seen by
-the embedded networks, and each belief is judged on layouts that it was not fitted on. With
---perception faults no network sees a picture: masks are the renderer's, with faults made up.
-Writes study.html and study.json. Drives are kept: a second start does only what is missing.
+There are thirteen kinds of layouts, five of them without an intersection. Every drive is rendered
+and processed by the embedded networks, and each belief is scored on layouts that it was not fitted
+to. With --perception faults, no network runs: masks are the renderer's, with simulated faults.
+Writes study.html and study.json. Drives are kept: a second start does only the missing ones.
 
 example:
   crosscue study layouts -o layouts --workers 2

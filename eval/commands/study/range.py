@@ -1,4 +1,4 @@
-"""How far without landmarks? 4,000 simulated drives with three compasses and with none.
+"""Measure the range without landmarks: 4,000 simulated drives with three compasses and without one.
 
 Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m. Results appear
 beside the published ones. An interrupted study continues where it stopped; the result is the same

@@ -1,7 +1,7 @@
-"""Pictures of simulated intersections with COCO annotations, to train networks on.
+"""Render pictures of simulated intersections with COCO annotations, to train networks on.
 
-Takes a few pictures of each of many runs: OUT/coco.json and OUT/images. Layouts are L and a number;
-A to H are those that crosscue is scored on, so nothing may learn from them.
+Writes a few pictures of each of many runs to OUT/coco.json and OUT/images. Layouts are L and a
+number; A to H are those that crosscue is scored on, so no network may train on them.
 
 examples:
   crosscue train frames L0-L299 --per-layout 8 -o frames

@@ -1,8 +1,8 @@
-r"""Train a Mask R-CNN on COCO annotations: a compact one from nothing, or an existing one.
+r"""Train a Mask R-CNN on COCO annotations: a compact one from scratch, or an existing one.
 
 OUT is a checkpoint (.safetensors) for the detector mask-rcnn. Beside it lie OUT's curve (JSON and
 PNG) and, until the training ends, the state that --resume continues from. --measure trains nothing:
-it reports average precision (COCO's rules), and precision and recall at the scores that cues take.
+it reports average precision (COCO's rules), and precision and recall at the thresholds of the cues.
 
 examples:
   crosscue train frames L0-L319 --per-layout 8 -o frames

@@ -3,7 +3,7 @@ r"""Train the road network on simulated intersections or on your own images with
 Simulated: renders --per-layout images of each layout of --layouts (L and a number) and validates on
 other layouts, --val-layouts. Layouts A to H are for --test-layouts only. Your own: a folder --data
 with images/NAME.jpg and masks/NAME.png, white where road is; every tenth image is held out.
---measure reports how well a network does on --test-layouts or --data, without training.
+--measure measures a network on --test-layouts or --data, without training.
 
 examples:
   crosscue train road --layouts L400-L519 --val-layouts L600-L611 \

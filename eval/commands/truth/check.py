@@ -1,7 +1,7 @@
 """Check that a truth file, and every file that it names, fits its log.
 
-Refused with one line: times outside the log, cues and classes that are not known, overlapping
-approaches, boxes outside the picture, pictures of another size, another log's hash.
+Refused with one line: times outside the log, unknown cues and classes, overlapping approaches,
+ boxes outside the picture, pictures of another size, another log's hash.
 
 example:
   crosscue truth check truth.json --log drive.mcap

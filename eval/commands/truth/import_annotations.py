@@ -1,14 +1,14 @@
-"""Turn annotated pictures of a log into its truth.
+"""Import annotated pictures of a log as its truth.
 
 Takes COCO, FiftyOne and Label Studio (.json), CVAT for images or video, XML 1.1 (.xml), and folders
 of YOLO and FiftyOne. Pictures find their frames by t_ns, by file name, or by the frame's number;
 those of an export (--export) by the export, which may be of many drives: each gets its truth file
 below DIR, and DIR/coco.json has all of them, to train with.
 
-A label that is a cue's name ("stop sign", "parked_left") says that the cue is there, and pictures
-annotated without it that it is not; --map says what other labels mean. Approaches are not part of
-such files: write them into the truth file by hand (see crosscue truth schema), and --add leaves
-them as they are. Cues of your own are those that the vehicle file has under [cues.own].
+A label that is a cue's name ("stop sign", "parked_left") means that the cue is present, and a
+picture annotated without it that it is absent; --map assigns other labels to cues. Approaches are
+not part of such files: write them into the truth file by hand (see crosscue truth schema), and
+--add keeps them. Your own cues are those that the vehicle file defines under [cues.own].
 
 examples:
   crosscue truth import coco.json --log drive.mcap -o truth.json

@@ -1,4 +1,4 @@
-"""Write the truth that a data set carries: truth.json and a TUM trajectory.
+"""Write the truth that a data set contains: truth.json and a TUM trajectory.
 
 example:
   crosscue truth comma2k19/Example_1/ROUTE/40 -o truth/

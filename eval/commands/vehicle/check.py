@@ -1,7 +1,7 @@
-"""Read seconds of a drive as a vehicle file says: what each signal shows, and what contradicts.
+"""Read part of a drive with a vehicle file; list each signal's values and any contradictions.
 
-The page shows a picture with the horizon, metres on the road and the regions in which road is
-looked for. Exit status 1 where signals contradict each other.
+The page shows a picture with the horizon, metres on the road and the regions searched for road.
+Exit status 1 where signals contradict each other.
 
 example:
   crosscue vehicle check drive.mcap --vehicle car.toml -o check.html
@@ -28,7 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--vehicle", type=Path, required=True, metavar="V.toml", help="the vehicle file to check"
     )
     parser.add_argument(
-        "--start-s", type=float, default=0.0, metavar="S", help="begin so long after the first row"
+        "--start-s",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="begin this many seconds after the first row",
     )
     parser.add_argument(
         "--seconds",

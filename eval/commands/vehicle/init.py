@@ -1,4 +1,4 @@
-"""Write a first vehicle file from what a log holds.
+"""Write a first vehicle file from the contents of a log.
 
 example:
   crosscue vehicle init drive.mcap --dbc car.dbc -o car.toml
@@ -19,12 +19,12 @@ from crosscue.eval.commands.shared.terminal import (
 )
 
 MOUNTING: Final = {
-    "x-m": "how far the camera sits ahead of the rear axle",
-    "y-m": "how far it sits left of the car's middle",
-    "height-m": "how far it sits above the road",
-    "pitch-deg": "how far its axis points below the horizon (default: estimated from pictures of a "
-    "straight way)",
-    "yaw-deg": "how far its axis points to the left (default: likewise)",
+    "x-m": "distance of the camera ahead of the rear axle",
+    "y-m": "distance to the left of the car's centre line",
+    "height-m": "height above the road",
+    "pitch-deg": "angle of its axis below the horizon (default: estimated from pictures of a "
+    "straight road)",
+    "yaw-deg": "angle of its axis to the left (default: likewise)",
 }
 
 
