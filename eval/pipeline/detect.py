@@ -277,6 +277,8 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
 
 def _without_cues(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
     """Detectors of objects of which none is counted by a cue."""
+    if vehicle.counts_any_label:
+        return []
     counted = {label for labels in vehicle.cue_labels().values() for label in labels}
     labels = {one.name: reportable(one.detector) for one in named}
     return [

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from functools import lru_cache
+from textwrap import shorten
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
@@ -26,6 +27,8 @@ from .candidates import CandidateRow
 from .record import Record
 
 FORMAT_VERSION: Final = 5
+LINE: Final = 100
+"""Characters of a field that are printed."""
 OWN_FRAME: Final = "no start heading and no compass: the map's x axis points where the car did"
 """The notice of a run whose poses are in a frame of its own, turned against any other."""
 
@@ -219,6 +222,16 @@ class _Versioned(Record):
     format_version: Literal[5] = FORMAT_VERSION
     versions: dict[str, str]
     """Of crosscue, Python and the libraries that results depend on."""
+
+    def __repr__(self) -> str:
+        """One line per field, for a notebook; long values are cut."""
+        fields = {name: repr(getattr(self, name)) for name in type(self).model_fields}
+        width = max(map(len, fields))
+        lines = [
+            f"{name:{width}}  {shorten(text, LINE, placeholder=' ...')}"
+            for name, text in fields.items()
+        ]
+        return "\n".join([type(self).__name__, *lines])
 
 
 class _Drive(_Versioned):

@@ -396,6 +396,13 @@ class Vehicle(Section):
         own = {name: one.labels for name, one in self.cues.own.items()}
         return {name: self.labels_of(cue) for name, cue in CUES.items()} | own
 
+    @property
+    def counts_any_label(self) -> bool:
+        """Whether a cue of objects names no label, as a plug-in's may: its rule reads any."""
+        return any(
+            cue.observed_by == "objects" and not self.labels_of(cue) for cue in CUES.values()
+        )
+
 
 def _is_simulated(info: ValidationInfo) -> bool:
     """Is it the file of a simulated car, whose defaults are as published?"""

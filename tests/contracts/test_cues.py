@@ -104,6 +104,13 @@ def a_fraction(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> f
     return 0.5
 
 
+def test_a_cue_that_names_no_label_may_count_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So no detector can be said to be useless to it."""
+    assert not Vehicle(version=1).counts_any_label
+    monkeypatch.setitem(CUES, DUMMY.name, replace(DUMMY, label=None))
+    assert Vehicle(version=1).counts_any_label
+
+
 def test_cues_of_a_group_share_its_row_of_table_5() -> None:
     for group in groups().values():
         assert len({(cue.title, cue.precision, cue.scored_as) for cue in group}) == 1

@@ -36,6 +36,14 @@ def test_a_run_is_tables(run: crosscue.Run) -> None:
         run["nonsense"]
 
 
+def test_its_manifest_is_printed_a_field_a_line(run: crosscue.Run) -> None:
+    head, *lines = repr(run.manifest).splitlines()
+
+    assert head == "EstimateManifest"
+    assert [line.split()[0] for line in lines] == [*type(run.manifest).model_fields]
+    assert max(map(len, lines)) < 130
+
+
 def test_it_is_what_the_command_writes(
     drive: DriveFiles, run: crosscue.Run, tmp_path: Path
 ) -> None:
