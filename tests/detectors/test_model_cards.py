@@ -15,6 +15,7 @@ from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.picture_input import prepared
 from crosscue.replay.base import VehicleError
+from crosscue.testing import check_detector
 from support.data import shared
 from support.detecting import yolox_card
 from support.onnx_models import bright_box_model, constant_model
@@ -140,6 +141,17 @@ def test_a_mask_is_as_large_as_the_camera_s_picture(tmp_path: Path) -> None:
     want[80:240, 160:320] = True
     np.testing.assert_array_equal(mask[:, :300], want[:, :300])
     assert mask[:, 340:].sum() == 0
+
+
+def test_a_box_ends_at_the_picture_and_one_outside_is_left_out(tmp_path: Path) -> None:
+    boxes = [[-8.0, -4.0, 20.0, 16.0, 0.9, 0.0], [70.0, 8.0, 90.0, 20.0, 0.8, 1.0]]
+    model = constant_model((1, 3, 32, 64), {"out": np.array([boxes], np.float32)})
+    path = card(tmp_path, model, BRIGHT)
+
+    (found,) = only(build(card=str(path)), frame(640, 320, (0, 0, 1, 1)))
+
+    np.testing.assert_allclose(found.boxes_px, [[0, 0, 200, 160]])
+    check_detector(lambda: build(card=str(path)))
 
 
 @pytest.mark.parametrize(
