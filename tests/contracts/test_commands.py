@@ -2,6 +2,8 @@
 
 import argparse
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -131,6 +133,22 @@ def test_help_has_an_example_of_the_command_itself(
     assert cli.run([*name.split(), "--help"]) == 0
     said = capsys.readouterr().out
     assert f"\n  crosscue {name}" in said.partition("example")[2]
+
+
+@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
+def test_every_example_is_one_that_the_command_understands(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cli.run([*name.split(), "--help"])
+    examples = capsys.readouterr().out.replace("\\\n", " ").partition("example")[2]
+
+    for line in re.findall(r"^  crosscue (.+?)(?: >.*|  +[a-z].*| \|.*)?$", examples, re.MULTILINE):
+        words = shlex.split(line)
+        command = max(
+            (one for one in cli.COMMANDS if words[: len(one.split())] == one.split()), key=len
+        )
+        _, parser = cli.parser_of(command)
+        parser.parse_args(words[len(command.split()) :])
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))

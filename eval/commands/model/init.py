@@ -7,7 +7,7 @@ listed. Weights are a state_dict (.pth, .pt) or safetensors: tensors, without co
 example:
   crosscue model init my.onnx --picture street.jpg
   crosscue model init weights.pth --class-names names.txt
-  crosscue replay drive.mcap --vehicle car.toml --detectors my.toml
+  crosscue replay drive.mcap --vehicle car.toml --detectors my.toml -o run
 """
 
 from __future__ import annotations
