@@ -10,7 +10,13 @@ from typing import Final
 
 from crosscue.eval.batch.merge import is_merged
 from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder
-from crosscue.replay.base import RunError, UnreadableRunError, UsageError, read_at_most
+from crosscue.replay.base import (
+    RunError,
+    UnreadableRunError,
+    UsageError,
+    is_remote,
+    read_at_most,
+)
 
 from .query.local import LocalRuns, is_cut_short
 
@@ -26,7 +32,8 @@ def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
 
     Raises:
         RunError: A folder that neither is nor holds a run.
-        UsageError: A pattern without a match, a list that cannot be read, or a run named twice.
+        UsageError: A pattern without a match, a list that cannot be read, a run named twice, or a
+            URL.
     """
     found = tuple(path for text in arguments for path in _expanded(text))
     for path, count in Counter(path.resolve() for path in found).items():
@@ -36,6 +43,11 @@ def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
 
 
 def _expanded(text: str) -> Iterator[Path]:
+    if is_remote(text):
+        raise UsageError(
+            f"{text}: runs on a store; copy those that are needed to this machine (query, compare "
+            "and history read them there)"
+        )
     if text.startswith("@"):
         for line in _lines(Path(text[1:])):
             yield from _expanded(line)

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
 from crosscue.replay.base import RunError, UnreadableRunError, UsageError
 
 from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, parts_of
 from .paired import compare_drives
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Scored: TypeAlias = tuple[list[DriveMetric] | None, bool]
+"""What each drive of a run adds to the metrics, None if not scored; and whether it is whole."""
+
+
+class Asked(Protocol):
+    """A catalog of runs."""
+
+    def query(self, sql: str) -> pa.Table:
+        """The rows that a query selects."""
+        ...
 
 
 class _Side(NamedTuple):
@@ -26,21 +40,46 @@ class _Side(NamedTuple):
         return {one.log for one in self.parts}
 
 
+def read_scored(path: Path | str) -> Scored:
+    """The score of a run folder.
+
+    Raises:
+        RunError: It is not one, or is damaged.
+    """
+    run = open_scored(Path(path))
+    return parts_of(run), is_whole_run(run)
+
+
+def scores_of(catalog: Asked) -> Callable[[Path | str], Scored]:
+    """The score of a run by its name in a catalog, which may be of a store."""
+    outcomes = catalog.query("select run, outcome from runs").to_pydict()
+    is_whole = {run: outcome == "whole" for run, outcome in zip(*outcomes.values(), strict=True)}
+    found: dict[str, list[DriveMetric]] = {}
+    table = catalog.query("select run, log, metric, kind, total, rows from scores order by all")
+    for row in table.to_pylist():
+        found.setdefault(row.pop("run"), []).append(DriveMetric(**row))
+    return lambda run: (found.get(str(run)), is_whole[str(run)])
+
+
 def compare_many(
-    first: Sequence[Path], second: Sequence[Path], tolerances: Sequence[Tolerance] = ()
+    first: Sequence[Path | str],
+    second: Sequence[Path | str],
+    tolerances: Sequence[Tolerance] = (),
+    read: Callable[[Path | str], Scored] = read_scored,
 ) -> Comparison:
     """Compare the scores of two sets of runs, drive by drive.
 
     Args:
-        first: Runs that were good.
+        first: Runs that were good: their folders, or what ``read`` takes.
         second: Runs to judge.
         tolerances: The last one whose pattern fits a metric counts; without any, none.
+        read: How to get the score of one.
 
     Raises:
         UsageError: A drive has two runs on one side.
         UnreadableRunError: No run of a side is scored.
     """
-    before, after = _side(first, "--against"), _side(second, "--runs")
+    before, after = _side(first, "--against", read), _side(second, "--runs", read)
     judged = compare_drives(
         before.parts, after.parts, lambda path, value: allowed_by(path, value, tolerances)
     )
@@ -60,16 +99,15 @@ def compare_many(
     )
 
 
-def _side(paths: Sequence[Path], option: str) -> _Side:
+def _side(paths: Sequence[Path | str], option: str, read: Callable[[Path | str], Scored]) -> _Side:
     parts: list[DriveMetric] = []
     left_out: dict[str, str] = {}
-    run_of: dict[str, Path] = {}
+    run_of: dict[str, Path | str] = {}
     is_whole = True
     for path in dict.fromkeys(paths):
         try:
-            run = open_scored(path)
-            found = parts_of(run)
-            is_whole = is_whole_run(run) and is_whole
+            found, is_run_whole = read(path)
+            is_whole = is_run_whole and is_whole
         except RunError as error:
             left_out[str(path)] = str(error)
             continue

@@ -94,15 +94,17 @@ def direction(path: str) -> Direction | None:
 def no_longer_scored(
     before: Sequence[DriveMetric], after: Sequence[DriveMetric]
 ) -> tuple[str, ...]:
-    """Paths that only the first run has, or of which no row of the drives of both is scored now."""
+    """Paths that drives of both have only in the first run, or of which no row is scored now."""
     known = {one.metric for one in after}
     logs = {one.log for one in before} & {one.log for one in after}
     scored = {one.metric for one in after if one.log in logs and one.total > 0.0}
 
     def is_lost(one: DriveMetric) -> bool:
+        if one.log not in logs:
+            return False
         if one.metric not in known:
             return one.rows > 0
-        was_scored = one.metric.endswith(f".{SCORED}") and one.log in logs and one.total > 0.0
+        was_scored = one.metric.endswith(f".{SCORED}") and one.total > 0.0
         return was_scored and one.metric not in scored
 
     return tuple(dict.fromkeys(one.metric for one in before if is_lost(one)))

@@ -90,12 +90,22 @@ class Catalog:
         """Folders of the runs that a query selects.
 
         Args:
+            query: As for ``named``.
+
+        Raises:
+            UsageError: As ``named``; the runs are on a store, where they have no folder.
+        """
+        return tuple(self._places.path(run) for run in self.named(query))
+
+    def named(self, query: str) -> tuple[str, ...]:
+        """Names of the runs that a query selects, as the column ``run`` has them; of a store, too.
+
+        Args:
             query: A condition on the table ``runs``, such as ``vehicle = 'car'``; or a whole SELECT
                 whose column ``run`` names them, in whose order they come, each once.
 
         Raises:
-            UsageError: As ``query``; the result has no column ``run``; the runs are on a store,
-                where they have no folder: ``query`` reads their tables there.
+            UsageError: As ``query``, or the result has no column ``run``.
         """
         sql = query
         if not database.is_statement(query):
@@ -114,7 +124,7 @@ class Catalog:
                 f"query: column run holds {strange[0]!r}, which is no run of {self._places.name}; "
                 "select the column run of a table"
             )
-        return tuple(self._places.path(run) for run in named)
+        return tuple(named)
 
     def schema(self) -> pa.Table:
         """Every table and column: table, column, type and meaning."""
@@ -195,13 +205,3 @@ def catalog(place: Path | str) -> Catalog:
             raise UnreadableRunError(f"{folder}: not a folder; give a folder of runs")
         places = LocalRuns(folder)
     return Catalog(places, open_index(places))
-
-
-def select_runs(place: Path | str, query: str) -> tuple[Path, ...]:
-    """Folders of the runs that a query selects; see ``Catalog.select``.
-
-    Args:
-        place: As for ``catalog``.
-        query: As for ``Catalog.select``.
-    """
-    return catalog(place).select(query)

@@ -120,6 +120,7 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
     },
     "scores": {
         **_RUN,
+        "log": Column("VARCHAR", "identity of the drive's logs: pairs runs of a drive"),
         "metric": Column("VARCHAR", "its path, such as cues.stop_sign.precision"),
         "kind": Column("VARCHAR", "mean, rms or sum: how drives are pooled"),
         "total": Column("DOUBLE", "sum over the drive's rows, of squares for rms"),
@@ -185,7 +186,7 @@ FILES: Final[Mapping[str, str]] = {
 }
 """Where a table is in a run, if not under its own name."""
 VIEWS: Final[Mapping[str, str]] = {
-    "scores": "select run, metric, kind, total, rows, case kind when 'sum' then total "
+    "scores": "select run, log, metric, kind, total, rows, case kind when 'sum' then total "
     "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
     "from {table}",
 }

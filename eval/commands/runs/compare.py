@@ -32,11 +32,9 @@ from crosscue.eval.commands.shared.terminal import print_result
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare flags."""
     parser.add_argument(
-        "first", type=Path, metavar="RUN_A", help="reference run; with --runs, a folder of runs"
+        "first", metavar="RUN_A", help="reference run; with --runs, a folder of runs, or its URL"
     )
-    parser.add_argument(
-        "second", nargs="?", type=Path, metavar="RUN_B", help="run to compare with it"
-    )
+    parser.add_argument("second", nargs="?", metavar="RUN_B", help="run to compare with it")
     parser.add_argument("--runs", metavar="QUERY", help="the runs to judge, of the folder RUN_A")
     parser.add_argument("--against", metavar="QUERY", help="the runs to compare them with")
     parser.add_argument(

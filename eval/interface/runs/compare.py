@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from crosscue.eval.catalog import compare, many_runs
-from crosscue.eval.catalog.query.catalog import select_runs
+from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.report.junit import cases_text
-from crosscue.replay.base import UsageError, write_text
+from crosscue.replay.base import UsageError, is_remote, write_text
 
 
 def compare_runs(
@@ -25,8 +25,15 @@ def compare_runs(
         second: The run to judge.
         tolerances: How much worse metrics may be: ``0.01``, ``2%`` or ``PATTERN=0.01``.
         junit: File for a test case of each judged metric, which fails where that is worse.
+
+    Raises:
+        UsageError: A tolerance that cannot be read, or a URL.
+        RunError: One is no finished run.
     """
     allowed = [compare.read_tolerance(text) for text in tolerances]
+    for one in (first, second):
+        if not isinstance(one, Run) and is_remote(one):
+            raise UsageError(f"{one}: a run on a store; give --runs and --against, or copy it")
     paths = [one.path if isinstance(one, Run) else Path(one) for one in (first, second)]
     before, after = (compare.open_scored(path) for path in paths)
     return _reported(compare.compare_runs(before, after, allowed), junit)
@@ -47,7 +54,7 @@ def compare_many(
     Args:
         runs: The runs to judge: their folders, or with ``folder`` a query that selects them.
         against: The runs to compare with, likewise.
-        folder: The folder of all runs, whose catalog the queries ask.
+        folder: The folder of all runs, or its URL, whose catalog the queries ask.
         tolerances: As of ``compare_runs``.
         junit: As of ``compare_runs``.
 
@@ -56,8 +63,17 @@ def compare_many(
         RunError: A side has no scored run.
     """
     allowed = [compare.read_tolerance(text) for text in tolerances]
-    after, before = (_selected(one, folder) for one in (runs, against))
-    return _reported(many_runs.compare_many(before, after, allowed), junit)
+    if folder is not None and is_remote(folder):
+        # Runs on a store have no folders: what is compared comes from their catalog.
+        found = catalog(folder)
+        if not (isinstance(runs, str) and isinstance(against, str)):
+            raise UsageError(f"{folder}: runs on a store; give two queries")
+        there = (found.named(against), found.named(runs))
+        judged = many_runs.compare_many(*there, allowed, many_runs.scores_of(found))
+    else:
+        here = (_selected(against, folder), _selected(runs, folder))
+        judged = many_runs.compare_many(*here, allowed)
+    return _reported(judged, junit)
 
 
 def _reported(found: compare.Comparison, junit: Path | str | None) -> compare.Comparison:
@@ -73,4 +89,4 @@ def _selected(
         return tuple(one.path if isinstance(one, Run) else Path(one) for one in runs)
     if folder is None:
         raise UsageError(f"{runs!r}: a query needs the folder of the runs; give folder")
-    return select_runs(folder, runs)
+    return catalog(folder).select(runs)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import fsspec
 import pyarrow.parquet as pq
 import pytest
 
@@ -61,6 +62,25 @@ def test_queries_select_what_is_compared(
     assert (root.get("tests"), root.get("failures")) == ("2", "2")
     turned = [QUERIES[0], QUERIES[3], QUERIES[2], QUERIES[1]]
     assert cli.run(["compare", str(fleet), *turned, "-q"]) == 0
+
+
+def test_runs_on_a_store_are_compared_as_in_a_folder(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    fsspec.filesystem("memory").put(f"{fleet}/", "/compared/", recursive=True)
+    asked = QUERIES[1], QUERIES[3]
+
+    there = crosscue.compare_many(*asked, "memory://compared")
+    here = crosscue.compare_many(*asked, fleet)
+
+    assert {one.path: one for one in there.judged} == {one.path: one for one in here.judged}
+    assert {*there.worse} == {RECALL, DUSK}
+    assert there.drives == here.drives == (8, 0, 0)
+    with pytest.raises(crosscue.UsageError, match="memory://compared: runs on a store; copy those"):
+        crosscue.failures("memory://compared")
+    with pytest.raises(crosscue.UsageError, match="give --runs and --against, or copy it"):
+        crosscue.compare_runs("memory://compared/before", "memory://compared/after")
 
 
 def test_a_table_for_a_pull_request(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,3 +93,16 @@ def test_what_is_not_scored_at_all_any_more_is_reported(scores: dict[str, Any]) 
     assert no_longer_scored(fleet(scores), fleet(off)) == ("cues.stop_sign.scored",)
     assert no_longer_scored(fleet(off), fleet(scores)) == ()
     assert no_longer_scored(fleet(scores), fleet(scores)) == ()
+
+
+def test_what_only_a_drive_of_one_side_has_is_not_lost() -> None:
+    """A fleet with one drive more has conditions that the other one never saw."""
+
+    def of(log: str, metric: str) -> DriveMetric:
+        return DriveMetric(log, metric, "mean", 1.0, 1)
+
+    dusk, recall = "cues.stop_sign.by_condition.dusk.recall", "cues.stop_sign.recall"
+    before = [of("monday", recall), of("tuesday", recall), of("tuesday", dusk)]
+
+    assert no_longer_scored(before, [of("monday", recall)]) == ()
+    assert no_longer_scored(before, [of("monday", recall), of("tuesday", recall)]) == (dusk,)
