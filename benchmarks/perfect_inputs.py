@@ -1,9 +1,12 @@
-"""How good the rules of cars, signs and lights can get: perfect masks in place of networks.
+"""How good the rules of cues can get: perfect masks in place of networks.
 
-Run it as ``python benchmarks/perfect_inputs.py DRIVES`` on what ``crosscue simulate`` wrote.
-Every object of ``objects.json`` of which enough is visible becomes a detection with its true mask
-and a score of 1. What is wrong then is wrong with the rule, and no network repairs it.
-Roads are not covered: their true masks are not stored with a drive.
+``python benchmarks/perfect_inputs.py DRIVES`` works on what ``crosscue simulate`` wrote. Every
+object of ``objects.json`` of which enough is visible becomes a detection with its true mask and a
+score of 1. What is wrong then is wrong with the rule, and no network repairs it.
+
+``python benchmarks/perfect_inputs.py --all A B C`` drives to these layouts (A to H without any),
+640 pixels wide, with pictures that are the renderer's masks of roads, cars, signs and lights, five
+a second, and scores every cue as ``crosscue score`` does.
 """
 
 from __future__ import annotations
@@ -12,11 +15,17 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+import crosscue
+from crosscue.datasets.scenes.drive import write_scene
+from crosscue.datasets.scenes.faulty_labels import DETECTORS, PERFECT_LABELS
+from crosscue.datasets.scenes.layout import SCORED
+from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.datasets.truth.truth import load
 from crosscue.detectors.cues.cars import (
     CarShapes,
@@ -25,7 +34,12 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
+from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.drives import judge
+from crosscue.eval.scoring.drives import score as as_score
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
+from crosscue.eval.scoring.runs import tables_of
+from crosscue.eval.scoring.truth import load as load_truth
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.perfect_boxes import frames, is_there
@@ -77,16 +91,34 @@ def _fraction(values: list[bool], clusters: list[int]) -> Proportion:
     return share(np.array(values, np.bool_), np.array(clusters, np.int64))
 
 
-def _text(one: Proportion) -> str:
-    if not one.of:
+def _text(one: Proportion | None) -> str:
+    if one is None or not one.of:
         return "none"
     ends = f"{one.clusters_low:.2f} to {one.clusters_high:.2f}"
     by_drive = TOO_FEW if np.isnan(one.clusters_low) else ends
     return f"{one.value:.2f} ({by_drive}; {one.of} frames, {one.clusters} drives)"
 
 
+def every_cue(layouts: list[str], folder: Path) -> None:
+    """Print precision and recall of every cue where masks are perfect."""
+    judged = []
+    for layout in layouts:
+        drive = folder / layout
+        scene = SceneSettings(layout=layout, camera=camera_of_width(640))
+        files = write_scene(drive, scene, imager=PERFECT_LABELS, is_calibrated=False)
+        crosscue.replay_drive(files.log, drive / "run", detectors=DETECTORS.split(","))
+        judged.append(judge(tables_of(open_run(drive / "run")), load_truth(files.truth, layout)))
+    print(f"{len(judged)} simulated drives, perfect masks: precision; recall")
+    for name, cue in as_score(judged).cues.items():
+        print(f"  {name:20} {_text(cue.precision)}; {_text(cue.recall)}")
+
+
 def main() -> None:
     """Print the ceiling of each rule, by how much of a thing must be visible."""
+    if sys.argv[1] == "--all":
+        with TemporaryDirectory() as folder:
+            every_cue(sys.argv[2:] or list(SCORED), Path(folder))
+        return
     drives = sorted(path.parent for path in Path(sys.argv[1]).glob("*/objects.json"))
     kinds = Counter(path.name[0] for path in drives)
     print(f"{len(drives)} simulated drives, layouts {' '.join(sorted(kinds))}; perfect masks")

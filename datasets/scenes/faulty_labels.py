@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -319,12 +319,14 @@ def _block(category: Category, x_px: float, y_px: float, height_px: float) -> La
     return LabelledObject(LABELS[category], 0.99, corner, np.ones((high, across), np.bool_))
 
 
-def label_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+def label_pictures(
+    world: World, settings: SceneSettings, faults: Faults = DEFAULTS
+) -> Iterator[tuple[int, Picture]]:
     """Times and label images from ``FROM_M`` before the intersection until the car is there.
 
     A car that stands sees next to nothing new, so fewer are taken then.
     """
-    labels, motion = FaultyLabels(world, settings), world.approach.motion
+    labels, motion = FaultyLabels(world, settings, faults), world.approach.motion
     due_ns = 0
     for t_ns in picture_times(world, settings).tolist():
         x_m, speed_mps = (
@@ -345,6 +347,30 @@ def png(picture: Picture, _: PictureSettings) -> bytes:
     return bytes(cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
+NO_FAULTS: Final = Faults(
+    sights=dict.fromkeys(LABELS, Sight(1.0, 1e-3)),
+    height_sd_fraction=0.0,
+    false_things={},
+    false_per_frame=0.0,
+    turned_around=0.0,
+    road_half_m=1e6,
+    ahead_half_m=1e6,
+    road_best=1.0,
+    lot_as_road=0.0,
+    driveway_as_road=0.0,
+    false_road=0.0,
+    false_roads=0.0,
+)
+"""Every mask is the renderer's, of things that can be seen by two thirds or more."""
+
+
+def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+    clear = replace(world, conditions=replace(world.conditions, light="noon", rain=0.0))
+    return label_pictures(clear, settings, NO_FAULTS)
+
+
+PERFECT_LABELS: Final = Imager("perfect labels 1", _perfect_pictures, png, "png", is_painted=False)
+"""What shows how good the rules can get."""
 LABEL_IMAGES: Final = Imager("faulty labels 1", label_pictures, png, "png", is_painted=False)
 """What a drive's camera records in place of photographs."""
 DETECTORS: Final = "crosscue.detectors.label_images:objects,crosscue.detectors.label_images:road"
