@@ -282,12 +282,12 @@ def judged(found: Detections, scene: Scene, least: Least) -> Counter[str]:
     """How many are right, how many find an object again, how many are false."""
     counts, met = Counter[str](), set[int]()
     for i in above(found, least):
-        shares = [
+        fractions = [
             float(overlaps(box, found.boxes_px[i : i + 1])[0]) if name == found.labels[i] else 0.0
             for name, box in scene.truth
         ]
-        best = max(range(len(shares)), key=shares.__getitem__, default=None)
-        if best is None or shares[best] < RIGHT_OVERLAP:
+        best = max(range(len(fractions)), key=fractions.__getitem__, default=None)
+        if best is None or fractions[best] < RIGHT_OVERLAP:
             counts["false"] += 1
         else:
             counts["doubles" if best in met else "right"] += 1

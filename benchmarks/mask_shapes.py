@@ -45,10 +45,10 @@ def pairs(
         for i, label in enumerate(detections.labels):
             if label != name or detections.scores[i] <= score or not truth:
                 continue
-            shares = overlaps(detections.boxes_px[i], boxes)
-            best = int(shares.argmax())
+            fractions = overlaps(detections.boxes_px[i], boxes)
+            best = int(fractions.argmax())
             mask = truth[best].mask
-            if shares[best] >= SAME_OBJECT and isinstance(mask, bytes):
+            if fractions[best] >= SAME_OBJECT and isinstance(mask, bytes):
                 yield detections.boxes_px[i], boxes[best], detections.masks[i], mask, picture
 
 

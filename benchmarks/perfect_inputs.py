@@ -37,7 +37,7 @@ from crosscue.detectors.cues.cars import (
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.drives import judge
 from crosscue.eval.scoring.drives import score as as_score
-from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
+from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.eval.scoring.runs import tables_of
 from crosscue.eval.scoring.truth import load as load_truth
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -88,7 +88,7 @@ def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion,
 
 
 def _fraction(values: list[bool], clusters: list[int]) -> Proportion:
-    return share(np.array(values, np.bool_), np.array(clusters, np.int64))
+    return fraction(np.array(values, np.bool_), np.array(clusters, np.int64))
 
 
 def _text(one: Proportion | None) -> str:

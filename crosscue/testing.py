@@ -348,9 +348,9 @@ def _observations(observed_by: str) -> dict[str, Any]:
         other = Detections(0, (64, 48), box, np.array([0.9]), ("surely unknown",), (b"",))
         return {"no detector": (), "nothing": (nothing,), "other labels": (other,)}
     if observed_by == "road":
-        from crosscue.detectors.cues.observed import RoadShares
+        from crosscue.detectors.cues.observed import RoadFractions
 
-        return {"nothing": RoadShares(0.0, 0.0, 0.0), "road": RoadShares(1.0, 1.0, 1.0)}
+        return {"nothing": RoadFractions(0.0, 0.0, 0.0), "road": RoadFractions(1.0, 1.0, 1.0)}
     if observed_by == "car pairs":
         from crosscue.detectors.cues.cars import no_pairs
 

@@ -43,14 +43,16 @@ class Learned(NamedTuple):
     if_not: float
     scale: float
 
-    def says(self, is_positive: bool, was_positive: bool | None, rho: float, share: float) -> float:
+    def says(
+        self, is_positive: bool, was_positive: bool | None, rho: float, fraction: float
+    ) -> float:
         """Log odds of one observation.
 
         Args:
             is_positive: Now.
             was_positive: At the look before; None for the first.
             rho: How much this look resembles the one before.
-            share: What a change is worth, 0 to 1.
+            fraction: What a change is worth, 0 to 1.
         """
         p, q = self.if_there, self.if_not
         if was_positive is is_positive:
@@ -58,7 +60,7 @@ class Learned(NamedTuple):
                 return self.scale * math.log((p + (1.0 - p) * rho) / (q + (1.0 - q) * rho))
             return self.scale * math.log((1.0 - p * (1.0 - rho)) / (1.0 - q * (1.0 - rho)))
         change = math.log(p / q) if is_positive else math.log((1.0 - p) / (1.0 - q))
-        return self.scale * share * change
+        return self.scale * fraction * change
 
 
 class Published(NamedTuple):
@@ -135,13 +137,13 @@ class CalibratedMessageModel:
         is_fresh = is_positive and _is_fresh(heard, count, situation.objects.get(voice.cue))
         before = False if is_fresh and heard.was_positive else heard.was_positive
         rho = math.exp(heard.looked_at - at)
-        share = 1.0
+        fraction = 1.0
         if before is not is_positive:
             last_at = heard.changed_at.get(is_positive, -math.inf)
-            share = 1.0 if is_fresh else effective_sample_fraction(at - last_at)
+            fraction = 1.0 if is_fresh else effective_sample_fraction(at - last_at)
             heard.changed_at[is_positive] = at
         for edge in voice.near if situation.is_near else voice.far:
-            out[edge.feature] += edge.says(is_positive, before, rho, share)
+            out[edge.feature] += edge.says(is_positive, before, rho, fraction)
         if is_positive:
             again = 1.0 if is_fresh else effective_sample_fraction(at - heard.sent_at)
             for other in voice.published_near if situation.is_near else voice.published_far:

@@ -46,9 +46,9 @@ def interpolate_angle(
     exact = t_ns[after] == at_ns
     before = np.where(exact, after, np.maximum(after - 1, 0))
     span_ns = t_ns[after] - t_ns[before]
-    share = np.where(span_ns > 0, (at_ns - t_ns[before]) / np.maximum(span_ns, 1), 0.0)
+    fraction = np.where(span_ns > 0, (at_ns - t_ns[before]) / np.maximum(span_ns, 1), 0.0)
     turned = wrap_all(angles_rad[after] - angles_rad[before])
-    found = wrap_all(angles_rad[before] + share * turned)
+    found = wrap_all(angles_rad[before] + fraction * turned)
     is_known = (at_ns >= t_ns[0]) & (at_ns <= t_ns[-1])
     if max_gap_ns is not None:
         is_known &= span_ns <= max_gap_ns

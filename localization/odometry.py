@@ -520,6 +520,6 @@ class _Turn:
         before = np.clip(np.searchsorted(self.t_ns, at_ns, side="right") - 1, 0, None)
         after = np.minimum(before + 1, len(self.t_ns) - 1)
         span_ns = np.maximum(self.t_ns[after] - self.t_ns[before], 1)
-        share: Floats = (at_ns - self.t_ns[before]) / span_ns
+        fraction: Floats = (at_ns - self.t_ns[before]) / span_ns
         rise: Floats = self.values[after] - self.values[before]
-        return self.values[before] + share * rise
+        return self.values[before] + fraction * rise

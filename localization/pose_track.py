@@ -403,13 +403,13 @@ class _Run:
         while True:
             to_ns = min(self.event_ns, stop_ns)
             if to_ns > self.t_ns:
-                share = (to_ns - self.t_ns) * per_ns
+                fraction = (to_ns - self.t_ns) * per_ns
                 self._move(
                     to_ns,
-                    share * distance_m,
-                    share * turn_rad,
-                    share * distance_var,
-                    share * turn_var,
+                    fraction * distance_m,
+                    fraction * turn_rad,
+                    fraction * distance_var,
+                    fraction * turn_var,
                 )
             if to_ns == stop_ns:
                 break

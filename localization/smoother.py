@@ -145,8 +145,8 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
         state, aside_var = _AT_REST, 0.0
         while now < until:
             to = min(until, stops[i])
-            share = (to - now) / (stops[i] - starts[i])
-            distance, turn, distance_var, turn_var = (share * value for value in rows[i])
+            fraction = (to - now) / (stops[i] - starts[i])
+            distance, turn, distance_var, turn_var = (fraction * value for value in rows[i])
             state = predict(state, distance, turn, distance_var, turn_var, 0.0)
             aside_var += distance_var if is_blind[i] else 0.0
             now = to

@@ -58,7 +58,7 @@ TRACKING_PERIOD_NS: Final = 100_000_000
 """Of a frame, where positions and speeds do not show it."""
 PERIOD_STEP_S: Final = 1e-4
 MAX_PERIOD_ERROR: Final = 0.2
-"""A share; a period further off the published 10 Hz is damage."""
+"""A fraction; a period further off the published 10 Hz is damage."""
 ROWS_PER_BLOCK: Final = 100
 FRAMES_FOR_PERIOD: Final = 10_000
 Unreadable: TypeAlias = tuple[str, str, int | None, str]

@@ -165,8 +165,8 @@ def _cabin(shape: Shape, paint: Rgb) -> list[Mesh]:
     wide = shape.half_width_m - 0.05
 
     def half(z: float) -> float:
-        share = (z - belt) / (roof - belt)
-        return float(wide + (shape.roof_half_width_m - wide) * share)
+        fraction = (z - belt) / (roof - belt)
+        return float(wide + (shape.roof_half_width_m - wide) * fraction)
 
     parts = []
     last = len(edge) - 2

@@ -20,7 +20,7 @@ LANES_REACH_M: Final = 45.0
 
 
 class Presence(NamedTuple):
-    """One cue in one picture: how many things show it, and the most visible one's share."""
+    """One cue in one picture: how many things show it, and how visible the best of them is."""
 
     things: int
     visible: float

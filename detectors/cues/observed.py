@@ -30,7 +30,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class RoadShares:
+class RoadFractions:
     """How much of each region of interest is road (eq. 13).
 
     Attributes:
@@ -48,7 +48,7 @@ class RoadShares:
         return self.left > min_fraction, self.straight > min_fraction, self.right > min_fraction
 
 
-NOT_SEEN: Final = RoadShares(math.nan, math.nan, math.nan)
+NOT_SEEN: Final = RoadFractions(math.nan, math.nan, math.nan)
 
 
 class Sides(NamedTuple):
@@ -128,7 +128,7 @@ class Seen:
         t_ns: Log time of the frame.
         objects: Of detectors of objects; empty where none ran.
         signs: Of detectors of one-way and do-not-enter signs; empty where none ran.
-        road: Road pixels, or their shares where these are known already.
+        road: Road pixels, or their fractions by region where these are known already.
         labels: What the detectors of objects and signs can report; None for anything.
         doubles: What was left out of ``objects`` and ``signs``, since another detector found it
             with a better score.
@@ -137,7 +137,7 @@ class Seen:
     t_ns: int
     objects: tuple[Detections, ...] = ()
     signs: tuple[Detections, ...] = ()
-    road: RoadMask | RoadShares | None = None
+    road: RoadMask | RoadFractions | None = None
     labels: frozenset[str] | None = None
     doubles: tuple[Detections, ...] = ()
 
@@ -199,4 +199,4 @@ class FrameCues:
     """
 
     counts: Mapping[str, int]
-    road: RoadShares | None
+    road: RoadFractions | None

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import RoadMask
 from crosscue.replay.vehicle.vehicle import CueSpec, Polygon, Regions, Vehicle
 
-from .observed import RoadShares
+from .observed import RoadFractions
 
 
-def is_road(shares: RoadShares, vehicle: Vehicle, cue: CueSpec) -> int | None:
+def is_road(fractions: RoadFractions, vehicle: Vehicle, cue: CueSpec) -> int | None:
     """1 where more than the vehicle file's fraction of the cue's region is road (eq. 14).
 
     None where the region is not seen.
     """
     side = ("left", "straight", "right").index(cue.supports[0])
-    if math.isnan((shares.left, shares.straight, shares.right)[side]):
+    if math.isnan((fractions.left, fractions.straight, fractions.right)[side]):
         return None
-    return int(shares.positive(vehicle.cues.road_fraction)[side])
+    return int(fractions.positive(vehicle.cues.road_fraction)[side])
 
 
 @lru_cache(maxsize=64)
@@ -40,7 +40,7 @@ def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return inside
 
 
-def road_fractions(road: RoadMask, regions: Regions) -> RoadShares:
+def road_fractions(road: RoadMask, regions: Regions) -> RoadFractions:
     """Road pixels over all pixels of each region (eq. 13); regions are scaled with the mask.
 
     Raises:
@@ -48,9 +48,9 @@ def road_fractions(road: RoadMask, regions: Regions) -> RoadShares:
     """
     width, height = road.mask_size_px
     is_road = road.pixels()
-    shares = []
+    fractions = []
     for polygon in (regions.left, regions.straight, regions.right):
         inside = region_mask(polygon, (height, width))
         count = int(np.count_nonzero(inside))
-        shares.append(np.count_nonzero(is_road & inside) / count if count else 0.0)
-    return RoadShares(*shares)
+        fractions.append(np.count_nonzero(is_road & inside) / count if count else 0.0)
+    return RoadFractions(*fractions)

@@ -28,7 +28,7 @@ from crosscue.detectors.base import RoadMask
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 
-from .observed import NOT_SEEN, Place, RoadShares
+from .observed import NOT_SEEN, Place, RoadFractions
 
 MARGIN: Final = 0.25
 """Of the intersection's depth, left out at either end."""
@@ -42,7 +42,7 @@ Rectangle: TypeAlias = tuple[float, float, float, float]
 
 def ground_fractions(
     road: RoadMask, camera: Camera, regions: Regions, place: Place | None
-) -> RoadShares:
+) -> RoadFractions:
     """Fractions of road in regions on the ground; NaN where one is not seen.
 
     Raises:
@@ -55,7 +55,7 @@ def ground_fractions(
         _fraction(is_road, road, camera, regions, one, margin_m, place.sd_m)
         for one, margin_m in rectangles(regions, place)
     ]
-    return RoadShares(*fractions)
+    return RoadFractions(*fractions)
 
 
 def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float], ...]:

@@ -28,7 +28,7 @@ from .candidates import (
     thresholds_met,
     unsure_of,
 )
-from .observed import Judged, RoadShares, of_side
+from .observed import Judged, RoadFractions, of_side
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,19 +138,19 @@ class CueTally:
             if scores and name in self.by_cue:
                 self.by_cue[name].take(scores, {SAME_OBJECT: len(scores)})
 
-    def road(self, shares: RoadShares) -> None:
+    def road(self, fractions: RoadFractions) -> None:
         """Of cues that look for road in a region."""
         threshold = self.vehicle.cues.road_fraction
         for cue in CUES.values():
             side = cue.supports[0] if cue.supports else ""
-            if cue.observed_by != "road" or side not in RoadShares.__slots__:
+            if cue.observed_by != "road" or side not in RoadFractions.__slots__:
                 continue
-            share: float = getattr(shares, side)
-            if math.isnan(share):
+            fraction: float = getattr(fractions, side)
+            if math.isnan(fraction):
                 unseen = self._of(cue.name, "frames", "[cues] road_fraction", threshold)
                 unseen.take([0.0], {REGION_NOT_SEEN: 1})
                 continue
-            found = [share] if share > 0.0 else []
+            found = [fraction] if fraction > 0.0 else []
             low = sum(one <= threshold for one in found)
             counted = self._of(cue.name, "frames", "[cues] road_fraction", threshold)
             counted.take(found, {TOO_LITTLE_ROAD: low})

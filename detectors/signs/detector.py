@@ -268,17 +268,17 @@ def _apart(
     if not candidates:
         return []
     boxes = np.array([box for _, _, box in candidates])
-    shares = np.array([share for share, _, _ in candidates])
+    fractions = np.array([fraction for fraction, _, _ in candidates])
     kinds = np.array([kind for _, kind, _ in candidates])
     sums = np.array(
         [
-            shares[(overlaps(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
+            fractions[(overlaps(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
             for _, kind, box in candidates
         ]
     )
-    scores = shares * sums / (sums + 1.0)
+    scores = fractions * sums / (sums + 1.0)
     kept: list[int] = []
-    for i in np.lexsort((-shares, -scores)).tolist():
+    for i in np.lexsort((-fractions, -scores)).tolist():
         if not kept or float(overlaps(boxes[i], boxes[kept]).max()) <= overlap:
             kept.append(i)
     return [(float(scores[i]), candidates[i][1], boxes[i]) for i in kept]

@@ -267,9 +267,9 @@ def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float 
     """Precision and recall of a class at calibrated scores, in percent; None where undefined."""
     reported: dict[str, float | None] = {}
     for aim, at in rates_by_score(rows, by).items():
-        for what, share in (("precision", at.precision), ("recall", at.recall)):
+        for what, fraction in (("precision", at.precision), ("recall", at.recall)):
             reported[f"{what} {name} at {aim}"] = (
-                round(100.0 * share, 2) if math.isfinite(share) else None
+                round(100.0 * fraction, 2) if math.isfinite(fraction) else None
             )
     return reported
 

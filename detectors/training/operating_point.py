@@ -71,10 +71,10 @@ def judge(
     is_right, counts = np.zeros(len(scores), np.bool_), np.ones(len(scores), np.bool_)
     left = set(range(len(truth_px)))
     for i in order.tolist():
-        shares = overlaps(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
-        fits = [k for k in left if shares[k] >= min_overlap]
+        fractions = overlaps(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
+        fits = [k for k in left if fractions[k] >= min_overlap]
         if fits:
-            taken = max(fits, key=lambda k: float(shares[k]))
+            taken = max(fits, key=lambda k: float(fractions[k]))
             left.remove(taken)
             is_right[i] = True
             counts[i] = heights[taken] >= min_height_px

@@ -65,8 +65,8 @@ class RoadSchedule:
         """The learning rate of a step."""
         if step < self.warm_up:
             return self.rate * (step + 1) / self.warm_up
-        share = (step - self.warm_up) / max(self.steps - self.warm_up, 1)
-        return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0))))
+        fraction = (step - self.warm_up) / max(self.steps - self.warm_up, 1)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(fraction, 1.0))))
 
 
 class RoadTraining:

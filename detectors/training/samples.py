@@ -205,8 +205,10 @@ def recoloured(pixels: Bytes, rng: Generator) -> Bytes:
     changed = np.asarray(cv2.LUT(pixels, table.reshape(1, 256, 3)), np.uint8)
     if rng.random() < 0.3:
         grey = cv2.cvtColor(changed, cv2.COLOR_BGR2GRAY)[:, :, None].repeat(3, axis=2)
-        share = rng.uniform(0.0, 1.0)
-        changed = np.asarray(cv2.addWeighted(changed, 1.0 - share, grey, share, 0.0), np.uint8)
+        fraction = rng.uniform(0.0, 1.0)
+        changed = np.asarray(
+            cv2.addWeighted(changed, 1.0 - fraction, grey, fraction, 0.0), np.uint8
+        )
     if rng.random() < 0.25:
         changed = np.asarray(cv2.GaussianBlur(changed, (3, 3), rng.uniform(0.3, 1.0)), np.uint8)
     if rng.random() < 0.25:
@@ -227,8 +229,8 @@ def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Windo
             continue
         box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
         scale = np.hypot(*warp[0, :2])
-        share = mask.sum() / max(float(whole.sum()) * scale * scale, 1.0)
-        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE_PX and share >= MIN_SHARE:
+        fraction = mask.sum() / max(float(whole.sum()) * scale * scale, 1.0)
+        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE_PX and fraction >= MIN_SHARE:
             boxes.append(box)
             labels.append(one.label + 1)
             masks.append(mask)

@@ -406,18 +406,18 @@ class _Tables:
                 self._held["detections"] += self._detection_rows(named.name, found, again[number])
         road = sorted_by_role.road
         if isinstance(road, RoadMask):
-            shares = cues.road
-            if shares is None or self.vehicle.regions.kind == "ground":
+            fractions = cues.road
+            if fractions is None or self.vehicle.regions.kind == "ground":
                 # Where the intersection is becomes known later; the mask is kept for that.
-                shares = road_fractions(road, self.vehicle.regions)
+                fractions = road_fractions(road, self.vehicle.regions)
             self._held["road"].append(
                 {
                     "frame": self._frame,
                     "t_ns": result.t_ns,
                     "camera": self.camera,
-                    "fraction_left": shares.left,
-                    "fraction_straight": shares.straight,
-                    "fraction_right": shares.right,
+                    "fraction_left": fractions.left,
+                    "fraction_straight": fractions.straight,
+                    "fraction_right": fractions.right,
                     "mask": road.mask,
                     "mask_width_px": road.mask_size_px[0],
                     "mask_height_px": road.mask_size_px[1],

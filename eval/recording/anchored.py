@@ -78,19 +78,19 @@ class Anchored:
         self._before = self._ranges.get(seen.t_ns, [])
         found = self._cues(seen, ego, place)
         if vehicle.regions.kind == "ground" and isinstance(seen.road, RoadMask):
-            shares = found.road
+            fractions = found.road
             polygons = outlines(vehicle.camera, vehicle.regions, place, frame.size_px)
             for side, corners in zip(SIDES, polygons, strict=True):
-                share = float("nan") if shares is None else getattr(shares, side)
+                fraction = float("nan") if fractions is None else getattr(fractions, side)
                 if corners is not None:
-                    self._region(side, corners, share)
+                    self._region(side, corners, fraction)
         if vehicle.cars.kind == "tracks":
             for car in self._cues.followed():
                 self._car(car, frame.size_px, place)
 
-    def _region(self, side: str, corners: NDArray[np.float64], share: float) -> None:
-        is_road = share > self.manifest.settings.cues.road_fraction
-        said = "not seen" if np.isnan(share) else f"{100.0 * share:.0f} %"
+    def _region(self, side: str, corners: NDArray[np.float64], fraction: float) -> None:
+        is_road = fraction > self.manifest.settings.cues.road_fraction
+        said = "not seen" if np.isnan(fraction) else f"{100.0 * fraction:.0f} %"
         colour = REGION_WITH_ROAD if is_road else REGION
         self.marks.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {said}")
 

@@ -24,7 +24,7 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.observed import RoadShares
+from crosscue.detectors.cues.observed import RoadFractions
 from crosscue.detectors.cues.road import road_fractions
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -122,17 +122,19 @@ class Marks:
         )
         return OWN if is_own else UNSURE
 
-    def _regions(self, road: RoadMask | RoadShares | None, size_px: tuple[int, int]) -> None:
+    def _regions(self, road: RoadMask | RoadFractions | None, size_px: tuple[int, int]) -> None:
         """Polygons, green where there is road; none where no detector looks for road."""
         if road is None:
             return
-        shares = road_fractions(road, self.vehicle.regions) if isinstance(road, RoadMask) else road
-        positive = shares.positive(self.vehicle.cues.road_fraction)
+        fractions = (
+            road_fractions(road, self.vehicle.regions) if isinstance(road, RoadMask) else road
+        )
+        positive = fractions.positive(self.vehicle.cues.road_fraction)
         for side, is_road in zip(SIDES, positive, strict=True):
             corners = np.array(getattr(self.vehicle.regions, side)) * size_px
             colour = REGION_WITH_ROAD if is_road else REGION
-            share = 100.0 * getattr(shares, side)
-            self.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {share:.0f} %")
+            fraction = 100.0 * getattr(fractions, side)
+            self.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {fraction:.0f} %")
 
     def _cars(self, found: tuple[Detections, ...]) -> None:
         now = car_shapes(found, self.vehicle.cars)

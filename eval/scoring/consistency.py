@@ -18,8 +18,8 @@ def quantile(probability: float, dimensions: int) -> float:
     return float(chdtri(dimensions, 1.0 - probability))
 
 
-def mean_band(dimensions: int, samples: int, share: float = 0.95) -> tuple[float, float]:
-    """Where the mean of independent chi-square samples lies with probability ``share``."""
+def mean_band(dimensions: int, samples: int, fraction: float = 0.95) -> tuple[float, float]:
+    """Where the mean of independent chi-square samples lies with probability ``fraction``."""
     total = dimensions * samples
-    tail = 0.5 * (1.0 - share)
+    tail = 0.5 * (1.0 - fraction)
     return quantile(tail, total) / samples, quantile(1.0 - tail, total) / samples

@@ -96,15 +96,17 @@ def wilson(right: int, of: int, confidence: float = CONFIDENCE) -> Interval:
     return _wilson(right / of, of, float(ndtri(0.5 + 0.5 * confidence)))
 
 
-def _wilson(share: float, of: float, z: float) -> Interval:
+def _wilson(fraction: float, of: float, z: float) -> Interval:
     shrink = 1.0 + z * z / of
-    middle = (share + 0.5 * z * z / of) / shrink
-    half = z * math.sqrt(share * (1.0 - share) / of + 0.25 * (z / of) ** 2) / shrink
+    middle = (fraction + 0.5 * z * z / of) / shrink
+    half = z * math.sqrt(fraction * (1.0 - fraction) / of + 0.25 * (z / of) ** 2) / shrink
     # At the ends the formula is exact but rounding is not.
-    return Interval(0.0 if share == 0.0 else middle - half, 1.0 if share == 1.0 else middle + half)
+    return Interval(
+        0.0 if fraction == 0.0 else middle - half, 1.0 if fraction == 1.0 else middle + half
+    )
 
 
-def share(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) -> Proportion:
+def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) -> Proportion:
     """The fraction of true rows with both intervals.
 
     Args:
@@ -113,7 +115,7 @@ def share(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) ->
     """
     right, of = int(is_right.sum()), len(is_right)
     ends = wilson(right, of)
-    by_cluster = share_by_cluster(is_right, clusters)
+    by_cluster = fraction_by_cluster(is_right, clusters)
     return Proportion(
         right=right,
         of=of,
@@ -152,7 +154,7 @@ def mean_by_cluster(
     return Interval(found.mean - half, found.mean + half)
 
 
-def share_by_cluster(
+def fraction_by_cluster(
     is_right: np.typing.NDArray[np.bool_],
     clusters: NDArray[np.int64],
     confidence: float = CONFIDENCE,

@@ -1,4 +1,4 @@
-"""Numbers with their 95 % intervals: means, shares, ratios, and the range at a success rate.
+"""Numbers with their 95 % intervals: means, fractions, ratios, and the range at a success rate.
 
 Means and ratios: Student's t, a ratio's variance by linearisation (Cochran, *Sampling Techniques*,
 section 6.4). Everything else by the bootstrap, its percentiles widened for few drives (Hesterberg,
@@ -39,7 +39,7 @@ def mean_of(values: Floats) -> Measured:
 
 
 def fraction_of(right: int, of: int) -> Measured:
-    """A share with Wilson's interval (1927)."""
+    """A fraction with Wilson's interval (1927)."""
     if not of:
         return Measured(math.nan, 0.0, 1.0)
     return Measured(right / of, *wilson(right, of))
@@ -99,22 +99,22 @@ def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Float
     return _with_t(ratio, ratio * (moves[0] - moves[1]))
 
 
-def range_at(distances_m: Floats, is_success: Floats, share: float) -> Measured:
-    """The distance at which success has fallen to ``share``, from a logistic curve.
+def range_at(distances_m: Floats, is_success: Floats, fraction: float) -> Measured:
+    """The distance at which success has fallen to ``fraction``, from a logistic curve.
 
     Args:
         distances_m: Shape (N,): from start to goal.
         is_success: Shape (N,): 1 or 0.
-        share: Between 0 and 1.
+        fraction: Between 0 and 1.
 
     Returns:
-        Infinite where the curve stays above ``share`` up to the farthest goal driven to; zero
+        Infinite where the curve stays above ``fraction`` up to the farthest goal driven to; zero
         where it begins below.
     """
     weights = weights_of(len(distances_m))
     a, b = logistic(distances_m, is_success, weights)
     farthest_m = float(distances_m.max())
-    level = math.log(share / (1.0 - share))
+    level = math.log(fraction / (1.0 - fraction))
     with np.errstate(divide="ignore", invalid="ignore"):
         found = (level - a) / b
     at_end = a + b * farthest_m

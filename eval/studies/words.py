@@ -18,7 +18,7 @@ def km(value: Measured, digits: int = 2) -> str:
 
 
 def percent(value: Measured) -> str:
-    """A share with its interval."""
+    """A fraction with its interval."""
     if math.isnan(value.low):
         return f"{100 * value.value:.1f} % ({TOO_FEW})"
     return f"{100 * value.value:.1f} % ({100 * value.low:.1f}..{100 * value.high:.1f})"

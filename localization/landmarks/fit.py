@@ -51,7 +51,7 @@ class ScoredPairs:
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """A share with its 95 % interval.
+    """A fraction with its 95 % interval.
 
     Attributes:
         hits: How many were so.
@@ -149,9 +149,9 @@ def wilson(count: int, of: int) -> Rate:
     """The 95 % score interval of a fraction; 0 to 1 where nothing was tried."""
     if of == 0:
         return Rate(0, 0, 0.0, 1.0)
-    share, z2 = count / of, Z_95**2
-    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
-    half = Z_95 / (1 + z2 / of) * math.sqrt(share * (1 - share) / of + z2 / (4 * of * of))
+    fraction, z2 = count / of, Z_95**2
+    middle = (fraction + z2 / (2 * of)) / (1 + z2 / of)
+    half = Z_95 / (1 + z2 / of) * math.sqrt(fraction * (1 - fraction) / of + z2 / (4 * of * of))
     low = 0.0 if count == 0 else middle - half
     return Rate(count, of, low, 1.0 if count == of else middle + half)
 
@@ -160,13 +160,13 @@ def clopper_pearson(count: int, of: int) -> Rate:
     """The exact 95 % interval of a fraction; 0 to 1 where nothing was tried."""
     if of == 0:
         return Rate(0, 0, 0.0, 1.0)
-    low = 0.0 if count == 0 else _share_at(count - 1, of, 0.975)
-    high = 1.0 if count == of else _share_at(count, of, 0.025)
+    low = 0.0 if count == 0 else _fraction_at(count - 1, of, 0.975)
+    high = 1.0 if count == of else _fraction_at(count, of, 0.025)
     return Rate(count, of, low, high)
 
 
-def _share_at(count: int, of: int, probability: float) -> float:
-    """The share at which no more than ``count`` of ``of`` come up with the given probability."""
+def _fraction_at(count: int, of: int, probability: float) -> float:
+    """The fraction at which no more than ``count`` of ``of`` come up with the given probability."""
     low, high = 0.0, 1.0
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -177,13 +177,13 @@ def _share_at(count: int, of: int, probability: float) -> float:
     return 0.5 * (low + high)
 
 
-def _at_most(count: int, of: int, share: float) -> float:
+def _at_most(count: int, of: int, fraction: float) -> float:
     """Binomial distribution function."""
-    if share <= 0.0 or share >= 1.0:
-        return 1.0 if share <= 0.0 else 0.0
+    if fraction <= 0.0 or fraction >= 1.0:
+        return 1.0 if fraction <= 0.0 else 0.0
     k = np.arange(count + 1)
     steps = np.log(of - k[:-1]) - np.log(k[1:])
     log_choose = np.concatenate([[0.0], np.cumsum(steps)])
-    logs = log_choose + k * math.log(share) + (of - k) * math.log1p(-share)
+    logs = log_choose + k * math.log(fraction) + (of - k) * math.log1p(-fraction)
     peak = float(logs.max())
     return min(math.exp(peak) * float(np.exp(logs - peak).sum()), 1.0)

@@ -42,11 +42,11 @@ class PeriodSketch:
         self._sums += np.bincount(bins, weights=steps_ns, minlength=_BINS)
         self._keep_longest(steps_ns, at_ns)
 
-    def quantile_ns(self, share: float) -> int | None:
-        """The step below which ``share`` of the steps lie, or None without any."""
+    def quantile_ns(self, fraction: float) -> int | None:
+        """The step below which ``fraction`` of the steps lie, or None without any."""
         if not self.count:
             return None
-        rank = int(share * (self.count - 1))
+        rank = int(fraction * (self.count - 1))
         bin_ = int(np.searchsorted(np.cumsum(self._counts), rank, side="right"))
         return round(float(self._sums[bin_]) / int(self._counts[bin_]))
 

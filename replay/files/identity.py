@@ -59,11 +59,11 @@ def identity_of(place: Path | str) -> Identity:
     try:
         path.stat()
         files = list(_files(path))
-        share = _fraction(len(files))
+        max_bytes = _hashed_bytes(len(files))
         for name, file in files:
             with file.open("rb", buffering=0) as stream:
                 opened = _Local(stream.fileno())
-                digest_of_all.update(_report_text(name, opened.size, _hash(opened, share)))
+                digest_of_all.update(_report_text(name, opened.size, _hash(opened, max_bytes)))
             total += opened.size
     except OSError as error:
         raise LogError(f"{error.filename or path}: {error.strerror or error}; check it") from None
@@ -96,10 +96,10 @@ def _identity_of_parts(url: str) -> Identity | None:
     remote = RemoteFiles(url)
     name = url.rstrip("/").rpartition("/")[2]
     names = sorted(_names_of(name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
-    share = _fraction(len(names))
+    max_bytes = _hashed_bytes(len(names))
     sizes = [remote.sizes[at] for _, at in names]
     total = sum(sizes)
-    if not names or remote.is_at_hand or total < 2 * sum(min(size, share) for size in sizes):
+    if not names or remote.is_at_hand or total < 2 * sum(min(size, max_bytes) for size in sizes):
         return None
     digest = hashlib.sha256()
     for reported, at in names:
@@ -109,7 +109,7 @@ def _identity_of_parts(url: str) -> Identity | None:
             if ranged is None:
                 return None
             with closing(ranged):
-                content = _hash(_Remote(ranged), share)
+                content = _hash(_Remote(ranged), max_bytes)
         digest.update(_report_text(os.fsencode(reported), remote.sizes[at], content))
     return Identity(name, total, digest.hexdigest())
 
@@ -123,7 +123,7 @@ def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
     return {name: name} | {f"beside/{other}": other for other in beside}
 
 
-def _fraction(files: int) -> int:
+def _hashed_bytes(files: int) -> int:
     """Bytes of each file that are hashed."""
     return max(SHARE_BYTES // max(files, 1), MIN_BYTES)
 
@@ -247,27 +247,27 @@ class _Remote:
         return self._ranged.at_least(at, size)[:size]
 
 
-def _hash(file: _File, share: int) -> bytes:
-    """Hash of a file's content, or of parts of it if it is longer than ``share``."""
+def _hash(file: _File, max_bytes: int) -> bytes:
+    """Hash of a file's content, or of parts of it if it is longer than ``max_bytes``."""
     digest = hashlib.sha256()
-    for at, end in _parts(file, share):
+    for at, end in _parts(file, max_bytes):
         while at < end and (part := file.read(at, min(end - at, MIB))):
             digest.update(part)
             at += len(part)
     return digest.digest()
 
 
-def _parts(file: _File, share: int) -> Iterator[tuple[int, int]]:
+def _parts(file: _File, max_bytes: int) -> Iterator[tuple[int, int]]:
     """Spans of the file to hash."""
     size = file.size
-    if size <= share:
+    if size <= max_bytes:
         yield 0, size
         return
     index = _index_at(file)
-    edge = share // 4 if index is None else min(EDGE_BYTES, share // 4)
+    edge = max_bytes // 4 if index is None else min(EDGE_BYTES, max_bytes // 4)
     yield 0, edge
     if index is None:
-        block = share // 2 // BLOCKS
+        block = max_bytes // 2 // BLOCKS
         between = size - 2 * edge - block
         for i in range(BLOCKS):
             at = edge + between * i // (BLOCKS - 1)

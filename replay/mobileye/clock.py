@@ -126,8 +126,8 @@ class CounterClock:
     def _early(self) -> int:
         if self._frames >= SETTLED_AFTER:
             return LAST_EARLY_NS
-        share = self._frames / SETTLED_AFTER
-        return int(FIRST_EARLY_NS + share * (LAST_EARLY_NS - FIRST_EARLY_NS))
+        fraction = self._frames / SETTLED_AFTER
+        return int(FIRST_EARLY_NS + fraction * (LAST_EARLY_NS - FIRST_EARLY_NS))
 
     def _follow(self, over_ns: int, elapsed_ns: int) -> int:
         """Move the offset towards the fastest frames; what is left over."""

@@ -290,12 +290,14 @@ def test_several_sequences_in_one_folder_are_refused(tmp_path: Path) -> None:
 @settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-@given(share=st.floats(0.0, 1.0))
-def test_a_tracking_file_cut_anywhere_gives_whole_lines_only(tmp_path: Path, share: float) -> None:
+@given(fraction=st.floats(0.0, 1.0))
+def test_a_tracking_file_cut_anywhere_gives_whole_lines_only(
+    tmp_path: Path, fraction: float
+) -> None:
     text = "\n".join(packet_lines(6)) + "\n"
     path = tmp_path / "oxts" / "0003.txt"
     path.parent.mkdir(exist_ok=True)
-    cut = text[: int(share * len(text))]
+    cut = text[: int(fraction * len(text))]
     path.write_text(cut)
 
     ledger = Ledger("drive")

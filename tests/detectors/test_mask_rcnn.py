@@ -567,9 +567,9 @@ def test_the_checkpoint_in_the_package_sees_what_stands_at_intersections_it_neve
 
     assert isinstance(found, Detections)
     kept = [i for i, name in enumerate(found.labels) if name == label]
-    share = overlaps(np.array(largest.box_px, np.float64), found.boxes_px[kept])
-    assert share.max() > 0.5
-    best = kept[int(share.argmax())]
+    fraction = overlaps(np.array(largest.box_px, np.float64), found.boxes_px[kept])
+    assert fraction.max() > 0.5
+    best = kept[int(fraction.argmax())]
     x0, y0, x1, y1 = largest.box_px
     mask = rle.decode(found.masks[best], (1280, 720))[y0:y1, x0:x1]
     assert (mask & largest.mask).sum() > 0.6 * (mask | largest.mask).sum()

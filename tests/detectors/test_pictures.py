@@ -138,10 +138,10 @@ def test_a_damaged_picture_is_reported_or_still_a_picture(
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_a_cut_picture_is_refused(suffix: str, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])
+def test_a_cut_picture_is_refused(suffix: str, fraction: float) -> None:
     whole = _encode(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8), suffix)
-    cut = whole.content[: int(len(whole.content) * share)]
+    cut = whole.content[: int(len(whole.content) * fraction)]
 
     with pytest.raises(LogFormatError):
         decode(Encoded(whole.coding, cut), COLOUR)

@@ -145,8 +145,8 @@ def test_any_picture_gives_a_mask_of_the_networks_size() -> None:
     for mask, frame in zip(masks(frames), frames, strict=True):
         assert (mask.t_ns, mask.size_px) == (frame.t_ns, frame.size_px)
         assert rle.decode(mask.mask, mask.mask_size_px).shape == mask.mask_size_px[::-1]
-        shares = road_fractions(mask, Regions())
-        assert min(shares.left, shares.straight, shares.right) >= 0.0
+        fractions = road_fractions(mask, Regions())
+        assert min(fractions.left, fractions.straight, fractions.right) >= 0.0
 
 
 def test_the_embedded_network_is_small_and_says_how_it_was_made() -> None:

@@ -38,7 +38,8 @@ def test_each_american_sign_is_found_where_it_is_and_called_what_it_is(kind: Kin
         found = _signs(grey)
         over = overlaps(box, found.boxes_px) if len(found) else np.empty(0)
         hits += any(
-            label == kind and share > 0.4 for label, share in zip(found.labels, over, strict=True)
+            label == kind and fraction > 0.4
+            for label, fraction in zip(found.labels, over, strict=True)
         )
 
     assert hits >= 7

@@ -146,12 +146,12 @@ def test_a_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> 
         [sampler(number) for number in range(20)]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
-def test_a_picture_cut_short_is_not_learnt_from(tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.0, 0.02, 0.5, 0.98])
+def test_a_picture_cut_short_is_not_learnt_from(tmp_path: Path, fraction: float) -> None:
     labelled = _bars(tmp_path)
     path = labelled.pictures[0].path
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
 
     with pytest.raises(LogError, match=rf"{path.name}: .*leave it out of the annotations"):
         read_picture(labelled.pictures[0])

@@ -170,9 +170,9 @@ def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
         if one.rates is not None:
             wanted = RATES[one.cue]
             found = (one.rates.if_there, one.rates.if_not)
-            for rate, side, share in zip(wanted, (one.there, one.missing), found, strict=True):
+            for rate, side, fraction in zip(wanted, (one.there, one.missing), found, strict=True):
                 four_sd = 4 * math.sqrt(rate * (1 - rate) / side.looks)
-                assert share == pytest.approx(rate, abs=four_sd)
+                assert fraction == pytest.approx(rate, abs=four_sd)
     learned = {(one.cue, one.feature) for one in fit.calibrated.rates}
     assert learned == {
         ("road_left", "left"),

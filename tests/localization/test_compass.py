@@ -65,8 +65,8 @@ def apart_deg(a: Floats, b: Floats) -> float:
     return float(np.degrees(np.abs(wrap_all(a - b)).max()))
 
 
-def around(share: float, n: int = 600) -> Floats:
-    return wrap_all(np.linspace(0.0, share * 2 * math.pi, n) + 0.3)
+def around(fraction: float, n: int = 600) -> Floats:
+    return wrap_all(np.linspace(0.0, fraction * 2 * math.pi, n) + 0.3)
 
 
 def test_facing_magnetic_north_is_a_quarter_turn_from_east() -> None:
@@ -210,9 +210,9 @@ def test_without_a_reference_half_an_ellipse_is_not_enough() -> None:
     assert dict(fit.not_observable)["soft iron"].startswith("headings cover 2")
 
 
-@pytest.mark.parametrize("share", [0.6, 2.0])
-def test_mirrored_axes_are_refused(share: float) -> None:
-    truth = around(share)
+@pytest.mark.parametrize("fraction", [0.6, 2.0])
+def test_mirrored_axes_are_refused(fraction: float) -> None:
+    truth = around(fraction)
     mirrored = readings(truth, IRON) * [1.0, -1.0, 1.0]
     with pytest.raises(VehicleError, match="turn the wrong way round"):
         fit_compass(times(600), mirrored, truth, given_mounting(IRON))

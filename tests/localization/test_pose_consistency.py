@@ -110,14 +110,14 @@ def reference(
         start, stop = int(made.start_ns[k]), int(made.stop_ns[k])
         inside = [w for w in waiting if belief.t_ns <= w[0] <= stop]
         for t_ns, heading, var in [*inside, (stop, None, None)]:
-            share = (int(t_ns) - belief.t_ns) / (stop - start)
+            fraction = (int(t_ns) - belief.t_ns) / (stop - start)
             dt_s = (int(t_ns) - belief.t_ns) * 1e-9
             moved = predict_odometry(
                 belief,
-                share * made.distance_m[k],
-                share * made.turn_rad[k],
-                share * made.distance_var_m2[k],
-                share * made.turn_var_rad2[k],
+                fraction * made.distance_m[k],
+                fraction * made.turn_rad[k],
+                fraction * made.distance_var_m2[k],
+                fraction * made.turn_var_rad2[k],
                 dt_s,
                 settings.accel_var_m2ps3,
             )

@@ -346,12 +346,12 @@ def test_windows_hold_their_extremes(values: list[int], width: int) -> None:
 
 @quick
 @given(st.lists(st.integers(0, 2**61), min_size=1, max_size=300), st.floats(0.0, 1.0))
-def test_a_quantile_is_right_to_the_width_of_a_bin(steps: list[int], share: float) -> None:
+def test_a_quantile_is_right_to_the_width_of_a_bin(steps: list[int], fraction: float) -> None:
     sketch = PeriodSketch()
     sketch.add(np.array(steps, dtype=np.int64), np.arange(len(steps), dtype=np.int64))
 
-    exact = sorted(steps)[int(share * (len(steps) - 1))]
-    assert sketch.quantile_ns(share) == pytest.approx(exact, rel=0.023, abs=1.0)
+    exact = sorted(steps)[int(fraction * (len(steps) - 1))]
+    assert sketch.quantile_ns(fraction) == pytest.approx(exact, rel=0.023, abs=1.0)
 
 
 def test_an_irregular_stream_of_bursts_has_no_gaps_of_its_own_making() -> None:

@@ -79,8 +79,8 @@ def test_a_window_of_a_remote_mcap_costs_its_chunks(tmp_path: Path, web: Served)
     assert there.integrity == here.integrity
     assert opened < 80_000
     # Four seconds of 40, and the chunks at both ends of them.
-    share = (4 + 2 * 2) / 40
-    assert web.sent - opened < 1.5 * share * path.stat().st_size
+    fraction = (4 + 2 * 2) / 40
+    assert web.sent - opened < 1.5 * fraction * path.stat().st_size
     assert any("bytes were fetched" in said for said in there.notices)
     assert not (tmp_path / "store").exists()
 

@@ -91,7 +91,7 @@ def compass(
     error = rng.normal(0.0, sd_rad, len(t_ns))
     if persists_s > 0.0:
         kept = np.exp(-np.diff(t_ns) * 1e-9 / persists_s)
-        for i, share in enumerate(kept, start=1):
-            error[i] = share * error[i - 1] + np.sqrt(1.0 - share**2) * error[i]
+        for i, fraction in enumerate(kept, start=1):
+            error[i] = fraction * error[i - 1] + np.sqrt(1.0 - fraction**2) * error[i]
     heading = wrap_all(truth.xyh[1::every, 2] + error)
     return Headings(t_ns, heading, np.full(len(t_ns), sd_rad**2))

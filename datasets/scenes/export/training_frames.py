@@ -34,13 +34,13 @@ def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:
     """
     motion, enter_s = world.approach.motion, world.approach.enter_s
     last_s = (len(motion) - 2) / 100.0
-    share = rng.random(count)
+    fraction = rng.random(count)
     until_s = np.where(rng.random(count) < BEFORE_ENTRY, min(enter_s, last_s), last_s)
     step_m = np.abs(motion.speed_mps) * 0.01 + 1e-9
     way_m = np.concatenate([[0.0], np.cumsum(step_m)[:-1]])
     at = np.arange(len(motion)) * 0.01
-    by_way = np.interp(share * np.interp(until_s, at, way_m), way_m, at)
-    return np.sort(np.where(rng.random(count) < 0.5, by_way, share * until_s))
+    by_way = np.interp(fraction * np.interp(until_s, at, way_m), way_m, at)
+    return np.sort(np.where(rng.random(count) < 0.5, by_way, fraction * until_s))
 
 
 def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:

@@ -251,7 +251,7 @@ def utility_pole(x: float, y: float) -> Mesh:
 def wire(a: tuple[float, float, float], b: tuple[float, float, float]) -> Mesh:
     """A sagging wire, thick enough to be seen."""
     start, stop = np.array(a), np.array(b)
-    share = np.linspace(0, 1, 9)[:, None]
-    points = start + share * (stop - start)
-    points[:, 2] -= 0.7 * 4 * (share * (1 - share))[:, 0]
+    fraction = np.linspace(0, 1, 9)[:, None]
+    points = start + fraction * (stop - start)
+    points[:, 2] -= 0.7 * 4 * (fraction * (1 - fraction))[:, 0]
     return joined([tube(p, q, 0.018, (0.08, 0.08, 0.09), 3) for p, q in pairwise(points)])

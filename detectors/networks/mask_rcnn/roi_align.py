@@ -78,7 +78,7 @@ def _places(
     size: int,
     low: NDArray[np.int64],
     high: NDArray[np.int64],
-    share: Grid,
+    fraction: Grid,
 ) -> None:
     """Where samples fall between the places of a row, and how far from the lower one.
 
@@ -95,7 +95,7 @@ def _places(
         at = max(at, np.float32(0.0))
         low[i] = min(np.int64(at), np.int64(size - 1))
         high[i] = min(low[i] + 1, np.int64(size - 1))
-        share[i] = at - np.float32(low[i]) if low[i] < size - 1 else np.float32(0.0)
+        fraction[i] = at - np.float32(low[i]) if low[i] < size - 1 else np.float32(0.0)
 
 
 @njit(cache=True, fastmath={"contract"})

@@ -215,8 +215,8 @@ def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place |
     span_ns = int(poses.t_ns[after] - poses.t_ns[before])
     if span_ns > MAX_GAP_NS:
         return None
-    share = (t_ns - int(poses.t_ns[before])) / span_ns if span_ns else 0.0
-    xy_m = (1.0 - share) * poses.xy_m[before] + share * poses.xy_m[after]
+    fraction = (t_ns - int(poses.t_ns[before])) / span_ns if span_ns else 0.0
+    xy_m = (1.0 - fraction) * poses.xy_m[before] + fraction * poses.xy_m[after]
     two = slice(before, after + 1)
     at = np.array([t_ns], np.int64)
     heading = interpolate_angle(at, poses.t_ns[two], poses.heading_rad[two])

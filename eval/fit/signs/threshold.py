@@ -14,7 +14,7 @@ from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
 from crosscue.eval.fit.signs.scores import Rules, judged_pictures
-from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, share
+from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Limits, UsageError
 
 Progress = Callable[[Iterable[Judged], Callable[[], tuple[int, int]]], Iterable[Judged]]
@@ -172,7 +172,7 @@ def _shown(score: float | None) -> float | None:
 def _fraction(counts: Sequence[tuple[int, int]]) -> Proportion:
     is_right = [np.arange(of) < right for right, of in counts]
     which = np.repeat(np.arange(len(counts)), [of for _, of in counts])
-    return share(np.concatenate(is_right), which)
+    return fraction(np.concatenate(is_right), which)
 
 
 def _proportion_text(name: str, part: Proportion) -> str:

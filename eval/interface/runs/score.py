@@ -170,12 +170,12 @@ class ScoredRun:
         rows = []
         for name, cue in scores_of([self.scored.one]).cues.items():
             row: dict[str, object] = {"cue": name}
-            for what, share in (("precision", cue.precision), ("recall", cue.recall)):
+            for what, fraction in (("precision", cue.precision), ("recall", cue.recall)):
                 row |= {
-                    what: None if share is None else share.value,
-                    f"{what}_low": None if share is None else share.low,
-                    f"{what}_high": None if share is None else share.high,
-                    f"{what}_of": 0 if share is None else share.of,
+                    what: None if fraction is None else fraction.value,
+                    f"{what}_low": None if fraction is None else fraction.low,
+                    f"{what}_high": None if fraction is None else fraction.high,
+                    f"{what}_of": 0 if fraction is None else fraction.of,
                 }
             rows.append(row)
         return pa.Table.from_pylist(rows)

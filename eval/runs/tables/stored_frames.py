@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Found, RoadMask
-from crosscue.detectors.cues.observed import RoadShares, Role, Seen, all_labels
+from crosscue.detectors.cues.observed import RoadFractions, Role, Seen, all_labels
 from crosscue.eval.runs.manifest import DetectorRow
 
 from .parquet import TableFolder
@@ -121,7 +121,7 @@ def stored_frames(
             again: dict[str, list[tuple[Any, ...]]] = {}
             for row in found.of(frame):
                 (by_name if row[10] is None else again).setdefault(row[0], []).append(row)
-            shares = road.of(frame) if has_road else []
+            fractions = road.of(frame) if has_road else []
             some, others = (
                 tuple(
                     _detections(t_ns, size, by_name.get(name, [])).with_min_scores(least[name])
@@ -134,7 +134,7 @@ def stored_frames(
                     t_ns,
                     some,
                     others,
-                    _road(t_ns, size, shares[0], with_road_masks) if shares else None,
+                    _road(t_ns, size, fractions[0], with_road_masks) if fractions else None,
                     labels,
                     tuple(_detections(t_ns, size, rows) for rows in again.values()),
                 ),
@@ -162,7 +162,7 @@ def _detections(t_ns: int, size: tuple[int, int], rows: list[tuple[Any, ...]]) -
 
 def _road(
     t_ns: int, size: tuple[int, int], row: tuple[Any, ...], with_mask: bool
-) -> RoadMask | RoadShares:
+) -> RoadMask | RoadFractions:
     if with_mask:
         return RoadMask(t_ns, size, row[0], (row[1], row[2]))
-    return RoadShares(*row)
+    return RoadFractions(*row)

@@ -81,13 +81,13 @@ class Odometer:
             first = row.start_ns if begin is None else max(row.start_ns, begin)
             last = min(row.stop_ns, t_ns)
             if last > first:
-                share = (last - first) / (row.stop_ns - row.start_ns)
-                distance += share * row.distance_m
-                turn += share * row.turn_rad
-                var += share * row.var_m2
+                fraction = (last - first) / (row.stop_ns - row.start_ns)
+                distance += fraction * row.distance_m
+                turn += fraction * row.turn_rad
+                var += fraction * row.var_m2
                 covered += last - first
                 assumed += (last - first) * row.is_gap
-                assumed_m += abs(share * row.distance_m) * row.is_gap
+                assumed_m += abs(fraction * row.distance_m) * row.is_gap
             if row.stop_ns > t_ns:
                 break
             self._next += 1

@@ -209,17 +209,17 @@ def _match_one(
     is_out = np.zeros(took.shape, np.bool_)
     if not len(truth):
         return took, is_out
-    shares = overlap_table(boxes, truth, is_region)
+    fractions = overlap_table(boxes, truth, is_region)
     for step, wanted in enumerate(np.minimum(overlaps, 1.0 - 1e-10).tolist()):
         is_free = np.ones(len(truth), np.bool_)
         for i in range(len(boxes)):
-            can = (is_free | is_region) & (shares[i] >= wanted)
+            can = (is_free | is_region) & (fractions[i] >= wanted)
             # What is to be found goes before what is ignored, whatever the overlap.
             for group in (can & ~is_ignored, can & is_ignored):
                 some = np.flatnonzero(group)
                 if len(some):
                     # Of equal ones the last, as pycocotools has it.
-                    k = int(some[len(some) - 1 - int(np.argmax(shares[i, some][::-1]))])
+                    k = int(some[len(some) - 1 - int(np.argmax(fractions[i, some][::-1]))])
                     took[step, i], is_out[step, i], is_free[k] = k, is_ignored[k], False
                     break
     return took, is_out

@@ -23,7 +23,7 @@ from crosscue.eval.scoring.intervals import (
     UNKNOWN,
     Interval,
     Spread,
-    share_by_cluster,
+    fraction_by_cluster,
 )
 
 from .matching import ALL, OVERLAPS, RANGES, SIZES, Boxes, Matched, Part, match
@@ -258,5 +258,5 @@ def _fraction_of(
     is_right = np.repeat([True, False], [len(right), len(wrong)])
     if not len(is_right):
         return _UNKNOWN
-    ends = share_by_cluster(is_right, blocks[np.concatenate([right, wrong])])
+    ends = fraction_by_cluster(is_right, blocks[np.concatenate([right, wrong])])
     return Measured(len(right) / len(is_right), *ends)

@@ -328,12 +328,12 @@ def _between(
     cov_xyh: Floats | None,
 ) -> tuple[Trajectory, Floats | None]:
     span_ns = np.maximum(estimate.t_ns[after] - estimate.t_ns[before], 1)
-    share = np.where(after > before, (t_ns - estimate.t_ns[before]) / span_ns, 0.0)
+    fraction = np.where(after > before, (t_ns - estimate.t_ns[before]) / span_ns, 0.0)
 
     def mixed(columns: Floats) -> Floats:
-        return columns[before] + share[:, None] * (columns[after] - columns[before])
+        return columns[before] + fraction[:, None] * (columns[after] - columns[before])
 
-    quat = between(estimate.quat_wxyz[before], estimate.quat_wxyz[after], share)
+    quat = between(estimate.quat_wxyz[before], estimate.quat_wxyz[after], fraction)
     found = Trajectory(t_ns, mixed(estimate.xyz_m), quat)
     return found, None if cov_xyh is None else mixed(cov_xyh)
 

@@ -51,19 +51,19 @@ def angle_rad(quat: Floats) -> Floats:
     return angle
 
 
-def between(a: Floats, b: Floats, share: Floats) -> Floats:
+def between(a: Floats, b: Floats, fraction: Floats) -> Floats:
     """Turn evenly from ``a`` to ``b`` (slerp), the shorter way.
 
     Args:
         a: Shape (N, 4).
         b: Shape (N, 4).
-        share: Shape (N,), from 0 at ``a`` to 1 at ``b``.
+        fraction: Shape (N,), from 0 at ``a`` to 1 at ``b``.
     """
     from scipy.spatial.transform import Rotation
 
     start = rotation_of(a)
     turn = (start.inv() * rotation_of(b)).as_rotvec()
-    return quat_of(start * Rotation.from_rotvec(share[:, None] * turn))
+    return quat_of(start * Rotation.from_rotvec(fraction[:, None] * turn))
 
 
 def about_z(angle: float) -> Floats:

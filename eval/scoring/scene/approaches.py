@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Approach
 from crosscue.eval.scoring.columns import NONE, BeliefRows, RunTables
-from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
+from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
 from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
@@ -460,7 +460,7 @@ def _is_unknown(distance_m: float | None) -> bool:
 
 def _fraction(values: Sequence[bool]) -> Proportion:
     # Approaches are the clusters, so Wilson's interval is the one that counts.
-    return share(np.array(values, np.bool_), np.arange(len(values)))
+    return fraction(np.array(values, np.bool_), np.arange(len(values)))
 
 
 def _mean(values: Sequence[float | None]) -> Mean:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, RunTables
-from crosscue.eval.scoring.intervals import Mean, Proportion, mean, share
+from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
 from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
@@ -231,7 +231,7 @@ def reliability(
             high=(number + 1) / bins,
             steps=int(mine.sum()),
             mean_probability=float(probability[mine].mean()),
-            there=share(is_there[mine], clusters[mine]),
+            there=fraction(is_there[mine], clusters[mine]),
         )
         for number in range(bins)
         for mine in [place == number]

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, CueRows, RunTables
-from crosscue.eval.scoring.intervals import Proportion, share
+from crosscue.eval.scoring.intervals import Proportion, fraction
 from crosscue.eval.scoring.pooling import (
     BINS_M,
     cluster_numbers,
@@ -380,13 +380,13 @@ class _Cut:
 
     def precision(self, rows: NDArray[np.bool_]) -> Proportion:
         rows = rows & self.is_found
-        return share(self.truth[rows] == 1, self.cluster[rows])
+        return fraction(self.truth[rows] == 1, self.cluster[rows])
 
     def recall(self, rows: NDArray[np.bool_]) -> Proportion | None:
         if not self.has_recall:
             return None
         rows = rows & (self.truth == 1)
-        return share(self.is_found[rows], self.cluster[rows])
+        return fraction(self.is_found[rows], self.cluster[rows])
 
     def part(self, rows: NDArray[np.bool_]) -> Part:
         return Part(int(rows.sum()), self.precision(rows), self.recall(rows))

@@ -83,9 +83,9 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
     return rows
 
 
-def _pooled(shares: Sequence[Proportion]) -> float:
-    of = sum(one.of for one in shares)
-    return sum(one.right for one in shares) / of if of else math.nan
+def _pooled(fractions: Sequence[Proportion]) -> float:
+    of = sum(one.of for one in fractions)
+    return sum(one.right for one in fractions) / of if of else math.nan
 
 
 def intersection_rows(results: Sequence[ApproachResult]) -> list[Row]:

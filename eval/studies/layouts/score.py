@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.intervals import Mean, mean, share
+from crosscue.eval.scoring.intervals import Mean, fraction, mean
 from crosscue.eval.scoring.scene.belief import brier, log_score
 from crosscue.eval.scoring.scene.detection import CONFIRM_FRAMES, held
 from crosscue.eval.scoring.truth import FEATURES as FEATURES
@@ -219,5 +219,5 @@ def _of_pictures(beliefs: Sequence[DriveBelief], flags_of: Callable[[DriveBelief
 
 def _fraction(flags: Flags, clusters: Int64s) -> Mean:
     """As ``mean``, its interval within 0 and 1."""
-    found = share(flags, clusters)
+    found = fraction(flags, clusters)
     return Mean(found.value, found.clusters_low, found.clusters_high, found.of, found.clusters)

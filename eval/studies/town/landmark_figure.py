@@ -158,11 +158,14 @@ def _success(axes: Axes, part: dict[str, NDArray[np.float64]], colour: str, labe
         inside = bins == k
         if not inside.any():
             continue
-        share = fraction_of(int(reached[inside].sum()), int(inside.sum()))
+        fraction = fraction_of(int(reached[inside].sum()), int(inside.sum()))
         axes.errorbar(
             float(distance_m[inside].mean()) * KM,
-            share.value,
-            yerr=[[max(share.value - share.low, 0.0)], [max(share.high - share.value, 0.0)]],
+            fraction.value,
+            yerr=[
+                [max(fraction.value - fraction.low, 0.0)],
+                [max(fraction.high - fraction.value, 0.0)],
+            ],
             fmt="o",
             ms=3,
             color=colour,

@@ -1,6 +1,6 @@
 """Who reaches the goal: success against distance, range at 80 % success, extra distance driven.
 
-Strategies that fraction density and rate share cities, starts, goals and sensor errors too, so that
+Strategies of the same density and rate share cities, starts, goals and sensor errors too, so that
 their differences are the strategies'.
 """
 
@@ -116,7 +116,7 @@ class Comparison:
             known.
         gain_m: Their mean.
         beyond: Cells below 10 per km2 where this strategy's range is beyond the farthest goal.
-        more_success: Difference in share reached, over all pairs of drives.
+        more_success: Difference in the fraction that reached the goal, over all pairs of drives.
     """
 
     strategy: str

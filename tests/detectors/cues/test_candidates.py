@@ -15,7 +15,7 @@ from crosscue.detectors.cues.candidates import (
     TOO_LITTLE_ROAD,
 )
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import RoadShares, Seen
+from crosscue.detectors.cues.observed import RoadFractions, Seen
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.cue_table import CUES
@@ -87,7 +87,7 @@ def test_a_car_that_is_followed_is_skipped_for_its_first_reason_too() -> None:
 
 def test_a_region_with_too_little_road_is_counted_and_one_without_is_not() -> None:
     cues, tally = _pass()
-    cues(Seen(0, road=RoadShares(left=0.13, straight=0.5, right=0.0)))
+    cues(Seen(0, road=RoadFractions(left=0.13, straight=0.5, right=0.0)))
 
     assert tally.by_cue["road_left"].skipped == {TOO_LITTLE_ROAD: 1}
     assert tally.by_cue["road_left"].max_score == 0.13

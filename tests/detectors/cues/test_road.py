@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.observed import RoadShares
+from crosscue.detectors.cues.observed import RoadFractions
 from crosscue.detectors.cues.road import region_mask, road_fractions
 from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.vehicle import Regions, parse
@@ -22,8 +22,8 @@ def _mask(road: NDArray[np.bool_]) -> RoadMask:
 def test_a_picture_full_of_road_is_all_road_and_an_empty_one_none() -> None:
     full = road_fractions(_mask(np.ones((90, 160), np.bool_)), Regions())
 
-    assert full == RoadShares(1.0, 1.0, 1.0)
-    assert road_fractions(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadShares(0, 0, 0)
+    assert full == RoadFractions(1.0, 1.0, 1.0)
+    assert road_fractions(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadFractions(0, 0, 0)
 
 
 @settings(deadline=None, max_examples=20)
@@ -51,7 +51,7 @@ def test_a_finer_picture_of_the_same_road_gives_the_same_fractions(factor: int) 
 
 
 def test_a_share_of_exactly_the_limit_is_not_more() -> None:
-    assert RoadShares(0.2, 0.21, 0.19).positive(0.2) == (False, True, False)
+    assert RoadFractions(0.2, 0.21, 0.19).positive(0.2) == (False, True, False)
 
 
 def test_a_square_region_holds_its_pixels_and_no_others() -> None:

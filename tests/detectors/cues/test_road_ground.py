@@ -14,7 +14,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Place, RoadShares, Seen
+from crosscue.detectors.cues.observed import Place, RoadFractions, Seen
 from crosscue.detectors.cues.road_ground import ground_fractions, outlines
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.ground_plane import GroundPlane
@@ -102,10 +102,10 @@ def test_a_wide_road_of_ones_own_never_votes_for_a_side(
 ) -> None:
     believed = at(start_m + off_m)
 
-    shares = ground_fractions(pictured(right_m, left_m), CAMERA, GROUND, believed)
+    fractions = ground_fractions(pictured(right_m, left_m), CAMERA, GROUND, believed)
 
-    for share in (shares.left, shares.right):
-        assert math.isnan(share) or share < 0.05
+    for fraction in (fractions.left, fractions.right):
+        assert math.isnan(fraction) or fraction < 0.05
 
 
 @pytest.mark.parametrize("start_m", [10.0, 16.0, 24.0])
@@ -115,12 +115,12 @@ def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, of
     place = at(start_m)
     believed = at(start_m + off_m)
 
-    shares = ground_fractions(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, believed)
+    fractions = ground_fractions(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, believed)
 
     for side in ("left", "right"):
-        share = getattr(shares, side)
-        if not math.isnan(share):
-            assert share > 0.9 if side in legs else share < 0.05
+        fraction = getattr(fractions, side)
+        if not math.isnan(fraction):
+            assert fraction > 0.9 if side in legs else fraction < 0.05
     seen = ground_fractions(pictured(3.0, 6.0), CAMERA, GROUND, at(16.0))
     assert not math.isnan(seen.left + seen.right + seen.straight)
 
@@ -129,9 +129,9 @@ def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, of
 def test_straight_is_the_lane_beyond_the_intersection(ahead: bool) -> None:
     place = at(12.0)
 
-    shares = ground_fractions(pictured(3.0, 6.0, place, ahead=ahead), CAMERA, GROUND, place)
+    fractions = ground_fractions(pictured(3.0, 6.0, place, ahead=ahead), CAMERA, GROUND, place)
 
-    assert shares.straight == pytest.approx(float(ahead), abs=0.1)
+    assert fractions.straight == pytest.approx(float(ahead), abs=0.1)
 
 
 def test_the_mirror_image_has_mirrored_fractions() -> None:
@@ -148,10 +148,10 @@ def test_the_mirror_image_has_mirrored_fractions() -> None:
     ids=["no range", "behind", "too far", "place unsure"],
 )
 def test_what_is_not_resolved_is_not_seen(place: Place | None) -> None:
-    shares = ground_fractions(pictured(3.0, 6.0), CAMERA, GROUND, place)
+    fractions = ground_fractions(pictured(3.0, 6.0), CAMERA, GROUND, place)
 
-    assert math.isnan(shares.left)
-    assert math.isnan(shares.right)
+    assert math.isnan(fractions.left)
+    assert math.isnan(fractions.right)
 
 
 def test_a_coarse_segmentation_sees_less_far() -> None:
@@ -179,7 +179,7 @@ def test_a_region_that_is_not_seen_says_nothing_and_is_counted() -> None:
         "road_right": 0,
     }
     assert tally.by_cue["road_left"].skipped[REGION_NOT_SEEN] == 1
-    assert isinstance(seen.road, RoadShares)
+    assert isinstance(seen.road, RoadFractions)
 
 
 def test_the_default_is_the_ground_unless_a_region_is_drawn_or_the_car_is_simulated() -> None:

@@ -76,13 +76,13 @@ def test_a_declared_size_of_gigabytes(tmp_path: Path, capsys: pytest.CaptureFixt
     assert status in (3, 4)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.35, 0.8, 0.999])
+@pytest.mark.parametrize("fraction", [0.02, 0.35, 0.8, 0.999])
 def test_a_cut_log_gives_what_is_there_and_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles, share: float
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles, fraction: float
 ) -> None:
     whole = drive.log.read_bytes()
     path = tmp_path / "cut.mcap"
-    path.write_bytes(whole[: int(len(whole) * share)])
+    path.write_bytes(whole[: int(len(whole) * fraction)])
 
     status, out, _ = _info(path, capsys)
 

@@ -291,9 +291,9 @@ def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
 
     assert run(["detect", str(log), "-o", str(tmp_path / "run"), *args]) == 0
 
-    shares = open_run(tmp_path / "run").table("road").to_pylist()[0]
-    assert shares["fraction_straight"] > 0.8
-    assert shares["fraction_left"] < 0.02
+    fractions = open_run(tmp_path / "run").table("road").to_pylist()[0]
+    assert fractions["fraction_straight"] > 0.8
+    assert fractions["fraction_left"] < 0.02
     cues = {
         row["cue"]: row["count"] for row in open_run(tmp_path / "run").table("cues").to_pylist()
     }

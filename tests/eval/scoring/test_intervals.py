@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from crosscue.eval.scoring.intervals import mean_by_cluster, share_by_cluster
+from crosscue.eval.scoring.intervals import fraction_by_cluster, mean_by_cluster
 from crosscue.eval.studies.intervals import mean_of, range_at, ratio_of, ratio_of_means
 from crosscue.replay.columns import Int64s
 
@@ -47,7 +47,7 @@ def test_intervals_of_shares_cover_nearly_what_they_state(
             chance.random(len(which))
             < chance.beta(fraction * rest, (1.0 - fraction) * rest, clusters)[which]
         )
-        low, high = share_by_cluster(is_right, which)
+        low, high = fraction_by_cluster(is_right, which)
         held += low <= fraction <= high
 
     assert held / TIMES > 0.89
@@ -77,11 +77,11 @@ def test_one_row_a_cluster_is_students_t() -> None:
 def test_intervals_stay_possible_and_need_four_clusters() -> None:
     right, drives = np.ones(400, np.bool_), np.repeat(np.arange(4), 100)
 
-    low, high = share_by_cluster(right, drives)
+    low, high = fraction_by_cluster(right, drives)
     assert 0.4 < low < 0.6
     assert high == 1.0
-    assert share_by_cluster(~right, drives) == pytest.approx((0.0, 1.0 - low))
-    assert np.isnan(share_by_cluster(right[:300], drives[:300])).all()
+    assert fraction_by_cluster(~right, drives) == pytest.approx((0.0, 1.0 - low))
+    assert np.isnan(fraction_by_cluster(right[:300], drives[:300])).all()
     assert np.isnan(mean_by_cluster(np.ones(300), drives[:300])).all()
     assert np.isnan(mean_of(np.ones(3)).low)
     assert np.isnan(range_at(np.arange(3.0), np.ones(3), 0.8).low)

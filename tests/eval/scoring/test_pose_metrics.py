@@ -265,11 +265,11 @@ def test_every_true_pose_is_accounted_for() -> None:
         assert coverage.scored + lost == coverage.truth_poses
 
 
-@given(seed=SEEDS, share=st.floats(0.0, 1.0))
+@given(seed=SEEDS, fraction=st.floats(0.0, 1.0))
 @settings(max_examples=40, deadline=None)
-def test_interpolation_moves_evenly(seed: int, share: float) -> None:
+def test_interpolation_moves_evenly(seed: int, fraction: float) -> None:
     two = walk(seed, 2)
-    middle = np.array([round(share * 100_000_000)], np.int64)
+    middle = np.array([round(fraction * 100_000_000)], np.int64)
     truth = Trajectory(middle, np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     cov = np.array([[0.0] * 6, [1.0] * 6])
     found = pair(truth, two, 10**9, cov)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.intervals import mean, share, wilson
+from crosscue.eval.scoring.intervals import fraction, mean, wilson
 from crosscue.eval.scoring.scene.cues import match_cues, score_cues
 from crosscue.replay.vehicle.cue_table import CUES
 from support.scoring import (
@@ -50,8 +50,8 @@ def test_frames_of_one_drive_say_nothing_about_the_next() -> None:
 def test_repeated_frames_narrow_wilsons_interval_but_not_that_over_drives() -> None:
     right = np.array([True, True, False, True, False])
     drives = np.arange(5)
-    few = share(right, drives)
-    many = share(np.repeat(right, 100), np.repeat(drives, 100))
+    few = fraction(right, drives)
+    many = fraction(np.repeat(right, 100), np.repeat(drives, 100))
 
     assert many.high - many.low < 0.2 * (few.high - few.low)
     assert many.clusters_high - many.clusters_low == few.clusters_high - few.clusters_low > 0.3

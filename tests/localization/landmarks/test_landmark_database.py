@@ -149,17 +149,17 @@ def test_a_search_wider_than_the_boxes_is_refused(grid: Path) -> None:
             database.near(np.array([np.nan, 0.0]), np.eye(2))
 
 
-@pytest.mark.parametrize("share", [0.5, 0.02, 0.99])
-def test_a_file_cut_short_is_refused(grid: Path, tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.5, 0.02, 0.99])
+def test_a_file_cut_short_is_refused(grid: Path, tmp_path: Path, fraction: float) -> None:
     whole = grid.read_bytes()
     cut = tmp_path / "cut.sqlite"
-    cut.write_bytes(whole[: int(share * len(whole))])
+    cut.write_bytes(whole[: int(fraction * len(whole))])
 
     with pytest.raises(LogFormatError, match=r"cut\.sqlite: cut short: .* build it again"):
         LandmarkDatabase(cut)
     with pytest.raises(LogFormatError, match="cut short"):
         LandmarkWriter(cut, "orb")
-    assert cut.read_bytes() == whole[: int(share * len(whole))]
+    assert cut.read_bytes() == whole[: int(fraction * len(whole))]
 
 
 def test_another_version_is_refused_and_left_alone(grid: Path, tmp_path: Path) -> None:

@@ -169,7 +169,7 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
 @settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-@given(share=st.floats(0.0, 0.98))
+@given(fraction=st.floats(0.0, 0.98))
 @pytest.mark.parametrize(
     ("name", "codec", "container", "tail"),
     [
@@ -180,14 +180,14 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
     ],
 )
 def test_a_video_cut_anywhere_is_refused_or_reported(
-    tmp_path: Path, name: str, codec: str, container: dict[str, str], tail: str, share: float
+    tmp_path: Path, name: str, codec: str, container: dict[str, str], tail: str, fraction: float
 ) -> None:
     whole = tmp_path / name
     if not whole.exists():
         video(whole, N, codec, NO_REORDERING if codec == "libx264" else {}, container)
     raw = whole.read_bytes()
     cut = tmp_path / f"cut{whole.suffix}"
-    cut.write_bytes(raw[: int(share * len(raw))])
+    cut.write_bytes(raw[: int(fraction * len(raw))])
     try:
         blocks, ledger = read(cut)
     except LogError as error:

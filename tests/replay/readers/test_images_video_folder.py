@@ -147,11 +147,11 @@ def test_damaged_cut_and_foreign_files_are_never_given(tmp_path: Path) -> None:
 @settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-@given(share=st.floats(0.0, 0.999))
-def test_a_picture_cut_anywhere_is_reported(tmp_path: Path, suffix: str, share: float) -> None:
+@given(fraction=st.floats(0.0, 0.999))
+def test_a_picture_cut_anywhere_is_reported(tmp_path: Path, suffix: str, fraction: float) -> None:
     folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5", suffix)
     whole = picture(0, suffix)
-    (folder / f"frame_0{suffix}").write_bytes(whole[: int(share * len(whole))])
+    (folder / f"frame_0{suffix}").write_bytes(whole[: int(fraction * len(whole))])
 
     blocks, ledger = read(folder)
 

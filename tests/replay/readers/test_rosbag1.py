@@ -187,15 +187,15 @@ def test_a_wrong_index_position_costs_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None)
-@given(share=st.floats(0.0, 1.0), compression=st.sampled_from(COMPRESSIONS))
+@given(fraction=st.floats(0.0, 1.0), compression=st.sampled_from(COMPRESSIONS))
 def test_a_cut_bag_gives_what_was_before_the_cut(
-    tmp_path_factory: pytest.TempPathFactory, share: float, compression: str
+    tmp_path_factory: pytest.TempPathFactory, fraction: float, compression: str
 ) -> None:
     rows = rows_of(300)
     folder = tmp_path_factory.mktemp("cut")
     content = write_bag(folder / "whole.bag", rows, compression).read_bytes()
     path = folder / "cut.bag"
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     try:
         reading = read_rows(path)
     except LogFormatError:

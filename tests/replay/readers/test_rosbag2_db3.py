@@ -366,21 +366,21 @@ def test_a_row_whose_time_the_index_disputes_is_not_given(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 @settings(max_examples=25, deadline=None)
-@given(share=st.floats(0.0, 1.0))
+@given(fraction=st.floats(0.0, 1.0))
 def test_a_cut_database_gives_only_true_rows_and_says_it_is_cut(
-    tmp_path_factory: pytest.TempPathFactory, share: float
+    tmp_path_factory: pytest.TempPathFactory, fraction: float
 ) -> None:
     rows = rows_of(150)
     path = db3_of(tmp_path_factory.mktemp("cut") / "bag", rows)
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     try:
         reading = read_rows(path)
     except LogError:
         return
 
     assert not Counter(reading.rows) - Counter(rows)
-    assert int(share * len(content)) == len(content) or not reading.ledger.is_whole
+    assert int(fraction * len(content)) == len(content) or not reading.ledger.is_whole
 
 
 def test_large_messages_come_in_blocks_of_bounded_size(tmp_path: Path) -> None:
