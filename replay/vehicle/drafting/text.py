@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import EmptyResultError, Log, name_of
+from crosscue.replay.base import EmptyResultError, Log, SchemaError, name_of
 from crosscue.replay.vehicle.roles import Role, role_of
 
 from .agreement import Verdict
@@ -41,6 +41,7 @@ class Examined:
         database: What they hold; None for no files.
         seen: Buses and motion.
         choices: The signals chosen.
+        left_out: Files that contradict the others, each with what.
     """
 
     logs: Sequence[Log]
@@ -48,6 +49,7 @@ class Examined:
     database: CanDatabase | None
     seen: Observed
     choices: Choices
+    left_out: Sequence[tuple[Path, str]] = ()
 
 
 def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
@@ -68,13 +70,49 @@ def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
             f"{', '.join(map(name_of, logs))}: no topic plays a role in a vehicle file; there are: "
             f"{names}; give a log with a CAN bus, camera, compass or inertial unit"
         )
-    database = None
-    if dbc:
-        from crosscue.replay.can.database import CanDatabase
-
-        database = CanDatabase.load(list(dbc))
+    if not dbc:
+        seen = observe(logs, None)
+        return Examined(logs, (), None, seen, choose(seen))
+    kept, database, left_out = _agreeing(logs, dbc)
     seen = observe(logs, database)
-    return Examined(logs, dbc, database, seen, choose(seen))
+    return Examined(logs, kept, database, seen, choose(seen), left_out)
+
+
+def _agreeing(
+    logs: Sequence[Log], dbc: Sequence[Path]
+) -> tuple[Sequence[Path], CanDatabase, Sequence[tuple[Path, str]]]:
+    """Files that do not contradict one another, what they hold, and those left out, with why.
+
+    Each bus of a car has files of its own, which may use one identifier for different messages.
+    A file that shows the wheels' speeds comes first, then the one that describes most of a bus.
+
+    Raises:
+        SchemaError: A single file cannot be read, or contradicts itself.
+    """
+    from crosscue.replay.can.database import CanDatabase
+
+    try:
+        return dbc, CanDatabase.load(list(dbc)), ()
+    except SchemaError:
+        if len(dbc) == 1:
+            raise
+    seen = {path: observe(logs, CanDatabase.load([path])) for path in dbc}
+
+    def worth(path: Path) -> tuple[bool, int]:
+        has_wheels = any(
+            one.has_axle and not one.verdict.wrong for one in choose(seen[path]).wheels
+        )
+        return has_wheels, max((bus.known for bus in seen[path].buses), default=0)
+
+    kept: list[Path] = []
+    left_out: list[tuple[Path, str]] = []
+    for path in sorted(dbc, key=worth, reverse=True):
+        try:
+            CanDatabase.load([*kept, path])
+            kept.append(path)
+        except SchemaError as error:
+            left_out.append((path, str(error).partition(", with different signals")[0]))
+    return kept, CanDatabase.load(kept), left_out
 
 
 def draft(examined: Examined, folder: Path, mounting: Mounting) -> str:
@@ -143,6 +181,8 @@ def _can_lines(examined: Examined, folder: Path) -> Iterator[str]:
         yield from ("# dbc = [...]  # give the files with --dbc to have signals looked up", "")
         return
     yield f"dbc = [{', '.join(_quoted(_relative(path, folder)) for path in examined.databases)}]"
+    for path, why in examined.left_out:
+        yield from _comment(f"left out, a file of another bus: {path.name}: {why}")
     yield ""
     yield from _wheel_lines(choices, main)
     yield from _angle_lines("yaw_rate", choices.yaw_rates, main)

@@ -135,3 +135,21 @@ def test_a_draft_names_every_bus_and_that_of_each_signal(log: MemoryLog, dbc: Pa
     # The same names on the other bus are listed with what is wrong there.
     assert "not chosen: Wheels.WheelSpeedRL, Wheels.WheelSpeedRR on chassis" in text
     assert len(observe([log], None).buses) == 2
+
+
+def test_the_file_of_another_bus_is_left_out_with_why(
+    log: MemoryLog, dbc: Path, tmp_path: Path
+) -> None:
+    """Buses may use one identifier differently; the file with the wheels is kept."""
+    radar = tmp_path / "radar.dbc"
+    radar.write_text('VERSION ""\nBU_: A\nBO_ 100 Track: 8 A\n SG_ Far : 0|8@1+ (1,0) [0|0] "" A\n')
+
+    examined = examine([log], [radar, dbc])
+
+    assert examined.databases == [dbc]
+    text = draft(examined, tmp_path, Mounting())
+    assert 'dbc = ["car.dbc"]' in text
+    assert "# left out, a file of another bus: radar.dbc: " in text
+    assert "0x064" in text
+    assert parse(text, "the draft").can.wheel_speeds is not None
+    assert examine([log], [dbc]).left_out == ()
