@@ -125,9 +125,9 @@ def _lines_together(found: ScoredRuns) -> list[str]:
     if found.failed:
         every = len(found.failed) + len(found.runs)
         lines.append(f"failed     {len(found.failed)} of {every} runs, left out")
-    for first, second in found.metrics["coverage"].get("same_log", ()):
-        names = f"{visible(first)} and {visible(second)}"
-        text = f"{names} are runs of one log, which therefore counts twice"
+    if same := found.metrics["coverage"].get("same_log", ()):
+        first, second = map(visible, same[0])
+        text = f"{len(same)} logs have several runs, as {first} and {second}: each run counts"
         lines.append(reported_line("twice", text))
     ones = _ones(found)
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
