@@ -94,7 +94,8 @@ def _range_text(cue: str, one: CandidateRow) -> list[str]:
     if unmeasured:
         lines.append(
             f"range: {unmeasured:,} {things} measured, no curve: [ranges.{cue}] is not given; "
-            "crosscue fit ranges, or give camera.focal_px for ranges from motion"
+            "crosscue fit ranges, or for ranges from motion give camera.focal_px and leave out "
+            "ranges.kind"
         )
     if skipped:
         reasons = ", ".join(f"{number:,} {why}" for why, number in skipped.items())
