@@ -108,7 +108,7 @@ def judge_drive(drive: Path, totals: Totals) -> None:
         if ego is None:
             continue
         cars, place = tracks([found], ego), at.get(found.t_ns)
-        one = judge(cars, tracks.seen, camera, settings, place)
+        one = judge(cars, tracks.standing(), tracks.seen, camera, settings, place)
         for name, sides in (("cross_traffic", one.crossing), ("parked", one.parked)):
             for side in ("left", "right"):
                 there = is_there(truth, f"{name}_{side}", found.t_ns)

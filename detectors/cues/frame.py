@@ -129,7 +129,8 @@ class CuePass:
             return None
         self._tracks = self._tracks or CarTracks(camera, cars)
         found = self._tracks(boxes, ego)
-        judged = judge(found, self._tracks.seen, camera, cars, place)
+        standing = self._tracks.standing()
+        judged = judge(found, standing, self._tracks.seen, camera, cars, place)
         judged = judged._replace(past=cars_past(self._tracks.longer(), camera, cars, place))
         return Pairs(
             np.array([car.step_px for car in found]).reshape(-1, 2),

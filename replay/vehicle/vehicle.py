@@ -243,6 +243,8 @@ class Cars(Section):
     """With ``kind = "tracks"``: min number of frames with a car before it is judged."""
     max_frames: Annotated[int, Field(ge=3, le=100)] = 10
     """Number of most recent frames by which it is judged."""
+    parked_frames: Annotated[int, Field(ge=3, le=100)] = 15
+    """The same for a parked one: it takes longer to be sure that a car stands."""
     within_m: Positive = 100.0
     """Cars farther away, by their height, are not judged; nearer ones are judged where their motion
     is certain."""

@@ -81,19 +81,25 @@ def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
 
 
 def judge(
-    cars: Sequence[CarMotion], seen: int, camera: Camera, settings: Cars, place: Place | None
+    cars: Sequence[CarMotion],
+    standing: Sequence[CarMotion],
+    seen: int,
+    camera: Camera,
+    settings: Cars,
+    place: Place | None,
 ) -> Judged:
     """Count what cars do, at the intersection and elsewhere.
 
     Args:
         cars: Those followed.
+        standing: The same, by ``CarTracks.standing``; parked ones are among them.
         seen: How many cars were whole and near enough.
         camera: Where it sits.
         settings: Thresholds.
         place: Of the intersection; None where unknown: cross traffic then counts anywhere, and
             parked cars nowhere.
     """
-    moving, still = crossing(cars, settings), parked(cars, settings)
+    moving, still = crossing(cars, settings), parked(standing, settings)
     moving_here = [c for c in moving if place is None or is_at(c, camera, place)]
     still_here = [c for c in still if place is not None and is_at(c, camera, place)]
     followed = sum(

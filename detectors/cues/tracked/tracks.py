@@ -72,7 +72,7 @@ class _Track:
         )
         self.box_px = box_px
         self.seen.append(one)
-        del self.seen[: -max(settings.max_frames, settings.past_frames)]
+        del self.seen[: -max(settings.max_frames, settings.parked_frames, settings.past_frames)]
 
 
 class CarTracks:
@@ -127,7 +127,19 @@ class CarTracks:
         count, but not fewer than ``max_frames``, where no steady motion fits all of them: the car
         has begun to move, or was taken for another one.
         """
-        return [_steady_motion(track, self._settings) for track in self._again]
+        settings = self._settings
+        return [
+            _steady_motion(track, settings.past_frames, settings, ALONG_ASIDE_MPS)
+            for track in self._again
+        ]
+
+    def standing(self) -> list[CarMotion]:
+        """The same cars by their newest ``parked_frames``: standing shows late.
+
+        Fewer count where no steady motion fits all of them, as in ``longer``.
+        """
+        settings = self._settings
+        return [_steady_motion(track, settings.parked_frames, settings) for track in self._again]
 
     def _observed(
         self, found: Sequence[Detections]
@@ -237,12 +249,13 @@ def _moved(axle: tuple[float, float, float], motion: Motion) -> tuple[float, flo
     )
 
 
-def _steady_motion(track: _Track, settings: Cars) -> CarMotion:
-    frames = settings.past_frames
-    found = _motion(track, frames, ALONG_ASIDE_MPS)
+def _steady_motion(
+    track: _Track, frames: int, settings: Cars, aside_mps: float = USUAL_MPS
+) -> CarMotion:
+    found = _motion(track, frames, aside_mps)
     while not found.is_steady and found.frames > settings.max_frames:
         frames = max(found.frames // 2, settings.max_frames)
-        found = _motion(track, frames, ALONG_ASIDE_MPS)
+        found = _motion(track, frames, aside_mps)
     return found
 
 

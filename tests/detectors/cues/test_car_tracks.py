@@ -149,7 +149,7 @@ def test_a_crossing_car_does_and_to_the_side_it_goes_to(
 
     (one,) = crossing(last, RULES)
     assert one.right_mps == pytest.approx(right_mps, rel=0.2)
-    assert judge(last, 1, CAMERA, RULES, None).crossing == Sides(right_mps < 0, right_mps > 0)
+    assert judge(last, last, 1, CAMERA, RULES, None).crossing == Sides(right_mps < 0, right_mps > 0)
     assert not parked(last, RULES)
 
 
@@ -193,14 +193,27 @@ def test_a_parked_car_counts_at_the_intersection_alone(nose: int) -> None:
     *_, last = drive([Car(40.0, 2.0, nose=nose)], steps)
     ahead_m = 40.0 - 10 * WAY_M
 
-    here = judge(last, 1, CAMERA, RULES, Place(ahead_m - 5.0, ahead_m + 8.0, 1.0))
-    further = judge(last, 1, CAMERA, RULES, Place(ahead_m + 30.0, ahead_m + 45.0, 1.0))
+    here = judge(last, last, 1, CAMERA, RULES, Place(ahead_m - 5.0, ahead_m + 8.0, 1.0))
+    further = judge(last, last, 1, CAMERA, RULES, Place(ahead_m + 30.0, ahead_m + 45.0, 1.0))
 
     side = Sides(nose < 0, nose > 0)
     assert (here.parked, here.parked_elsewhere) == (side, Sides(0, 0))
     assert (further.parked, further.parked_elsewhere) == (Sides(0, 0), side)
-    assert judge(last, 1, CAMERA, RULES, None).parked == Sides(0, 0)
+    assert judge(last, last, 1, CAMERA, RULES, None).parked == Sides(0, 0)
     assert here.crossing == further.crossing == Sides(0, 0)
+
+
+@pytest.mark.parametrize("right_m", [-20.0, 20.0])
+@pytest.mark.parametrize(("right_mps", "is_parked"), [(0.0, True), (2.5, False), (-2.5, False)])
+def test_more_frames_show_that_a_far_car_aside_stands(
+    right_m: float, right_mps: float, is_parked: bool
+) -> None:
+    tracks = CarTracks(CAMERA, RULES)
+    car = Car(70.0, right_m, right_mps, nose=1)
+    *_, last = drive([car], steady(RULES.parked_frames, 0.6), tracks=tracks)
+
+    assert not parked(last, RULES)
+    assert bool(parked(tracks.standing(), RULES)) == is_parked
 
 
 @given(bearing=st.floats(-0.9, 0.9))
