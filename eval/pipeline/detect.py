@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -191,6 +191,7 @@ def detect_into(
             *_simulated_only(choices, logs),
             *_without_cues(named, vehicle),
             *_without_thresholds(named, vehicle),
+            *_without_masks(tables.boxed, vehicle),
             *tables.notices,
         )
         write_manifest(
@@ -315,6 +316,32 @@ def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
     return notices
 
 
+def _without_masks(boxed: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]:
+    """Which rules used boxes where the source uses masks, by detector.
+
+    Args:
+        boxed: Labels that a detector reported without a mask.
+        vehicle: With what the cues count.
+    """
+    cues, cars = vehicle.cues, vehicle.cars
+    heights = {*cues.stop_sign_labels, *cues.traffic_light_labels}
+    said = {
+        name: [
+            *(["heights of signs and lights are those of boxes"] if labels & heights else []),
+            *(
+                [
+                    "cross traffic is judged by boxes (eq. 15 has masks), and no car counts as "
+                    "parked, since only a mask shows where it faces (eq. 16)"
+                ]
+                if labels & {*cars.labels}
+                else []
+            ),
+        ]
+        for name, labels in boxed.items()
+    }
+    return [f"{name}: no masks: {'; '.join(rules)}" for name, rules in said.items() if rules]
+
+
 def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
     for result in runner(block):
         tables.add(result)
@@ -336,6 +363,8 @@ class _Tables:
     clock: LogClock
     notices: list[str] = field(default_factory=list)
     objects: dict[str, int] = field(default_factory=dict)
+    boxed: dict[str, set[str]] = field(default_factory=dict)
+    """By detector: labels of objects that it reported without a mask."""
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, LabelledSink] = field(default_factory=dict)
     _open: ExitStack = field(default_factory=ExitStack)
@@ -464,6 +493,8 @@ class _Tables:
             x0, y0, x1, y1 = found.boxes_px[i].tolist()
             key = f"{name}: {label}"
             self.objects[key] = self.objects.get(key, 0) + 1
+            if not found.masks[i]:
+                self.boxed.setdefault(name, set()).add(label)
             height = _height_px(found, i)
             ranged = detection_range(self.vehicle, label, found.boxes_px[i], height, found.size_px)
             rows.append(

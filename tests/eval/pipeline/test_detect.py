@@ -95,6 +95,33 @@ def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
     assert set(found["label"].to_pylist()) == {"bright"}
 
 
+@pytest.mark.parametrize(
+    ("counted", "said"),
+    [
+        ('[cars]\nlabels = ["bright"]', "no car counts as parked"),
+        (
+            '[cues]\ntraffic_light_labels = ["bright"]',
+            "heights of signs and lights are those of boxes",
+        ),
+        ("", None),
+    ],
+    ids=("cars", "lights", "not counted"),
+)
+def test_rules_that_used_boxes_for_masks_are_named(
+    tmp_path: Path, counted: str, said: str | None
+) -> None:
+    """A detector of boxes alone serves eq. 15 by boxes and eq. 16 not at all."""
+    log, out, vehicle = _folder(tmp_path, 1), tmp_path / "run", tmp_path / "car.toml"
+    vehicle.write_text(f"version = 1\n{counted}\n")
+
+    args = ["--vehicle", str(vehicle), "--detectors", BRIGHT, "--no-cache", "-q"]
+    assert run(["detect", str(log), "-o", str(out), *args]) == 0
+
+    notices = [one for one in open_run(out).drive_manifest().notices if "no masks" in one]
+    assert [said in one for one in notices if said] == [True] * (said is not None)
+    assert len(notices) == (said is not None)
+
+
 def test_a_detector_of_an_installed_package_is_asked_for_by_its_entry_points_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
