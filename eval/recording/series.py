@@ -25,6 +25,8 @@ BELIEF: Final = ("plots", "belief")
 RANGE: Final = ("plots", "range")
 CUES: Final = ("cues",)
 FOUND: Final = "found"
+ONE_FRAME_NS: Final = 100_000_000
+"""How long the only frame of a run is shown to last."""
 POSE: Final[Mapping[str, str]] = {
     "speed": "Speed (m/s)",
     "heading": "Heading (deg)",
@@ -149,9 +151,12 @@ def _changes(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Times at which a cue comes or goes, and 1 or 0 from then on.
 
-    Where it was not looked for, and in gaps of the drive, it counts as 0.
+    Where it was not looked for, in gaps of the drive, and once the last frame has lasted as long as
+    frames usually do, it counts as 0.
     """
-    times = np.union1d(frames_ns, gaps_ns)
+    frames_ns = np.unique(frames_ns)
+    period_ns = int(np.median(np.diff(frames_ns))) if len(frames_ns) > 1 else ONE_FRAME_NS
+    times = np.union1d(np.append(frames_ns, frames_ns[-1:] + period_ns), gaps_ns)
     everywhere = np.isin(times, t_ns[is_found]).astype(np.int64)
     turns = np.flatnonzero(np.diff(everywhere, prepend=-1))
     return times[turns], everywhere[turns]

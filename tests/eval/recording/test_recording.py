@@ -88,7 +88,8 @@ def test_a_cue_comes_and_goes_with_its_frames(tmp_path: Path) -> None:
 
     states = _cells(path, "/cues/road_left", "state")
     assert states == [None, ["found"], None] or states == [[], ["found"], []]
-    assert _rows(path)["/cues/cross_traffic_right"] == 2
+    # Nothing, found in the last frames, and nothing again behind the last one.
+    assert _rows(path)["/cues/cross_traffic_right"] == 3
 
 
 def test_arrows_follow_a_crossing_car(tmp_path: Path) -> None:
