@@ -253,16 +253,16 @@ def _faster(first: Sequence[float], other: Sequence[float]) -> float:
     return median(a / b for a, b in zip(first, other, strict=True))
 
 
-def above(found: Detections, least: Least) -> list[int]:
+def above(found: Detections, min_score: Least) -> list[int]:
     """Those whose score is at least what their class asks, the best first."""
-    kept = [i for i, label in enumerate(found.labels) if found.scores[i] >= least(label)]
+    kept = [i for i, label in enumerate(found.labels) if found.scores[i] >= min_score(label)]
     return sorted(kept, key=lambda i: -float(found.scores[i]))
 
 
-def matches(theirs: Detections, ours: Detections, least: Least) -> Counter[str]:
+def matches(theirs: Detections, ours: Detections, min_score: Least) -> Counter[str]:
     """How many are the same in both, and how many are in one alone."""
-    free, counts = set(above(ours, least)), Counter[str]()
-    for i in above(theirs, least):
+    free, counts = set(above(ours, min_score)), Counter[str]()
+    for i in above(theirs, min_score):
         apart_px = {
             j: float(np.abs(ours.boxes_px[j] - theirs.boxes_px[i]).max())
             for j in free
@@ -278,10 +278,10 @@ def matches(theirs: Detections, ours: Detections, least: Least) -> Counter[str]:
     return counts
 
 
-def judged(found: Detections, scene: Scene, least: Least) -> Counter[str]:
+def judged(found: Detections, scene: Scene, min_score: Least) -> Counter[str]:
     """How many are right, how many find an object again, how many are false."""
     counts, met = Counter[str](), set[int]()
-    for i in above(found, least):
+    for i in above(found, min_score):
         fractions = [
             float(overlaps(box, found.boxes_px[i : i + 1])[0]) if name == found.labels[i] else 0.0
             for name, box in scene.truth
@@ -305,14 +305,16 @@ def reported_equality(
     """Print what ours finds of what the plain loop finds, and where truth counts, what is right."""
     theirs = [plain.detections(scene.frame) for scene in seen]
     found = {name: [one_result(d, s.frame) for s in seen] for name, d in ours.items()}
-    for level, least in levels.items():
+    for level, min_score in levels.items():
         print(f"  {level}")
         for name, results in {PLAIN: theirs, **found}.items():
             same = sum(
-                (matches(a, b, least) for a, b in zip(theirs, results, strict=True)), Counter[str]()
+                (matches(a, b, min_score) for a, b in zip(theirs, results, strict=True)),
+                Counter[str](),
             )
             true = sum(
-                (judged(a, s, least) for a, s in zip(results, seen, strict=True)), Counter[str]()
+                (judged(a, s, min_score) for a, s in zip(results, seen, strict=True)),
+                Counter[str](),
             )
             reported = (
                 f"    {name:36} {same['the same']:4} the same, {same['only plain']} only plain, "
@@ -329,7 +331,8 @@ def score_levels(checkpoint: Checkpoint) -> dict[str, Least]:
     """A raw score of one half, and the scores from which the cues take detections."""
     by = checkpoint.facts.calibration
     cues = {
-        name: raw_score(least, by.get(name, Calibration())) for name, least in CUE_SCORES.items()
+        name: raw_score(min_score, by.get(name, Calibration()))
+        for name, min_score in CUE_SCORES.items()
     }
     return {
         "raw score of 0.5 and more": lambda name: 0.5,

@@ -143,15 +143,15 @@ class Detections:
         Args:
             setting: The vehicle file's threshold; without one the detector's holds.
         """
-        least = self.min_scores if setting is None else setting
-        return np.asarray(self.scores > (MIN_SCORE if least is None else least))
+        min_score = self.min_scores if setting is None else setting
+        return np.asarray(self.scores > (MIN_SCORE if min_score is None else min_score))
 
     def with_min_scores(self, by_label: Mapping[str, float]) -> Self:
         """The same detections with the thresholds that their detector has for their labels."""
         if not by_label:
             return self
-        least = [by_label.get(label, MIN_SCORE) for label in self.labels]
-        return replace(self, min_scores=np.array(least, np.float64))
+        min_score = [by_label.get(label, MIN_SCORE) for label in self.labels]
+        return replace(self, min_scores=np.array(min_score, np.float64))
 
     def taken(self, is_taken: NDArray[np.bool_]) -> Self:
         """The detections that shape (N,) marks, in the same order."""

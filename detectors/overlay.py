@@ -32,11 +32,11 @@ class Drawer:
 
     Attributes:
         folder: Made when first needed.
-        most: How many pictures at most.
+        max_pictures: How many pictures at most.
     """
 
     folder: Path
-    most: int
+    max_pictures: int
     _seen: int = field(default=0)
     _every: int = field(default=1)
     _written: list[Path] = field(default_factory=list)
@@ -56,9 +56,9 @@ class Drawer:
             OutputError: A picture cannot be written.
         """
         number, self._seen = self._seen, self._seen + 1
-        if not self.most or number % self._every:
+        if not self.max_pictures or number % self._every:
             return
-        if len(self._written) == self.most:
+        if len(self._written) == self.max_pictures:
             self._thin()
             if number % self._every:
                 return

@@ -101,7 +101,7 @@ class _Heard:
     was_positive: bool | None = None
     changed_at: dict[bool, float] = field(default_factory=dict)
     sent_at: float = -math.inf
-    most: int = 0
+    max_count: int = 0
     known: set[int] = field(default_factory=set)
 
 
@@ -156,8 +156,8 @@ class CalibratedMessageModel:
 def _is_fresh(heard: _Heard, count: int, objects: tuple[int, ...] | None) -> bool:
     """Is there a thing not seen before in this approach? Remembers what there is."""
     if objects is None:
-        is_fresh = count > heard.most
-        heard.most = max(heard.most, count)
+        is_fresh = count > heard.max_count
+        heard.max_count = max(heard.max_count, count)
         return is_fresh
     is_fresh = not heard.known.issuperset(objects)
     heard.known.update(objects)

@@ -65,11 +65,11 @@ def choose(
     """
     if len(headings_rad) == 0:
         raise ValueError("choose: expected at least one option, found none")
-    chosen, least = 0, np.inf
+    chosen, lowest = 0, np.inf
     for i in range(len(headings_rad)):
         cost = option_cost(headings_rad[i], bearings_rad[i], penalties_rad[i])
-        if cost < least:
-            chosen, least = i, cost
+        if cost < lowest:
+            chosen, lowest = i, cost
     return chosen
 
 
@@ -128,11 +128,11 @@ def empty_memory() -> Memory:
 
 def recognise(memory: Memory, x_m: float, y_m: float, radius_m: float) -> int:
     """The nearest known place within the radius, or ``NONE``."""
-    nearest, least = NONE, radius_m**2
+    nearest, lowest = NONE, radius_m**2
     for i in range(memory.sizes[PLACES]):
         square = (memory.x_m[i] - x_m) ** 2 + (memory.y_m[i] - y_m) ** 2
-        if square < least:
-            nearest, least = i, square
+        if square < lowest:
+            nearest, lowest = i, square
     return nearest
 
 
@@ -140,12 +140,12 @@ def known_option(memory: Memory, place: int, heading_rad: float, same_rad: float
     """The option of a place whose heading is nearest and closer than ``same_rad``, or ``NONE``."""
     if place == NONE:
         return NONE
-    nearest, least = NONE, same_rad
+    nearest, lowest = NONE, same_rad
     option = memory.first[place]
     while option != NONE:
         apart = abs(wrap(memory.headings_rad[option] - heading_rad))
-        if apart < least:
-            nearest, least = option, apart
+        if apart < lowest:
+            nearest, lowest = option, apart
         option = memory.following[option]
     return nearest
 
@@ -237,13 +237,13 @@ def landmark_ahead(
         is_visited: Shape (L,).
     """
     to_goal = (goal_x_m - x_m) ** 2 + (goal_y_m - y_m) ** 2
-    nearest, least = NONE, np.inf
+    nearest, lowest = NONE, np.inf
     for i in range(len(landmarks_m)):
         lx, ly = landmarks_m[i, 0], landmarks_m[i, 1]
         to_car = (lx - x_m) ** 2 + (ly - y_m) ** 2
         left = (lx - goal_x_m) ** 2 + (ly - goal_y_m) ** 2
-        if left < to_goal and to_car < to_goal and not is_visited[i] and to_car < least:
-            nearest, least = i, to_car
+        if left < to_goal and to_car < to_goal and not is_visited[i] and to_car < lowest:
+            nearest, lowest = i, to_car
     return nearest
 
 

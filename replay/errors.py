@@ -116,14 +116,14 @@ class AccountError(CrosscueError):
     """An account does not add up, so no result can be relied on; always a bug of ours."""
 
 
-def one_line(error: BaseException, most: int | None = None) -> str:
+def one_line(error: BaseException, max_length: int | None = None) -> str:
     """What an error says, on one line: each run of white space, line ends too, becomes one space.
 
     Args:
         error: Often another library's, whose message may span lines and quote a whole file.
-        most: Keep this many characters; None keeps all.
+        max_length: Keep this many characters; None keeps all.
     """
-    return " ".join(str(error).split())[:most]
+    return " ".join(str(error).split())[:max_length]
 
 
 class LossWarning(UserWarning):

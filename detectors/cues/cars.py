@@ -157,8 +157,8 @@ def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:
     if not len(pairs.nose):
         return NONE
     x, y = pairs.step_px[:, 0], pairs.step_px[:, 1]
-    least = settings.still_change * pairs.width_px
-    is_moving = (np.abs(x) > least) & (np.abs(y) <= settings.slope * np.abs(x))
+    min_step_px = settings.still_change * pairs.width_px
+    is_moving = (np.abs(x) > min_step_px) & (np.abs(y) <= settings.slope * np.abs(x))
     return Sides(int(np.sum(is_moving & (x < 0))), int(np.sum(is_moving & (x > 0))))
 
 
@@ -166,8 +166,8 @@ def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
     """Cars that stand and face left, and right (eq. 16); an unknown nose says nothing."""
     if not len(pairs.nose):
         return NONE
-    least = settings.still_change * pairs.width_px
-    is_still = (np.abs(pairs.step_px) <= least).all(axis=1)
+    min_step_px = settings.still_change * pairs.width_px
+    is_still = (np.abs(pairs.step_px) <= min_step_px).all(axis=1)
     return Sides(int(np.sum(is_still & (pairs.nose < 0))), int(np.sum(is_still & (pairs.nose > 0))))
 
 

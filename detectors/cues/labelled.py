@@ -10,8 +10,8 @@ from crosscue.replay.vehicle.vehicle import CueSpec, Vehicle
 
 def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
     """How many detections with a cue's labels are surer than its setting, if it has one."""
-    setting, least = vehicle.threshold_of(cue)
-    return count_labels(boxes, vehicle.labels_of(cue), 0.0 if setting is None else least)
+    setting, min_score = vehicle.threshold_of(cue)
+    return count_labels(boxes, vehicle.labels_of(cue), 0.0 if setting is None else min_score)
 
 
 def count_labels(boxes: Sequence[Detections], labels: tuple[str, ...], score: float | None) -> int:

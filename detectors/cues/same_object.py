@@ -74,12 +74,12 @@ def _best_kept(
     """The kept detection that overlaps most with one, of those that may stand for it."""
     label = found[k].labels[i]
     wanted = meaning.get(label, label)
-    best, most = None, MIN_IOU
+    best, largest = None, MIN_IOU
     for (other, j), taken in stands_for.items():
         name = found[other].labels[j]
         if k in taken or meaning.get(name, name) != wanted:
             continue
         overlap = iou(found[k].boxes_px[i], found[other].boxes_px[j])
-        if overlap > most:
-            best, most = (other, j), overlap
+        if overlap > largest:
+            best, largest = (other, j), overlap
     return best

@@ -84,7 +84,7 @@ class Points:
     words: Words
 
 
-def orb_points(grey: NDArray[np.uint8], most: int, fast: int = 10) -> Points:
+def orb_points(grey: NDArray[np.uint8], max_points: int, fast: int = 10) -> Points:
     """Points with upright descriptors; patches small enough for signs of fifty pixels.
 
     Signs stand upright. Descriptors turned with the picture would take a left arrow for a right one
@@ -94,11 +94,11 @@ def orb_points(grey: NDArray[np.uint8], most: int, fast: int = 10) -> Points:
 
     # OpenCV's defaults leave no point in a window of 64 pixels: border and patch of 31.
     orb = cv2.ORB.create(
-        nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=fast
+        nfeatures=max_points, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=fast
     )
     # ORB's detection is FAST, then a choice of the best and angles: needless where all may stay.
     keypoints = cv2.FastFeatureDetector.create(fast).detect(grey, None)
-    if len(keypoints) > most:
+    if len(keypoints) > max_points:
         keypoints = orb.detect(grey, None)
     for keypoint in keypoints:
         keypoint.angle = 0.0
@@ -233,12 +233,12 @@ class SignDetector:
         rows, columns = shape[0] // _CELL_PX + 1, shape[1] // _CELL_PX + 1
         cells = np.floor(votes / _CELL_PX).astype(np.int64)
         counts = window_counts(cells, at, rows, columns, reach)
-        least = max(self.settings.min_fraction * points_drawn, self.settings.min_votes)
-        if counts.max(initial=0) < least:
+        min_count = max(self.settings.min_fraction * points_drawn, self.settings.min_votes)
+        if counts.max(initial=0) < min_count:
             return []
         half = np.array(drawing.size_px) / 2.0
         found = []
-        for row, column in np.argwhere(_is_peak(counts, reach) & (counts >= least)):
+        for row, column in np.argwhere(_is_peak(counts, reach) & (counts >= min_count)):
             middle = (np.array([column, row]) + 0.5) * _CELL_PX
             box = np.concatenate([middle - half, middle + half]) / scale
             found.append((float(counts[row, column]) / points_drawn, drawing.kind, box))

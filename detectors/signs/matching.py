@@ -43,23 +43,23 @@ def _keys(point: Words, a: Words, b: Words, c: Words, d: Words, keys: Words) -> 
 
 @njit(cache=True)
 def _min_above(keys: Words, floor: np.uint64) -> np.uint64:
-    least = _NONE
+    smallest = _NONE
     for j in range(keys.size):
-        least = min(least, keys[j] if keys[j] > floor else _NONE)
-    return least
+        smallest = min(smallest, keys[j] if keys[j] > floor else _NONE)
+    return smallest
 
 
 @njit(cache=True)
-def _least(keys: Words) -> np.uint64:
-    least = _NONE
+def _smallest(keys: Words) -> np.uint64:
+    smallest = _NONE
     for j in range(keys.size):
-        least = min(least, keys[j])
-    return least
+        smallest = min(smallest, keys[j])
+    return smallest
 
 
 @njit(cache=True, nogil=True)
 def nearest(
-    points: Words, drawn: Words, first: NDArray[np.int64], ratio: float, most: int
+    points: Words, drawn: Words, first: NDArray[np.int64], ratio: float, max_count: int
 ) -> NDArray[np.int64]:
     """For each drawing and point the drawing's descriptor that passes the ratio test, else -1.
 
@@ -68,7 +68,7 @@ def nearest(
         drawn: Shape (M, 4): descriptors of all drawings, one after the other.
         first: Shape (K + 1,): where each drawing's descriptors begin.
         ratio: Nearest over second nearest must be below.
-        most: Bits in which the nearest may differ.
+        max_count: Bits in which the nearest may differ.
 
     Returns:
         Shape (K, N), int64.
@@ -81,9 +81,9 @@ def nearest(
         _keys(points[i], a, b, c, d, keys)
         for k in range(len(first) - 1):
             of_drawing = keys[first[k] : first[k + 1]]
-            best = _least(of_drawing)
+            best = _smallest(of_drawing)
             bits = np.int64(best >> _BITS_AT)
-            if bits <= most:
+            if bits <= max_count:
                 second = np.int64(_min_above(of_drawing, best) >> _BITS_AT)
                 if bits < ratio * second:
                     found[k, i] = np.int64(best & _PLACE)

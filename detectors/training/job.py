@@ -229,10 +229,10 @@ def _learned(
         yield point
 
 
-def _spread(pictures: tuple[Any, ...], most: int) -> tuple[Any, ...]:
-    if len(pictures) <= most:
+def _spread(pictures: tuple[Any, ...], max_count: int) -> tuple[Any, ...]:
+    if len(pictures) <= max_count:
         return pictures
-    return tuple(pictures[i] for i in np.linspace(0, len(pictures) - 1, most).astype(int))
+    return tuple(pictures[i] for i in np.linspace(0, len(pictures) - 1, max_count).astype(int))
 
 
 def finished_facts(

@@ -63,8 +63,8 @@ def _of_frames(run: RunFolder, scene: SceneJudged, abouts: Mapping[int, About]) 
     for cue in judged.cues:
         spec = CUES.get(cue.cue)
         labels = () if spec is None else vehicle.labels_of(spec)
-        least = None if spec is None else vehicle.threshold_of(spec)[1]
-        found += missed_and_false(cue, judged.cues, labels, least, detected, abouts, name)
+        min_score = None if spec is None else vehicle.threshold_of(spec)[1]
+        found += missed_and_false(cue, judged.cues, labels, min_score, detected, abouts, name)
     return found
 
 

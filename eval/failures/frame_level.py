@@ -30,7 +30,7 @@ def missed_and_false(
     cue: CueFrames,
     others: Sequence[CueFrames],
     labels: Sequence[str],
-    least: float | None,
+    min_score: float | None,
     detected: Detected,
     about: Mapping[int, About],
     run: str,
@@ -41,14 +41,14 @@ def missed_and_false(
         cue: In all frames of a drive.
         others: All cues of the drive.
         labels: Of the detections that it is made of; none for road and Mobileye.
-        least: Score that they need; None for any.
+        min_score: Score that they need; None for any.
         detected: What detectors found at the times of failures.
         about: Approaches by id.
         run: The run's folder.
     """
     is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
     for rows in _episodes(cue.t_ns, np.flatnonzero(is_missed), cue.approach):
-        why = _why_missed(cue, rows, labels, least, detected)
+        why = _why_missed(cue, rows, labels, min_score, detected)
         # The nearest frame that is not yet at the intersection: there it should be easiest.
         ahead = rows[~(cue.distance_m[rows] < NEAR_M)]
         row = int(ahead[-1] if len(ahead) else rows[-1])
@@ -115,7 +115,7 @@ def _why_missed(
     cue: CueFrames,
     rows: NDArray[np.intp],
     labels: Sequence[str],
-    least: float | None,
+    min_score: float | None,
     detected: Detected,
 ) -> tuple[str, str]:
     if not labels:
@@ -126,8 +126,8 @@ def _why_missed(
     if not found:
         return "not detected", f"no {names} detected in {len(rows)} frames"
     text = f"{names} detected in {len(found)} of {len(rows)} frames, at most {max(found):.2f}"
-    if least is not None and max(found) < least:
-        return "score too low", f"{text}; {least:g} is needed"
+    if min_score is not None and max(found) < min_score:
+        return "score too low", f"{text}; {min_score:g} is needed"
     return "detected, but ruled out", text
 
 

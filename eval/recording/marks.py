@@ -110,12 +110,12 @@ class Marks:
         """Grey for what is too unsure to be a cue."""
         cues, cars = self.vehicle.cues, self.vehicle.cars
         label = found.labels[row]
-        for labels, least, colour in (
+        for labels, min_score, colour in (
             (cars.labels, cars.score, CAR),
             (cues.stop_sign_labels, cues.stop_sign_score, STOP_SIGN),
             (cues.traffic_light_labels, cues.traffic_light_score, TRAFFIC_LIGHT),
         ):
-            if label in labels and found.are_sure(least)[row]:
+            if label in labels and found.are_sure(min_score)[row]:
                 return colour
         is_own = any(
             label in one.labels and found.are_sure(one.score)[row] for one in cues.own.values()

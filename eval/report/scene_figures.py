@@ -264,15 +264,15 @@ def draw_range(
     rows = [one for one in judged if len(one.true_m)]
     few = sum(len(np.unique(one.approach)) for one in rows) <= TRACES
     errors = np.concatenate([np.abs(one.error_m) for one in rows])
-    most = max(1.0, float(np.percentile(errors, 99.0)) * 1.15)
+    limit_m = max(1.0, float(np.percentile(errors, 99.0)) * 1.15)
     far = max(10.0, max(float(one.true_m.max()) for one in rows))
     nearest = min(float(one.true_m.min()) for one in rows)
     near = min(0.0, nearest) if nearest < WIDEST_BIN_M else nearest - WIDEST_BIN_M / 2.0
     if few:
         # A band that fills the panel says nothing about how wide it is.
         two_sd = np.concatenate([2.0 * np.sqrt(one.var_m2) for one in rows])
-        most = max(most, float(np.percentile(two_sd, 90.0)) * 1.15)
-    above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-most, most))
+        limit_m = max(limit_m, float(np.percentile(two_sd, 90.0)) * 1.15)
+    above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-limit_m, limit_m))
     below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _max_nees(scores)))
     drawing = Drawing(
         WIDTH,
@@ -360,7 +360,7 @@ def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
     )
     drawing.axes(panel, "stated probability", "observed fraction")
     drawing.rule(panel.x(0), panel.y(0), panel.x(1), panel.y(1), "line dash")
-    most = max((one.steps for score in belief.values() for one in score.reliability), default=1)
+    limit_m = max((one.steps for score in belief.values() for one in score.reliability), default=1)
     for place, (name, score) in enumerate(belief.items()):
         for one in score.reliability:
             # A little apart, so that features do not hide each other.
@@ -369,7 +369,7 @@ def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
                 one.there.low, one.there.high, one.there.clusters_low, one.there.clusters_high
             )
             drawing.rule(x, panel.y(low), x, panel.y(high), f"line {style_of(name)}")
-            radius = 2.0 + 4.0 * math.sqrt(one.steps / most)
+            radius = 2.0 + 4.0 * math.sqrt(one.steps / limit_m)
             hint = f"{name}: {one.steps} steps, stated {one.mean_probability:.2f}, so in "
             drawing.dot(
                 x,

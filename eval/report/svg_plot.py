@@ -173,10 +173,10 @@ class Drawing:
             x += 30 + 6.2 * len(text)
 
 
-def ticks(low: float, high: float, most: int = 6) -> list[float]:
+def ticks(low: float, high: float, max_count: int = 6) -> list[float]:
     """Round values within a range, either way round."""
     low, high = min(low, high), max(low, high)
-    rough = (high - low) / most
+    rough = (high - low) / max_count
     scale = 10.0 ** math.floor(math.log10(rough))
     step = next(m * scale for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * scale >= rough)
     first = math.ceil(low / step - 1e-9)

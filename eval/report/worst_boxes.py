@@ -54,7 +54,7 @@ class WorstPicture:
     picture: str | None = None
 
 
-def worst_pictures(labelled: LabelledRun, overlap: float, most: int) -> list[WorstPicture]:
+def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> list[WorstPicture]:
     """The pictures with most mistakes, those of one moment once.
 
     Raises:
@@ -68,7 +68,7 @@ def worst_pictures(labelled: LabelledRun, overlap: float, most: int) -> list[Wor
     )
     chosen: list[int] = []
     for i in order:
-        if len(chosen) < most and all(
+        if len(chosen) < max_count and all(
             abs(int(labelled.t_ns[i] - labelled.t_ns[k])) >= APART_NS for k in chosen
         ):
             chosen.append(i)

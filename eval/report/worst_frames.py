@@ -21,7 +21,7 @@ from crosscue.replay.vehicle.vehicle import CUES, Vehicle
 
 from .scene_figures import WorstFrame
 
-MOST: Final = 6
+MAX_FRAMES: Final = 6
 APART_NS: Final = 2_000_000_000
 """Wrong frames of one cue closer than this are one mistake; its most confident frame is shown."""
 WIDTH_PX: Final = 640
@@ -39,7 +39,7 @@ FOUND: Final = (
 )
 
 
-def worst_frames(scored: Sequence[RunScored], most: int = MOST) -> list[WorstFrame]:
+def worst_frames(scored: Sequence[RunScored], max_count: int = MAX_FRAMES) -> list[WorstFrame]:
     """The most confident wrong cues of all runs, most confident first.
 
     Raises:
@@ -49,7 +49,7 @@ def worst_frames(scored: Sequence[RunScored], most: int = MOST) -> list[WorstFra
     found = [wrong for one in scored for wrong in _wrong(one)]
     found.sort(key=lambda one: (-(one.confidence or 0.0), -one.frames, one.run, one.t_ns, one.cue))
     folders = {one.judged.coverage.drive: one.run for one in scored}
-    return [_with_picture(one, folders[one.run]) for one in found[:most]]
+    return [_with_picture(one, folders[one.run]) for one in found[:max_count]]
 
 
 def _wrong(scored: RunScored) -> list[WorstFrame]:

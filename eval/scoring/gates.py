@@ -8,7 +8,7 @@ A gate file is TOML::
     metric = "cues.stop_sign.precision"
     min = 0.95
     use = "low"      # the interval's lower end must reach it; default: "value"
-    least = 100      # on fewer rows than this the gate fails; default: 1
+    min_count = 100  # on fewer rows than this the gate fails; default: 1
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Gate(BaseModel):
     max: Bound | None = None
     use: Literal["value", "low", "high"] = "value"
     """The metric itself, or an end of its interval (the wider one where there are two)."""
-    least: Annotated[int, Field(ge=1)] = 1
+    min_count: Annotated[int, Field(ge=1)] = 1
     """Rows that the metric must stand on, where it says how many."""
 
     @model_validator(mode="after")
@@ -147,8 +147,8 @@ def _failure(gate: Gate, found: MetricValue, value: float) -> str:
         return "not scored: nothing to measure it by"
     if math.isnan(value):
         return f"its interval has no {gate.use} end: too few drives"
-    if found.of is not None and found.of < gate.least:
-        return f"stands on {found.of} rows, expected {gate.least} or more"
+    if found.of is not None and found.of < gate.min_count:
+        return f"based on {found.of} rows, expected {gate.min_count} or more"
     if gate.min is not None and value < gate.min:
         return f"{value:.6g} is below {gate.min:g}"
     if gate.max is not None and value > gate.max:

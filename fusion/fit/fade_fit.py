@@ -120,16 +120,16 @@ def _binned(distance: NDArray[np.float64], correlation: NDArray[np.float64]) -> 
 
 def _integral(binned: Binned, scales: NDArray[np.float64], length: float) -> tuple[float, float]:
     """Integral of the best curve over ``length``, and its misfit less what no curve can repair."""
-    best, least = float(scales[0]), float("inf")
+    best, lowest = float(scales[0]), float("inf")
     for scale in scales.tolist():
         shape = np.exp(-binned.distance / scale)
         always, fading = _line(shape, binned)
         curve = always + fading * shape
         misfit = float((binned.pairs * curve * (curve - 2.0 * binned.correlation)).sum())
-        if misfit < least:
-            least = misfit
+        if misfit < lowest:
+            lowest = misfit
             best = always * length + fading * scale * -float(np.expm1(-length / scale))
-    return max(best, float(scales[0])), least
+    return max(best, float(scales[0])), lowest
 
 
 def _line(shape: NDArray[np.float64], binned: Binned) -> tuple[float, float]:

@@ -41,7 +41,7 @@ PULL_STEPS: Final = 20.0
 STRAY_SD: Final = 3.0
 EXPONENTS: Final = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 LAPSES: Final = (0.0, 0.02, 0.05, 0.1)
-LEAST: Final = 0.002
+MIN_RATE: Final = 0.002
 """No probability is learned nearer to 0 or 1: what was never seen can happen."""
 
 
@@ -338,4 +338,4 @@ def _rate(tally: Tally, what: str, usual: float) -> float:
     hits = sum(count for (_, when, now), count in tally.items() if when == what and now)
     of = sum(count for (_, when, _), count in tally.items() if when == what)
     rate = (hits + PULL_STEPS * usual) / (of + PULL_STEPS)
-    return round(min(max(rate, LEAST), 1.0 - LEAST), 4)
+    return round(min(max(rate, MIN_RATE), 1.0 - MIN_RATE), 4)

@@ -314,12 +314,12 @@ class _Fit:
         from scipy.optimize import minimize
 
         names = self._noises()
-        least = MIN_FIX_SD_M / self.drive.fix_sd_m
+        min_scale = MIN_FIX_SD_M / self.drive.fix_sd_m
         begin = [max(getattr(self.given, name), _MIN_SD) for name in names] + [self.fix_scale]
 
         def at(logs: Floats) -> _Fit:
             *noise, scale = np.exp(logs).tolist()
-            scale = max(scale, least)
+            scale = max(scale, min_scale)
             return replace(
                 self,
                 given=_changed(self.given, dict(zip(names, noise, strict=True))),

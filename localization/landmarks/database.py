@@ -160,7 +160,7 @@ class LandmarkDatabase:
             return int(self._sql.execute("SELECT count(*) FROM landmark").fetchone()[0])
 
     def near(
-        self, xy_m: Floats, cov_m2: Floats, sigmas: float = 2.0, most: int = 50
+        self, xy_m: Floats, cov_m2: Floats, sigmas: float = 2.0, max_count: int = 50
     ) -> tuple[Nearby, ...]:
         """Landmarks inside the ellipse around a position, nearest (in sigmas) first.
 
@@ -171,7 +171,7 @@ class LandmarkDatabase:
             xy_m: Shape (2,): where the camera is believed to be.
             cov_m2: Shape (2, 2): how surely; may be singular.
             sigmas: Size of the ellipse, at most ``REACH_SIGMAS``.
-            most: Give no more than these.
+            max_count: Give no more than these.
 
         Raises:
             ValueError: ``sigmas`` out of range, or numbers that are not finite.
@@ -194,7 +194,7 @@ class LandmarkDatabase:
             )
             found = (self._nearby(row, xy_m, cov_m2) for row in rows)
             inside = (one for one in found if one.sigmas <= sigmas)
-            return tuple(heapq.nsmallest(most, inside, key=lambda one: (one.sigmas, one.key)))
+            return tuple(heapq.nsmallest(max_count, inside, key=lambda one: (one.sigmas, one.key)))
 
     def within(self, xy_m: Floats, radius_m: float) -> Iterator[Nearby]:
         """Landmarks no further than ``radius_m`` from a position, in the order of adding."""

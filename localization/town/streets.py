@@ -182,7 +182,7 @@ def _largest_part(gates: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
     """What can be reached, and how, from the first place of the part with most places."""
     size = gates.shape[1]
     best, seen = np.zeros(size, np.uint8), np.zeros(size, np.bool_)
-    most, left = 0, size
+    largest, left = 0, size
     for start in range(size):
         if seen[start]:
             continue
@@ -194,10 +194,10 @@ def _largest_part(gates: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
             if reach[node] != 0:
                 seen[node] = True
                 count += 1
-        if count > most:
-            most, best = count, reach
+        if count > largest:
+            largest, best = count, reach
         left -= count
-        if left <= most:
+        if left <= largest:
             break
     return best
 

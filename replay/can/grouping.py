@@ -78,8 +78,8 @@ class Tables:
 
 def _fitting_lengths(sizes: NDArray[np.int64], longest: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Shape (2, M, 256), from shapes (M,) and (2, M): which lengths messages may have."""
-    length, most = np.arange(256), longest[:, :, None]
-    fits: NDArray[np.bool_] = (length >= sizes[:, None]) & (length <= most)
+    length, max_length = np.arange(256), longest[:, :, None]
+    fits: NDArray[np.bool_] = (length >= sizes[:, None]) & (length <= max_length)
     # Where the log keeps no lengths there is nothing to hold against the database.
     fits[:, :, LENGTH_UNKNOWN] |= longest >= 0
     return fits

@@ -68,13 +68,13 @@ class NumpyEngine:
         if not len(groups):
             return True
         lengths = frames.length.take(order[: ends[-1]])
-        least = np.minimum.reduceat(lengths, ends[groups])
-        most = np.maximum.reduceat(lengths, ends[groups])
+        shortest = np.minimum.reduceat(lengths, ends[groups])
+        max_length = np.maximum.reduceat(lengths, ends[groups])
         fits = self._tables.fits[frames.data.shape[1]][0, groups + 1]
         at = np.arange(len(groups))
         # Between two fitting lengths all fit, but for the number that stands for "unknown".
-        in_one_piece = (most < LENGTH_UNKNOWN) | (least == LENGTH_UNKNOWN)
-        return bool((fits[at, least] & fits[at, most] & in_one_piece).all())
+        in_one_piece = (max_length < LENGTH_UNKNOWN) | (shortest == LENGTH_UNKNOWN)
+        return bool((fits[at, shortest] & fits[at, max_length] & in_one_piece).all())
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
         """Columns of one message of the frames grouped last."""

@@ -166,12 +166,12 @@ class _CanIds:
                 self.counts[int(key)] += int(count)
 
     def top(self, duration_s: float) -> tuple[CanIdCount, ...]:
-        most = sorted(self.counts.items(), key=lambda item: (-item[1], item[0]))[:CAN_IDS_SHOWN]
+        frequent = sorted(self.counts.items(), key=lambda item: (-item[1], item[0]))[:CAN_IDS_SHOWN]
         return tuple(
             CanIdCount(
                 key % _EXTENDED, key >= _EXTENDED, n, n / duration_s if duration_s > 0 else None
             )
-            for key, n in most
+            for key, n in frequent
         )
 
 

@@ -256,8 +256,8 @@ def _clocks(
     aligned: Sequence[_Aligned], gap_ns: int, known: Timeline | None
 ) -> tuple[LogClock, ...]:
     shifts: list[list[int]] = [[0] for _ in aligned]
-    most = max((len(one.events) for one in aligned), default=0)
-    for number in range(1, most + 1):
+    max_events = max((len(one.events) for one in aligned), default=0)
+    for number in range(1, max_events + 1):
         for i, one in enumerate(aligned):
             if len(one.events) < number:
                 continue

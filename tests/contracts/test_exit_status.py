@@ -150,9 +150,9 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for name in ("noise", "noise2"):
         (folder / name).write_bytes(bytes(range(256)) * 8)
     (folder / "cut.mcap").write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
-    for name, least in (("kept", 0.0), ("violated", 2.0)):
+    for name, bound in (("kept", 0.0), ("violated", 2.0)):
         (folder / f"{name}.toml").write_text(
-            f'version = 1\n[[gate]]\nmetric = "cues.stop_sign.precision"\nmin = {least}\n'
+            f'version = 1\n[[gate]]\nmetric = "cues.stop_sign.precision"\nmin = {bound}\n'
         )
     dbc = (drive / "simulated_car.dbc").read_text()
     (drive / "turned.dbc").write_text(dbc.replace("|16@1", "|15@1").replace("|16@0", "|15@0"))

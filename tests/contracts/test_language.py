@@ -46,7 +46,7 @@ PHRASES: Final = {
 
 NAMES: Final = {
     "report": r"(^|_)(told|tells|tell)(_|$)(?!apart|from)",
-    "max or min": r"^_?(MOST|LEAST|most|least)_(?!common|recent|squares)",
+    "max or min": r"^_?(MOST|LEAST|most|least)(_(?!common|recent|squares)|$)",
     "fraction": r"(^|_)(?<!dead_end_)(?<!row_)(?<!column_)shares?(_at|_by_cluster)?$|[a-z]Shares$",
     "repair": r"(^|_)mend(s|ed|ing)?(_|$)",
     "overconfident": r"(^|_)(over|under)_sure(_|$)",

@@ -63,17 +63,19 @@ def test_cues_that_are_not_there_are_not_named() -> None:
     assert (_drawn((), {"stop_sign": 1}) != _drawn((), {})).any()
 
 
-@given(frames=st.integers(0, 40), most=st.integers(0, 9))
+@given(frames=st.integers(0, 40), max_count=st.integers(0, 9))
 @settings(max_examples=40, deadline=None)
-def test_pictures_are_spread_evenly_over_a_drive_of_any_length(frames: int, most: int) -> None:
+def test_pictures_are_spread_evenly_over_a_drive_of_any_length(frames: int, max_count: int) -> None:
     _, coded = cv2.imencode(".jpg", GREY[:16, :16])
     with TemporaryDirectory() as name:
-        drawer = Drawer(Path(name) / "pictures", most)
+        drawer = Drawer(Path(name) / "pictures", max_count)
         for t_ns in range(frames):
             picture = Encoded("jpeg", memoryview(coded.tobytes()))
             drawer(t_ns, picture, (), {})
         drawn = sorted(int(path.stem) for path in Path(name).glob("pictures/*"))
 
-    assert len(drawn) <= most
-    assert len(drawn) >= min(frames, (most + 1) // 2)
-    assert drawn == list(range(0, frames, drawn[1] if len(drawn) > 1 else max(frames, 1)))[:most]
+    assert len(drawn) <= max_count
+    assert len(drawn) >= min(frames, (max_count + 1) // 2)
+    assert (
+        drawn == list(range(0, frames, drawn[1] if len(drawn) > 1 else max(frames, 1)))[:max_count]
+    )

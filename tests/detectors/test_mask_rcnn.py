@@ -167,12 +167,12 @@ class _Small:
     """A back end whose device holds so many pictures at a time."""
 
     within: Parts
-    most: int
+    max_count: int
     tried: list[int] = field(default_factory=list)
 
     def body(self, pictures: Bytes, /) -> Body:
         self.tried.append(len(pictures))
-        if len(pictures) > self.most:
+        if len(pictures) > self.max_count:
             raise torch.OutOfMemoryError("no memory")
         return self.within.body(pictures)
 
@@ -183,9 +183,9 @@ class _Small:
         return self.within.masks(pooled)
 
 
-def _with_memory(most: int) -> tuple[MaskRcnnDetector, _Small]:
+def _with_memory(max_count: int) -> tuple[MaskRcnnDetector, _Small]:
     plenty = _detector(batch=8)
-    small = _Small(plenty.parts, most)
+    small = _Small(plenty.parts, max_count)
     return replace(plenty, parts=small), small
 
 

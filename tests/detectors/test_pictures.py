@@ -37,9 +37,9 @@ def test_every_coding_gives_the_size_and_channels_asked_for(suffix: str, view: V
     assert pixels.shape == ((48, 64) if view.is_grey else (48, 64, 3))
 
 
-@pytest.mark.parametrize(("least", "by"), [(None, 1), (64, 1), (33, 1), (32, 2), (10, 4), (8, 8)])
-def test_a_jpeg_is_decoded_at_the_smallest_scale_that_serves(least: int | None, by: int) -> None:
-    view = View(min_width_px=least)
+@pytest.mark.parametrize(("min_px", "by"), [(None, 1), (64, 1), (33, 1), (32, 2), (10, 4), (8, 8)])
+def test_a_jpeg_is_decoded_at_the_smallest_scale_that_serves(min_px: int | None, by: int) -> None:
+    view = View(min_width_px=min_px)
 
     pixels, size = decode(_encode(_ramp(), ".jpg"), view)
 

@@ -23,7 +23,7 @@ SIZE_PX = (96, 128)
     st.floats(5.0, 60.0),
 )
 def test_the_boxes_and_their_order_are_torchvisions(
-    counts: list[int], most: int, floor: float, seed: int, spread_px: float
+    counts: list[int], max_count: int, floor: float, seed: int, spread_px: float
 ) -> None:
     rng = np.random.default_rng(seed)
     total = sum(counts)
@@ -32,7 +32,7 @@ def test_the_boxes_and_their_order_are_torchvisions(
     boxes = torch.from_numpy(np.hstack([middles - halves, middles + halves]).astype(np.float32))
     logits = torch.from_numpy(rng.normal(0.0, 2.0, total).astype(np.float32))
     rpn = build_network(plan_of()).eval().rpn
-    rpn._pre_nms_top_n["testing"], rpn._post_nms_top_n["testing"] = 1000, most
+    rpn._pre_nms_top_n["testing"], rpn._post_nms_top_n["testing"] = 1000, max_count
     rpn.score_thresh = floor
 
     ours = likeliest_apart(rpn, boxes, logits, np.repeat(np.arange(len(counts)), counts), SIZE_PX)

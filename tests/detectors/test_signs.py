@@ -111,18 +111,20 @@ def test_the_ratio_test_agrees_with_opencv(seed: int) -> None:
     assert got[0, 4] == 2
 
 
-@pytest.mark.parametrize("most", [100, 20_000])
-def test_points_are_those_of_upright_orb_whether_or_not_it_must_choose(most: int) -> None:
+@pytest.mark.parametrize("max_count", [100, 20_000])
+def test_points_are_those_of_upright_orb_whether_or_not_it_must_choose(max_count: int) -> None:
     grey = clutter(5)
-    orb = cv2.ORB.create(nfeatures=most, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=6)
+    orb = cv2.ORB.create(
+        nfeatures=max_count, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=6
+    )
     keypoints = orb.detect(grey, None)
     for keypoint in keypoints:
         keypoint.angle = 0.0
     keypoints, descriptors = orb.compute(grey, keypoints)
 
-    points = orb_points(grey, most, 6)
+    points = orb_points(grey, max_count, 6)
 
-    assert len(keypoints) == most if most == 100 else 100 < len(keypoints) < most
+    assert len(keypoints) == max_count if max_count == 100 else 100 < len(keypoints) < max_count
     np.testing.assert_array_equal(points.at_px, [keypoint.pt for keypoint in keypoints])
     np.testing.assert_array_equal(points.words.view(np.uint8), descriptors)
 

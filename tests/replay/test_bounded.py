@@ -18,13 +18,15 @@ from crosscue.replay.vehicle import vehicle
 ENDLESS = Path("/dev/zero")
 
 
-@given(content=st.binary(max_size=40), most=st.integers(0, 40))
-def test_a_file_comes_whole_or_not_at_all(content: bytes, most: int) -> None:
+@given(content=st.binary(max_size=40), max_count=st.integers(0, 40))
+def test_a_file_comes_whole_or_not_at_all(content: bytes, max_count: int) -> None:
     with tempfile.NamedTemporaryFile() as file:
         file.write(content)
         file.flush()
 
-        assert read_at_most(Path(file.name), most) == (content if len(content) <= most else None)
+        assert read_at_most(Path(file.name), max_count) == (
+            content if len(content) <= max_count else None
+        )
 
 
 @pytest.mark.skipif(not ENDLESS.exists(), reason="no /dev/zero here")

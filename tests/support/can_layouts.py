@@ -141,9 +141,9 @@ OFFSETS = st.sampled_from([0, 0, 0, -40, 1, 500, 0.5, -273.15, -(2**31), 1e-3])
 def signals(draw: st.DrawFn, name: str, length_bytes: int) -> CanSignal:
     """One signal that fits into so many bytes."""
     is_float = length_bytes >= 4 and draw(st.integers(0, 7)) == 0
-    most = min(64, 8 * length_bytes)
-    short = st.integers(1, min(16, most))
-    length = draw(st.one_of(short, st.integers(1, most)))
+    max_count = min(64, 8 * length_bytes)
+    short = st.integers(1, min(16, max_count))
+    length = draw(st.one_of(short, st.integers(1, max_count)))
     if is_float:
         length = draw(st.sampled_from([32, 64])) if length_bytes >= 8 else 32
     is_big_endian = draw(st.booleans())

@@ -45,9 +45,11 @@ def likeliest_apart(
 
 
 @njit(cache=True)
-def _apart(boxes: Boxes, levels: NDArray[np.int64], overlap: float, most: int) -> NDArray[np.int64]:
+def _apart(
+    boxes: Boxes, levels: NDArray[np.int64], overlap: float, max_kept: int
+) -> NDArray[np.int64]:
     """Rows of boxes that no better kept one of their level overlaps more than that."""
-    kept = np.empty(min(most, len(boxes)), np.int64)
+    kept = np.empty(min(max_kept, len(boxes)), np.int64)
     areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     count = 0
     for i in range(len(boxes)):

@@ -42,7 +42,7 @@ class ScreenedParts(TorchParts):
         """Of a network that ``can_screen``; its least score is taken as it is now."""
         super().__init__(network, torch.device("cpu"))
         self._heads: Final = network.roi_heads
-        self._least: Final = float(torch.logit(torch.tensor(float(self._heads.score_thresh))))
+        self._min_logit: Final = float(torch.logit(torch.tensor(float(self._heads.score_thresh))))
         first = self._heads.box_head.fc6
         with torch.inference_mode():
             # The left singular vectors, from a matrix that is small however wide the layer is.
@@ -58,12 +58,12 @@ class ScreenedParts(TorchParts):
         """As ``Parts``; shifts are 0 where logits are rough."""
         logits = self._rough(pooled)
         rough = _log_odds(logits)
-        is_close = rough >= self._least - MARGIN
+        is_close = rough >= self._min_logit - MARGIN
         is_close[::CHECKED] = True
         rows = is_close.nonzero()[:, 0]
         close, close_shifts = super().boxes(pooled[rows])
         exact = _log_odds(close)
-        counts = exact >= self._least - MARGIN
+        counts = exact >= self._min_logit - MARGIN
         if bool((counts & (exact - rough[rows] > MARGIN / 2.0)).any()):
             return super().boxes(pooled)
         logits[rows] = close

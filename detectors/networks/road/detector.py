@@ -81,10 +81,10 @@ class RoadNetworkDetector:
             return []
         size = (self.checkpoint.facts.width_px, self.checkpoint.facts.height_px)
         given = np.stack([resized(frame.pixels, size) for frame in frames])
-        least = float(np.log(self.settings.probability / (1.0 - self.settings.probability)))
+        min_logit = float(np.log(self.settings.probability / (1.0 - self.settings.probability)))
         with torch.inference_mode():
             logits = logits_of(self.checkpoint.network, torch.from_numpy(given).to(self.device))
-            road = (logits > least).cpu().numpy()
+            road = (logits > min_logit).cpu().numpy()
         return [
             RoadMask(frame.t_ns, frame.size_px, rle.encode(mask, (0, 0), size), size)
             for frame, mask in zip(frames, road, strict=True)

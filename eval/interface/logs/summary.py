@@ -206,8 +206,8 @@ def _ids_in_words(bus: TopicSummary) -> str:
         + (f" {i.rate_hz:.3g} Hz" if i.rate_hz else f" {i.count} times")
         for i in bus.can_ids
     )
-    most = "most frequent: " if bus.can_id_count > len(bus.can_ids) else ""
-    return f"{bus.can_id_count} ids; {most}{named}"
+    prefix = "most frequent: " if bus.can_id_count > len(bus.can_ids) else ""
+    return f"{bus.can_id_count} ids; {prefix}{named}"
 
 
 def _losses(summary: LogSummary, width: int) -> Iterator[str]:

@@ -11,7 +11,7 @@ from typing import Final
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.replay.base import UsageError, write_text
 
-MOST: Final = 100_000
+MAX_LAYOUTS: Final = 100_000
 """Layouts a command takes; far more than anybody has the time to render."""
 
 
@@ -28,8 +28,8 @@ def layouts_of(texts: Sequence[str], who: str) -> list[str]:
     names: list[str] = []
     for text in texts:
         names += _span(text, who)
-        if len(names) > MOST:
-            raise UsageError(f"{who}: {text}: expected at most {MOST:,} layouts; give fewer")
+        if len(names) > MAX_LAYOUTS:
+            raise UsageError(f"{who}: {text}: expected at most {MAX_LAYOUTS:,} layouts; give fewer")
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise UsageError(f"{who}: {twice}: named twice; name each layout once")
@@ -53,7 +53,7 @@ def _span(text: str, who: str) -> Sequence[str]:
     letters = re.fullmatch(r"([A-H])(?:-([A-H]))?", text)
     if numbers is not None:
         first, last = int(numbers[1]), int(numbers[2] or numbers[1])
-        names: Sequence[str] = [f"L{k}" for k in range(first, min(last, first + MOST) + 1)]
+        names: Sequence[str] = [f"L{k}" for k in range(first, min(last, first + MAX_LAYOUTS) + 1)]
     elif letters is not None:
         names = SCORED[SCORED.index(letters[1]) : SCORED.index(letters[2] or letters[1]) + 1]
     else:

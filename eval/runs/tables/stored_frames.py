@@ -104,7 +104,7 @@ def stored_frames(
     Raises:
         RunError: A table is missing or damaged.
     """
-    least = {d.name: d.min_scores for d in detectors}
+    scores_of = {d.name: d.min_scores for d in detectors}
     objects = [d.name for d in detectors if d.role == Role.OBJECTS]
     signs = [d.name for d in detectors if d.role == Role.SIGNS]
     labels = all_labels(d.labels for d in detectors if d.role in (Role.OBJECTS, Role.SIGNS))
@@ -124,7 +124,7 @@ def stored_frames(
             fractions = road.of(frame) if has_road else []
             some, others = (
                 tuple(
-                    _detections(t_ns, size, by_name.get(name, [])).with_min_scores(least[name])
+                    _detections(t_ns, size, by_name.get(name, [])).with_min_scores(scores_of[name])
                     for name in names
                 )
                 for names in (objects, signs)

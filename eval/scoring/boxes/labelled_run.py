@@ -83,8 +83,8 @@ class LabelledRun:
 
     def threshold(self, name: str) -> float:
         """Of a class, as the detector says; the highest of its labels."""
-        least = self.detector.min_scores
-        return max(least.get(label, MIN_SCORE) for label in self.members[name])
+        thresholds = self.detector.min_scores
+        return max(thresholds.get(label, MIN_SCORE) for label in self.members[name])
 
     def part(self, is_chosen: np.typing.NDArray[np.bool_]) -> tuple[Boxes, Boxes]:
         """Labels and detections of some pictures, shape (P,), under their numbers there."""

@@ -244,11 +244,11 @@ def _result(get: Callable[[], Floats]) -> Floats:
 def _on_ray(chunks: Sequence[Chunk], workers: int, address: str) -> Iterator[tuple[Chunk, Floats]]:
     with joined(address, workers) as ray:
         drive = ray.remote(max_retries=2)(_drive_chunk)
-        most = 2 * max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        max_running = 2 * max(int(ray.cluster_resources().get("CPU", 1)), 1)
         waiting = deque(chunks)
         running: dict[Any, Chunk] = {}
         while waiting or running:
-            while waiting and len(running) < most:
+            while waiting and len(running) < max_running:
                 chunk = waiting.popleft()
                 running[drive.remote(chunk)] = chunk
             ready, _ = ray.wait(list(running), num_returns=1)

@@ -245,12 +245,12 @@ class _Planner:
         self._count()
         one = Field(each.name, each.type_name, text_bound=each.text_bound)
         item = tuple(_in_runs(self._one(one, path, depth)))
-        least = sum(_least(step) for step in item)
+        min_bytes = sum(_min_bytes(step) for step in item)
         fixed = all(isinstance(step, Run) for step in item)
         is_array = each.shape is Shape.ARRAY
-        if is_array and least * each.size > self.limits.message_bytes:
+        if is_array and min_bytes * each.size > self.limits.message_bytes:
             raise SchemaError(
-                f"{self.root}: {path} alone takes {least * each.size} bytes, over the limit of "
+                f"{self.root}: {path} alone takes {min_bytes * each.size} bytes, over the limit of "
                 f"{self.limits.message_bytes} for a message"
             )
         return Items(
@@ -261,7 +261,7 @@ class _Planner:
             PRIMITIVES.get(each.type_name, ""),
             _jumps([step.size for step in item if isinstance(step, Run)]) if fixed else None,
             _jumps([step.cdr_size for step in item if isinstance(step, Run)]) if fixed else None,
-            least,
+            min_bytes,
         )
 
     def _count(self) -> None:
@@ -270,7 +270,7 @@ class _Planner:
             raise SchemaError(f"{self.root}: its definition unfolds to over {MAX_STEPS} fields")
 
 
-def _least(step: Step) -> int:
+def _min_bytes(step: Step) -> int:
     if isinstance(step, Run):
         return int(step.size.min())
     if isinstance(step, Text):

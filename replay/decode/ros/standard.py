@@ -155,8 +155,8 @@ def _can_fd_frame(fields: Fields) -> CanFrames:
 def _can_fd_doubts(fields: Fields) -> Iterator[Doubt]:
     identifier = fields.number("id").astype(np.int64)
     extended = fields.number("is_extended").astype(np.bool_)
-    most = np.where(extended, 0x1FFF_FFFF, 0x7FF)
-    yield identifier > most, "identifier has more bits than its frame kind"
+    max_id = np.where(extended, 0x1FFF_FFFF, 0x7FF)
+    yield identifier > max_id, "identifier has more bits than its frame kind"
     yield fields.items("data")[1] > FD_BYTES, "over 64 data bytes"
 
 

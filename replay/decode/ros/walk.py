@@ -133,9 +133,9 @@ class Walker:
         """Walk from the first field to the last and see that nothing is left over."""
         self.refuse(cursor, cursor.stop < 0, "no room for the encapsulation")
         self.steps(plan.steps, cursor, keep=True)
-        most = CDR_PADDING if plan.is_cdr else 0
+        max_left = CDR_PADDING if plan.is_cdr else 0
         left = cursor.stop - cursor.at
-        self.refuse(cursor, left > most, "bytes left over after the last field")
+        self.refuse(cursor, left > max_left, "bytes left over after the last field")
 
     def refuse(self, cursor: Cursor, bad: Bools, why: str) -> None:
         """Mark the messages of ``cursor`` that are ``bad``, unless they were already."""
@@ -231,8 +231,8 @@ class Walker:
         if items.count is None:
             count = self._length(items.path, cursor)
             room = cursor.stop - cursor.at
-            least = max(items.item_bytes, 1)
-            self.refuse(cursor, count * least > room, f"sequence {items.path} passes the end")
+            min_bytes = max(items.item_bytes, 1)
+            self.refuse(cursor, count * min_bytes > room, f"sequence {items.path} passes the end")
             if items.bound:
                 over = count > items.bound
                 self.refuse(cursor, over, f"sequence {items.path} is over its bound")

@@ -76,11 +76,11 @@ def _nibbles8(word: Words) -> tuple[Words, Bools]:
     return nibble, ok
 
 
-def _filled(word: Words, table: Words, count: Int64s, fewest: int, most: int) -> Words:
+def _filled(word: Words, table: Words, count: Int64s, fewest: int, max_count: int) -> Words:
     """Each word with only ``count`` of its characters, clipped to 0..8, and ``0`` elsewhere."""
     if fewest >= 8:
         return word
-    if fewest == most:
+    if fewest == max_count:
         keep = table[max(fewest, 0)]
         filled: Words = (word & keep) | (_ZEROS & ~keep)
         return filled
@@ -97,12 +97,12 @@ def decimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
     """
     if not len(count):
         return np.zeros(0, np.int64), np.zeros(0, np.bool_)
-    fewest, most = int(count.min()), int(count.max())
-    value, ok = _decimal8(_filled(words[stop - 8], _KEEP_LAST, count, fewest, most))
-    if fewest < 1 or most > 16:
+    fewest, max_count = int(count.min()), int(count.max())
+    value, ok = _decimal8(_filled(words[stop - 8], _KEEP_LAST, count, fewest, max_count))
+    if fewest < 1 or max_count > 16:
         ok &= (count > 0) & (count <= 16)
-    if most > 8:
-        word = _filled(words[stop - 16], _KEEP_LAST, count - 8, fewest - 8, most - 8)
+    if max_count > 8:
+        word = _filled(words[stop - 16], _KEEP_LAST, count - 8, fewest - 8, max_count - 8)
         if bool((word == word[0]).all()):
             word = word[:1]  # the leading digits of times are mostly all the same
         high, high_ok = _decimal8(word)
@@ -115,8 +115,8 @@ def hexadecimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bool
     """Hexadecimal fields of 1 to 8 digits that end before ``stop``, as ``decimal``."""
     if not len(count):
         return np.zeros(0, np.int64), np.zeros(0, np.bool_)
-    fewest, most = int(count.min()), int(count.max())
-    nibble, ok = _nibbles8(_filled(words[stop - 8], _KEEP_LAST, count, fewest, most))
+    fewest, max_count = int(count.min()), int(count.max())
+    nibble, ok = _nibbles8(_filled(words[stop - 8], _KEEP_LAST, count, fewest, max_count))
     value = _packed(nibble).astype(np.uint32).byteswap().astype(np.int64)
     return value, ok & (count > 0) & (count <= 8)
 
@@ -193,12 +193,12 @@ def payload8(words: Words, start: Int64s, length: Int64s) -> tuple[Bytes, Bools]
     if not len(length):
         return np.zeros((0, 8), np.uint8), np.zeros(0, np.bool_)
     digits = 2 * length
-    fewest, most = int(digits.min()), int(digits.max())
-    low, ok = _nibbles8(_filled(words[start], _KEEP_FIRST, digits, fewest, most))
-    word = _filled(words[start + 8], _KEEP_FIRST, digits - 8, fewest - 8, most - 8)
+    fewest, max_count = int(digits.min()), int(digits.max())
+    low, ok = _nibbles8(_filled(words[start], _KEEP_FIRST, digits, fewest, max_count))
+    word = _filled(words[start + 8], _KEEP_FIRST, digits - 8, fewest - 8, max_count - 8)
     high, high_ok = _nibbles8(word)
     ok &= high_ok
-    if most > 16:
+    if max_count > 16:
         ok &= length <= 8
     return _rows8(_packed(low), _packed(high)), ok
 
@@ -272,13 +272,13 @@ def labels(words: Words, start: Int64s, count: Int64s) -> tuple[Int64s, tuple[by
     """
     if not len(start):
         return np.zeros(0, np.int64), ()
-    fewest, most = int(count.min()), int(count.max())
-    if fewest == most:
-        low = words[start] & _KEEP_FIRST[min(max(most, 0), 8)]
+    fewest, max_count = int(count.min()), int(count.max())
+    if fewest == max_count:
+        low = words[start] & _KEEP_FIRST[min(max(max_count, 0), 8)]
     else:
         low = words[start] & _KEEP_FIRST[np.minimum(np.maximum(count, 0), 8)]
     high = np.zeros(len(start), np.uint64)
-    if most > 8:
+    if max_count > 8:
         high = words[start + 8] & _KEEP_FIRST[np.minimum(np.maximum(count - 8, 0), 8)]
     names = [_spelled(int(low[0]), int(high[0]), int(count[0]))]
     is_first = (low == low[0]) & (high == high[0])

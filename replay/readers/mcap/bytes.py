@@ -77,11 +77,11 @@ class ByteFile:
         """
         return self.window(at, size)[:size]
 
-    def window(self, at: int, least: int) -> memoryview:
-        """What is at hand from ``at`` on: at least ``least`` bytes, less only at the end."""
+    def window(self, at: int, min_bytes: int) -> memoryview:
+        """What is at hand from ``at`` on: at least ``min_bytes`` bytes, less only at the end."""
         begin = at - self._window_at
-        if begin < 0 or begin + least > len(self._window):
-            self._window = self._pread(at, max(least, WINDOW))
+        if begin < 0 or begin + min_bytes > len(self._window):
+            self._window = self._pread(at, max(min_bytes, WINDOW))
             self._window_at, begin = at, 0
         return memoryview(self._window)[begin:]
 
@@ -153,9 +153,9 @@ class RangedByteFile(ByteFile):
         self.size = ranged.size
         self.buffers = Buffers()
 
-    def window(self, at: int, least: int) -> memoryview:
-        """What is at hand from ``at`` on: at least ``least`` bytes, less only at the end."""
-        return self._ranged.at_least(at, least)
+    def window(self, at: int, min_bytes: int) -> memoryview:
+        """What is at hand from ``at`` on: at least ``min_bytes`` bytes, less only at the end."""
+        return self._ranged.at_least(at, min_bytes)
 
     def read_into(self, at: int, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The bytes at ``at``, written into ``array``; fewer than it has at the end."""

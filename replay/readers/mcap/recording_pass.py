@@ -288,14 +288,14 @@ class SegmentPass:
         Raises:
             BrokenRecordError: Something is wrong, or there are too many.
         """
-        most = self._limits.records_per_chunk
-        if sum(len(index.entries) for index in chunk.messages) > most:
-            raise BrokenRecordError(f"its index names more than {most} messages")
+        max_records = self._limits.records_per_chunk
+        if sum(len(index.entries) for index in chunk.messages) > max_records:
+            raise BrokenRecordError(f"its index names more than {max_records} messages")
         rows = rows_by_index(buffer, chunk.messages) if chunk.messages else None
         if rows is None:
             if chunk.messages or chunk.index_fault:
                 self._checks.bad_indexes.add(f"that of the chunk at byte {chunk.at}")
-            rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, most)
+            rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, max_records)
             if rows.end != len(buffer):
                 raise BrokenRecordError(f"its records break off at {rows.end} of {len(buffer)}")
         self._vouch(chunk, rows)

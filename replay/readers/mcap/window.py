@@ -93,8 +93,8 @@ class Window:
         rest: Counter[int] = Counter()
         for channel_id in statistics.by_channel.keys() | held.keys():
             count = statistics.by_channel.get(channel_id, 0) - held.get(channel_id, 0)
-            least = int(named[channel_id]) if channel_id < len(named) else 0
-            if count < least or (count and not least and not is_open):
+            min_count = int(named[channel_id]) if channel_id < len(named) else 0
+            if count < min_count or (count and not min_count and not is_open):
                 return None
             rest[channel_id] = count
         return +rest

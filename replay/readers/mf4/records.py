@@ -356,8 +356,8 @@ class _Finder:
             first = int(head[0])
             stride = at - first
             columns = np.concatenate([np.arange(*pair) for pair in zip(head, start, strict=True)])
-            for most in (_FEW, (len(content) - at) // stride):
-                count = min((len(content) - at) // stride, most)
+            for max_count in (_FEW, (len(content) - at) // stride):
+                count = min((len(content) - at) // stride, max_count)
                 bytes_ = np.frombuffer(content, np.uint8, (count + 1) * stride, first)
                 table = bytes_.reshape(count + 1, stride)[:, columns - first]
                 differs = (table != table[0]).any(axis=1)

@@ -346,15 +346,15 @@ def _all(parts: list[Int64s]) -> Int64s:
     return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
 
 
-def _run_of_messages(raw: bytes, at: int, steps: _Steps, most: int) -> tuple[int, int]:
-    """Up to ``most`` message records of one layout from ``at`` on; their number and the end."""
+def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tuple[int, int]:
+    """Up to ``max_count`` message records of one layout from ``at`` on; their number and end."""
     layout = _layout_of(raw[at : at + _HEAD])
     if layout is None:
         return 0, at
     places: list[int] = []
     here, size = at, len(raw)
     unpack = _U32.unpack_from
-    while len(places) < most and here + _HEAD <= size and unpack(raw, here)[0] == _HEADER:
+    while len(places) < max_count and here + _HEAD <= size and unpack(raw, here)[0] == _HEADER:
         after = here + _HEAD + unpack(raw, here + _HEAD - 4)[0]
         if after > size:
             break

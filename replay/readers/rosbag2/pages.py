@@ -280,9 +280,9 @@ class _Pages:
     def _local(self, total: Int64s) -> Int64s:
         """Bytes of each row that are in its leaf page."""
         usable = self._usable
-        least = (usable - 12) * 32 // 255 - 23
-        part = least + (total - least) % (usable - 4)
-        return np.where(total <= usable - 35, total, np.where(part <= usable - 35, part, least))
+        min_local = (usable - 12) * 32 // 255 - 23
+        part = min_local + (total - min_local) % (usable - 4)
+        return np.where(total <= usable - 35, total, np.where(part <= usable - 35, part, min_local))
 
     def _ascending(self, cells: _Cells) -> int:
         """How many rows have ids that ascend, from those before on."""

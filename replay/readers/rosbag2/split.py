@@ -136,9 +136,9 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
     """
     import zstandard
 
-    most = limits.chunk_bytes
-    if (declared := _declared(packed)) > most:
-        return f"declares {declared} bytes, the limit is {most} (--max-chunk)"
+    max_bytes = limits.chunk_bytes
+    if (declared := _declared(packed)) > max_bytes:
+        return f"declares {declared} bytes, the limit is {max_bytes} (--max-chunk)"
     written = 0
     unpacking = _Unpacking()
     with packed.open("rb") as source, plain.open("wb") as target:
@@ -151,9 +151,9 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
             try:
                 for out in unpacking.feed(part):
                     written += target.write(out)
-                    if written > most:
+                    if written > max_bytes:
                         size = packed.stat().st_size
-                        return f"{size} bytes unpack to over {most}, the limit (--max-chunk)"
+                        return f"{size} bytes unpack to over {max_bytes}, the limit (--max-chunk)"
             except zstandard.ZstdError as error:
                 return f"compressed file is damaged after {written} bytes ({error})"
     return "" if unpacking.is_at_end else f"compressed file is cut after {written} bytes"

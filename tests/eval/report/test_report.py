@@ -335,10 +335,10 @@ def test_the_chart_of_ranges_keeps_its_worst_bin(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 9))
-def test_ticks_are_few_round_and_inside(low: float, width: float, most: int) -> None:
-    found = ticks(low, low + width, most)
+def test_ticks_are_few_round_and_inside(low: float, width: float, max_count: int) -> None:
+    found = ticks(low, low + width, max_count)
 
-    assert len(found) <= most + 1
+    assert len(found) <= max_count + 1
     assert all(low - 1e-6 * width <= one <= low + width * (1 + 1e-6) for one in found)
     assert found == sorted(found)
 

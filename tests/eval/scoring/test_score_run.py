@@ -136,12 +136,12 @@ def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> 
         ('metric = "cues.stop_sign.precision"\nmin = nan', "finite number"),
         ('metric = "a"\nmin = 2\nmax = 1', "min 2 is above max 1"),
         (
-            'metric = "a"\nmin = 0.9\nleest = 5',
-            "gates.toml:5: gate.0.leest: no such key; did you mean least?",
+            'metric = "a"\nmin = 0.9\nmin_coumt = 5',
+            "gates.toml:5: gate.0.min_coumt: no such key; did you mean min_count?",
         ),
         (
             'metric = "a"\nmin = 0.9\n[[gate]]\nmetric = "b"\nmin = 1\nwarn = true',
-            "gates.toml:8: gate.1.warn: no such key; there are: least, max, metric, min, use",
+            "gates.toml:8: gate.1.warn: no such key; there are: max, metric, min, min_count, use",
         ),
         ("metric = [", "not readable as TOML"),
     ],
@@ -159,7 +159,7 @@ def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
     gates = [
         'metric = "pose.ape.none.translation_m.rmse"\nmax = 1.0',
         'metric = "cues.do_not_enter.precision"\nmin = 0.9',
-        'metric = "cues.stop_sign.precision"\nmin = 0.9\nleast = 1000',
+        'metric = "cues.stop_sign.precision"\nmin = 0.9\nmin_count = 1000',
     ]
 
     assert cli.run(["score", str(run), "-q", "--gate", _gates(tmp_path, *gates)]) == 1
@@ -170,7 +170,7 @@ def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
     assert len(messages) == 3
     assert "no track" in messages[0]
     assert "nothing to measure it by" in messages[1]
-    assert "stands on 30 rows" in messages[2]
+    assert "based on 30 rows" in messages[2]
 
 
 def test_gates_over_several_runs_need_a_place_for_their_results(
@@ -188,7 +188,7 @@ def test_gates_over_several_runs_need_a_place_for_their_results(
 @settings(max_examples=60, deadline=None)
 @given(st.text(min_size=1), st.text())
 def test_hostile_names_stay_names_in_junit(metric: str, suite: str) -> None:
-    gate = Gate.model_construct(metric=metric, min=0.5, max=None, use="value", least=1)
+    gate = Gate.model_construct(metric=metric, min=0.5, max=None, use="value", min_count=1)
     results = check_gates([gate], {metric: MetricValue(0.1)}, {})
     root = ET.fromstring(junit_text(results, suite))
 
@@ -198,7 +198,7 @@ def test_hostile_names_stay_names_in_junit(metric: str, suite: str) -> None:
 
 def test_control_characters_and_markup_are_shown_in_junit() -> None:
     name = 'a"]]><x>\x1b[31m\x00\ud800\n'
-    gate = Gate.model_construct(metric=name, min=0.5, max=None, use="value", least=1)
+    gate = Gate.model_construct(metric=name, min=0.5, max=None, use="value", min_count=1)
     text = junit_text(check_gates([gate], {name: MetricValue(0.9)}, {}), "suite")
 
     assert "\x1b" not in text

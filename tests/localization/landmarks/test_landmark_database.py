@@ -76,7 +76,7 @@ def test_the_ellipse_holds_just_the_landmarks_that_a_full_look_finds(
     sure = np.abs(distance - sigmas) > 1e-6
 
     with LandmarkDatabase(grid) as database:
-        found = database.near(centre, cov, sigmas, most=1000)
+        found = database.near(centre, cov, sigmas, max_count=1000)
 
     names = {int(one.place.name) for one in found}
     assert names >= set(np.flatnonzero(sure & (distance < sigmas)).tolist())
@@ -87,7 +87,7 @@ def test_the_ellipse_holds_just_the_landmarks_that_a_full_look_finds(
 def test_no_more_candidates_than_asked_for_and_the_nearest_of_them(grid: Path) -> None:
     with LandmarkDatabase(grid) as database:
         centre = np.array([110.0, 60.0]) + 5e6
-        nearest = database.near(centre, 1e4 * np.eye(2), most=3)
+        nearest = database.near(centre, 1e4 * np.eye(2), max_count=3)
         names = [one.place.name for one in database.within(np.array([0.0, 0.0]) + 5e6, 51.0)]
 
     assert [one.place.name for one in nearest] == ["12", "13", "22"]

@@ -88,17 +88,19 @@ def test_ours_and_the_mcap_package_agree(
     records=st.lists(st.tuples(st.integers(0, 12), st.integers(0, 40)), max_size=50),
     tail=st.binary(max_size=8),
     stop=st.integers(1, 12),
-    most=st.integers(0, 60),
+    max_count=st.integers(0, 60),
 )
 def test_a_scan_gives_the_records_up_to_the_first_it_must_stop_at(
-    records: list[tuple[int, int]], tail: bytes, stop: int, most: int
+    records: list[tuple[int, int]], tail: bytes, stop: int, max_count: int
 ) -> None:
     coded = b"".join(struct.pack("<BQ", kind, size) + bytes(size) for kind, size in records)
     buffer = np.frombuffer(coded + tail, dtype=np.uint8)
-    kinds = [kind for kind, _ in takewhile(lambda one: one[0] not in (0, stop), records[:most])]
+    kinds = [
+        kind for kind, _ in takewhile(lambda one: one[0] not in (0, stop), records[:max_count])
+    ]
     begins = np.cumsum([0, *(9 + size for _, size in records)])
 
-    scan = scan_of(buffer, np.arange(256) == stop, most)
+    scan = scan_of(buffer, np.arange(256) == stop, max_count)
 
     assert scan.opcode.tolist() == kinds
     assert [*scan.offset.tolist(), scan.end] == begins[: len(kinds) + 1].tolist()

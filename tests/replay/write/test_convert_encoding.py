@@ -162,8 +162,8 @@ def can_frames(n: int, width: int, seed: int = 0) -> CanFrames:
     extended = rng.random(n) < 0.5
     kind = rng.choice([0, 0, 0, 1, 2], n).astype(np.uint8)
     fd = rng.random(n) < 0.5 if width == 64 else np.zeros(n, np.bool_)
-    most = np.where(fd, 64, 8)
-    length = np.where(kind == 1, 0, rng.integers(0, most + 1)).astype(np.uint8)
+    max_count = np.where(fd, 64, 8)
+    length = np.where(kind == 1, 0, rng.integers(0, max_count + 1)).astype(np.uint8)
     data = rng.integers(0, 256, (n, width), dtype=np.uint8)
     data[np.arange(width) >= length[:, None]] = 0
     identifier = np.where(extended, rng.integers(0, 1 << 29, n), rng.integers(0, 1 << 11, n))

@@ -144,10 +144,10 @@ def run_of(records: bytes, at: int, size: int) -> int:
     if records[ahead : ahead + PREFIX.size] != prefix:
         return count
     view = np.frombuffer(records, dtype=np.uint8)[at:]
-    most = (len(records) - at) // size
+    max_count = (len(records) - at) // size
     first = np.frombuffer(prefix, dtype=np.uint8)
-    while count < most:
-        step = min(_RUN * count, most)
+    while count < max_count:
+        step = min(_RUN * count, max_count)
         rows = view[: step * size].reshape(step, size)[:, : PREFIX.size]
         same = (rows == first).all(axis=1)
         if not same.all():

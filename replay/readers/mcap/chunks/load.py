@@ -214,10 +214,12 @@ class Loader:
         head = chunk.head
         if chunk.fault or head is None:
             raise BrokenRecordError(chunk.fault or "its fields cannot be read")
-        most = self._limits.chunk_bytes
-        if max(head.size, min(head.body_size, self._file.size)) > most:
+        max_bytes = self._limits.chunk_bytes
+        if max(head.size, min(head.body_size, self._file.size)) > max_bytes:
             size = max(head.size, head.body_size)
-            raise BrokenRecordError(f"declares {size} bytes, the limit is {most} (--max-chunk)")
+            raise BrokenRecordError(
+                f"declares {size} bytes, the limit is {max_bytes} (--max-chunk)"
+            )
         if room is not None and not head.compression and head.body_size == head.size:
             return inflate(self._file.read_into(chunk.body_at, room[: head.size]), head, room)
         body = self._file.read(chunk.body_at, head.body_size)

@@ -241,20 +241,20 @@ def join(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
     )
 
 
-def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], most: int) -> Rows:
+def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_records: int) -> Rows:
     """The messages of a stretch up to where it cannot be followed any further (``Rows.end``).
 
     Args:
         buffer: Shape (B,).
         stop_at: Operation codes before which to stop.
-        most: Records allowed.
+        max_records: Records allowed.
 
     Raises:
-        BrokenRecordError: More than ``most`` records, or too many definitions.
+        BrokenRecordError: More than ``max_records`` records, or too many definitions.
     """
-    scan = scan_of(buffer, stop_at, most + 1)
-    if len(scan.offset) > most:
-        raise BrokenRecordError(f"holds more than {most} records")
+    scan = scan_of(buffer, stop_at, max_records + 1)
+    if len(scan.offset) > max_records:
+        raise BrokenRecordError(f"holds more than {max_records} records")
     is_message = scan.opcode == MESSAGE
     offset = scan.offset[is_message]
     end = scan.end

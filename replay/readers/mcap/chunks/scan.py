@@ -31,20 +31,20 @@ class Scan:
     end: int
 
 
-def scan_of(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], most: int) -> Scan:
+def scan_of(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_records: int) -> Scan:
     """The records of ``buffer`` from its beginning.
 
     Args:
         buffer: Shape (B,).
         stop_at: Shape (256,), bool: operation codes before which to stop.
-        most: Records after which to stop.
+        max_records: Records after which to stop.
     """
     view, unpack = buffer.data, PREFIX.unpack_from
     stops = frozenset(np.flatnonzero(stop_at).tolist()) | {0}
     at, size, last = 0, len(buffer), len(buffer) - PREFIX.size
     offsets: list[int] = []
     opcodes = bytearray()
-    while at <= last and len(offsets) < most:
+    while at <= last and len(offsets) < max_records:
         opcode, length = unpack(view, at)
         after = at + PREFIX.size + length
         if after > size or opcode in stops:

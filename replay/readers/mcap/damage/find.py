@@ -80,9 +80,9 @@ def find_chunk(
     return None if other is None else (other, False)
 
 
-def _candidates(window: Bytes, most: int) -> list[int]:
-    """Offsets, up to ``most``, where a chunk of a sane length may begin."""
-    first = window[: max(min(most, len(window) - PREFIX.size - CHUNK_FIXED), 0)]
+def _candidates(window: Bytes, limit_at: int) -> list[int]:
+    """Offsets, up to ``limit_at``, where a chunk of a sane length may begin."""
+    first = window[: max(min(limit_at, len(window) - PREFIX.size - CHUNK_FIXED), 0)]
     at = np.flatnonzero(first == CHUNK)
     for byte in (6, 7, 8):  # no chunk has a length of 2^40 bytes
         at = at[window[at + byte] == 0]

@@ -44,7 +44,7 @@ LINKS: Final = 3
 DAY_NS: Final = 86_400 * 10**9
 """How far from the messages before it a log time may lie, where no statistics bound it."""
 LATEST: Final = (1 << 63) - 1
-MOST: Final = (1 << 64) - 1
+MAX_UINT64: Final = (1 << 64) - 1
 PIECE_MIN: Final = 4 << 10
 PIECE_MAX: Final = 1 << 20
 MAX_DEFINITION: Final = 1 << 20
@@ -108,7 +108,7 @@ class Plausible:
 
 def _within(log: NDArray[np.uint64], first: int, last: int) -> NDArray[np.bool_]:
     """Which times are between two, both included."""
-    low, high = np.uint64(max(first, 0)), np.uint64(min(max(last, 0), MOST))
+    low, high = np.uint64(max(first, 0)), np.uint64(min(max(last, 0), MAX_UINT64))
     is_in: NDArray[np.bool_] = (log >= low) & (log <= high)
     return is_in
 
@@ -204,9 +204,9 @@ class Resync:
         raw = bytes(self._file.peek(at, PREFIX.size))
         return raw == PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
-    def _candidates(self, window: NDArray[np.uint8], most: int) -> list[int]:
-        """Offsets, below ``most``, at which a message, schema or channel may begin."""
-        at = _kinds(window, most, SCHEMA, MESSAGE)
+    def _candidates(self, window: NDArray[np.uint8], limit_at: int) -> list[int]:
+        """Offsets, below ``limit_at``, at which a message, schema or channel may begin."""
+        at = _kinds(window, limit_at, SCHEMA, MESSAGE)
         is_message = window[at] == MESSAGE
         found = np.concatenate((self._messages(window, at[is_message]), at[~is_message]))
         found.sort()
@@ -258,9 +258,9 @@ class Resync:
         return head.compression in COMPRESSIONS and length == head.body_at + head.body_size
 
 
-def _kinds(window: NDArray[np.uint8], most: int, first: int, last: int) -> NDArray[np.int64]:
-    """Offsets, below ``most``, of records of one of these kinds that may have a sane length."""
-    heads = window[: max(min(most, len(window) - MESSAGE_HEAD.itemsize + 1), 0)]
+def _kinds(window: NDArray[np.uint8], limit_at: int, first: int, last: int) -> NDArray[np.int64]:
+    """Offsets, below ``limit_at``, of records of one of these kinds that may have a sane length."""
+    heads = window[: max(min(limit_at, len(window) - MESSAGE_HEAD.itemsize + 1), 0)]
     at: NDArray[np.int64] = np.flatnonzero((heads >= first) & (heads <= last)).astype(np.int64)
     for byte in (6, 7, 8):  # no record has a length of 2^40 bytes
         at = at[window[at + byte] == 0]
