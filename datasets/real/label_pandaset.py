@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.datasets.adapters.pandaset import FRONT, Poses, read_poses
-from crosscue.replay.base import Floats, json_tree, strict_json, write_text
+from crosscue.replay.base import Floats, LogFormatError, json_tree, strict_json, write_text
 
 CATEGORIES: Final = {"car": 1, "truck": 2, "person": 3}
 LABELS: Final = {
@@ -55,7 +55,7 @@ def write_labels(sequence: Path, output: Path) -> Path:
     """Write the labels.
 
     Raises:
-        LogFormatError: The sequence has no poses.
+        LogFormatError: The sequence has no poses, or its boxes are not a table yet.
         OutputError: It cannot be written.
     """
     import pyarrow.parquet as pq
@@ -63,7 +63,13 @@ def write_labels(sequence: Path, output: Path) -> Path:
     poses = read_poses(sequence)
     found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
     camera = np.array([found[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
-    table = pq.read_table(sequence / "annotations" / "cuboids.parquet")
+    path = sequence / "annotations" / "cuboids.parquet"
+    if not path.exists():
+        raise LogFormatError(
+            f"{path}: not there; the boxes are published as pickles, which are not read; "
+            "docs/reference/formats.md says how to make this table of them"
+        )
+    table = pq.read_table(path)
     rows: dict[str, Any] = {
         name: table[name].to_numpy(zero_copy_only=False) for name in (*_COLUMNS, "yaw_rad")
     }
@@ -150,4 +156,7 @@ def _visible(seen: list[_Seen]) -> Iterator[tuple[_Seen, float]]:
 
 
 if __name__ == "__main__":
-    print(write_labels(Path(sys.argv[1]), Path(sys.argv[2])))
+    try:
+        print(write_labels(Path(sys.argv[1]), Path(sys.argv[2])))
+    except LogFormatError as error:
+        sys.exit(f"crosscue: {error}")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.adapters.pandaset import read_poses
+from crosscue.datasets.real.label_pandaset import write_labels
 from crosscue.datasets.truth.truth import load, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.base import Ledger, LogFormatError, Selection
@@ -102,3 +103,19 @@ def test_the_real_sequence(tmp_path: Path) -> None:
     assert ledger.is_whole
     assert speed[0] == pytest.approx(0.07, abs=0.05)
     assert float(speed.sum()) * 0.1 == pytest.approx(21.5, abs=0.3)
+
+
+def test_boxes_that_are_still_pickles_are_never_opened(tmp_path: Path) -> None:
+    """A pickle runs code when it is read; the line says where the conversion is described."""
+    folder = pandaset_drive(tmp_path / "002", 2)
+    (folder / "camera" / "front_camera" / "intrinsics.json").write_text(
+        '{"fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 8.0}'
+    )
+    boxes = folder / "annotations" / "cuboids"
+    boxes.mkdir(parents=True)
+    (boxes / "00.pkl.gz").write_bytes(b"not read")
+
+    with pytest.raises(LogFormatError, match="published as pickles, which are not read"):
+        write_labels(folder, tmp_path / "labels.json")
+
+    assert not (tmp_path / "labels.json").exists()
