@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -236,20 +237,15 @@ def fit_detector(
         )
         for name in _common(parts, others)
     )
-    left_out: dict[str, int] = {}
-    for part in (*parts, *others):
-        for why, count in part.left_out.items():
-            left_out[why] = left_out.get(why, 0) + count
+    left_out = sum((Counter(part.left_out) for part in whole), Counter[str]())
     fitted_to, held = (sum(int(one.sum()) for one in which) for which in (first, rest))
     written = None
     if output is not None and source is not None and any(one.scores for one in fits):
-        logs_of = (log.name for part in (*parts, *others) for log in part.run.drive_manifest().logs)
-        names_of = ", ".join(sorted({*logs_of}))
-        when = _date_of(parts)
-        pictures = f"{fitted_to} images fitted to, {held} held out, of {names_of}{when}"
+        written = Path(output)
+        counts = f"{fitted_to} images fitted to, {held} held out"
+        pictures = f"{counts}, of {_log_names(whole)}{_date_of(parts)}"
         aim = f"precision {precision:g} with {CONFIDENCE:.0%} confidence"
         text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, date, aim)
-        written = Path(output)
         write_text(written, text)
     is_whole = all(part.is_whole for part in whole)
     return FittedDetector(row, fits, precision, fitted_to, held, left_out, written, is_whole)
@@ -325,6 +321,10 @@ def _judged(
         right.append(matched.is_right[0][judged])
         labels += len(matched.labels)
     return Judged(np.concatenate(scores), np.concatenate(right), labels)
+
+
+def _log_names(parts: Sequence[LabelledRun]) -> str:
+    return ", ".join(sorted({log.name for one in parts for log in one.run.drive_manifest().logs}))
 
 
 def _date_of(parts: Sequence[LabelledRun]) -> str:
