@@ -11,7 +11,7 @@ from typing import Final
 from markupsafe import Markup
 
 from .html import write_page
-from .svg_plot import Drawing, Panel
+from .svg_plot import Drawing, Panel, ticks
 
 TEMPLATE: Final = "history.html.j2"
 WIDTH: Final = 460.0
@@ -110,11 +110,9 @@ def draw_chart(one: Chart, versions: Sequence[str]) -> Markup:
 
 
 def _draw_axis(drawing: Drawing, panel: Panel, one: Chart, versions: Sequence[str]) -> None:
-    span = panel.y_range[1] - panel.y_range[0]
-    for fraction in (0.1, 0.5, 0.9):
-        value = panel.y_range[0] + fraction * span
+    for value in ticks(*panel.y_range, 4):
         drawing.rule(panel.left, panel.y(value), panel.right, panel.y(value), "grid")
-        drawing.text(panel.left - 6, panel.y(value) + 4, f"{value:.3g}", anchor="end")
+        drawing.text(panel.left - 6, panel.y(value) + 4, f"{value:g}", anchor="end")
     taken: list[float] = []
     # What matters most is named first; names that would overlap are left out.
     wanted = [*(mark.at for mark in one.marks), 0, len(versions) - 1, *range(len(versions))]

@@ -29,8 +29,8 @@
     text.className = "text";
     element("b", row[KIND] + ": " + row[CUE].replaceAll("_", " "), text);
     text.append(row[CAUSE]);
-    const away = row[DISTANCE_M] === null ? "" : ", " + row[DISTANCE_M].toFixed(0) + " m away";
-    element("span", row[RUN] + " at " + row[AT].toFixed(1) + " s" + away, text);
+    const away = row[DISTANCE_M] === null ? "" : ", " + row[DISTANCE_M].toFixed(0) + "\u00a0m\u00a0away";
+    element("span", row[RUN] + " at " + row[AT].toFixed(1) + "\u00a0s" + away, text);
     const conditions = row[CONDITION].filter((tag) => tag !== "none");
     element("span", ["severity " + row[SEVERITY].toFixed(1), ...conditions].join(", "), text);
     return link.parentNode;
