@@ -9,6 +9,7 @@ estimating a short drive without any.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -81,3 +82,25 @@ def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> Rang
         x=np.float64(belief.mean_m), P=belief.var_m2, z=measured_m, R=sensor_var_m2
     )
     return RangeBelief(float(mean_m), float(var_m2))
+
+
+def smooth(
+    filtered: Sequence[RangeBelief], travelled_m: Sequence[float], odometry_var_m2: Sequence[float]
+) -> list[RangeBelief]:
+    """What all measurements together say of each step (Rauch, Tung, Striebel, 1965).
+
+    The model is linear and Gaussian, so this is the solution of the factor graph.
+
+    Args:
+        filtered: Of N steps, each with the measurements up to it.
+        travelled_m: From each step to the next, N - 1.
+        odometry_var_m2: Of those.
+    """
+    found = [filtered[-1]]
+    steps = zip(filtered[:-1], travelled_m, odometry_var_m2, strict=True)
+    for now, way_m, way_var_m2 in reversed(list(steps)):
+        ahead, later = predict(now, way_m, way_var_m2), found[-1]
+        gain = now.var_m2 / ahead.var_m2
+        mean_m = now.mean_m + gain * (later.mean_m - ahead.mean_m)
+        found.append(RangeBelief(mean_m, now.var_m2 + gain**2 * (later.var_m2 - ahead.var_m2)))
+    return found[::-1]

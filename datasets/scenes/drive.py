@@ -257,37 +257,30 @@ class _Record:
             for block in sensor_blocks(sense(self._motion, self._car), self.conditions.seed)
         ]
         batch: list[tuple[int, Picture]] = []
-        until = START_NS
+        begin, until = -(2**62), START_NS
         late = np.random.default_rng([self.conditions.seed, 10])
         for t_ns, picture in self._imager.pictures(self.world, self.settings):
             self._note(t_ns, picture)
             batch.append((t_ns, picture))
-            until = self._until(batch)
+            until = t_ns + 1_000_000_000 // self.settings.rate_hz
             if len(batch) == self.settings.rate_hz:
-                yield from self._second(batch, others, device, late)
-                batch = []
-        yield from self._second(batch, others, device, late)
+                yield from self._second(batch, _between(others, begin, until), device, late)
+                # Pictures may be far apart: the sensors go on between two batches.
+                batch, begin = [], until
+        if batch:
+            yield from self._second(batch, _between(others, begin, until), device, late)
         for block in others:
             yield block.take(block.log_ns >= until)
-
-    def _until(self, batch: list[tuple[int, Picture]]) -> int:
-        return batch[-1][0] + 1_000_000_000 // self.settings.rate_hz
 
     def _second(
         self,
         batch: list[tuple[int, Picture]],
-        others: list[Block],
+        others: Iterator[Block],
         device: Device,
         late: np.random.Generator,
     ) -> Iterator[Block]:
-        if not batch:
-            return
+        yield from others
         times = np.array([t_ns for t_ns, _ in batch], np.int64)
-        begin = int(times[0]) if int(times[0]) > START_NS else -(2**62)
-        for block in others:
-            part = block.take((block.log_ns >= begin) & (block.log_ns < self._until(batch)))
-            if len(part):
-                yield part
         log_ns = times + 9_000_000 + np.rint(late.exponential(2e6, len(times))).astype(np.int64)
         coded = [self._imager.encode(picture, self.settings.picture) for _, picture in batch]
         yield _images(times, log_ns, coded, self._imager.coding)
@@ -367,6 +360,14 @@ def _in_map(motion: TrueMotion, heading_rad: float) -> TrueMotion:
     return replace(
         motion, x_m=c * x - s * y, y_m=s * x + c * y, heading_rad=motion.heading_rad + heading_rad
     )
+
+
+def _between(blocks: list[Block], begin_ns: int, end_ns: int) -> Iterator[Block]:
+    """Their rows from one time up to another, where there are any."""
+    for block in blocks:
+        part = block.take((block.log_ns >= begin_ns) & (block.log_ns < end_ns))
+        if len(part):
+            yield part
 
 
 def _images(times: Int64s, log_ns: Int64s, coded: list[bytes], coding: ImageCoding) -> Block:

@@ -22,6 +22,7 @@ from crosscue.eval.runs.folder import (
     summed,
 )
 from crosscue.eval.runs.logs import place_of
+from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.replay.base import RunError, SchemaError, UsageError, is_remote
 
 from . import intervals
@@ -31,6 +32,7 @@ from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, ju
 from .pose import score as score_pose
 from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
+from .scene.ranges import RangeSmoothed, score_smoothed
 from .truth import DriveTruth
 
 TABLES: Final = ("frames", "cues", "range", "belief")
@@ -160,6 +162,11 @@ def tables_of(run: RunFolder) -> RunTables:
     timeline = run.drive_manifest().timeline
     found = {name: run.table(name) for name in TABLES if run.file(f"{name}.parquet").exists()}
     return in_log_time(str(run.path), found, timeline)
+
+
+def smoothed_ranges(one: RunScored) -> dict[str, RangeSmoothed]:
+    """By reference, the range filter beside what all of the run's measurements say together."""
+    return score_smoothed(tables_of(one.run), one.truth, odometer_of(one.run))
 
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.fusion.intersection_range import RangeBelief, initialise, nis, predict, update
+from crosscue.fusion.intersection_range import (
+    RangeBelief,
+    initialise,
+    nis,
+    predict,
+    smooth,
+    update,
+)
 from crosscue.fusion.range_track import (
     NOTHING,
     RangeTrack,
@@ -256,3 +263,30 @@ def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> Non
 
     assert np.mean(nees[fade_m]) == pytest.approx(1.0, abs=0.15)
     assert np.mean(nees[0.0]) > 3.0
+
+
+def test_the_smoother_is_the_least_squares_solution_over_all_measurements() -> None:
+    travelled_m, way_var_m2 = [2.0, 3.0, 1.0], [0.1, 0.2, 0.05]
+    measured_m, sensor_var_m2 = [40.5, None, 34.2, 34.1], 2.0
+    belief = initialise(40.5, sensor_var_m2)
+    filtered = [belief]
+    for way_m, way_m2, measured in zip(travelled_m, way_var_m2, measured_m[1:], strict=True):
+        belief = predict(belief, way_m, way_m2)
+        belief = belief if measured is None else update(belief, measured, sensor_var_m2)
+        filtered.append(belief)
+    rows, right = [], []
+    for i, measured in enumerate(measured_m):
+        if measured is not None:
+            rows.append(np.eye(4)[i] / np.sqrt(sensor_var_m2))
+            right.append(measured / np.sqrt(sensor_var_m2))
+    for i, (way_m, way_m2) in enumerate(zip(travelled_m, way_var_m2, strict=True)):
+        rows.append((np.eye(4)[i + 1] - np.eye(4)[i]) / np.sqrt(way_m2))
+        right.append(-way_m / np.sqrt(way_m2))
+    cov = np.linalg.inv(np.array(rows).T @ np.array(rows))
+
+    found = smooth(filtered, travelled_m, way_var_m2)
+
+    np.testing.assert_allclose(
+        [one.mean_m for one in found], cov @ np.array(rows).T @ np.array(right), rtol=1e-9
+    )
+    np.testing.assert_allclose([one.var_m2 for one in found], np.diagonal(cov), rtol=1e-9)

@@ -16,7 +16,14 @@ from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
-from crosscue.eval.scoring.runs import RunScored, find_truth, judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.runs import (
+    RunScored,
+    find_truth,
+    judge_run,
+    metrics_of,
+    scores_of,
+    smoothed_ranges,
+)
 from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError
 from crosscue.replay.processes import in_processes
@@ -35,7 +42,7 @@ class Scored:
         one: Laid beside its truth.
         metrics: What its ``metrics.json`` holds.
         report: Its page.
-        smoothed: The batch smoother beside the filter, if asked for.
+        smoothed: Smoothers beside the filters, if asked for.
     """
 
     one: RunScored
@@ -95,8 +102,9 @@ class ScoreWork:
             one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
             scores = scores_of([one], self.settings)
             metrics = metrics_of([one], scores)
-            smoothed = score_smoother(folder, truth_path) if self.has_smoother else None
-            if smoothed is not None:
+            smoothed = None
+            if self.has_smoother:
+                smoothed = score_smoother(folder, truth_path, smoothed_ranges(one))
                 metrics["smoother"] = asdict(smoothed)
             report = write_files(
                 folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -11,6 +12,7 @@ import numpy as np
 
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.scoring.scene.ranges import RangeSmoothed
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
 from crosscue.replay.base import Floats, Int64s, SchemaError, strict_json, write_text
@@ -37,6 +39,7 @@ class SmootherScore:
         smoother_end_m: The same of the smoother.
         filter_nees_xyh: Are the filter's errors as large as claimed?
         smoother_nees_xyh: Are the smoother's?
+        range: The range filter beside its smoother, by reference.
     """
 
     poses: int
@@ -48,10 +51,18 @@ class SmootherScore:
     smoother_end_m: float
     filter_nees_xyh: NeesSummary
     smoother_nees_xyh: NeesSummary
+    range: Mapping[str, RangeSmoothed]
 
 
-def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
+def score_smoother(
+    run: RunFolder, truth_path: Path, ranges: Mapping[str, RangeSmoothed]
+) -> SmootherScore:
     """Smooth a run's measurements, compare with truth, write ``score/smoother.json``.
+
+    Args:
+        run: Finished.
+        truth_path: Of its drive.
+        ranges: The range filter beside its smoother.
 
     Raises:
         UsageError: GTSAM is not installed.
@@ -89,7 +100,7 @@ def score_smoother(run: RunFolder, truth_path: Path) -> SmootherScore:
         vehicle,
         truth,
     )
-    result = _compared(true, filtered, smoothed)
+    result = _compared(true, filtered, smoothed, ranges)
     folder = run.file("score")
     folder.mkdir(exist_ok=True)
     write_text(folder / "smoother.json", strict_json(asdict(result)) + "\n")
@@ -106,7 +117,10 @@ def _thinned(t_ns: Int64s) -> Int64s:
 
 
 def _compared(
-    true: Trajectory, filtered: tuple[Trajectory, Floats], smoothed: tuple[Trajectory, Floats]
+    true: Trajectory,
+    filtered: tuple[Trajectory, Floats],
+    smoothed: tuple[Trajectory, Floats],
+    ranges: Mapping[str, RangeSmoothed],
 ) -> SmootherScore:
     apart: list[tuple[float, float, float]] = []
     honest: list[NeesSummary] = []
@@ -128,6 +142,7 @@ def _compared(
         smoother_end,
         honest[0],
         honest[1],
+        ranges,
     )
 
 
@@ -148,5 +163,11 @@ def smoother_text(result: SmootherScore) -> str:
             f"{result.filter_end_m:.3f} and {result.smoother_end_m:.3f} m,",
             f"  mean NEES {result.filter_nees_xyh.mean:.2f} and "
             f"{result.smoother_nees_xyh.mean:.2f} (3 is honest)",
+            *(
+                f"range to {name}, filter and smoother, {one.rows} rows: rmse "
+                f"{one.filter_rmse_m:.2f} and {one.smoother_rmse_m:.2f} m, mean NEES "
+                f"{one.filter_nees:.2f} and {one.smoother_nees:.2f} (1 is honest)"
+                for name, one in result.range.items()
+            ),
         ]
     )

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.columns import AMBIGUOUS, RunTables
+from crosscue.eval.runs.tables.travelled import Odometer
+from crosscue.eval.scoring.columns import AMBIGUOUS, RangeRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.pooling import (
     BINS_M,
@@ -20,6 +23,10 @@ from crosscue.eval.scoring.pooling import (
 )
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
+from crosscue.fusion.intersection_range import RangeBelief, predict, smooth
+
+RESTART_NIS: Final = 25.0
+"""A range that jumps by more standard deviations than the root of this began anew."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +95,17 @@ class RangeScore:
     by_control: dict[str, RangeBin]
 
 
+@dataclass(frozen=True, slots=True)
+class RangeSmoothed:
+    """Filter and smoother of one reference at the same rows."""
+
+    rows: int
+    filter_rmse_m: float
+    smoother_rmse_m: float
+    filter_nees: float
+    smoother_nees: float
+
+
 def sds_off(judged: RangeJudged) -> NDArray[np.float64]:
     """Errors in standard deviations, without sign, shape (N,)."""
     return np.asarray(np.abs(judged.error_m) / np.sqrt(judged.var_m2), np.float64)
@@ -130,6 +148,70 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
             )
         )
     return judged
+
+
+def score_smoothed(
+    tables: RunTables, truth: DriveTruth, odometer: Odometer
+) -> dict[str, RangeSmoothed]:
+    """The filter's ranges, by reference, beside what all of a drive's measurements say."""
+    if tables.ranges is None:
+        return {}
+    whole = replace(tables, ranges=smoothed_rows(tables.ranges, odometer))
+    filtered, smoothed = (score_range(judge_range(one, truth)) for one in (tables, whole))
+    return {
+        name: RangeSmoothed(
+            one.scored, one.rmse_m, smoothed[name].rmse_m, one.nees.mean, smoothed[name].nees.mean
+        )
+        for name, one in filtered.items()
+        if one.scored
+    }
+
+
+def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
+    """The same rows, each with the measurements behind it weighed in as well.
+
+    Where odometry is missing or a range began anew, the measurements behind say nothing of those
+    before.
+    """
+    times = np.unique(rows.t_ns)
+    ways = [odometer.until(t_ns) for t_ns in times.tolist()]
+    gone_m, var_m2, covered_ns = (
+        np.cumsum([getattr(way, name) for way in ways])
+        for name in ("distance_m", "var_m2", "covered_ns")
+    )
+    range_m, range_var_m2 = rows.range_m.copy(), rows.var_m2.copy()
+    for approach, reference in dict.fromkeys(
+        zip(rows.approach.tolist(), rows.reference.tolist(), strict=True)
+    ):
+        mine = np.flatnonzero((rows.approach == approach) & (rows.reference == reference))
+        mine = mine[np.argsort(rows.t_ns[mine], kind="stable")]
+        at = np.searchsorted(times, rows.t_ns[mine])
+        steps_m, steps_m2 = np.diff(gone_m[at]), np.diff(var_m2[at])
+        beliefs = [RangeBelief(rows.range_m[i], rows.var_m2[i]) for i in mine.tolist()]
+        goes_on = np.diff(covered_ns[at]) >= np.diff(rows.t_ns[mine])
+        goes_on &= np.array(
+            [
+                _goes_on(predict(before, *step), after)
+                for before, after, *step in zip(
+                    beliefs[:-1], beliefs[1:], steps_m.tolist(), steps_m2.tolist(), strict=True
+                )
+            ],
+            np.bool_,
+        )
+        ends = [0, *(np.flatnonzero(~goes_on) + 1).tolist(), len(beliefs)]
+        for first, stop in pairwise(ends):
+            inside = slice(first, stop - 1)
+            found = smooth(beliefs[first:stop], steps_m[inside].tolist(), steps_m2[inside].tolist())
+            range_m[mine[first:stop]] = [one.mean_m for one in found]
+            range_var_m2[mine[first:stop]] = [one.var_m2 for one in found]
+    return replace(rows, range_m=range_m, var_m2=range_var_m2)
+
+
+def _goes_on(predicted: RangeBelief, after: RangeBelief) -> bool:
+    """Whether a measurement may have led from one to the other: it adds knowledge, and no leap."""
+    gained_m2 = predicted.var_m2 - after.var_m2
+    leap_m = after.mean_m - predicted.mean_m
+    return gained_m2 > -1e-6 and leap_m**2 <= RESTART_NIS * max(gained_m2, 0.0) + 1e-6
 
 
 def score_range(

@@ -15,6 +15,7 @@ from crosscue.datasets.scenes.drive import (
     CAR_BUS,
     IMAGES,
     MOBILEYE_BUS,
+    SPARSE_PHOTOGRAPHS,
     SceneFiles,
     write_scene,
 )
@@ -67,6 +68,19 @@ def test_the_same_seed_gives_the_same_bytes(files: SceneFiles, tmp_path: Path) -
 
     for one in ("drive.mcap", "truth.json", "objects.json", "pose.tum", "ranges.csv"):
         assert (again.log.parent / one).read_bytes() == (files.log.parent / one).read_bytes()
+
+
+def test_the_other_sensors_rows_do_not_depend_on_how_far_pictures_are_apart(
+    files: SceneFiles, tmp_path: Path
+) -> None:
+    sparse = write_scene(tmp_path / "sparse", settings(), imager=SPARSE_PHOTOGRAPHS)
+
+    for topic in (CAR_BUS, "/imu", "/compass"):
+        all_ns, found_ns = (
+            np.sort(np.concatenate([block.log_ns for block in blocks(one.log, topic)]))
+            for one in (files, sparse)
+        )
+        np.testing.assert_array_equal(found_ns, all_ns)
 
 
 def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) -> None:

@@ -186,7 +186,7 @@ def test_the_smoother_weighs_in_what_the_filter_was_given(tmp_path: Path) -> Non
     run = run_of(tmp_path / "run", vehicle)
     truth = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
 
-    assert score_smoother(run, truth).smoother_rmse_m < 1.0
+    assert score_smoother(run, truth, {}).smoother_rmse_m < 1.0
 
 
 def test_positions_cannot_be_weighed_into_a_map_that_lies_nowhere() -> None:

@@ -253,7 +253,7 @@ def test_the_pose_filter_grows_by_what_a_car_could_have_done(tmp_path: Path) -> 
 def test_the_smoother_crosses_a_gap(marked: Outcome) -> None:
     pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
 
-    score = score_smoother(marked.run, marked.run.path.parent / "truth.json")
+    score = score_smoother(marked.run, marked.run.path.parent / "truth.json", {})
 
     assert score.poses == 14
     # It knows afterwards where the car came out.
