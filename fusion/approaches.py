@@ -203,12 +203,14 @@ class Approaches:
             self.counts[f"evidence refused: {why}"] += 1
             return None
         self._last_ns = evidence.t_ns
-        passed_s = 0.0 if last_ns is None else (evidence.t_ns - last_ns) * 1e-9
+        if last_ns is None:
+            # A log may begin long before its first picture: what was passed then is not ahead.
+            return _Moved(0.0, 0.0, 0.0, 0.0)
+        passed_s = (evidence.t_ns - last_ns) * 1e-9
         if evidence.travelled_m is not None and _has_way(evidence):
             way_m, var_m2 = evidence.travelled_m, evidence.travelled_var_m2
             return _Moved(abs(way_m), passed_s, way_m, var_m2)
-        if last_ns is not None:
-            self.counts["odometry missing"] += 1
+        self.counts["odometry missing"] += 1
         way_m = self._filter.unseen_mps * passed_s
         # Nobody knows how far: half of the way that is reckoned with, give or take that half.
         return _Moved(way_m, passed_s, 0.5 * way_m, 0.25 * way_m * way_m)

@@ -17,7 +17,8 @@ from crosscue.eval.scoring.scene import belief as score_belief
 from crosscue.eval.scoring.scene.approaches import ApproachesJudged, ApproachScore, judge_approaches
 from crosscue.eval.scoring.scene.belief import BeliefJudged, BeliefScore, judge_belief
 from crosscue.eval.scoring.scene.cues import CueFrames, CueScore, match_cues, score_cues
-from crosscue.eval.scoring.scene.detection import RULES, Definition
+from crosscue.eval.scoring.scene.detection import RULES
+from crosscue.eval.scoring.scene.detection import Definition as Definition
 from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore, judge_range, score_range
 from crosscue.replay.errors import SchemaError
 

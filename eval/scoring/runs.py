@@ -32,7 +32,7 @@ from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, ju
 from .pose import score as score_pose
 from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
-from .scene.ranges import RangeSmoothed, score_smoothed
+from .scene.ranges import FilterAndSmoother, score_smoothed
 from .truth import DriveTruth
 
 TABLES: Final = ("frames", "cues", "range", "belief")
@@ -164,7 +164,7 @@ def tables_of(run: RunFolder) -> RunTables:
     return in_log_time(str(run.path), found, timeline)
 
 
-def smoothed_ranges(one: RunScored) -> dict[str, RangeSmoothed]:
+def smoothed_ranges(one: RunScored) -> dict[str, FilterAndSmoother]:
     """By reference, the range filter beside what all of the run's measurements say together."""
     return score_smoothed(tables_of(one.run), one.truth, odometer_of(one.run))
 

@@ -322,6 +322,16 @@ def test_what_a_run_writes_keeps_the_bounds_and_the_hysteresis(
         was = step.established
 
 
+def test_the_way_before_the_first_picture_changes_nothing() -> None:
+    settings = Fusion().model_copy(update=TEMPORAL | {"temporal": learned()})
+    at_once, later = (Approaches(GRAPH, settings, FILTER) for _ in range(2))
+
+    first = at_once(frame(0, 1, 5.0))
+    after_a_way = later(replace(frame(0, 1, 5.0), travelled_m=37.0, travelled_var_m2=1.0))
+
+    assert after_a_way.probabilities == first.probabilities
+
+
 def test_a_drive_begins_again_after_a_gap() -> None:
     settings = Fusion().model_copy(update=TEMPORAL | {"temporal": learned()})
     belief = Approaches(GRAPH, settings, FILTER)

@@ -11,7 +11,7 @@ from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import headline, pose_summary, summary
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import locked, open_run
-from crosscue.eval.scoring.drives import Scores, ScoreSettings
+from crosscue.eval.scoring.drives import Definition, Scores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.score import load_truth
@@ -24,7 +24,6 @@ from crosscue.eval.scoring.runs import (
     scores_of,
     smoothed_ranges,
 )
-from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError
 from crosscue.replay.processes import in_processes
 

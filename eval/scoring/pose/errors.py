@@ -94,6 +94,17 @@ class PoseErrors:
 
 
 @dataclass(frozen=True, slots=True)
+class FilterAndSmoother:
+    """Errors of a filter of one number beside those of its smoother, at the same rows."""
+
+    rows: int
+    filter_rmse_m: float
+    smoother_rmse_m: float
+    filter_nees: float
+    smoother_nees: float
+
+
+@dataclass(frozen=True, slots=True)
 class NeesSummary:
     """Are errors as large as claimed?
 

@@ -12,12 +12,11 @@ import numpy as np
 
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.scoring.scene.ranges import RangeSmoothed
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
 from crosscue.replay.base import Floats, Int64s, SchemaError, strict_json, write_text
 
-from .errors import NeesSummary, nees, pair, summarise_nees
+from .errors import FilterAndSmoother, NeesSummary, nees, pair, summarise_nees
 from .measured import read_measured
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
 
@@ -51,11 +50,11 @@ class SmootherScore:
     smoother_end_m: float
     filter_nees_xyh: NeesSummary
     smoother_nees_xyh: NeesSummary
-    range: Mapping[str, RangeSmoothed]
+    range: Mapping[str, FilterAndSmoother]
 
 
 def score_smoother(
-    run: RunFolder, truth_path: Path, ranges: Mapping[str, RangeSmoothed]
+    run: RunFolder, truth_path: Path, ranges: Mapping[str, FilterAndSmoother]
 ) -> SmootherScore:
     """Smooth a run's measurements, compare with truth, write ``score/smoother.json``.
 
@@ -120,7 +119,7 @@ def _compared(
     true: Trajectory,
     filtered: tuple[Trajectory, Floats],
     smoothed: tuple[Trajectory, Floats],
-    ranges: Mapping[str, RangeSmoothed],
+    ranges: Mapping[str, FilterAndSmoother],
 ) -> SmootherScore:
     apart: list[tuple[float, float, float]] = []
     honest: list[NeesSummary] = []

@@ -6,12 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.travelled import Odometer
 from crosscue.eval.scoring.columns import AMBIGUOUS, RangeRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.pooling import (
@@ -21,6 +20,7 @@ from crosscue.eval.scoring.pooling import (
     first_reasons,
     summed,
 )
+from crosscue.eval.scoring.pose.errors import FilterAndSmoother as FilterAndSmoother
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.fusion.intersection_range import RangeBelief, predict, smooth
@@ -95,15 +95,21 @@ class RangeScore:
     by_control: dict[str, RangeBin]
 
 
-@dataclass(frozen=True, slots=True)
-class RangeSmoothed:
-    """Filter and smoother of one reference at the same rows."""
+class _Way(Protocol):
+    @property
+    def distance_m(self) -> float: ...
+    @property
+    def var_m2(self) -> float: ...
+    @property
+    def covered_ns(self) -> int: ...
 
-    rows: int
-    filter_rmse_m: float
-    smoother_rmse_m: float
-    filter_nees: float
-    smoother_nees: float
+
+class Odometer(Protocol):
+    """Says how far the car went since it was last asked; times never fall."""
+
+    def until(self, t_ns: int, /) -> _Way:
+        """The way since the last call."""
+        ...
 
 
 def sds_off(judged: RangeJudged) -> NDArray[np.float64]:
@@ -152,14 +158,14 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
 
 def score_smoothed(
     tables: RunTables, truth: DriveTruth, odometer: Odometer
-) -> dict[str, RangeSmoothed]:
+) -> dict[str, FilterAndSmoother]:
     """The filter's ranges, by reference, beside what all of a drive's measurements say."""
     if tables.ranges is None:
         return {}
     whole = replace(tables, ranges=smoothed_rows(tables.ranges, odometer))
     filtered, smoothed = (score_range(judge_range(one, truth)) for one in (tables, whole))
     return {
-        name: RangeSmoothed(
+        name: FilterAndSmoother(
             one.scored, one.rmse_m, smoothed[name].rmse_m, one.nees.mean, smoothed[name].nees.mean
         )
         for name, one in filtered.items()
