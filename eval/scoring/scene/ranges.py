@@ -26,7 +26,7 @@ from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.fusion.intersection_range import RangeBelief, predict, smooth
 
 RESTART_NIS: Final = 25.0
-"""A range that jumps by more standard deviations than the root of this began anew."""
+"""A range that jumps by more standard deviations than the root of this has restarted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +176,7 @@ def score_smoothed(
 def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
     """The same rows, each with the measurements behind it weighed in as well.
 
-    Where odometry is missing or a range began anew, the measurements behind say nothing of those
+    Where odometry is missing or a range restarted, the measurements behind say nothing of those
     before.
     """
     times = np.unique(rows.t_ns)

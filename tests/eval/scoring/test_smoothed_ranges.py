@@ -48,7 +48,7 @@ def test_the_smoother_knows_at_the_first_row_what_the_filter_knows_at_the_last()
     assert np.mean(smoother_m2) < 0.8 * np.mean(filter_m2)
 
 
-def test_a_range_that_began_anew_says_nothing_of_the_one_before() -> None:
+def test_a_range_that_restarts_says_nothing_of_the_one_before() -> None:
     rng = np.random.default_rng(seed=4)
     first = filtered(60.0 - STEP_M * np.arange(10) + rng.normal(0.0, 2.0, 10))
     second = filtered(90.0 - STEP_M * np.arange(10) + rng.normal(0.0, 2.0, 10))
