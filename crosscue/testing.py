@@ -155,8 +155,8 @@ def check_dataset(
 ) -> None:
     """Check that a data set keeps the contract of a reader, and that its truth fits its log.
 
-    A true track states where the body sits whose track it is, or that nobody knows (null), and who
-    says so.
+    A true track states whose track it is and that body's mounting (null where unknown), with the
+    source.
 
     Args:
         log: A small, whole drive of the data set.

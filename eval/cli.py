@@ -270,7 +270,7 @@ def _guarded(module: Command, args: argparse.Namespace) -> int:
         )
         return _complain(OSError(f"{where}{error.strerror or error}; {hint}"), 1, args)
     except Exception as error:
-        # The last resort: a bug of ours must still be one line, with a way to report it.
+        # The last resort: a bug in crosscue must still be one line, with a way to report it.
         text = (
             f"{type(error).__name__}: {error}; a bug in crosscue: run again with -v and report it"
         )

@@ -19,7 +19,7 @@ from .intersection_range import RangeBelief, initialise, nis, predict, update
 
 
 class Verdict(StrEnum):
-    """What became of a measurement."""
+    """The outcome of a measurement."""
 
     WAITS = "waits"
     BEGAN = "began"

@@ -111,7 +111,7 @@ class Motion(NamedTuple):
 
 
 class Updated(NamedTuple):
-    """What became of one measurement.
+    """The outcome of one measurement.
 
     Attributes:
         belief: The posterior; the prior unchanged where the gate refused the measurement.

@@ -17,7 +17,7 @@
     * StudyFileError         a study file cannot be read or does not fit (exit status 2)
     * WorkerError            a worker died; finished parts are kept
     * EmptyResultError       nothing of what was asked for is in the logs
-    * AccountError           rows in are not rows used, skipped and dropped: a bug of ours
+    * AccountError           rows in are not rows used, skipped and dropped: a bug in crosscue
 
 A wrong argument from the caller's own code stays a ``ValueError``. Dropped rows, which
 stop nothing, are a ``LossWarning``.
@@ -113,7 +113,7 @@ class EmptyResultError(CrosscueError):
 
 
 class AccountError(CrosscueError):
-    """An account does not add up, so no result can be relied on; always a bug of ours."""
+    """An account does not add up, so no result can be relied on; always a bug in crosscue."""
 
 
 def one_line(error: BaseException, max_length: int | None = None) -> str:

@@ -64,7 +64,7 @@ class DriveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueMotion:
-    """The car's rear axle, 100 times a second.
+    """The car's rear axle, 100 times per second.
 
     Attributes:
         t_ns: Shape (N,), int64.

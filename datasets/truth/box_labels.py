@@ -272,7 +272,7 @@ def _names_of(path: Path) -> tuple[str, ...]:
                 return _yaml_names(file) if file.suffix == ".yaml" else tuple(_lines(file))
     raise UsageError(
         f"{path}: YOLO labels without class names (no {', '.join(NAME_FILES)}); put classes.txt "
-        "with one a line beside them, or give --class-names FILE where a command takes it"
+        "with one per line beside them, or give --class-names FILE where a command takes it"
     )
 
 
@@ -312,7 +312,7 @@ def _numbers(words: Sequence[str], where: str) -> list[float]:
 
 
 def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
-    """Class names, or those of a file with one a line.
+    """Class names, or those of a file with one per line.
 
     Raises:
         UsageError: The file cannot be read, or is empty.
@@ -323,12 +323,12 @@ def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
     try:
         content = read_at_most(path, MIB)
         if content is None:
-            raise UsageError(f"{path}: over 1 MiB; give class names, one a line")
+            raise UsageError(f"{path}: over 1 MiB; give class names, one per line")
         lines = content.decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"{path}: {why}; give class names, one a line") from None
+        raise UsageError(f"{path}: {why}; give class names, one per line") from None
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
-        raise UsageError(f"{path}: no name in it; give class names, one a line")
+        raise UsageError(f"{path}: no name in it; give class names, one per line")
     return names

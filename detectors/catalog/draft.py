@@ -118,7 +118,7 @@ def _classes(
         assumed.append("the 91 classes are COCO's numbers, 0 unused")
         return ("unused 0", *COCO_90)
     raise UsageError(
-        f"{path}: {count} classes and no names in the file; give one a line: --class-names FILE"
+        f"{path}: {count} classes and no names in the file; give one per line: --class-names FILE"
     )
 
 

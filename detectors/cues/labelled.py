@@ -9,7 +9,7 @@ from crosscue.replay.vehicle.vehicle import CueSpec, Vehicle
 
 
 def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
-    """How many detections with a cue's labels are surer than its setting, if it has one."""
+    """How many detections with a cue's labels score above its setting, if it has one."""
     setting, min_score = vehicle.threshold_of(cue)
     return count_labels(boxes, vehicle.labels_of(cue), 0.0 if setting is None else min_score)
 

@@ -75,7 +75,7 @@ class Judged(NamedTuple):
         crossing: Cross traffic at the intersection.
         parked: Parked cars there.
         crossing_elsewhere: Cross traffic that is not there.
-        parked_elsewhere: Likewise, or nobody knows where the intersection is.
+        parked_elsewhere: Likewise, or the place of the intersection is unknown.
         seen: Cars that were whole and near enough.
         followed: Those of them that were seen in frames enough.
         past: Cars that move along the road past the intersection; None where its place is unknown.
@@ -194,7 +194,7 @@ class FrameCues:
 
     Attributes:
         counts: From each cue that was looked for, a user's own among them, to how many there were;
-            0 is looked and not found.
+            0 means searched for and not found.
         road: Fractions of road, where a detector segments.
     """
 

@@ -4,7 +4,7 @@ Two detections of different detectors in one frame are the same object if they m
 cues and their boxes overlap by more than half (intersection over union). The one with the better
 score is kept: a calibrated score, which is a probability, before one that is not; else the higher.
 A kept detection stands for at most one of each other detector, so that two cars in a row stay two.
-Detections of one detector are its own affair.
+Detections of the same detector are not compared.
 """
 
 from __future__ import annotations

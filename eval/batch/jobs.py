@@ -72,7 +72,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Done(Generic[R]):
-    """What became of a job.
+    """The outcome of a job.
 
     Attributes:
         job: The job.

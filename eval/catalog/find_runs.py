@@ -27,8 +27,8 @@ def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
     """The run folders that RUN arguments mean, in the order given.
 
     A folder with a manifest or tables is a run, whole or cut short; any other stands for the runs
-    in it, without those that were merged of others; ``@runs.txt`` names one a line; a pattern that
-    the shell left alone stands for what it matches.
+    in it, without those that were merged of others; ``@runs.txt`` names one per line; a pattern
+    that the shell left alone stands for what it matches.
 
     Raises:
         RunError: A folder that neither is nor holds a run.

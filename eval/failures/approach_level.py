@@ -18,7 +18,7 @@ from .causes import Finding, approach_findings
 from .record import About, Failure, Kind
 
 SURE: Final = 1e-6
-"""No probability counts as surer than this: 20 bits."""
+"""No probability counts as closer to 0 or 1 than this: 20 bits."""
 EVEN: Final = 0.5
 AGAINST: Final = "a cue speaks against it"
 NOTHING: Final = "no cue speaks against it"

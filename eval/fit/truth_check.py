@@ -100,7 +100,7 @@ class TruthFit:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class ImportedTruth:
-    """What came of an import; printed as ``truth import`` prints it.
+    """The result of an import; printed as ``truth import`` prints it.
 
     Attributes:
         truth: Path of the truth file.

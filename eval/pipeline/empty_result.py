@@ -1,4 +1,4 @@
-"""Nothing came of what was asked for: one line that says what there is instead."""
+"""An empty result: one line that says what the log has instead."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def silent_roles(planned: Plan, received: Mapping[Signal, int]) -> dict[Signal, 
 
 @contextmanager
 def nothing_left(run: RunFolder) -> Iterator[None]:
-    """Take a run's files away again when nothing came of it, so that it does not look finished.
+    """Take a run's files away again when the result is empty, so that it does not look finished.
 
     Detections that are whole stay where only the settings of the estimate are refused.
     """

@@ -218,7 +218,7 @@ def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUse
 
 
 def _of_detecting(found: DetectManifest | None) -> list[str]:
-    """What the detect stage had to say, but for the gaps: those are said of the whole run."""
+    """What the detect stage had to say, but for the gaps: those are reported for the whole run."""
     if found is None:
         return []
     return [one for one in found.notices if one not in found.time.notices]

@@ -89,7 +89,7 @@ def replay_drive(
     Raises:
         UsageError: It is to be resumed, and the folder holds a run of other logs or settings.
         VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: Nothing came of it; the folder is as it was.
+        EmptyResultError: The result is empty; the folder is unchanged.
         OutputError: The disk is full.
     """
     mine = input_of(

@@ -131,7 +131,7 @@ def _pieces(
 
 
 def _every(t_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """Indices of about ``rate_hz`` rows a second, the last one included."""
+    """Indices of about ``rate_hz`` rows per second, the last one included."""
     slots = (t_ns - t_ns[0]) // round(1e9 / rate_hz)
     first = np.flatnonzero(np.diff(slots, prepend=-1))
     return np.union1d(first, [len(t_ns) - 1]).astype(np.int64)

@@ -6,7 +6,7 @@ For every topic of every log, and for every stream that a stage takes in::
 
 The manifest holds it under ``account``: *reading* has the topics of each log; *detecting* the
 camera's frames; *estimating* what the filters take. ``score`` adds *scoring* to ``metrics.json``.
-What was used is counted by who used it, so that the identity can fail; then it is a bug of ours.
+What was used is counted by who used it, so the identity can fail; that is a bug in crosscue.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def _text_of(one: CandidateRow) -> str:
 
 
 def _range_text(cue: str, one: CandidateRow) -> list[str]:
-    """Scores are the cue's own affair and reported there."""
+    """Scores belong to the cue and are reported there."""
     skipped = {why: number for why, number in one.skipped.items() if why != BELOW_SCORE}
     things = f"{cue.replace('_', ' ')}s"
     lines = []

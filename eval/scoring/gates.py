@@ -71,7 +71,7 @@ class GateFile(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
-    """What became of a gate.
+    """The outcome of a gate.
 
     Attributes:
         gate: The gate.

@@ -61,7 +61,7 @@ class Match(NamedTuple):
     """How alike two pictures are.
 
     Attributes:
-        score: Larger is surer; what it is worth is for ``crosscue fit landmarks`` to say.
+        score: Larger is more certain; ``crosscue fit landmarks`` calibrates it.
         pairs: Points that look alike.
         agreeing: Of those, the ones that move as one scene would.
     """

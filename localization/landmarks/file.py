@@ -89,7 +89,7 @@ def check_length(path: Path) -> None:
     changes, pages = struct.unpack_from(">II", header, 24)
     page = 65_536 if page == 1 else page
     (valid_for,) = struct.unpack_from(">I", header, 92)
-    # While a journal waits to be rolled back, the header is not to be believed.
+    # While a journal waits to be rolled back, the header cannot be trusted.
     is_settled = changes == valid_for and not journal_of(path).exists()
     if is_settled and length < pages * page:
         raise LogFormatError(

@@ -184,7 +184,7 @@ class OwnTypes:
         return None if own is None else own.fields
 
     def messages(self, block: Block, table: Table, ledger: Ledger) -> Outgoing:
-        """Rows as messages of the topic's own type; what it cannot hold is said."""
+        """Rows as messages of the topic's own type; what it cannot hold is reported."""
         own = self._made.get(block.topic)
         if own is None:
             own = self._made[block.topic] = self._make(block.topic, table)

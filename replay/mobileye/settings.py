@@ -63,7 +63,7 @@ DEFAULTS: Final = MobileyeSettings()
 
 
 def mounting_of(settings: MobileyeSettings, bus: str, ledger: Ledger) -> Mounting:
-    """Where the reference point lies; where nobody says, at the rear axle, which is reported."""
+    """Where the reference point lies; if not stated, at the rear axle, which is reported."""
     if settings.mounting is None:
         ledger.notice(
             f"{bus}: where the Mobileye's reference point lies is not given; distances count "

@@ -84,7 +84,7 @@ class Fade(Section):
 
 
 class CueEntry(Section):
-    """One cue: how far it is to be believed, and about what."""
+    """One cue: its reliability, and the features that it is about."""
 
     precision: Probability
     """Fraction of its detections that are right; what it sends along its edges (Table 5)."""

@@ -238,7 +238,7 @@ def test_dead_and_missing_readings_are_left_out_and_counted() -> None:
 
 @pytest.mark.parametrize("persists_s", [0.5, 3.0])
 def test_a_lasting_error_is_recognised_as_lasting(persists_s: float) -> None:
-    """Simulated residuals that fade exponentially, read ten times a second for an hour."""
+    """Simulated residuals that fade exponentially, read ten times per second for an hour."""
     rng = np.random.default_rng(2)
     n, kept = 36_000, math.exp(-0.1 / persists_s)
     residual = np.zeros(n)

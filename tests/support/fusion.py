@@ -86,7 +86,7 @@ def drive(
     step_m: float = 1.0,
     begin_ns: int = 0,
 ) -> Iterator[FrameEvidence]:
-    """A car that goes towards an intersection at ten frames a second.
+    """A car that goes towards an intersection at ten frames per second.
 
     Args:
         from_m: First distance to the start of the intersection.

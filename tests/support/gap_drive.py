@@ -45,7 +45,7 @@ from crosscue.replay.write.convert import LogWriter
 SECOND: Final = 1_000_000_000
 BEGIN: Final = 1_700_000_000 * SECOND
 ROW: Final = SECOND // 10
-"""Ten wheel rows and pictures a second."""
+"""Ten wheel rows and pictures per second."""
 SPEED_MPS: Final = 6.0
 START_M: Final = 70.0
 """From the first frame to the intersection."""

@@ -26,7 +26,7 @@ LATE_S: Final = 1.1
 
 
 def phone_drive(path: Path, count: int = 60) -> Path:
-    """Both files, ten rows a second; the phone is on its right side, leaning back a little."""
+    """Both files, ten rows per second; the phone is on its right side, leaning back a little."""
     path.mkdir(parents=True)
     car, phone = [CAR], [PHONE]
     lean = 0.3

@@ -1,4 +1,4 @@
-"""A small made-up drive to score, checked by hand: one approach, ten frames a second."""
+"""A small made-up drive to score, checked by hand: one approach, ten frames per second."""
 
 from __future__ import annotations
 

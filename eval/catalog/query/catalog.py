@@ -82,7 +82,7 @@ class Catalog:
             try:
                 return database.select(sql, tables, self._names)
             except database.FailedError:
-                # A file whose head is sound may be damaged or gone further on.
+                # A file whose head is sound may be damaged further on, or gone.
                 if not sum(one.drop_damaged() for one in files.values()):
                     raise
 

@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and report; 1 when no class has got a threshold, 3 when runs had dropped something."""
+    """Fit and report; 1 when no class has a threshold, 3 when runs had dropped something."""
     found = crosscue.fit_detector(
         args.runs,
         args.labels,

@@ -58,7 +58,7 @@ class FittedDetector:
 
     @property
     def has_threshold(self) -> bool:
-        """At least one class has got a threshold."""
+        """At least one class has a threshold."""
         return any(one.scores and one.scores.threshold is not None for one in self.classes)
 
     def as_dict(self) -> dict[str, object]:
@@ -183,7 +183,7 @@ def fit_detector(
         card: The detector's card, where the run does not say.
         detector: Its name, where several ran.
         kind: Format of the labels.
-        class_names: Of YOLO labels in their order, or a file with one a line.
+        class_names: Of YOLO labels in their order, or a file with one per line.
         meanings: From a class of the labels or of the detector to the class that it counts as.
         overlap: That makes a detection right.
         date: Of the fit, for the card; the date of the first picture if left out.

@@ -23,7 +23,7 @@ from crosscue.replay.base import EmptyResultError, write_text
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedMessages:
-    """How far each cue is to be believed; printed with its counts.
+    """The reliability of each cue; printed with its counts.
 
     Attributes:
         fitted: Rates, fades and exponents.
@@ -202,7 +202,7 @@ def fit_messages(
     overwrite: bool = False,
     on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> FittedMessages:
-    """Learn how far each cue is to be believed, for ``fusion.kind = "calibrated"``.
+    """Learn the reliability of each cue, for ``fusion.kind = "calibrated"``.
 
     Args:
         runs: Finished runs.

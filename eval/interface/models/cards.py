@@ -119,7 +119,7 @@ def draft_card(
             torchvision's (``.pth``, ``.pt``, ``.safetensors``).
         output: The card, in the folder of the weights; their name, ``.toml``, if left out.
         kind: Layout of its outputs, or torchvision's name of the network, where several fit.
-        class_names: In the order of its outputs, or a file with one a line, where it has none.
+        class_names: In the order of its outputs, or a file with one per line, where it has none.
         size_px: Width and height of its input, or as text, ``1280x736``, where it allows any.
         picture: What the network finds in it is drawn beside the card, as
             ``CARD.PICTURE.found.jpg``.

@@ -33,7 +33,7 @@ from .make import replay_drive
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ReplayedDrives:
-    """What became of many drives; printed in a line each.
+    """The outcomes of many drives; printed in a line each.
 
     Attributes:
         drives: Each with its job, what the replay counted, or why it failed.
@@ -267,7 +267,7 @@ def replay_drives(
     try:
         _merge(done, folder)
     except CrosscueError as error:
-        # The drives are done, and that must be reported, whatever became of their common table.
+        # The drives are done, and that must be reported, whether or not they could be merged.
         why = str(error)
     return ReplayedDrives(done, folder / FOLDER, why)
 

@@ -205,7 +205,7 @@ def score_detector(
         output: Folder for the page and its numbers; ``RUN/score`` if left out.
         detector: Its name, where several ran.
         kind: Format of the labels; recognised if left out.
-        class_names: Of YOLO labels in their order, or a file with one a line.
+        class_names: Of YOLO labels in their order, or a file with one per line.
         meanings: From a class of the labels or of the detector to the class that it counts as;
             empty for one that is neither to be found nor wrong.
         overlap: That makes a detection right, for precision, recall and calibration.

@@ -59,7 +59,7 @@ def replay_drive(
     Raises:
         VehicleError: The vehicle file does not fit the log.
         RunError: The folder holds something else.
-        EmptyResultError: Nothing comes of it; the folder is as it was.
+        EmptyResultError: The result is empty; the folder is unchanged.
     """
     from crosscue.eval.fit.first_pose import with_start
     from crosscue.eval.pipeline.landmarks import matcher_for, open_for

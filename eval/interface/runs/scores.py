@@ -52,7 +52,7 @@ class ScoredRuns:
         failed: From the folder of a run that could not be scored to the reason.
         metrics: Of all runs together, as in ``metrics.json``; of the run where there is one.
         scores: What the metrics are made of.
-        gates: What became of each gate.
+        gates: The outcome of each gate.
         attribution: What each cue was worth, where that was asked for.
         report: The page; None for several runs without ``output``.
     """

@@ -22,7 +22,7 @@ class IntersectionResult:
     """The published experiment, simulated; printed as its tables beside the published numbers.
 
     Attributes:
-        drives: What became of each drive.
+        drives: The outcome of each drive.
         scored: Distances, cues and beliefs, and what each cue was worth.
         files: The page, its tables as JSON, the metrics and a sheet of pictures.
     """

@@ -76,7 +76,7 @@ class FieldResult:
 
     Attributes:
         folder: Where runs, picture and page are.
-        runs: What became of each run.
+        runs: The outcome of each run.
         tables: Results in words.
         notes: What to know when reading them.
     """

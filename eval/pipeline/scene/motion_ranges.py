@@ -11,7 +11,7 @@ Which object reports the range:
   lights.
 
 The choice stays while that holds, groups are never averaged, and every range is that object's own
-posterior. Lights of which nobody knows where they face count as facing where no other does.
+posterior. Lights whose facing is unknown count as facing where no other does.
 """
 
 from __future__ import annotations

@@ -273,7 +273,7 @@ def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
 
 
 def _wall(seed: int, number: int) -> Bytes:
-    """A made-up wall with enough corners; negative numbers are walls that nobody knows."""
+    """A made-up wall with enough corners; negative numbers are walls without a landmark."""
     import cv2
 
     rng = np.random.default_rng(key_of(seed, number & 0xFFFF_FFFF, int(number < 0)))

@@ -72,7 +72,7 @@ def unwanted(
 
 def _is_outside(times_ns: list[int | None], selection: Selection) -> bool:
     known = [t for t in times_ns if t is not None]
-    # The last container's frames run on for nobody knows how long.
+    # The last container's frames run on for an unknown time.
     is_last = len(times_ns) < 3
     if len(known) < len(times_ns):
         return False

@@ -105,7 +105,7 @@ class MessageNumbers:
         elif not self._fill(first, last):
             self._backward += 1
             _note(self._back_places, f"line {line}: {first} after {self._last}")
-            # Another recording begins, or a part comes again: nobody knows what is between.
+            # Another recording begins, or a part comes again: what lies between is unknown.
             self._settle_gaps()
             self._highest = last
         self._highest = max(self._highest, last)

@@ -51,7 +51,10 @@ class Checks:
             )
         for tally, sentence in (
             (self.bad_indexes, "message indexes that do not fit their chunks, which were scanned"),
-            (self.bad_heads, "chunks that match their checksum but not what is said of them"),
+            (
+                self.bad_heads,
+                "chunks that match their checksum but not what the file states about them",
+            ),
             (self.bad_attachments, "attachments that do not match their checksum"),
             (self.bad_definitions, "schemas or channels that cannot be read or contradict"),
             (self.ignored, "records of unknown kinds, passed over"),

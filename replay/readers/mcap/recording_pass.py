@@ -217,7 +217,7 @@ class SegmentPass:
         )
 
     def _plausible(self) -> Plausible:
-        """What messages must look like to be believed behind damaged bytes."""
+        """What messages must look like to be trusted behind damaged bytes."""
         statistics = self._summary.statistics
         channels = [channel.id for channel in self._segment.channels]
         if statistics is None or not statistics.message_count:

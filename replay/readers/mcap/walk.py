@@ -132,7 +132,7 @@ class Stray:
 class Gap:
     """Bytes from ``at`` to ``to`` that cannot be read as records.
 
-    A run before it may reach beyond ``at``: what of it begins there or later is not to be believed.
+    A run before it may reach beyond ``at``: what of it begins there or later cannot be trusted.
     """
 
     at: int
@@ -265,7 +265,7 @@ class Walk:
         return Gap(since, self._at, why)
 
     def _next_record(self, at: int, bound: int) -> tuple[int, int | None]:
-        """From where on records outside chunks are not to be believed, and where they are again."""
+        """Where records outside chunks stop being trustworthy, and where they are so again."""
         if not self._has_bare:
             return at, None
         since = at

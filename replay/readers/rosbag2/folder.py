@@ -224,7 +224,7 @@ def _groups(splits: list[Split]) -> list[list[Split]]:
 
 
 def _counted(split: Split) -> list[int]:
-    """Declared counts of its topics, one for a count nobody knows."""
+    """Declared counts of its topics, one for an unknown count."""
     return [1 if topic.declared is None else topic.declared for topic in split.topics]
 
 

@@ -15,7 +15,7 @@ _BRACKETS: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class SplitHint:
-    """What is said of one storage file.
+    """What the metadata state about one storage file.
 
     Attributes:
         name: File name without any folder.
@@ -30,7 +30,7 @@ class SplitHint:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What is said of the folder.
+    """What the metadata state about the folder.
 
     Attributes:
         splits: Storage files in the order listed.

@@ -24,7 +24,7 @@ SEGMENT = ("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "4
 
 
 def _drive(yaw_rate_radps: float, seconds: int = 20, speed_mps: float = 10.0) -> list[Block]:
-    """Ten wheel rows and twenty gyro rows a second."""
+    """Ten wheel rows and twenty gyro rows per second."""
     blocks: list[Block] = []
     for second in range(seconds):
         start = second * SECOND

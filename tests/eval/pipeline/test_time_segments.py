@@ -26,11 +26,11 @@ from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 SECOND = 1_000_000_000
 BEGIN = 1_000 * SECOND
 ROW = SECOND // 10
-"""Ten wheel rows a second."""
+"""Ten wheel rows per second."""
 
 
 def _drive(seconds: int = 20, rows_a_block: int = 7) -> list[Block]:
-    """Ten wheel rows and twenty gyro rows a second, of a car that speeds up and turns."""
+    """Ten wheel rows and twenty gyro rows per second, of a car that speeds up and turns."""
     wheel_t = np.arange(seconds * 10) * ROW + BEGIN
     gyro_t = np.arange(seconds * 20) * (ROW // 2) + BEGIN
     wheels = [

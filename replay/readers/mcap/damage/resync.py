@@ -137,7 +137,7 @@ class Resync:
     def last_trusted(self, rows: Rows) -> int:
         """Where, within a run that leads into damage, the last plausible message begins.
 
-        Its length led into the damage, so it is the first record not to be believed.
+        Its length led into the damage, so it is the first record that cannot be trusted.
         """
         good = np.flatnonzero(self.plausible.messages(rows))
         return int(rows.offset[good[-1]]) if len(good) else 0
