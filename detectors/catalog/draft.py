@@ -110,8 +110,9 @@ def _classes(
     if model.class_names:
         certain.append(f"{len(model.class_names)} class names in its metadata")
         return model.class_names
+    usual = COCO_90 if guess.numbers_as_coco else COCO_80
     for known in (COCO_80, COCO_90):
-        if count == len(known) or (count is None and known is COCO_90):
+        if count == len(known) or (count is None and known is usual):
             assumed.append(f"the {len(known)} classes are COCO's, in its order")
             return known
     if count == len(COCO_90) + 1:

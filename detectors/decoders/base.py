@@ -90,6 +90,7 @@ class Guess:
         input: Keys of the card's ``[input]`` that networks of this layout usually have.
         network: Keys of the card's ``[network]``, for tensors alone.
         usual_size_px: Width and height to run at, where the file leaves them open.
+        numbers_as_coco: Networks of this layout number classes as COCO does, with its gaps.
     """
 
     settings: Mapping[str, object]
@@ -99,6 +100,7 @@ class Guess:
     input: Mapping[str, object] | None = None
     network: Mapping[str, object] | None = None
     usual_size_px: tuple[int, int] = (640, 640)
+    numbers_as_coco: bool = False
 
 
 class BoxOutput(Settings):
@@ -188,6 +190,8 @@ def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
     return size if isinstance(size, int) else None
 
 
+PICTURE_SIZE_INPUT: Final = "orig_target_sizes"
+"""Second input of RT-DETR, D-FINE and others: width and height that boxes are scaled to."""
 GRID_STRIDES: Final = (8, 16, 32)
 """Of the grids of YOLO networks and of YOLOX."""
 

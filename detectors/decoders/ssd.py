@@ -69,6 +69,7 @@ class TensorflowSsdOutput(BoxOutput):
             ("its outputs have the names of TensorFlow's detection API",),
             ("class numbers start at 1 (TFLite: first_class = 0)",),
             {"colour": "rgb", "fit": "stretch", "layout": "nhwc", "dtype": "uint8"},
+            numbers_as_coco=True,
         )
 
 
@@ -106,4 +107,5 @@ class DetectionOutput(BoxOutput):
             ("rows of 7, as the operation DetectionOutput returns",),
             ("class 0 is the background, the classes start at 1",),
             {"colour": "bgr", "fit": "stretch"},
+            numbers_as_coco=True,
         )

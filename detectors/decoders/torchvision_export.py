@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    PICTURE_SIZE_INPUT,
     Array,
     BoxOutput,
     Candidates,
@@ -74,6 +75,14 @@ class TorchvisionOutput(BoxOutput):
             "overlap": 1.0,
             **{key: out.name for key, out in found.items() if key == "masks" or out.name != key},
         }
+        if any(given.name == PICTURE_SIZE_INPUT for given in model.inputs[1:]):
+            return Guess(
+                {**settings, "first_class": 0},
+                len(model.class_names) or None,
+                (f"outputs boxes, labels and scores, and an input {PICTURE_SIZE_INPUT}",),
+                ("it is of the DETR family: classes start at 0, pixels are scaled to 0..1",),
+                {"colour": "rgb", "fit": "stretch", "scale": (1 / 255,) * 3},
+            )
         is_single = len(model.inputs[0].shape) == 3
         return Guess(
             settings,
@@ -91,6 +100,7 @@ class TorchvisionOutput(BoxOutput):
                 "layout": "chw" if is_single else "nchw",
             },
             usual_size_px=_USUAL_SIZE_PX,
+            numbers_as_coco=True,
         )
 
 

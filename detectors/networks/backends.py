@@ -17,6 +17,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.detectors.decoders.base import PICTURE_SIZE_INPUT
 from crosscue.replay.base import VehicleError, installed, one_line
 
 from .free_size import Size, free_size, resized
@@ -108,10 +109,15 @@ def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Net
     options.log_severity_level = 4
     content = weights.content if size_px is None else free_size(weights.content)
     session = ort.InferenceSession(content, options, providers=_ort_providers(ort))
-    given, names = session.get_inputs()[0].name, [out.name for out in session.get_outputs()]
+    inputs = [one.name for one in session.get_inputs()]
+    names = [out.name for out in session.get_outputs()]
 
     def call(batch: Array) -> Mapping[str, Array]:
-        return dict(zip(names, session.run(names, {given: batch}), strict=True))
+        feed: dict[str, Array] = {inputs[0]: batch}
+        if PICTURE_SIZE_INPUT in inputs[1:]:
+            # Boxes come in pixels of the batch, as of every other layout.
+            feed[PICTURE_SIZE_INPUT] = np.array([batch.shape[:-3:-1]] * len(batch), np.int64)
+        return dict(zip(names, session.run(names, feed), strict=True))
 
     return _Function(f"onnxruntime {ort.__version__} {session.get_providers()[0]}", call)
 

@@ -330,7 +330,7 @@ def _without_masks(boxed: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]
             *(["heights of signs and lights are those of boxes"] if labels & heights else []),
             *(
                 [
-                    "cross traffic is judged by boxes (eq. 15 has masks), and no car counts as "
+                    "cross traffic is judged by boxes (eq. 15 takes masks), and no car counts as "
                     "parked, since only a mask shows where it faces (eq. 16)"
                 ]
                 if labels & {*cars.labels}

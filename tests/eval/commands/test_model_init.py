@@ -14,6 +14,8 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.recognise import class_names
 from crosscue.detectors.decoders.detr import DetrOutput
 from crosscue.detectors.decoders.torchvision_export import TorchvisionOutput
+from crosscue.detectors.networks.backends import load_network
+from crosscue.detectors.networks.weights import Weights
 from crosscue.eval.cli import run
 from support.data import shared
 from support.onnx_models import Array, bright_box_model, constant_model
@@ -164,6 +166,52 @@ def test_a_yolox_with_decoded_boxes_keeps_its_colours(tmp_path: Path) -> None:
 
         given = read_card(tmp_path / "my.toml").input
         assert (given.colour, given.scale) == (colour, (scale,) * 3)
+
+
+@pytest.mark.parametrize(("kind", "number"), [("end-to-end", 11), ("torchvision", 12)])
+def test_coco_s_classes_are_numbered_as_the_layout_s_networks_do(
+    tmp_path: Path, kind: str, number: int
+) -> None:
+    """Those of YOLO count 80 without gaps; torchvision's and TensorFlow's keep COCO's numbers."""
+    crosscue.draft_card(_file(tmp_path, kind, {}), kind=kind)
+
+    assert read_card(tmp_path / "my.toml").output.classes.index("stop sign") == number
+
+
+def test_a_network_that_scales_its_boxes_is_given_the_size(tmp_path: Path) -> None:
+    """RT-DETR's own exporter asks for width and height, and multiplies its boxes by them."""
+    tensors = {"labels": np.array([[11]]), "scores": np.array([[0.9]], np.float32)}
+    model = onnx.load_model_from_string(constant_model((1, 3, 64, 128), tensors))
+    graph, helper = model.graph, onnx.helper
+    given = helper.make_tensor_value_info("orig_target_sizes", onnx.TensorProto.INT64, [1, 2])
+    graph.input.append(given)
+    unit = np.array([[[0.25, 0.5, 0.5, 1.0]]], np.float32)
+    graph.initializer.append(onnx.numpy_helper.from_array(unit, "unit"))
+    graph.node.extend(
+        [
+            helper.make_node("Cast", ["orig_target_sizes"], ["size"], to=onnx.TensorProto.FLOAT),
+            helper.make_node("Concat", ["size", "size"], ["sides"], axis=1),
+            helper.make_node("Mul", ["unit", "sides"], ["boxes"]),
+        ]
+    )
+    graph.output.append(
+        helper.make_tensor_value_info("boxes", onnx.TensorProto.FLOAT, [1, None, 4])
+    )
+    path, street = tmp_path / "my.onnx", tmp_path / "street.jpg"
+    path.write_bytes(model.SerializeToString())
+    street.write_bytes(picture(0, ".jpg"))
+
+    drafted = crosscue.draft_card(path)
+    checked = crosscue.check_card(drafted.path, street)
+
+    assert checked.found == {"stop sign": 1}
+    output = read_card(drafted.path).output
+    assert isinstance(output, TorchvisionOutput)
+    network = load_network(Weights(name=str(path), content=path.read_bytes()))
+    outputs = network(np.zeros((1, 3, 64, 128), np.float32))
+    np.testing.assert_allclose(
+        output.candidates(outputs, (128, 64)).boxes_px, [[32.0, 32.0, 64.0, 64.0]]
+    )
 
 
 def test_a_network_for_another_task_is_said_to_be_one(tmp_path: Path) -> None:
