@@ -403,7 +403,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> object:
-        """Import a public name when it is first asked for."""
+        """Import a public name when it is first used."""
         if name == "__version__":
             found = import_module("crosscue.replay.versions").installed("crosscue")
         elif name in _EXPORTS:

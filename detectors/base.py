@@ -249,7 +249,7 @@ def reportable(detector: Detector) -> tuple[str, ...] | None:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One detector as asked for.
+    """One detector as requested.
 
     Attributes:
         name: What it is called in tables.

@@ -1,4 +1,4 @@
-"""Detectors by name, each imported only when it is asked for.
+"""Detectors by name, each imported only when it is used.
 
 A name is one of ``BUILTIN``, a model of the catalog (``crosscue model list``), one that an
 installed package offers under the entry point group ``crosscue.detectors``, a ``module:factory``,
@@ -75,7 +75,7 @@ def knows_simulated_only(choice: Choice) -> bool:
 
 
 def known(sections: Mapping[str, Choice]) -> list[str]:
-    """All names that can be asked for."""
+    """All names that can be used."""
     offered = (point.name for point in entry_points(group=GROUP))
     return sorted({*sections, *BUILTIN, *catalog.names(), *offered})
 

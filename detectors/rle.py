@@ -114,7 +114,7 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> NDArray[np.float
     column = (stops - objects) // height
     if (column == (stops - 1) // height).all():
         return np.asarray(np.bincount(column, objects, width), np.float64)
-    # A run goes on into the next column. Between two edges the count of object pixels grows
+    # A run continues into the next column. Between two edges the count of object pixels grows
     # evenly, so looking it up at the columns' borders is exact.
     counted = np.zeros(len(edges) + 1)
     objects.cumsum(out=counted[2::2])

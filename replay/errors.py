@@ -11,12 +11,12 @@
         * AnnotationError    a file of annotations cannot be read (exit status 4)
     * VehicleError           the vehicle file is wrong or lacks a role
         * MissingTopicError  a topic that it or a flag names is not in the logs
-    * RunError               a run folder is locked, or does not hold what was asked for
+    * RunError               a run folder is locked, or does not hold what was requested
         * UnreadableRunError it is missing, damaged or of another version (exit status 4)
     * OutputError            a result cannot be written (disk full, no permission)
     * StudyFileError         a study file cannot be read or does not fit (exit status 2)
     * WorkerError            a worker died; finished parts are kept
-    * EmptyResultError       nothing of what was asked for is in the logs
+    * EmptyResultError       nothing of what was requested is in the logs
     * AccountError           rows in are not rows used, skipped and dropped: a bug in crosscue
 
 A wrong argument from the caller's own code stays a ``ValueError``. Dropped rows, which
@@ -85,7 +85,7 @@ class MissingTopicError(VehicleError, UsageError):
 
 
 class RunError(CrosscueError):
-    """A run folder is locked, or does not hold what was asked for."""
+    """A run folder is locked, or does not hold what was requested."""
 
 
 class UnreadableRunError(RunError):
@@ -109,7 +109,7 @@ class WorkerError(CrosscueError):
 
 
 class EmptyResultError(CrosscueError):
-    """Nothing of what was asked for is in the logs."""
+    """Nothing of what was requested is in the logs."""
 
 
 class AccountError(CrosscueError):

@@ -44,7 +44,7 @@ GRID: Final = 10
 BEHIND_M: Final = 3.0
 """Boxes nearer to each other are of one car: most cars are boxed twice."""
 REACH_M: Final = 110.0
-"""Of a vehicle further away nobody can tell its direction in these frames apart from others."""
+"""The direction of a vehicle further away cannot be recognised in these frames."""
 ALONG: Final = ("oncoming_cars", "outgoing_cars")
 ACROSS_DEG: Final = 45.0
 """A vehicle whose heading is further off the road, both ways, stands or moves across it."""

@@ -14,7 +14,7 @@ from .layout import Layout
 from .world import Thing
 
 MIN_PIXELS: Final = 12
-"""Of a smaller thing nobody can tell what it is."""
+"""A smaller thing cannot be recognised."""
 PAST_REACH_M: Final = 110.0
 LANES_REACH_M: Final = 45.0
 

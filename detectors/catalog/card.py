@@ -1,4 +1,4 @@
-"""Model cards: what a network wants to be given and what its numbers mean, as a TOML file.
+"""Model cards: the input that a network expects and what its numbers mean, as a TOML file.
 
 version = 1
 weights = "yolox_nano.onnx"      # next to the card; .onnx, .xml (OpenVINO), .tflite, or tensors

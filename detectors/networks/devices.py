@@ -11,7 +11,7 @@ from crosscue.replay.errors import VehicleError
 
 
 def chosen_device(asked: str, who: str) -> torch.device:
-    """The device asked for; by itself (``auto``) CUDA, else MPS, else the CPU.
+    """The requested device; ``auto`` is CUDA, else MPS, else the CPU.
 
     Args:
         asked: ``auto``, ``cpu``, ``cuda`` or ``mps``.

@@ -29,7 +29,7 @@ MIN_SIDE_PX: Final = 32
 _CELL_PX: Final = 4
 """Side of the squares that votes are counted in."""
 _SAME_SIGN: Final = 0.5
-"""Windows that overlap more (intersection over union) speak of one sign."""
+"""Windows that overlap more (intersection over union) are the same sign."""
 
 
 class SignSettings(Settings):
@@ -66,7 +66,7 @@ class SignSettings(Settings):
     min_fraction: Proportion = 0.25
     """And the fraction of the drawing's points that they must be."""
     min_score: Proportion = 0.065
-    """For precision 0.95 on simulated layouts L800 to L838; one's own camera wants its own."""
+    """For precision 0.95 on simulated layouts L800 to L838; your camera needs its own."""
     overlap: Proportion = 0.2
     """Of two signs that overlap more, the better stays."""
 

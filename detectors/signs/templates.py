@@ -1,4 +1,4 @@
-"""Our own drawings of the signs that rule a turn out, in grey, as an ORB matcher wants them.
+"""Our own drawings of the signs that rule a turn out, in grey, as an ORB matcher needs them.
 
 They are read from files, as each version of OpenCV has letters of its own.
 

@@ -68,7 +68,7 @@ class Job:
 
     @property
     def state_path(self) -> Path:
-        """What a killed training goes on from."""
+        """What a killed training continues from."""
         return self.output.with_suffix(".state.safetensors")
 
     @property
@@ -153,7 +153,7 @@ def _run(
 def _check_place(job: Job, overwrite: bool) -> None:
     for path in (job.state_path, job.output):
         if path.exists() and not overwrite:
-            how = "--resume goes on with it, " if path == job.state_path else ""
+            how = "--resume continues it, " if path == job.state_path else ""
             raise OutputError(f"{path}: exists; {how}--overwrite starts over")
     job.state_path.unlink(missing_ok=True)
 

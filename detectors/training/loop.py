@@ -62,7 +62,7 @@ class Schedule:
 
 
 class Training:
-    """A network in training; ``steps`` goes on, ``save`` and ``resume`` keep and restore it all.
+    """A network in training; ``steps`` continues, ``save`` and ``resume`` keep and restore it all.
 
     Attributes:
         network: Learns.

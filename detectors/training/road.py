@@ -70,7 +70,7 @@ class RoadSchedule:
 
 
 class RoadTraining:
-    """A network that learns; ``steps`` goes on, ``save`` and ``resume`` keep and restore it.
+    """A network that learns; ``steps`` continues, ``save`` and ``resume`` keep and restore it.
 
     Attributes:
         network: Learns.

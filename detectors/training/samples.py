@@ -22,9 +22,9 @@ from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 NEAR_OBJECT: Final = 0.85
 """Fraction of windows that are laid about an object."""
 MIN_SIDE_PX: Final = 3.0
-"""Of an object in the window: nobody could tell a smaller one."""
+"""Of an object in the window; a smaller one cannot be recognised."""
 MIN_SHARE: Final = 0.3
-"""Of an object's pixels within the window; a thinner slice is not asked for."""
+"""Of an object's pixels within the window; a thinner slice is not requested."""
 MAX_OBJECTS: Final = 24
 
 
@@ -92,7 +92,7 @@ def read_picture(picture: LabelledPicture) -> Bytes:
 
 
 def normalised(pixels: Bytes) -> NDArray[np.float32]:
-    """From (H, W, 3) blue, green, red to (3, H, W) as the networks want it."""
+    """From (H, W, 3) blue, green, red to (3, H, W) as the networks expect it."""
     scaled = pixels[:, :, ::-1].astype(np.float32)
     mean, spread = np.array(MEAN, np.float32), np.array(SPREAD, np.float32)
     scaled = (scaled - 255.0 * mean) * (1.0 / (255.0 * spread))

@@ -16,7 +16,7 @@ COLUMNS: Final = (
     (" medium", "medium"),
     (" large", "large"),
 )
-"""How a kind's name goes on, and what stands above the column."""
+"""How a kind's name continues, and what stands above the column."""
 
 
 def measured_text(network: str, pictures: int, proposals: int, reached: Measured) -> str:

@@ -160,7 +160,7 @@ def decode_tables(
     Raises:
         SchemaError: A DBC file cannot be read.
         AccountError: A topic's rows do not add up.
-        EmptyResultError: Not one row in the part asked for; the folder is as it was.
+        EmptyResultError: Not one row in the requested part; the folder is as it was.
         OutputError: The disk is full.
     """
     ledgers = tuple(Ledger(name_of(log)) for log in logs)

@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate all that was asked for."""
+    """Simulate everything requested."""
     layouts, runs = _wanted(args)
     if args.sheet is not None:
         return _sheet(layouts, runs, args)

@@ -134,7 +134,7 @@ def detect_into(
 
     Raises:
         VehicleError: No camera or several; a card, weights or settings that do not fit.
-        EmptyResultError: Not one frame in the part asked for.
+        EmptyResultError: Not one frame in the requested part.
         OutputError: The disk is full.
     """
     began = time.monotonic()
@@ -233,7 +233,7 @@ def detect_into(
 
 
 def _declared(topic: Topic, selection: Selection) -> int | None:
-    """How many frames the log declares in the part asked for; None for a span of time."""
+    """How many frames the log declares in the requested part; None for a span of time."""
     is_whole = selection.start_ns is None and selection.end_ns is None
     return topic.declared if is_whole else None
 

@@ -98,7 +98,7 @@ def estimate_into(
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: The part asked for holds nothing to estimate from.
+        EmptyResultError: The requested part holds nothing to estimate from.
         UsageError: The frames of the detect stage are labelled with other segments.
         OutputError: The disk is full.
     """

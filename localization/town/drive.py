@@ -337,7 +337,7 @@ def _start(p: Parameters, streets: Streets, places: Stream) -> tuple[int, int, T
 
 
 def _one_landmark(p: Parameters, streets: Streets, places: Stream) -> tuple[Ints, Stream]:
-    """Perhaps one landmark, as dense as asked for on average."""
+    """Perhaps one landmark, as dense as requested on average."""
     number, places = uniform(places)
     nodes = np.empty(1 if number < p.landmarks_per_km2 * streets.area_km2 else 0, np.int64)
     if len(nodes):

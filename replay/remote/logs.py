@@ -1,6 +1,6 @@
 """Logs on object stores: a part is read by ranges, a whole is fetched into a bounded store.
 
-Of an MCAP file or ROS 1 bag whose index leads to the part asked for, only the index and that part
+Of an MCAP file or ROS 1 bag whose index leads to the requested part, only the index and that part
 are fetched (``RangedLog``). A log that is read to its end is often read twice, and some readers
 need a real file (SQLite, videos), so one download beats many ranged reads there. What was fetched
 is kept under a name made of its address and version, so a changed object is fetched again; the

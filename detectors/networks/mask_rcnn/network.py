@@ -21,7 +21,7 @@ CHANNELS: Final = 64
 """Of the compact network's pyramid and heads."""
 MEAN: Final = (0.485, 0.456, 0.406)
 SPREAD: Final = (0.229, 0.224, 0.225)
-"""Mean and standard deviation of red, green and blue, as torchvision's weights want them."""
+"""Mean and standard deviation of red, green and blue, as torchvision's weights expect them."""
 STRIDE: Final = 32
 """Pictures are padded to a multiple of it, as torchvision pads them."""
 ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))

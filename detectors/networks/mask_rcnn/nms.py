@@ -1,7 +1,7 @@
 """The likeliest boxes of a picture that do not cover each other, on a processor.
 
 As torchvision's ``RegionProposalNetwork.filter_proposals``, which compares every box of a level
-with all that follow it; here it ends as soon as there are as many as asked for.
+with all that follow it; here it ends as soon as there are as many as requested.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Catalog:
         return tuple(self._places.path(run) for run in done)
 
     def query(self, sql: str) -> pa.Table:
-        """The rows that a query selects; ``schema`` lists what can be asked for.
+        """The rows that a query selects; ``schema`` lists what can be queried.
 
         Nothing is written and no other file is read, whatever the query says. A run of which a
         table cannot be read is left out of that table, and added to ``left_out``.

@@ -117,7 +117,7 @@ class RemoteRuns:
 
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
-        """For Arrow: what is read of an object is what was asked for, without reading ahead."""
+        """For Arrow: what is read of an object is what was requested, without reading ahead."""
         import pyarrow as pa
         import pyarrow.fs
 

@@ -21,7 +21,7 @@ FORMAT: Final = "format"
 
 
 class Stored:
-    """An index that was read; its tables are opened when they are asked for."""
+    """An index that was read; its tables are opened when they are used."""
 
     def __init__(self, content: bytes, mark: str) -> None:
         """Check the head.

@@ -45,7 +45,7 @@ def detectors_of(args: argparse.Namespace) -> Sequence[str] | None:
 
 
 def cache_of(args: argparse.Namespace) -> Path | None:
-    """Where results are kept: as asked for, or in the user's cache folder."""
+    """Where results are kept: as requested, or in the user's cache folder."""
     if args.no_cache:
         return None
     return default_cache() if args.cache is None else Path(args.cache)

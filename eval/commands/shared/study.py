@@ -50,7 +50,7 @@ def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:
-    """The study asked for: the published one, or a file's, with flags on top.
+    """The requested study: the published one, or a file's, with flags on top.
 
     Raises:
         UsageError: A flag out of range.

@@ -39,7 +39,7 @@ class FittedDetector:
     Attributes:
         detector: As it ran.
         classes: Of every class that labels and detector have.
-        precision: That was asked for.
+        precision: That was required.
         fitted_to: Pictures.
         held_out: Other pictures.
         left_out: What of the labels was left out, by reason.
@@ -95,7 +95,7 @@ def _class_lines(one: ClassFit, precision: float) -> list[str]:
     if one.scores is not None and one.scores.threshold is not None:
         lines.append(
             f"  threshold   {one.scores.threshold:g}: precision at least {one.bound:.3f} with "
-            f"{CONFIDENCE:.0%} confidence (asked: {precision:g})"
+            f"{CONFIDENCE:.0%} confidence (required: {precision:g})"
         )
     if one.scores is not None and one.scores.calibration is not None:
         lines.append(f"  calibration {_calibration_text(one)}")

@@ -168,7 +168,7 @@ class SegmentPass:
         found = find_window(self._segment, self._declarations, self._selection)
         if isinstance(found, Window):
             return found
-        self._notice(f"the part asked for was found by walking through the file: {found}")
+        self._notice(f"the requested part was found by walking through the file: {found}")
         return None
 
     def _windowed(self, window: Window) -> Iterator[Block]:

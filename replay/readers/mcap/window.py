@@ -34,7 +34,7 @@ class Window:
 
     Attributes:
         chunks: All chunks there are.
-        is_read: Shape (N,), bool: of these, the ones that may hold what was asked for.
+        is_read: Shape (N,), bool: of these, the ones that may hold what was requested.
         begin: Where the recording's first record stands.
         end: Where its data section ends.
     """

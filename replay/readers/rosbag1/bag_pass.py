@@ -245,7 +245,7 @@ class Pass:
         )
         if isinstance(found, BagWindow):
             return found
-        self._ledger.notice(f"the part asked for was found by walking through the bag: {found}")
+        self._ledger.notice(f"the requested part was found by walking through the bag: {found}")
         return None
 
     def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
