@@ -28,11 +28,20 @@ from crosscue.replay.base import RunError, SchemaError, UsageError, is_remote
 from . import intervals
 from . import truth as score_truth
 from .columns import AMBIGUOUS, RunTables
-from .drives import DEFAULTS, DriveJudged, Scores, ScoreSettings, as_metrics, judge, score
+from .drives import (
+    DEFAULTS,
+    DriveJudged,
+    FilterAndSmoother,
+    Scores,
+    ScoreSettings,
+    as_metrics,
+    judge,
+    score,
+    score_smoothed,
+)
 from .pose import score as score_pose
 from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
-from .scene.ranges import FilterAndSmoother, score_smoothed
 from .truth import DriveTruth
 
 TABLES: Final = ("frames", "cues", "range", "belief")
