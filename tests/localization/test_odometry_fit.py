@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,7 +105,8 @@ def test_the_claimed_error_is_about_what_the_uncertain_parameters_would_cause(
     caused_m2 = 0.0
     for one in fit.fitted:
         if hasattr(CAR, one.parameter):
-            off = replace(fit.settings, **{one.parameter: one.value + one.sd})
+            change: dict[str, Any] = {one.parameter: one.value + one.sd}
+            off = replace(fit.settings, **change)
             moved = found.follow(fit.start, found.steps(off)).xy_m - claimed.xy_m
             caused_m2 += float(np.mean(np.sum(moved**2, axis=1)))
     claimed_m2 = float(np.mean(np.trace(claimed.cov_m2, axis1=1, axis2=2)))
