@@ -6,6 +6,7 @@ short has each layout about as often; a second start goes on with what is missin
 
 from __future__ import annotations
 
+import ast
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -86,11 +87,29 @@ class Work:
 
 
 def code_of(folder: str) -> str:
-    """A hash of a folder's sources: what they made is stale when they change."""
+    """A hash of a folder's code: what it made is stale when the code changes, not its comments."""
     digest = hashlib.sha256()
     for source in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
-        digest.update(source.read_bytes())
+        digest.update(meaning_of(source.read_text(encoding="utf-8")).encode())
     return digest.hexdigest()
+
+
+def meaning_of(source: str) -> str:
+    """A module's syntax tree without docstrings and comments."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            body[:] = [one for one in body if not _is_text(one)]
+    return ast.dump(tree)
+
+
+def _is_text(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
 
 
 def run_drives(

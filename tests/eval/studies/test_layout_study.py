@@ -97,6 +97,16 @@ def test_a_drive_is_made_again_when_it_is_not_whole_or_what_made_it_has_changed(
     assert (tmp_path / "M12-01" / MADE_BY).read_text(encoding="utf-8") == "b"
 
 
+def test_comments_and_docstrings_make_no_drive_stale_and_another_number_does() -> None:
+    plain = "def height(x):\n    return 2 * x\n"
+    said = '"""Heights."""\n\n\ndef height(x):\n    """Twice as high."""\n    return 2 * x  # m\n'
+
+    assert simulated_drives.meaning_of(said) == simulated_drives.meaning_of(plain)
+    assert simulated_drives.meaning_of(plain.replace("2", "3")) != simulated_drives.meaning_of(
+        plain
+    )
+
+
 def test_pictures_are_few_and_end_where_the_intersection_begins() -> None:
     scene = SceneSettings(layout="M0", camera=camera_of_width(64))
     _, _, world = world_of(scene, is_painted=False)
