@@ -127,7 +127,8 @@ def _lines_together(found: ScoredRuns) -> list[str]:
         lines.append(f"failed     {len(found.failed)} of {every} runs, left out")
     if same := found.metrics["coverage"].get("same_log", ()):
         first, second = map(visible, same[0])
-        text = f"{len(same)} logs have several runs, as {first} and {second}: each run counts"
+        more = f" (and {len(same) - 1} pairs more)" if len(same) > 1 else ""
+        text = f"{first} and {second} are runs of one log{more}: each run counts"
         lines.append(reported_line("twice", text))
     ones = _ones(found)
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
