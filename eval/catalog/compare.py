@@ -330,10 +330,16 @@ def _tree_of(path: Path) -> dict[str, Any]:
 def _others(
     before: Mapping[str, MetricValue], after: Mapping[str, MetricValue]
 ) -> tuple[MetricChange, ...]:
-    """Metrics that differ and are not judged."""
+    """Metrics that differ and are not judged.
+
+    A drive's own are named by the folder of its run; where only one side has that folder, nothing
+    changed.
+    """
     lacking = MetricValue(math.nan)
     changes = []
     for path in dict.fromkeys([*before, *after]):
+        if BY_DRIVE in path.split(".") and not (path in before and path in after):
+            continue
         old, new = before.get(path, lacking).value, after.get(path, lacking).value
         is_same = old == new or (math.isnan(old) and math.isnan(new))
         if not is_same and direction(path) is None:

@@ -8,8 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.catalog.compare import compare_runs, read_tolerance
+from crosscue.eval.catalog.compare import compare_runs, open_scored, read_tolerance
 from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.by_drive import table_of
 from crosscue.replay.base import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -118,6 +119,19 @@ def test_drives_that_one_run_lacks_are_counted_and_left_out(
     assert cli.run(["compare", str(good), str(tmp_path)]) == 4
     assert "not a run folder" in capsys.readouterr().err
     assert worse.exists()
+
+
+def test_a_drive_whose_run_has_another_name_is_no_difference(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        drives = {name: {"distance_m": 8.0}, "both": {"distance_m": float(name == "a")}}
+        (folder / "metrics.json").write_text(json.dumps({"pose": {"by_drive": drives}}))
+        pq.write_table(table_of(iter([])), folder / "by_drive.parquet")
+
+    found = compare_runs(open_scored(tmp_path / "a"), open_scored(tmp_path / "b"))
+
+    assert [one.path for one in found.metrics] == ["pose.by_drive.both.distance_m"]
 
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "nan", "1e999", "x=%", "5%%"])
