@@ -191,7 +191,7 @@ def detect_into(
             *_simulated_only(choices, logs),
             *_without_cues(named, vehicle),
             *_without_thresholds(named, vehicle),
-            *_without_masks(tables.boxed, vehicle),
+            *_without_masks(tables.boxes_only, vehicle),
             *tables.notices,
         )
         write_manifest(
@@ -258,6 +258,8 @@ def _detector_rows(
             settings=dict(choice.settings),
             min_scores=min_scores_of(one.detector),
             calibrated=calibrated_labels(one.detector),
+            with_mask=tuple(sorted(tables.masked.get(one.name, ()))),
+            boxes_only=tuple(sorted(tables.boxes_only.get(one.name, ()))),
         )
         for one, choice in zip(named, choices, strict=True)
     )
@@ -316,11 +318,11 @@ def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
     return notices
 
 
-def _without_masks(boxed: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]:
+def _without_masks(boxes_only: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]:
     """Which rules used boxes where the source uses masks, by detector.
 
     Args:
-        boxed: Labels that a detector reported without a mask.
+        boxes_only: Labels that a detector reported, never with a mask.
         vehicle: With what the cues count.
     """
     cues, cars = vehicle.cues, vehicle.cars
@@ -330,14 +332,14 @@ def _without_masks(boxed: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]
             *(["heights of signs and lights are those of boxes"] if labels & heights else []),
             *(
                 [
-                    "cross traffic is judged by boxes (eq. 15 takes masks), and no car counts as "
-                    "parked, since only a mask shows where it faces (eq. 16)"
+                    "cross traffic is judged by boxes (eq. 15 takes masks), and its cars do not "
+                    "count as parked, since only a mask shows where one faces (eq. 16)"
                 ]
                 if labels & {*cars.labels}
                 else []
             ),
         ]
-        for name, labels in boxed.items()
+        for name, labels in boxes_only.items()
     }
     return [f"{name}: no masks: {'; '.join(rules)}" for name, rules in said.items() if rules]
 
@@ -363,8 +365,9 @@ class _Tables:
     clock: LogClock
     notices: list[str] = field(default_factory=list)
     objects: dict[str, int] = field(default_factory=dict)
-    boxed: dict[str, set[str]] = field(default_factory=dict)
-    """By detector: labels of objects that it reported without a mask."""
+    masked: dict[str, set[str]] = field(default_factory=dict)
+    """By detector: labels of objects that it reported with a mask."""
+    _boxed: dict[str, set[str]] = field(default_factory=dict)
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, LabelledSink] = field(default_factory=dict)
     _open: ExitStack = field(default_factory=ExitStack)
@@ -376,6 +379,11 @@ class _Tables:
     _min_scores: list[dict[str, float]] = field(default_factory=list)
     _labels: frozenset[str] | None = None
     """What the detectors that give boxes can report; known from the first frame on."""
+
+    @property
+    def boxes_only(self) -> dict[str, set[str]]:
+        """By detector: labels of objects that it reported, never with a mask."""
+        return {name: labels - self.masked.get(name, set()) for name, labels in self._boxed.items()}
 
     def __enter__(self) -> _Tables:
         with ExitStack() as stack:
@@ -493,8 +501,8 @@ class _Tables:
             x0, y0, x1, y1 = found.boxes_px[i].tolist()
             key = f"{name}: {label}"
             self.objects[key] = self.objects.get(key, 0) + 1
-            if not found.masks[i]:
-                self.boxed.setdefault(name, set()).add(label)
+            by_mask = self.masked if found.masks[i] else self._boxed
+            by_mask.setdefault(name, set()).add(label)
             height = _height_px(found, i)
             ranged = detection_range(self.vehicle, label, found.boxes_px[i], height, found.size_px)
             rows.append(

@@ -132,6 +132,10 @@ class DetectorRow(Record):
     """From label to the score above which a detection is a cue, as far as the detector says."""
     calibrated: tuple[str, ...] = ()
     """Labels whose scores a fitted calibration has turned into probabilities."""
+    with_mask: tuple[str, ...] = ()
+    """Labels of what it found with a mask."""
+    boxes_only: tuple[str, ...] = ()
+    """Labels of what it found, never with a mask."""
 
 
 class DetectCounts(Record):

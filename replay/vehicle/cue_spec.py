@@ -35,6 +35,7 @@ class CueSpec:
         can_start: May send before an intersection is established.
         per_detection: One message per detection instead of one per frame.
         absence_counts: Near the intersection its absence is evidence against ``supports``.
+        needs_masks: Boxes alone cannot show it.
         label: Detector label that it counts, if it is fixed.
         settings: Prefix of its labels and score under ``[cues]`` of the vehicle file, if any.
         colour: In recordings: red, green, blue.
@@ -59,6 +60,7 @@ class CueSpec:
     can_start: bool = False
     per_detection: bool = False
     absence_counts: bool = False
+    needs_masks: bool = False
     label: str | None = None
     settings: str | None = None
     colour: Colour = FEATURE_COLOURS["intersection"]

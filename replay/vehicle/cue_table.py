@@ -61,6 +61,7 @@ def _cars(
         supports=(side,),
         per_detection=True,
         absence_counts=True,
+        needs_masks=group == "parked",
         colour=FEATURE_COLOURS[side],
         fade_s=fade_s,
     )

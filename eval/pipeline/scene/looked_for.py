@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from types import MappingProxyType
 from typing import Final
 
@@ -15,7 +15,25 @@ NO_OBJECTS: Final = "no detector of objects"
 NO_ROAD: Final = "no detector of road"
 NO_MOBILEYE: Final = "no Mobileye, or no range to an intersection"
 NO_PLACE: Final = 'no range to an intersection, or not cars.kind = "tracks"'
+NO_MASKS: Final = "only masks show which way a parked car faces (eq. 16), and all cars are boxes"
 NEVER: Final = "no frame in which they could be computed"
+
+
+def needing_masks(detectors: Sequence[DetectorRow], car_labels: Sequence[str]) -> frozenset[str]:
+    """Cues that only masks show, if every car of the run is a box without one.
+
+    Their absence would otherwise count as evidence that a road is not there.
+
+    Args:
+        detectors: As the manifest has them.
+        car_labels: Which labels are cars.
+    """
+    cars = {*car_labels}
+    has_boxes = any(cars & {*one.boxes_only} for one in detectors)
+    has_masks = any(cars & {*one.with_mask} for one in detectors)
+    if has_masks or not has_boxes:
+        return frozenset()
+    return frozenset(cue.name for cue in CUES.values() if cue.needs_masks)
 
 
 def not_looked_for(
@@ -23,6 +41,7 @@ def not_looked_for(
     detectors: Sequence[DetectorRow],
     cue_labels: Mapping[str, Sequence[str]],
     not_followed: Mapping[str, int] = MappingProxyType({}),
+    without: Set[str] = frozenset(),
 ) -> dict[str, str]:
     """From each cue, a user's own among them, that has no row to the reason.
 
@@ -31,6 +50,7 @@ def not_looked_for(
         detectors: As the manifest has them.
         cue_labels: All cues, with the labels they are made of.
         not_followed: Frames in which cars could not be followed, by reason.
+        without: Cues that ``needing_masks`` names.
     """
     roles = {one.role for one in detectors}
     finders = [one for one in detectors if one.role in (Role.OBJECTS, Role.SIGNS)]
@@ -42,6 +62,8 @@ def not_looked_for(
             return NO_MOBILEYE
         if observed_by == "road":
             return NEVER if Role.ROAD in roles else NO_ROAD
+        if cue in without:
+            return NO_MASKS
         wanted = cue_labels[cue]
         if labels is not None and finders and wanted and labels.isdisjoint(wanted):
             return NO_LABEL

@@ -19,7 +19,7 @@ from crosscue.detectors.cues.observed import Place, Seen
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.eval.pipeline.progress import OnTime, report_time, unwatched_time
-from crosscue.eval.pipeline.scene.looked_for import not_looked_for
+from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
 from crosscue.eval.runs.folder import DetectManifest, RunFolder
@@ -89,6 +89,7 @@ def estimate_scene(
         EgoMotion(odometer_of(run)),
         _Rows(sink, features_of(vehicle), gives_reasons(vehicle)),
     )
+    boxes_only = needing_masks(detected.detectors, vehicle.cars.labels)
     restarts = Restarts(vehicle, timeline)
     regions = vehicle.regions
     fresh_regions = regions.kind == "ground" or detected.settings.regions != regions
@@ -97,7 +98,7 @@ def estimate_scene(
         if fresh_ns is not None:
             scene.restart(fresh_ns)
             on_restart(fresh_ns)
-        scene.step(frame, past(frame.seen.t_ns), without)
+        scene.step(frame, past(frame.seen.t_ns), without | boxes_only)
         report_time(on_time, timeline, frame.seen.t_ns)
     scene.rows.flush()
     scene.approaches.finish()
@@ -107,10 +108,14 @@ def estimate_scene(
         tuple(scene.summaries.values()),
         scene.approaches.counts + scene.motion.counts + scene.cues.notes(),
         scene.ego.without_odometry,
-        scene.tally.by_cue,
+        {cue: one for cue, one in scene.tally.by_cue.items() if cue not in boxes_only},
         scene.signs.by_cue,
         not_looked_for(
-            scene.looked, detected.detectors, vehicle.cue_labels(), scene.cues.not_followed
+            scene.looked,
+            detected.detectors,
+            vehicle.cue_labels(),
+            scene.cues.not_followed,
+            boxes_only,
         ),
     )
 

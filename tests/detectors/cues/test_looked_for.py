@@ -12,9 +12,11 @@ from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.scene.looked_for import (
     NEVER,
     NO_LABEL,
+    NO_MASKS,
     NO_MOBILEYE,
     NO_OBJECTS,
     NO_ROAD,
+    needing_masks,
     not_looked_for,
 )
 from crosscue.eval.runs.manifest import DetectorRow
@@ -24,6 +26,7 @@ from support.detecting import yolox_card
 
 VEHICLE = Vehicle(version=1, cues=Cues(own={"crossing": OwnCue(labels=("zebra",))}))
 SIGNS = {"one_way_left", "one_way_right", "do_not_enter"}
+PARKED = {"parked_left", "parked_right"}
 CONTROLS = {"stop_sign", "traffic_light"}
 
 
@@ -98,3 +101,25 @@ def test_every_cue_without_a_row_has_its_reason() -> None:
     assert only_road["road_left"] == NEVER
 
     assert not_looked_for((), [_row("objects", None)], VEHICLE.cue_labels())["parked_left"] == NEVER
+
+
+@pytest.mark.parametrize(
+    ("found", "is_without"),
+    [
+        ([{"boxes_only": ("car", "truck")}], True),
+        ([{"boxes_only": ("truck",), "with_mask": ("car",)}], False),
+        ([{"boxes_only": ("car",)}, {"with_mask": ("car",)}], False),
+        ([{"boxes_only": ("car",)}, {"with_mask": ("person",)}], True),
+        ([{"boxes_only": ("stop sign",)}], False),
+        ([{}], False),
+    ],
+)
+def test_parked_cars_are_not_looked_for_where_every_car_is_a_box(
+    found: list[dict[str, tuple[str, ...]]], is_without: bool
+) -> None:
+    rows = [_row("objects", ("car",)).model_copy(update=labels) for labels in found]
+    without = needing_masks(rows, VEHICLE.cars.labels)
+
+    assert without == (PARKED if is_without else frozenset())
+    why = not_looked_for((), rows, VEHICLE.cue_labels(), without=without)
+    assert {why[cue] for cue in PARKED} == {NO_MASKS if is_without else NEVER}

@@ -98,7 +98,7 @@ def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("counted", "said"),
     [
-        ('[cars]\nlabels = ["bright"]', "no car counts as parked"),
+        ('[cars]\nlabels = ["bright"]', "its cars do not count as parked"),
         (
             '[cues]\ntraffic_light_labels = ["bright"]',
             "heights of signs and lights are those of boxes",
