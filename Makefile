@@ -36,11 +36,14 @@ unit: $(VENV)/.ready-dev
 docs: $(VENV)/.ready-dev
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/_build/html
 
-# Tests of the packages that differ from main: make quick, or make quick IN="replay detectors".
-IN ?= $(shell git diff --name-only $$(git merge-base HEAD origin/main 2>/dev/null || echo HEAD) | cut -d/ -f1 | sort -u | grep -E '^(replay|detectors|fusion|localization|datasets|eval)$$')
+# Tests of what differs from main, by package, and by part of eval: make quick, or
+# make quick IN="replay eval/scoring".
+CHANGED = git diff --name-only $$(git merge-base HEAD origin/main 2>/dev/null || echo HEAD)
+PART = s,^(replay|detectors|fusion|localization|datasets|eval/[a-z]+)/.*,\1,p;s,^eval/cli\.py$$,eval/commands,p
+IN ?= $(shell $(CHANGED) | sed -nE '$(PART)' | sort -u)
 quick: $(VENV)/.ready-dev
 	$(BIN)/ruff check . && $(BIN)/lint-imports
-	$(if $(IN),$(BIN)/pytest -q -n $(WORKERS) --dist worksteal -m "not slow" $(addprefix tests/,$(IN)),@echo "no package differs from main; name some: make quick IN=replay")
+	$(if $(IN),$(BIN)/pytest -q -n $(WORKERS) --dist worksteal -m "not slow" $(addprefix tests/,$(IN)),@echo "no package differs from main; name some: make quick IN=eval/scoring")
 
 format: $(VENV)/.ready-dev
 	$(BIN)/ruff format .
