@@ -17,7 +17,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Final, Generic, Protocol, TypeAlias, TypeVar
 
 from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder, is_alive, signature
 from crosscue.replay.base import (
@@ -26,6 +26,7 @@ from crosscue.replay.base import (
     UsageError,
     losses_heard,
     one_line,
+    read_at_most,
     strict_json,
     versions,
     warn_again,
@@ -35,6 +36,8 @@ from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
 
 from .journal import STALE_S, beating, error_of, read_entry, silent_s, write_entry, write_plan
+
+MAX_LOCK_BYTES: Final = 4096
 
 
 class Result(Protocol):
@@ -283,12 +286,12 @@ def _check_free(job: Job) -> None:
         return
     silent = silent_s(job.run)
     if silent <= STALE_S:
-        pid, host = worker.split(" ")[:2]
+        process = " on ".join(worker.split(" ")[:2])
         raise RunError(
-            f"{job.run}: process {pid} on {host} is writing it; wait, or if it is gone start again "
-            f"in {STALE_S - silent:.0f} s"
+            f"{job.run}: process {process} is writing it; wait, or if it is gone start again in "
+            f"{STALE_S - silent:.0f} s"
         )
-    if lock.read_text() == worker:
+    if read_at_most(lock, MAX_LOCK_BYTES) == worker.encode():
         lock.unlink()
 
 

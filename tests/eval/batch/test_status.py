@@ -113,6 +113,20 @@ def test_a_drive_whose_worker_died_on_another_machine_is_begun_again(tmp_path: P
     assert states(tmp_path / "runs") == {"drive0": "done"}
 
 
+def test_a_damaged_entry_and_lock_do_not_stop_a_drive(tmp_path: Path) -> None:
+    (job,) = made_jobs(tmp_path, ["plain"])
+    job.run.mkdir(parents=True)
+    write_entry(job.run, {"inputs": None, "worker": "damaged"})
+    job.run.joinpath(LOCK).write_bytes(b"\xff\xfe")
+
+    (early,) = run_many([job], letters, in_turn)
+    os.utime(entry_path(job.run), (1.0e9, 1.0e9))
+    (late,) = run_many([job], letters, in_turn)
+
+    assert "process damaged is writing it" in str(early.error)
+    assert late.error is None
+
+
 def test_drives_without_a_run_are_merged_as_failures_whatever_the_order(
     batch: list[Job], tmp_path: Path
 ) -> None:
