@@ -1,10 +1,10 @@
-"""What every module may ask of a log, and the names that nearly every module imports.
+"""The interface of an open log, and the names that nearly every module imports.
 
-What every open recording can do, whatever its format, is written here (``opening.open_log`` opens
-one). With it comes the ground that all of crosscue stands on, so that one line imports it: what a
-log gives (``columns``), the account of it (``ledger``), how much it may cost (``limits``), what is
-raised (``errors``), and files read and written with care. Whoever stands above imports these names
-from here; the modules that define them import nothing but each other.
+``Log`` is the interface of an open recording of any format (``opening.open_log`` opens one). This
+module also re-exports the common base of crosscue: the column types of a log (``columns``), the
+account of its rows (``ledger``), size limits (``limits``), exceptions (``errors``), and functions
+that read and write files safely. Higher-level modules import these names from here. The modules
+that define them import only each other.
 """
 
 from __future__ import annotations
@@ -171,12 +171,12 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What of a log is wanted.
+    """The topics and the time range to read from a log.
 
     Attributes:
-        topics: Names, or None for all.
-        start_ns: First log time wanted, or None.
-        end_ns: First log time no longer wanted (half open), or None.
+        topics: Names of the selected topics, or None for all.
+        start_ns: First selected log time, or None for no lower bound.
+        end_ns: End of the selected log times, exclusive, or None for no upper bound.
     """
 
     topics: frozenset[str] | None = None
@@ -184,11 +184,11 @@ class Selection:
     end_ns: int | None = None
 
     def wants(self, topic: str) -> bool:
-        """Is ``topic`` wanted?"""
+        """Return whether ``topic`` is selected."""
         return self.topics is None or topic in self.topics
 
     def inside(self, t_ns: Int64s) -> NDArray[np.bool_]:
-        """Which of these times are wanted, shape (N,)."""
+        """Return a mask of the times inside the range, shape (N,)."""
         keep = np.ones(len(t_ns), dtype=np.bool_)
         if self.start_ns is not None:
             keep &= t_ns >= self.start_ns
@@ -202,10 +202,10 @@ _URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 
 
 class Readable(Protocol):
-    """A source of blocks: a log, or one that is read on another time."""
+    """A source of blocks: a log, or a log whose times are mapped to another clock."""
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """As ``Log.read``."""
+        """Read the rows, as ``Log.read`` does."""
         ...
 
 
@@ -214,39 +214,41 @@ class Log(Protocol):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file or folder."""
         ...
 
     @property
     def format(self) -> str:
-        """Short name of the format, as in ``FORMATS``."""
+        """Short name of the format, a key of ``FORMATS``."""
         ...
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """What it holds, known without reading the body wherever the format allows.
+        """Topics of the log, listed without reading the body wherever the format allows.
 
-        A topic may come to light only while reading (a cut file without a summary): readers then
-        put it into the ledger and into the tuple returned by a later call.
+        Some topics are discovered only while reading (a truncated file without a summary). The
+        reader then adds them to the ledger, and later calls return them too.
         """
         ...
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The log's rows in stored order, a block at a time, accounting as it goes.
+        """Yield the log's rows in stored order, one block at a time, and account for each row.
 
-        Every row met is ``ledger.find``-ed; rows read but outside ``selection`` are skipped with
-        the reasons ``NOT_ASKED_TIME`` and ``NOT_ASKED_TOPIC``; an index may be used to avoid
-        reading them, and the declared counts then say how many were skipped. Once exhausted,
-        declared counts have been settled and ``ledger.integrity`` is set. Damage never raises here
-        after the log was opened: what is readable is given, the rest is ``ledger.lose``-d. A row
-        whose bytes are known to be damaged is never given; where a checksum only says that one of
-        many rows is damaged, all that are structurally sound are given and the log is not whole.
-        (A seal knows of damage by the MiB, not by the row, see ``sealed_log``.)
+        Every row found is counted with ``ledger.find``. Rows outside ``selection`` are skipped with
+        the reasons ``NOT_ASKED_TIME`` and ``NOT_ASKED_TOPIC``. A reader may use an index to avoid
+        reading them; it then takes the number of skipped rows from the declared counts. When the
+        iterator is exhausted, the declared counts are settled and ``ledger.integrity`` is set.
+
+        Once the log is open, damage raises no exception: the reader yields the readable rows and
+        counts the others with ``ledger.drop``. It never yields a row whose bytes are known to be
+        damaged. If a checksum covers many rows and fails, the reader yields all structurally sound
+        rows, and the log is not complete. (A seal locates damage to the MiB, not to the row; see
+        ``sealed_log``.)
         """
         ...
 
     def close(self) -> None:
-        """Release files."""
+        """Close the files."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -261,42 +263,42 @@ class Log(Protocol):
 
 @runtime_checkable
 class HasUrl(Protocol):
-    """A log that was opened by a URL; asking for its path may fetch all of it."""
+    """A log that was opened from a URL; reading its ``path`` may fetch the complete log."""
 
     @property
     def url(self) -> str:
-        """As it was given."""
+        """The URL as the user wrote it."""
         ...
 
 
 def origin(log: Log) -> Path | str:
-    """Where a log comes from: a path or a URL."""
+    """Return the path or the URL that a log was opened from."""
     return log.url if isinstance(log, HasUrl) else log.path
 
 
 def is_remote(path: Path | str) -> bool:
-    """Is it a URL? A ``Path`` never is: it would have lost one of the slashes."""
+    """Return whether ``path`` is a URL; never for a ``Path``, which collapses the slashes."""
     return isinstance(path, str) and _URL.match(path) is not None
 
 
 def name_of(log: Log) -> str:
-    """What a log is called in accounts: its URL, else its path."""
+    """Return the name of a log in accounts: its URL, else its path."""
     return str(origin(log))
 
 
 @runtime_checkable
 class KnowsItsEnd(Protocol):
-    """A log that can tell without reading its body that something is missing."""
+    """A log that detects missing data without reading its body."""
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Drop what its opening, or a look at its end, shows to be missing.
+        """Count as dropped the rows that the log's header, index or end shows to be missing.
 
-        Reading the log reports it as well, with more detail; only one of both is asked for.
+        ``Log.read`` reports them too, with more detail. Callers use only one of the two.
         """
         ...
 
 
 def report_missing(log: Log, ledger: Ledger) -> None:
-    """As ``KnowsItsEnd.report_missing``, of a log that knows; else nothing."""
+    """Call ``log.report_missing`` if the log supports it."""
     if isinstance(log, KnowsItsEnd):
         log.report_missing(ledger)

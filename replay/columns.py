@@ -1,11 +1,11 @@
-"""What a recording holds, in columns: one object per chunk of a topic, never one per message.
+"""Columnar types of the rows of a log: one object per block of rows, never one per message.
 
-A reader yields ``Block``s. The rows of a block are one of
+A reader yields ``Block``s. The rows of a block have one of these types:
 
 * ``Messages``   opaque messages, as ranges of one buffer (ROS, protobuf, JSON, encoded video);
 * ``CanFrames``  raw CAN frames (CAN logs; ``can_msgs/Frame`` after decoding);
 * ``Table``      named numeric columns (data sets, MF4; any message after decoding);
-* ``Images``     pictures, still encoded.
+* ``Images``     encoded images.
 
 ``crosscue.replay.decode`` turns blocks of ``Messages`` into the other three.
 """
@@ -25,35 +25,36 @@ Floats: TypeAlias = NDArray[np.float64]
 Flag = TypeVar("Flag", np.bool_, np.uint8)
 
 BLOCK_ROWS: Final = 65_536
-"""Most rows a reader puts into one block; with ``BLOCK_BYTES`` this bounds memory."""
+"""Maximum number of rows in one block; with ``BLOCK_BYTES`` this bounds memory."""
 BLOCK_BYTES: Final = 8 << 20
-"""Most payload bytes a reader aims to put into one block, unless one message is larger."""
+"""Target for the maximum payload bytes in one block, unless one message is larger."""
 
 DATA: Final = 0
 REMOTE: Final = 1
 ERROR: Final = 2
 
 LENGTH_UNKNOWN: Final = 255
-"""``CanFrames.length`` where the log does not keep it; the bytes are then padded with zeros."""
+"""``CanFrames.length`` where the log does not store it; the bytes are then padded with zeros."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One stream of a recording, known without reading the body.
+    """One stream of a log, known without reading the body.
 
     Attributes:
-        name: As the log spells it; a bus name for CAN logs (``can0``).
+        name: Name as stored in the log; a bus name for CAN logs (``can0``).
         type_name: Message type (``sensor_msgs/msg/Imu``, ``foxglove.CompressedImage``), or one of
-            our own: ``crosscue/CanFrames``, ``crosscue/Table``, ``crosscue/Images``.
-        encoding: How messages are coded: ``cdr``, ``ros1``, ``protobuf``, ``json``; ``columns``
-            when the reader yields ``CanFrames``, ``Table`` or ``Images`` itself; else as stored.
+            crosscue's own: ``crosscue/CanFrames``, ``crosscue/Table``, ``crosscue/Images``.
+        encoding: Message encoding: ``cdr``, ``ros1``, ``protobuf``, ``json``; ``columns`` when the
+            reader itself yields ``CanFrames``, ``Table`` or ``Images``; else as stored.
         schema: The message definition, as stored.
         schema_encoding: ``ros2msg``, ``ros1msg``, ``ros2idl``, ``protobuf``, ``jsonschema``
             or empty.
-        declared: Messages that the format itself says there are (statistics, connection counts,
-            rows), or None where it says nothing.
-        converted_from: Type of the stream that ``convert`` made this one from, which decides its
-            role: the message type that holds a table may say more or less than the table did.
+        declared: Number of messages that the log declares (statistics, connection counts, rows),
+            or None where it declares none.
+        converted_from: Type of the stream that ``convert`` made this one from. It decides the
+            topic's role, because the message type that stores a table may carry more or less
+            information than the table.
     """
 
     name: str
@@ -70,9 +71,9 @@ class Messages:
     """N opaque messages as ranges of one buffer.
 
     Attributes:
-        buffer: Shape (B,), uint8, read-only by agreement; kept alive by this object.
-        start: Shape (N,), int64: first byte of each message.
-        stop: Shape (N,), int64: one past its last byte.
+        buffer: Shape (B,), uint8, read-only by convention; kept alive by this object.
+        start: Shape (N,), int64: offset of each message's first byte.
+        stop: Shape (N,), int64: offset one past each message's last byte.
     """
 
     buffer: Bytes
@@ -80,7 +81,7 @@ class Messages:
     stop: Int64s
 
     def __post_init__(self) -> None:
-        """Refuse ranges that do not line up."""
+        """Check that the ranges have equal shapes."""
         if self.start.shape != self.stop.shape or self.start.ndim != 1:
             raise ValueError(
                 f"start {self.start.shape} and stop {self.stop.shape}: expected equal (N,)"
@@ -90,16 +91,16 @@ class Messages:
         return len(self.start)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Messages:
-        """The messages picked by ``index``; the buffer is shared."""
+        """Return the selected messages; the buffer is shared."""
         return Messages(self.buffer, self.start[index], self.stop[index])
 
     def payload(self, i: int) -> memoryview:
-        """Bytes of message ``i``, not copied."""
+        """Return the bytes of message ``i`` without copying them."""
         return self.buffer.data[int(self.start[i]) : int(self.stop[i])]
 
 
-def _picked(flags: NDArray[Flag], index: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[Flag]:
-    """Flags by their index; where none is set, as is usual, they need not be looked up."""
+def _take_flags(flags: NDArray[Flag], index: NDArray[np.intp] | NDArray[np.bool_]) -> NDArray[Flag]:
+    """Select flags by index; fast in the common case that no flag is set."""
     return flags.take(index) if flags.any() else np.zeros(len(index), flags.dtype)
 
 
@@ -108,15 +109,15 @@ class CanFrames:
     """N CAN or CAN FD frames of one bus.
 
     Attributes:
-        arbitration_id: Shape (N,), uint32, 11 or 29 bits, without flag bits.
+        arbitration_id: Shape (N,), uint32: 11-bit or 29-bit identifier, without flag bits.
         is_extended: Shape (N,), bool: 29-bit identifier.
         kind: Shape (N,), uint8: ``DATA``, ``REMOTE`` or ``ERROR``.
-        length: Shape (N,), uint8: payload bytes that the frame really carries (not the DLC code),
-            or ``LENGTH_UNKNOWN``.
+        length: Shape (N,), uint8: number of payload bytes in the frame (not the DLC code), or
+            ``LENGTH_UNKNOWN``.
         data: Shape (N, W), uint8, W = 8 or 64; bytes from ``length`` on are zero.
         is_fd: Shape (N,), bool: CAN FD frame.
         is_tx: Shape (N,), bool: sent by the logger itself, not received; None where the log or its
-            reader does not keep the direction.
+            reader does not record the direction.
     """
 
     arbitration_id: NDArray[np.uint32]
@@ -143,19 +144,19 @@ class CanFrames:
         return len(self.arbitration_id)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> CanFrames:
-        """The frames picked by ``index``."""
+        """Return the selected frames."""
         if isinstance(index, np.ndarray) and index.dtype == np.bool_:
             index = np.flatnonzero(index)
         if not isinstance(index, slice):
-            # Faster than an index: for rows of a payload fifteen times.
+            # ``take`` is faster than indexing: fifteen times for payload rows.
             return CanFrames(
                 self.arbitration_id.take(index),
-                _picked(self.is_extended, index),
-                _picked(self.kind, index),
+                _take_flags(self.is_extended, index),
+                _take_flags(self.kind, index),
                 self.length.take(index),
                 self.data.take(index, axis=0),
-                _picked(self.is_fd, index),
-                None if self.is_tx is None else _picked(self.is_tx, index),
+                _take_flags(self.is_fd, index),
+                None if self.is_tx is None else _take_flags(self.is_tx, index),
             )
         return CanFrames(
             self.arbitration_id[index],
@@ -173,15 +174,15 @@ class Table:
     """Named columns of equal length.
 
     Attributes:
-        columns: From column name (unit last: ``gyro_z_radps``) to an array of shape (N,) or (N, k).
-        units: From column name to its unit, where the name does not carry it (DBC signals).
+        columns: Arrays of shape (N,) or (N, k) by column name (unit last: ``gyro_z_radps``).
+        units: Units by column name, for columns whose name has no unit suffix (DBC signals).
     """
 
     columns: Mapping[str, NDArray[np.generic]]
     units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse columns of different lengths."""
+        """Check that all columns have the same length."""
         lengths = {name: len(column) for name, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"columns differ in length: {lengths}")
@@ -193,7 +194,7 @@ class Table:
         return self.columns[name]
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Table:
-        """The rows picked by ``index``."""
+        """Return the selected rows."""
         return Table({name: column[index] for name, column in self.columns.items()}, self.units)
 
 
@@ -202,14 +203,14 @@ ImageCoding: TypeAlias = Literal["jpeg", "png", "webp", "tiff", "bmp", "raw", "h
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Images:
-    """N pictures of one camera, still encoded.
+    """N encoded images of one camera.
 
     Attributes:
-        bytes_: The encoded pictures as ranges of one buffer.
-        coding: N codings; ``h264``, ``h265`` and ``av1`` are packets of a stream; ``raw`` needs the
-            four below.
-        width_px: Shape (N,), int32, or None where only the encoded bytes say it.
-        height_px: The same.
+        bytes_: The encoded images as ranges of one buffer.
+        coding: N codings. ``h264``, ``h265`` and ``av1`` images are packets of a stream; ``raw``
+            images need the four attributes below.
+        width_px: Shape (N,), int32, or None where only the encoded bytes contain it.
+        height_px: Shape (N,), int32, or None as for the width.
         step_bytes: Bytes per row of a raw image.
         pixel_format: N ROS encodings (``rgb8``, ``mono16``, ``bayer_rggb8``, ...) of raw images.
     """
@@ -230,7 +231,7 @@ class Images:
         return len(self.bytes_)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Images:
-        """The pictures picked by ``index``; the buffer is shared."""
+        """Return the selected images; the buffer is shared."""
         picked = np.arange(len(self))[index]
         formats = self.pixel_format
         return Images(
@@ -252,11 +253,11 @@ class Block:
 
     Attributes:
         topic: Name of the topic.
-        log_ns: Shape (N,), int64: when the recorder stored each row.
+        log_ns: Shape (N,), int64: time at which the recorder stored each row.
         rows: N rows.
-        publish_ns: Shape (N,), int64: when the sender sent it, or None where the format has no such
-            time.
-        header_ns: Shape (N,), int64: the sensor's own stamp, known after decoding, or None.
+        publish_ns: Shape (N,), int64: time at which the sender published each row, or None where
+            the format has no such time.
+        header_ns: Shape (N,), int64: the sensor's own time stamp, known after decoding, or None.
         sequence: Shape (N,), uint32: the sender's message counter as stored, or None where the
             format has none.
     """
@@ -286,7 +287,7 @@ class Block:
         return len(self.log_ns)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Block:
-        """The rows picked by ``index``."""
+        """Return the selected rows."""
         return replace(
             self,
             log_ns=self.log_ns[index],

@@ -1,8 +1,8 @@
-"""Plain functions compiled by Numba where millions of steps need it, and only there.
+"""Compile plain Python functions with Numba, for loops of millions of steps.
 
 The motion model, the filter and the rules of the simulated town are plain Python functions on
-numbers and arrays. A replay calls them as they are; the Monte Carlo studies call ``kept(f)``,
-which compiles ``f`` and every function of ours that it calls. Numba is imported only then.
+numbers and arrays. A replay calls them uncompiled. The Monte Carlo studies call ``kept(f)``, which
+compiles ``f`` and every crosscue function that it calls. Numba is imported only then.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _PACKAGE = __name__.rpartition(".")[0].partition(".")[0]
 
 
 def compiled(function: Function) -> Function:
-    """The same function compiled, with everything of ours that it calls."""
+    """Compile a function and every crosscue function that it calls."""
     return cast("Function", _dispatcher(function))
 
 
 def kept(function: Function) -> Function:
-    """``compiled``, loaded as an earlier process compiled it where no source has changed since."""
+    """Like ``compiled``, with a cache on disk that is valid until one of the sources changes."""
     return cast("Function", _kept(function))
 
 
@@ -42,16 +42,16 @@ def _kept(function: FunctionType) -> Any:
     from numba import njit
 
     bound = _bound(function)
-    # The compiler's cache knows a function by its own file and name alone.
+    # Numba's cache identifies a function by its own file and name only.
     bound.__qualname__ += f"_{fingerprint(function)[:16]}"
     try:
         return njit(cache=True, nogil=True, error_model="numpy")(bound)
-    except RuntimeError:  # no folder to keep compiled code in
+    except RuntimeError:  # no writable cache folder
         return njit(nogil=True, error_model="numpy")(bound)
 
 
 def _bound(function: FunctionType) -> FunctionType:
-    """A copy of the function whose calls go to compiled functions."""
+    """Return a copy of the function that calls the compiled versions of crosscue functions."""
     names = function.__globals__ | {
         name: _dispatcher(called) for name, called in _called(function).items()
     }
@@ -61,7 +61,7 @@ def _bound(function: FunctionType) -> FunctionType:
 
 
 def _called(function: FunctionType) -> dict[str, FunctionType]:
-    """Functions of this package that ``function`` calls by a global name."""
+    """Return the functions of this package that ``function`` calls by a global name."""
     found = {name: function.__globals__.get(name) for name in _names(function.__code__)}
     return {
         name: value
@@ -77,7 +77,7 @@ def _names(code: CodeType) -> list[str]:
 
 @cache
 def fingerprint(function: FunctionType) -> str:
-    """SHA-256 of the source files of a function and of everything of ours that it calls."""
+    """Return the SHA-256 of the source files of a function and of all crosscue code it calls."""
     files = {__file__}
     waiting, seen = [function], {function}
     while waiting:

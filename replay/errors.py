@@ -1,31 +1,31 @@
-"""Everything this toolkit raises on purpose.
+"""The exceptions of crosscue.
 
-* CrosscueError              one line for a person: what, where, what to do
-    * UsageError             the command or call cannot mean anything (exit status 2)
-    * LogError               a recording cannot be read as asked (exit status 4)
-        * LogFormatError     the bytes do not say what the format promises
-        * LogTooLargeError   a declared or produced size is over the limit
-        * UnknownFormatError no reader knows this file or folder
-    * SchemaError            a message type, DBC or truth file cannot be understood
+* CrosscueError              base class; a one-line message: what happened, where, what to do
+    * UsageError             the command or call is invalid (exit status 2)
+    * LogError               a log cannot be read as requested (exit status 4)
+        * LogFormatError     the bytes violate the format
+        * LogTooLargeError   a declared or decoded size exceeds the limit
+        * UnknownFormatError no reader supports this file or folder
+    * SchemaError            a message definition, DBC or truth file is invalid
         * CanDatabaseError   a CAN database cannot be read (exit status 4)
-        * AnnotationError    a file of annotations cannot be read (exit status 4)
-    * VehicleError           the vehicle file is wrong or lacks a role
-        * MissingTopicError  a topic that it or a flag names is not in the logs
-    * RunError               a run folder is locked, or does not hold what was requested
+        * AnnotationError    an annotation file cannot be read (exit status 4)
+    * VehicleError           the vehicle file is invalid or lacks a role
+        * MissingTopicError  a topic named in it or in an option is not in the logs
+    * RunError               a run folder is locked, or lacks the requested results
         * UnreadableRunError it is missing, damaged or of another version (exit status 4)
     * OutputError            a result cannot be written (disk full, no permission)
-    * StudyFileError         a study file cannot be read or does not fit (exit status 2)
-    * WorkerError            a worker died; finished parts are kept
-    * EmptyResultError       nothing of what was requested is in the logs
-    * AccountError           rows in are not rows used, skipped and dropped: a bug in crosscue
+    * StudyFileError         a study file is unreadable or does not match (exit status 2)
+    * WorkerError            a worker process died; finished parts are kept
+    * EmptyResultError       the logs contain nothing that was requested
+    * AccountError           the row counts do not add up: a bug in crosscue
 
-A wrong argument from the caller's own code stays a ``ValueError``. Dropped rows, which
-stop nothing, are a ``LossWarning``.
+An invalid argument of the caller's own code raises ``ValueError``. Dropped rows do not stop the
+work; they issue a ``LossWarning``.
 """
 
 
 class CrosscueError(Exception):
-    """Catch this to catch all of ours and nothing else.
+    """Base class of all exceptions that crosscue raises on purpose.
 
     The message is one line: what happened, where (file, topic, time), what was expected, what
     to do.
@@ -35,61 +35,61 @@ class CrosscueError(Exception):
 
 
 class UsageError(CrosscueError):
-    """The command or call cannot mean anything."""
+    """The command or call is invalid."""
 
     exit_status = 2
 
 
 class LogError(CrosscueError):
-    """A recording cannot be read as asked."""
+    """A log cannot be read as requested."""
 
     exit_status = 4
 
 
 class LogFormatError(LogError):
-    """The bytes do not say what the format promises."""
+    """The bytes of a log violate its format."""
 
 
 class LogTooLargeError(LogError):
-    """A declared or produced size is over the limit."""
+    """A declared or decoded size exceeds the limit."""
 
 
 class UnknownFormatError(LogError):
-    """No reader knows this file or folder."""
+    """No reader supports this file or folder."""
 
 
 class SchemaError(CrosscueError):
-    """A message type, DBC or truth file cannot be understood."""
+    """A message definition, DBC or truth file is invalid."""
 
 
 class CanDatabaseError(SchemaError):
-    """A CAN database (DBC, KCD, ARXML, SYM) is missing, damaged or something else."""
+    """A CAN database (DBC, KCD, ARXML, SYM) is missing, damaged or in another format."""
 
     exit_status = 4
 
 
 class AnnotationError(SchemaError):
-    """A file of annotations is missing, damaged or does not follow its schema."""
+    """An annotation file is missing, damaged or does not match its schema."""
 
     exit_status = 4
 
 
 class VehicleError(CrosscueError):
-    """The vehicle file is wrong or lacks a role."""
+    """The vehicle file is invalid or lacks a role."""
 
     exit_status = 2
 
 
 class MissingTopicError(VehicleError, UsageError):
-    """A topic that the vehicle file or a flag names is not in the logs, or a log has no row."""
+    """A topic named in the vehicle file or in an option is not in the logs, or has no rows."""
 
 
 class RunError(CrosscueError):
-    """A run folder is locked, or does not hold what was requested."""
+    """A run folder is locked, or lacks the requested results."""
 
 
 class UnreadableRunError(RunError):
-    """A run folder, or the logs that it names, is missing, damaged or of another version."""
+    """A run folder, or a log that it refers to, is missing, damaged or of another version."""
 
     exit_status = 4
 
@@ -99,32 +99,32 @@ class OutputError(CrosscueError):
 
 
 class StudyFileError(CrosscueError):
-    """A study file cannot be read or does not fit."""
+    """A study file is unreadable or does not match."""
 
     exit_status = 2
 
 
 class WorkerError(CrosscueError):
-    """A worker died; what was finished is kept."""
+    """A worker process died; finished parts are kept."""
 
 
 class EmptyResultError(CrosscueError):
-    """Nothing of what was requested is in the logs."""
+    """The logs contain nothing that was requested."""
 
 
 class AccountError(CrosscueError):
-    """An account does not add up, so no result can be relied on; always a bug in crosscue."""
+    """The row counts do not add up, so results are unreliable; always a bug in crosscue."""
 
 
 def one_line(error: BaseException, max_length: int | None = None) -> str:
-    """What an error says, on one line: each run of white space, line ends too, becomes one space.
+    """Return an error's message on one line, with runs of white space collapsed.
 
     Args:
-        error: Often another library's, whose message may span lines and quote a whole file.
-        max_length: Keep this many characters; None keeps all.
+        error: The exception. Messages of other libraries may span lines and quote a complete file.
+        max_length: Maximum number of characters to keep; None keeps all.
     """
     return " ".join(str(error).split())[:max_length]
 
 
 class LossWarning(UserWarning):
-    """Something of a log was dropped, in one line."""
+    """Rows of a log were dropped; the message is one line."""

@@ -1,7 +1,7 @@
-"""The table of formats: who reads which file or folder.
+"""The table of supported log formats and their readers.
 
-A new format is one file and one line in ``FORMATS``: a module with a function
-``open_PATH(path, limits) -> Log``, imported when needed.
+A new format takes one module and one line in ``FORMATS``. The module defines a function with the
+signature ``(path, limits) -> Log`` and is imported on demand.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from .plugins import loaded
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """One line of the table.
+    """One log format and its reader.
 
     Attributes:
-        suffixes: Lower-case file suffixes; empty for folders known by ``markers``.
-        markers: Relative paths, one of which a folder must hold (glob patterns allowed).
+        suffixes: Lower-case file suffixes; empty for folders recognised by ``markers``.
+        markers: Relative paths or glob patterns; a folder that contains one of them matches.
         opener: ``module:function``, called with the path and limits.
-        says: What a person calls it.
+        says: Name of the format in messages.
     """
 
     suffixes: tuple[str, ...]
@@ -37,12 +37,12 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
-    """A data set: a format whose logs carry their own truth.
+    """A data set: a format whose logs include ground truth.
 
     Attributes:
-        format: How its logs are known and opened.
-        truth: ``module:function`` from a log's path and a folder to the ``truth.json`` that it
-            writes there.
+        format: The format of its logs.
+        truth: ``module:function`` that takes a log's path and a folder, writes ``truth.json`` into
+            the folder and returns its path.
     """
 
     format: Format
@@ -122,32 +122,32 @@ FORMATS: Final[dict[str, Format]] = {
         "folder of images with a time file",
     ),
 }
-"""Folders are tried in this order, so data sets come before loose images."""
+"""Folders are matched in this order, so data sets come before folders of images."""
 
 
 def known_formats() -> dict[str, Format]:
-    """Every format by name: our own, then those of installed readers and data sets."""
+    """Return every format by name: the built-in formats, then those of installed plug-ins."""
     return _formats_on(tuple(sys.path))
 
 
 @lru_cache(maxsize=4)
 def _formats_on(path: tuple[str, ...]) -> dict[str, Format]:
-    """Looked up once for each ``sys.path``: reading all installed packages' names takes 30 ms."""
+    """Find the formats once for each ``sys.path``, because scanning the packages takes 30 ms."""
     found = FORMATS | dict(loaded("reader", Format, FORMATS))
     return found | {name: one.format for name, one in data_sets(found).items()}
 
 
 def data_sets(taken: Collection[str] = ()) -> dict[str, DataSet]:
-    """The data sets of installed packages, by name."""
+    """Return the data sets of installed packages, by name."""
     return dict(loaded("dataset", DataSet, {*FORMATS, *taken}))
 
 
 def format_of(path: Path) -> str:
-    """Which of ``FORMATS`` a file or folder is.
+    """Return the name of the format of a file or folder.
 
     Raises:
-        UnknownFormatError: No format fits; the message lists those there are.
-        LogError: It is not there, or is not a file or folder.
+        UnknownFormatError: No format matches; the message lists the known formats.
+        LogError: The path does not exist, or is not a file or folder.
     """
     try:
         is_folder, is_file = path.is_dir(), path.is_file()
@@ -155,7 +155,7 @@ def format_of(path: Path) -> str:
             what = "not a regular file or folder" if path.exists() else "no such file or folder"
             raise LogError(f"{path}: {what}; give a recording")
         if is_folder:
-            # A glob in a folder that may not be read finds nothing, and says nothing.
+            # ``glob`` silently finds nothing in a folder without read permission.
             next(path.iterdir(), None)
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path") from None

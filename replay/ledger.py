@@ -1,15 +1,15 @@
-"""The account of what became of every message of a log.
+"""The account of every row of a log.
 
-For every topic: ``in file = used + skipped (by reason) + dropped (by reason)``.
+For every topic, ``in file = used + skipped (by reason) + dropped (by reason)``, where
 
-* *found*: rows that a reader met in the file's bytes and could tell apart;
-* *skipped*: of those, the ones not handed on or not decodable, each with a reason;
-* *used*: found less skipped;
-* *dropped*: rows that must have been in the file (a declared count, a damaged chunk whose index
-  says what it held, a cut record) but could not be read.
+* *found* rows were identified in the file's bytes by a reader;
+* *skipped* rows were found, but not selected or not decodable, each with a reason;
+* *used* rows are the found rows that were not skipped;
+* *dropped* rows must have been in the file (a declared count, a damaged chunk whose index lists its
+  contents, a truncated record), but could not be read.
 
-A loss whose extent cannot be known (a cut file without statistics) is a ``Loss`` with count None:
-the log is then not whole, and the summary says "at least".
+The extent of some losses is unknown (a truncated file without statistics). Such a loss is recorded
+with the count None. The log is then incomplete, and the summary reports "at least".
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from typing import Final, Protocol, TypeVar
 from .errors import AccountError, LossWarning
 
 DETAILS_KEPT: Final = 1000
-"""Single skips and losses kept with time and text; counts are exact beyond it."""
+"""Maximum number of skips and losses stored with their details; counts stay exact beyond it."""
 
 NOT_ASKED_TIME: Final = "outside --from/--to"
-NOT_ASKED_TOPIC: Final = "topic not asked for"
+NOT_ASKED_TOPIC: Final = "topic not selected"
 DIFFERS: Final = "bytes differ from the seal"
 CHANGED: Final = "files differ from the seal"
 
 
 class RowsOfTopic(Protocol):
-    """What a reader hands on: rows of one topic."""
+    """Rows of one topic, as yielded by a reader."""
 
     @property
     def topic(self) -> str:
@@ -47,15 +47,15 @@ B = TypeVar("B", bound=RowsOfTopic)
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """One thing skipped or dropped, for ``skipped.parquet``.
+    """One skip or loss, as stored in ``skipped.parquet``.
 
     Attributes:
         topic: Topic name, or empty where the damage hides it.
         reason: The same short text as in the counts.
-        detail: Where and why: byte offset, declared against found, the library's words.
+        detail: Place and cause: byte offset, declared and found counts, a library's message.
         t_ns: Log time where known.
-        count: Rows concerned; None if that cannot be known.
-        is_dropped: Dropped, not merely skipped.
+        count: Number of rows, or None where unknown.
+        is_dropped: True if the rows were dropped, False if they were skipped.
     """
 
     topic: str
@@ -68,11 +68,11 @@ class Detail:
 
 @dataclass(slots=True)
 class TopicAccount:
-    """Counts of one topic; see the module's text for the terms.
+    """Row counts of one topic; the module's docstring defines the terms.
 
-    Two counts are kept apart from the others, so that they can be held against them: the rows that
-    the reader really handed on (``Ledger.handing_on``), and those that were skipped or spoiled
-    after that.
+    Two counts are independent of the others and serve to check them: ``handed_on``, the rows that
+    the reader yielded (see ``Ledger.handing_on``), and ``refused``, those that were skipped or
+    spoiled after that.
     """
 
     declared: int | None = None
@@ -85,17 +85,17 @@ class TopicAccount:
 
     @property
     def used(self) -> int:
-        """Rows handed on and understood."""
+        """Number of rows that were yielded and decoded."""
         return self.found - self.skipped.total()
 
     @property
     def in_file(self) -> int:
-        """Rows that are or must have been in the file."""
+        """Number of rows that are, or must have been, in the file."""
         return self.found + self.dropped.total()
 
     @property
     def is_whole(self) -> bool:
-        """Nothing dropped; skips are choices or bad messages, not losses."""
+        """True if no row was dropped; skipped rows do not count as losses."""
         return not self.dropped.total() and not self.dropped_unknown
 
 
@@ -104,11 +104,11 @@ class Ledger:
     """One log's account, filled by its reader and by the decoders.
 
     Attributes:
-        log: Path as the user gave it.
-        integrity: In plain words, which checksums were verified, or that the format has none.
-        accounts: By topic name; the empty name holds what cannot be attributed.
-        details: The first ``DETAILS_KEPT`` single skips and losses.
-        notices: Plain sentences about the log that are not a loss (no index, clock reset, ...).
+        log: Path as the user wrote it.
+        integrity: A sentence on which checksums were verified, or that the format has none.
+        accounts: Accounts by topic name; the empty name holds losses of unknown topics.
+        details: The first ``DETAILS_KEPT`` skips and losses.
+        notices: Sentences about the log that report no loss (no index, clock reset, ...).
     """
 
     log: str
@@ -119,28 +119,28 @@ class Ledger:
     _is_reading: bool = True
 
     def topic(self, name: str) -> TopicAccount:
-        """The account of ``name``, opened when first asked for."""
+        """Return the account of a topic, created on first use."""
         return self.accounts.setdefault(name, TopicAccount())
 
     def declare(self, topic: str, count: int | None) -> None:
-        """What the format itself says it holds of ``topic``."""
+        """Record the number of rows that the file declares for ``topic``."""
         self.topic(topic).declared = count
 
     def find(self, topic: str, count: int) -> None:
-        """``count`` rows met in the bytes."""
+        """Count rows found in the file's bytes."""
         self.topic(topic).found += count
 
     def skip(
         self, topic: str, reason: str, count: int = 1, detail: str = "", t_ns: int | None = None
     ) -> None:
-        """``count`` of the rows found are not used.
+        """Count rows that were found but are not used.
 
         Args:
             topic: Topic name.
-            reason: Short and the same for all of a kind; numbers belong in ``detail``.
-            count: Rows.
-            detail: Where and why.
-            t_ns: Log time of the first one.
+            reason: Short text, identical for all skips of a kind; numbers belong in ``detail``.
+            count: Number of rows.
+            detail: Place and cause.
+            t_ns: Log time of the first row.
         """
         if count:
             self.skip_more(topic, reason, count)
@@ -148,7 +148,7 @@ class Ledger:
                 self._keep(Detail(topic, reason, detail, t_ns, count, is_dropped=False))
 
     def skip_more(self, topic: str, reason: str, count: int) -> None:
-        """Count more rows skipped for a reason that has been reported with its detail already."""
+        """Count more skipped rows for a reason whose detail is already recorded."""
         self.topic(topic).skipped[reason] += count
         self._refuse(topic, count)
 
@@ -160,7 +160,7 @@ class Ledger:
         detail: str = "",
         t_ns: int | None = None,
     ) -> None:
-        """Rows of the file that could not be read; ``count`` is None where it is unknown."""
+        """Count rows of the file that could not be read; ``count`` is None where unknown."""
         if count == 0:
             return
         account = self.topic(topic)
@@ -173,13 +173,13 @@ class Ledger:
     def spoil(
         self, topic: str, reason: str, count: int = 1, detail: str = "", t_ns: int | None = None
     ) -> None:
-        """Of the rows found, ``count`` turn out to be damaged: they are dropped, not skipped."""
+        """Count rows that were found but prove to be damaged: they become dropped rows."""
         self.find(topic, -count)
         self._refuse(topic, count)
         self.drop(topic, reason, count, detail, t_ns)
 
     def handing_on(self, blocks: Iterable[B]) -> Iterator[B]:
-        """A reader's blocks, their rows counted as they leave it, for ``check``."""
+        """Pass a reader's blocks through and count their rows, for ``check``."""
         rest = iter(blocks)
         while True:
             self._is_reading = True
@@ -191,13 +191,13 @@ class Ledger:
             yield block
 
     def check(self, used: Mapping[str, int] | None = None) -> None:
-        """Hold the account against what was counted apart from it; at the end of a whole pass.
+        """Check the account against independent counts, at the end of a complete pass.
 
         Args:
-            used: By topic, rows that whoever was handed them has used, by its own count.
+            used: Number of used rows by topic, as counted by the consumer of the blocks.
 
         Raises:
-            AccountError: Rows have come from nowhere or gone without a word.
+            AccountError: The counts do not add up.
         """
         for name, account in self.accounts.items():
             left = account.handed_on - account.refused
@@ -211,7 +211,7 @@ class Ledger:
             if self.topic(name).used != count:
                 raise AccountError(
                     f"{self.log}: {name}: {self.topic(name).used} rows used by the account, "
-                    f"{count} by what used them; it is a bug in crosscue, please report it"
+                    f"{count} by the consumer's count; it is a bug in crosscue, please report it"
                 )
 
     def _refuse(self, topic: str, count: int) -> None:
@@ -219,14 +219,15 @@ class Ledger:
             self.topic(topic).refused += count
 
     def notice(self, sentence: str) -> None:
-        """Say something about the log once; a repeated sentence is kept once."""
+        """Add a notice about the log; a repeated sentence is stored once."""
         if sentence not in self.notices:
             self.notices.append(sentence)
 
     def settle(self, topic: str, reason: str = "declared by the format, not in its bytes") -> None:
-        """Compare with the declared count at the end of a full pass.
+        """Compare the rows found with the declared count, at the end of a complete pass.
 
-        Fewer found than declared: the rest is dropped. More: a notice; the bytes are the truth.
+        If fewer rows were found, the difference is dropped. If more were found, the bytes take
+        precedence and a notice is added.
         """
         account = self.topic(topic)
         if account.declared is None:
@@ -241,10 +242,10 @@ class Ledger:
             )
 
     def claim(self, topic: str, missing: int) -> int:
-        """Give rows dropped without a name to the topic that lacks rows: they are the same ones.
+        """Attribute losses of unknown topics to a topic that lacks rows.
 
         Returns:
-            How many of the ``missing`` rows have so been dropped with their own reason and place.
+            The number of ``missing`` rows attributed this way; they keep their reason and detail.
         """
         nameless, account = self.accounts.get(""), self.topic(topic)
         if nameless is None or nameless is account:
@@ -259,7 +260,7 @@ class Ledger:
         return missing - left
 
     def _rename(self, reason: str, topic: str, rows: int) -> None:
-        """Name the topic of so many ``rows`` among the details of losses without one."""
+        """Set the topic of up to ``rows`` rows in the details of losses without a topic."""
         for i, one in enumerate(self.details):
             if not rows:
                 return
@@ -273,11 +274,11 @@ class Ledger:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing is known to be dropped."""
+        """True if no row is known to be dropped."""
         return all(account.is_whole for account in self.accounts.values())
 
     def drops(self) -> Iterator[Detail]:
-        """The details that are losses."""
+        """Return the details of dropped rows."""
         return (d for d in self.details if d.is_dropped)
 
     def _keep(self, detail: Detail) -> None:
@@ -286,7 +287,7 @@ class Ledger:
 
 
 def warn_of(ledger: Ledger) -> None:
-    """Warn of all that was dropped from a log."""
+    """Issue a ``LossWarning`` for each recorded loss of a log."""
     for drop in ledger.drops():
         detail = f" ({drop.detail})" if drop.detail else ""
         text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"

@@ -1,4 +1,4 @@
-"""How much one declared size may cost before a reader refuses it."""
+"""Limits on declared sizes, above which a reader refuses a log."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ MIB: Final = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Sizes above which a reader refuses, both as declared and as really produced.
+    """Maximum sizes that a reader accepts, both declared and after decompression.
 
     Attributes:
-        chunk_bytes: One decompressed chunk, container or page.
-        message_bytes: One message or one encoded image.
-        records_per_chunk: Records inside one chunk; a few kilobytes can hold millions of them.
-        schema_bytes: One message definition.
-        record_bytes: One of our own JSON files that says what a result is made of.
+        chunk_bytes: Size of a decompressed chunk, container or page.
+        message_bytes: Size of a message or an encoded image.
+        records_per_chunk: Number of records in a chunk; a few kilobytes can hold millions.
+        schema_bytes: Size of a message definition.
+        record_bytes: Size of a JSON file in which crosscue records how a result was made.
     """
 
     chunk_bytes: int = 256 * MIB

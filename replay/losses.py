@@ -1,7 +1,7 @@
-"""Losses met where no account is kept: logs read again for their pictures, or for a fit.
+"""Losses as Python warnings, for passes without a ledger: a second pass for images, or a fit.
 
-Each is a Python warning, so that no caller has to pass a ledger along; a command prints them and
-ends with exit status 3.
+As warnings, they reach the command without a ledger in every signature. The command prints them
+and exits with status 3.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ R = TypeVar("R")
 
 
 def with_losses(work: Callable[[T], R], one: T) -> tuple[R, tuple[str, ...]]:
-    """What ``work`` makes of ``one``, and its losses: for another process, whose warnings are lost.
+    """Return ``work(one)`` and its losses, for a worker process, whose warnings would be lost.
 
-    The process that asked passes them on with ``warn_again``.
+    The parent process issues them with ``warn_again``.
     """
     with losses_heard() as heard:
         result = work(one)
@@ -28,14 +28,14 @@ def with_losses(work: Callable[[T], R], one: T) -> tuple[R, tuple[str, ...]]:
 
 
 def warn_again(losses: Iterable[str]) -> None:
-    """Warn here of losses met in another process."""
+    """Issue warnings for losses that were collected in another process."""
     for loss in losses:
         warnings.warn(loss, LossWarning, stacklevel=3)
 
 
 @contextmanager
 def losses_heard() -> Iterator[list[str]]:
-    """The losses that are warned of within the ``with`` block, each once, instead of on stderr."""
+    """Collect the loss warnings of the ``with`` block, each once, instead of printing them."""
     heard: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("always", LossWarning)

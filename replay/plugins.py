@@ -1,11 +1,11 @@
-"""Detectors, cues, readers and data sets that other installed packages offer as entry points.
+"""Plug-ins: detectors, cues, readers and data sets of other installed packages.
 
-A package names them in its ``pyproject.toml``::
+A package declares them as entry points in its ``pyproject.toml``::
 
     [project.entry-points."crosscue.readers"]
     vbo = "my_package.vbo:FORMAT"
 
-One that does not load stops nothing; ``crosscue plugins`` says why.
+A plug-in that fails to load is ignored with a warning; ``crosscue plugins`` reports the cause.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ GROUPS: Final[dict[Kind, str]] = {
     "reader": "crosscue.readers",
     "dataset": "crosscue.datasets",
 }
-"""From what is offered to its entry point group."""
+"""Entry point groups by kind of plug-in."""
 
 
 class PluginWarning(UserWarning):
-    """An installed plug-in does not load, so crosscue goes on without it."""
+    """An installed plug-in does not load and is ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """One entry point.
+    """One plug-in.
 
     Attributes:
-        name: What it is called in crosscue.
+        name: Its name in crosscue.
         kind: ``detector``, ``cue``, ``reader`` or ``dataset``.
-        package: The installed package that offers it.
-        version: Of that package.
+        package: The installed package that declares it.
+        version: Version of that package.
         place: ``module:object``.
-        problem: Why it does not load; empty if it does.
+        problem: Reason why it does not load; empty if it loads.
     """
 
     name: str
@@ -54,38 +54,38 @@ class Plugin:
 
 
 def offered(kind: Kind) -> list[EntryPoint]:
-    """The entry points of a kind, by name; where a name is offered twice, both."""
+    """Return the entry points of a kind, sorted by name; duplicate names are all included."""
     points = entry_points(group=GROUPS[kind])
     return sorted(points, key=lambda point: (point.name, point.value))
 
 
 def load(point: EntryPoint, wanted: type[T]) -> T:
-    """The object behind an entry point.
+    """Load the object of an entry point.
 
     Raises:
-        ImportError: It cannot be imported, or is something else; one line says why.
+        ImportError: It cannot be imported, or has another type; the message is one line.
     """
     try:
         found = point.load()
     except (Exception, SystemExit) as error:
-        # Whatever another package does when imported must not end crosscue.
+        # An import error in another package must not terminate crosscue.
         raise ImportError(f"{type(error).__name__}: {_short(error)}") from None
     if not isinstance(found, wanted):
         raise ImportError(
             f"{point.value} is {type(found).__name__}; expected {wanted.__name__}"
         ) from None
     if getattr(found, "name", point.name) != point.name:
-        raise ImportError(f"{point.value} is named otherwise; expected the name {point.name!r}")
+        raise ImportError(f"{point.value} has another name; expected the name {point.name!r}")
     return found
 
 
 def loaded(kind: Kind, wanted: type[T], taken: Collection[str]) -> Iterator[tuple[str, T]]:
-    """What installed packages offer of a kind, by name; warns of what does not load.
+    """Yield the names and objects of a kind of plug-in; warn of those that do not load.
 
     Args:
-        kind: Which.
-        wanted: What it must be.
-        taken: Names of crosscue's own, which no plug-in replaces.
+        kind: Kind of plug-in.
+        wanted: Required type of the objects.
+        taken: Built-in names, which a plug-in cannot replace.
     """
     seen = {*taken}
     for point in offered(kind):
@@ -102,12 +102,12 @@ def loaded(kind: Kind, wanted: type[T], taken: Collection[str]) -> Iterator[tupl
 
 
 def _short(error: BaseException) -> str:
-    """On one line, whatever another package says."""
+    """Return the message of another package's error on one line."""
     return " ".join(str(error).split())[:300]
 
 
 def described(point: EntryPoint, kind: Kind, problem: str) -> Plugin:
-    """One line of ``crosscue plugins``."""
+    """Describe an entry point and its package, for ``crosscue plugins``."""
     package = "unknown" if point.dist is None else str(point.dist.metadata["Name"])
     version = "unknown" if point.dist is None else str(point.dist.version)
     return Plugin(point.name, kind, package, version, point.value, problem)

@@ -1,6 +1,6 @@
-"""One function for work on many things side by side, in their order.
+"""Apply a function to many items in parallel, with results in order.
 
-Batches of drives have ``eval/batch``: it survives the death of a worker, which this does not.
+Batches of drives use ``eval/batch`` instead, because it survives the death of a worker process.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ R = TypeVar("R")
 
 
 def in_processes(work: Callable[[T], R], things: Sequence[T], workers: int) -> Iterator[R]:
-    """What ``work`` returns for each of ``things``, in order, as it becomes ready.
+    """Yield ``work(thing)`` for each of ``things``, in order, as results become available.
 
-    Losses that it warns of in another process are warned of here.
+    Loss warnings of the worker processes are issued again in this process.
 
     Args:
         work: An importable function, or a ``partial`` of one.
-        things: Picklable.
-        workers: How many processes; with 1, or for one thing, this one works.
+        things: Picklable arguments.
+        workers: Number of processes; with 1, or for a single item, this process does the work.
     """
     if workers == 1 or len(things) <= 1:
         yield from map(work, things)
         return
-    # A fork would copy the locks of threads that libraries have started.
+    # A fork would copy locks held by threads of libraries.
     fresh = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(things)), mp_context=fresh) as pool:
         for result, losses in pool.map(partial(with_losses, work), things):

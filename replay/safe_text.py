@@ -1,4 +1,4 @@
-"""Tables and lines for a terminal that cannot be fooled by what a log holds."""
+"""Tables and lines for a terminal, safe against control characters in a log's names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CUT: Final = "~"
 
 
 def visible(text: str) -> str:
-    """``text`` with control characters, reordering marks and undecodable bytes as escapes."""
+    """Escape control characters, reordering marks and undecodable bytes in ``text``."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -24,7 +24,7 @@ def visible(text: str) -> str:
 
 
 def cells(text: str) -> int:
-    """How many columns of a terminal ``text`` takes."""
+    """Return the number of terminal columns that ``text`` occupies."""
     if text.isascii():
         return len(text)
     return sum(
@@ -34,21 +34,22 @@ def cells(text: str) -> int:
 
 
 def terminal_width() -> int:
-    """Columns to fill: the terminal's or ``COLUMNS``, else 100."""
+    """Return the terminal's width in columns, or that of ``COLUMNS``, else 100; at least 40."""
     return max(shutil.get_terminal_size(fallback=(100, 24)).columns, 40)
 
 
 def table(
     head: Sequence[str], rows: Sequence[Sequence[str]], width: int, text_columns: Sequence[int]
 ) -> Iterator[str]:
-    """Lines of a table no wider than ``width`` as long as its numbers fit.
+    """Yield the lines of a table, no wider than ``width`` unless its numbers need more.
 
     Args:
         head: Column names.
-        rows: Cells; made visible here.
-        width: Columns of the terminal.
-        text_columns: Which columns hold text: left-aligned, and cut in the middle to make room;
-            the others are right-aligned and whole.
+        rows: Cells; harmful characters are escaped here.
+        width: Width of the terminal in columns.
+        text_columns: Indices of the text columns. They are left-aligned, and shortened in the
+            middle if the table is too wide. The other columns are right-aligned and never
+            shortened.
     """
     shown = [[visible(cell) for cell in row] for row in [head, *rows]]
     widths = [max(cells(row[i]) for row in shown) for i in range(len(head))]
@@ -65,7 +66,7 @@ def table(
 
 
 def wrapped(sentence: str, width: int, lead: str = "- ") -> str:
-    """One bullet point over as many lines as it takes; a word longer than a line is broken."""
+    """Wrap a bullet point over several lines; words longer than a line are split."""
     room = width - cells(lead)
     lines = [""]
     for word in visible(sentence).split():
@@ -85,7 +86,7 @@ def wrapped(sentence: str, width: int, lead: str = "- ") -> str:
 
 def _fitted(cell: str, width: int, *, left: bool) -> str:
     if cells(cell) > width:
-        # Ends tell topics apart more often than beginnings, so two thirds go to the end.
+        # Names of topics differ more often at the end, so two thirds of the width go there.
         head = max((width - 1) // 3, 1)
         cell = _first(cell, head) + _CUT + _first(cell[::-1], width - 1 - head)[::-1]
     room = " " * (width - cells(cell))

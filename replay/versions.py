@@ -1,4 +1,4 @@
-"""Versions of what is installed, for manifests, model cards and ``crosscue --version``."""
+"""Versions of installed packages, for manifests, model cards and ``crosscue --version``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 
 @cache
 def installed(package: str) -> str:
-    """The version of ``package``, or "unknown" where its metadata is missing or not readable."""
-    from importlib.metadata import version  # 20 ms, which ``crosscue --help`` need not wait for
+    """Return the version of ``package``, or "unknown" if its metadata is missing or unreadable."""
+    from importlib.metadata import version  # takes 20 ms, which would delay ``crosscue --help``
 
     try:
         return version(package)
@@ -20,15 +20,15 @@ def installed(package: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of crosscue, Python and the libraries that results depend on."""
+    """Return the versions of crosscue, Python and the libraries that results depend on."""
     libraries = ("crosscue", "numpy", "numba", "cantools", "rosbags", "mcap", "pyarrow")
     return {"python": platform.python_version(), **{name: installed(name) for name in libraries}}
 
 
 def versions_and_commit() -> dict[str, str]:
-    """The same for a manifest: with the commit of crosscue, where it is known.
+    """Return ``versions`` and, where known, the commit of crosscue, for a manifest.
 
-    It is not part of ``versions``, which decide whether a run can be resumed.
+    The commit is not part of ``versions``, because those decide whether a run can be resumed.
     """
     found = commit(Path(__file__).resolve().parents[1])
     return versions() if found is None else {**versions(), "crosscue_commit": found}
@@ -36,9 +36,9 @@ def versions_and_commit() -> dict[str, str]:
 
 @cache
 def commit(folder: Path) -> str | None:
-    """The commit that is checked out in ``folder``, or that crosscue was installed from.
+    """Return the commit that is checked out in ``folder``, or that crosscue was installed from.
 
-    None for a release; uncommitted changes do not show.
+    None for a release. Uncommitted changes are not detected.
     """
     try:
         text = _head(folder)
@@ -48,10 +48,10 @@ def commit(folder: Path) -> str | None:
 
 
 def _head(folder: Path) -> str:
-    """What HEAD of a checkout is; its files are read, as git need not be installed."""
+    """Return the commit of a checkout's HEAD, read from its files because git may be missing."""
     git = folder / ".git"
     if git.is_file():
-        # A worktree: its own folder is inside that of the repository.
+        # In a worktree, ``.git`` is a file with the path of the worktree's git folder.
         git = folder / git.read_text().removeprefix("gitdir:").strip()
     head = (git / "HEAD").read_text().strip()
     if not head.startswith("ref:"):
@@ -67,7 +67,7 @@ def _head(folder: Path) -> str:
 
 
 def _installed_from() -> str:
-    """The commit in what pip writes beside a package that it took from a repository."""
+    """Return the commit that pip records for a package installed from a repository."""
     from importlib.metadata import distribution
 
     from crosscue.replay.files.tree_text import json_tree  # not for ``--help``

@@ -41,7 +41,7 @@ def test_rows_of_the_span_come_as_columns(tmp_path: Path) -> None:
     assert len(part) == 25
     assert part.ledger.is_whole
     assert part.ledger.accounts["/speed"].skipped == {"outside --from/--to": 175}
-    assert part.ledger.accounts["/other"].skipped == {"topic not asked for": 200}
+    assert part.ledger.accounts["/other"].skipped == {"topic not selected": 200}
 
 
 def test_a_type_that_nobody_knows_comes_as_messages(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def test_chunks_without_the_topic_are_not_looked_at(tmp_path: Path) -> None:
 
     assert len(reading.messages["/t1"]) == 30
     assert reading.ledger.is_whole
-    assert reading.ledger.accounts["/t2"].skipped == {"topic not asked for": 30}
+    assert reading.ledger.accounts["/t2"].skipped == {"topic not selected": 30}
 
 
 def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:

@@ -478,5 +478,5 @@ def test_payloads_of_topics_not_asked_for_are_not_fetched(tmp_path: Path) -> Non
     assert reading.rows == (Row("/a", 1, b"wanted"),)
     accounts = reading.ledger.accounts
     # That one of them is not a blob is not examined.
-    assert accounts["/b"].skipped == {"topic not asked for": 2}
+    assert accounts["/b"].skipped == {"topic not selected": 2}
     assert accounts[""].skipped == {"message without a topic": 1}
