@@ -1,1 +1,1 @@
-"""CAN payloads to signal columns, by the bit layouts of a DBC file."""
+"""Decode CAN payloads into columns of signals, by the bit layouts of a CAN database."""

@@ -1,7 +1,7 @@
-"""Reads CAN databases (DBC, KCD, ARXML, SYM) and says what is doubtful about them.
+"""Read CAN databases (DBC, KCD, ARXML, SYM) and report what is doubtful about them.
 
-cantools parses; what it lets pass in silence is looked for here: files that end too early, one
-identifier defined twice, signals that overlap or do not fit, text in another encoding.
+cantools parses the files. This module detects what cantools accepts silently: truncated files,
+identifiers defined twice, signals that overlap or do not fit, and text in another encoding.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class Conflict:
     """Two definitions of one identifier.
 
     Attributes:
-        kept: The one that is used: the first met.
-        other: The one that is not.
-        is_harmless: Both decode every frame to the same columns.
+        kept: The definition that is used, which is the first one found.
+        other: The definition that is ignored.
+        is_harmless: True if both decode every frame to the same columns.
     """
 
     kept: CanMessage
@@ -62,9 +62,9 @@ class CanDatabase:
     """The messages of one bus.
 
     Attributes:
-        messages: One for each identifier, in the order of the files.
-        notices: Plain sentences about what is doubtful in the files.
-        conflicts: Identifiers that were defined more than once.
+        messages: One message for each identifier, in the order of the files.
+        notices: Warnings about doubtful contents of the files, one sentence each.
+        conflicts: Identifiers that are defined more than once.
     """
 
     messages: tuple[CanMessage, ...]
@@ -82,7 +82,7 @@ class CanDatabase:
         *,
         keep_first: bool = False,
     ) -> CanDatabase:
-        """Read database files that together describe one bus.
+        """Read the database files that together describe one bus.
 
         Args:
             paths: Files ending in .dbc, .kcd, .arxml or .sym.
@@ -92,8 +92,8 @@ class CanDatabase:
 
         Raises:
             CanDatabaseError: A file is missing or does not parse.
-            SchemaError: It contradicts another.
-            LogTooLargeError: A file, or a size that it declares, is over the limit.
+            SchemaError: Two files contradict each other.
+            LogTooLargeError: A file, or a size that it declares, exceeds the limit.
         """
         found: list[CanMessage] = []
         notices: list[str] = []
@@ -111,10 +111,10 @@ class CanDatabase:
         *,
         keep_first: bool = False,
     ) -> CanDatabase:
-        """Put messages together, looking for identifiers and names that occur twice.
+        """Build a database from messages, and check for duplicate identifiers and names.
 
         Raises:
-            SchemaError: Two messages of one identifier differ, and ``keep_first`` is not set.
+            SchemaError: Two messages with one identifier differ, and ``keep_first`` is not set.
         """
         by_key: dict[tuple[int, bool], CanMessage] = {}
         conflicts: list[Conflict] = []
@@ -128,22 +128,22 @@ class CanDatabase:
             more = f" (and {len(harmful) - 1} more)" if len(harmful) > 1 else ""
             raise SchemaError(
                 f"{harmful[0]}{more}, with different signals; expected one definition for each "
-                "identifier; give only the file of this bus, or ask to keep the first"
+                "identifier; pass only the file of this bus, or choose to keep the first definition"
             )
         named, renamed = _with_topics(by_key.values())
         return cls(named, tuple(said + renamed), tuple(conflicts))
 
     def find(self, arbitration_id: int, is_extended: bool) -> CanMessage | None:
-        """The message with this identifier; 11-bit and 29-bit ones are never mixed up."""
+        """Return the message with an identifier; 11-bit and 29-bit identifiers are distinct."""
         wanted = (arbitration_id, is_extended)
         return next((m for m in self.messages if m.key == wanted), None)
 
     def extractor(self, message: CanMessage, wanted: Collection[str] | None = None) -> Extractor:
-        """What takes signals out of a message of this database; planned once for all logs.
+        """Return the extractor of a message's signals, which is planned once for all logs.
 
         Args:
             message: One of ``messages``, without ``problem``.
-            wanted: Names of the signals to give, or None for all.
+            wanted: Names of the signals to extract, or None for all.
         """
         key = (*message.key, None if wanted is None else frozenset(wanted))
         found = self._extractors.get(key)
@@ -152,39 +152,39 @@ class CanDatabase:
         return found
 
     def named(self, name: str) -> CanMessage:
-        """The message called ``name``, or with that ``topic_name``.
+        """Return the message with this ``name`` or ``topic_name``.
 
         Raises:
-            ValueError: No such message, or several; the error says which there are.
+            ValueError: No message or several messages match; the error lists them.
         """
         fitting = [m for m in self.messages if name in (m.name, m.topic_name)]
         if len(fitting) == 1:
             return fitting[0]
         if fitting:
             names = ", ".join(m.topic_name for m in fitting)
-            raise ValueError(f"{len(fitting)} messages are called {name!r}; say which: {names}")
+            raise ValueError(f"{len(fitting)} messages are named {name!r}; choose one of: {names}")
         near = difflib.get_close_matches(name, [m.topic_name for m in self.messages], n=3)
         hint = f"; did you mean {' or '.join(near)}" if near else ""
         raise ValueError(f"no message {name!r} among {len(self.messages)}{hint}")
 
 
 def spell_id(arbitration_id: int, is_extended: bool) -> str:
-    """An identifier as people write it: three hexadecimal digits, or eight if extended."""
+    """Format an identifier with three hexadecimal digits, or eight if it is extended."""
     return f"0x{arbitration_id:08X} (extended)" if is_extended else f"0x{arbitration_id:03X}"
 
 
 def _notice_of(conflict: Conflict) -> str:
-    result = "both alike" if conflict.is_harmless else "the first is used"
+    result = "with the same layout" if conflict.is_harmless else "the first is used"
     return f"{conflict}: {result}"
 
 
 def _with_topics(messages: Iterable[CanMessage]) -> tuple[tuple[CanMessage, ...], list[str]]:
-    """Messages with distinct topics: identifiers tell apart those that share a name."""
+    """Return messages with distinct topics: identifiers are added where names are shared."""
     messages = list(messages)
     uses = Counter(message.name for message in messages)
     repeated = {name for name, n in uses.items() if n > 1}
     notices = [
-        f"{uses[name]} messages are called {name}; their topics end in their identifiers"
+        f"{uses[name]} messages are named {name}; their topics end in their identifiers"
         for name in sorted(repeated)
     ]
     named = tuple(
@@ -202,7 +202,7 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
     form = path.suffix.lower().removeprefix(".")
     if form not in FORMATS:
         known = " ".join(f".{suffix}" for suffix in FORMATS)
-        raise CanDatabaseError(f"{path}: no CAN database; expected a file ending in one of {known}")
+        raise CanDatabaseError(f"{path}: not a CAN database; expected a name ending in {known}")
     source = read_text(path, limits)
     entry = LayoutEntry(source, form, cache_folder())
     kept = entry.read()
@@ -214,7 +214,7 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
 
 
 def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], list[str]]:
-    """Messages, and notices about what is doubtful in them."""
+    """Return messages, and notices about their doubtful contents."""
     path = source.path
     refuse_bombs(source, form)
     lines = source.lines_of_messages(form)
@@ -226,7 +226,7 @@ def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], lis
         problem = one.problem or _problem(one, marked.get(one.source, []))
         messages.append(replace(one, source=where, problem=problem, topic=one.name))
     if not messages:
-        raise CanDatabaseError(f"{path}: defines no message; check that the file is whole")
+        raise CanDatabaseError(f"{path}: defines no message; check that the file is complete")
     notices = [*source.notices, *doubts(source, form, [m.name for m in messages])]
     for message in messages:
         notices += _doubts_of(message)
@@ -237,13 +237,13 @@ def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], lis
 
 
 def _defined(source: DatabaseText, form: str) -> list[CanMessage]:
-    """The messages of a file; their ``source`` is what ``lines_of_messages`` calls them."""
+    """Return the messages of a file, with the keys of ``lines_of_messages`` as ``source``."""
     quick = read_dbc(source.text) if form == "dbc" else None
     if quick is not None:
         return quick
     parsed = _parse(source, form)
-    says_fd = _says_fd(parsed, form)
-    return [_message(one, form, says_fd) for one in parsed.messages]
+    distinguishes_fd = _distinguishes_fd(parsed, form)
+    return [_message(one, form, distinguishes_fd) for one in parsed.messages]
 
 
 def _parse(source: DatabaseText, form: str) -> InternalDatabase:
@@ -252,29 +252,29 @@ def _parse(source: DatabaseText, form: str) -> InternalDatabase:
     load: Callable[[str, bool], InternalDatabase]
     load = {"dbc": dbc, "kcd": kcd, "arxml": arxml, "sym": sym}[form].load_string
     try:
-        # Not strict: one bad message would cost the whole file. Each is checked afterwards.
+        # Not strict, because one bad message would fail the whole file. Each is checked afterwards.
         return load(source.text, False)
     except (RecursionError, MemoryError) as error:
         raise LogTooLargeError(
             f"{source.path}: too large or too deeply nested to parse ({type(error).__name__})"
         ) from None
-    except Exception as error:  # cantools documents none; whatever a damaged file provokes
+    except Exception as error:  # cantools does not document what damaged files raise
         words = one_line(error, 300) or type(error).__name__
         line = source.line_of_error(str(error))
         raise CanDatabaseError(
             f"{source.path}:{line}: not a readable {form.upper()} file: {words}; "
-            "correct that line or get a whole copy of the file"
+            "correct that line or get a complete copy of the file"
         ) from None
 
 
-def _says_fd(parsed: InternalDatabase, form: str) -> bool:
-    """Whether the file distinguishes CAN FD frames from classic ones at all."""
+def _distinguishes_fd(parsed: InternalDatabase, form: str) -> bool:
+    """Return whether the file distinguishes CAN FD frames from classic ones."""
     if form == "dbc":
         return parsed.dbc is not None and "VFrameFormat" in parsed.dbc.attribute_definitions
     return form == "arxml"
 
 
-def _message(parsed: Message, form: str, says_fd: bool) -> CanMessage:
+def _message(parsed: Message, form: str, distinguishes_fd: bool) -> CanMessage:
     stored = str(parsed.frame_id | (_EXTENDED_FLAG if parsed.is_extended_frame else 0))
     return CanMessage(
         name=parsed.name,
@@ -282,7 +282,7 @@ def _message(parsed: Message, form: str, says_fd: bool) -> CanMessage:
         is_extended=parsed.is_extended_frame,
         length=parsed.length,
         signals=tuple(_signal(s) for s in parsed.signals),
-        is_fd=parsed.is_fd if says_fd else None,
+        is_fd=parsed.is_fd if distinguishes_fd else None,
         problem="container message, not supported" if parsed.is_container else "",
         source=stored if form == "dbc" else parsed.name,
     )
@@ -291,7 +291,7 @@ def _message(parsed: Message, form: str, says_fd: bool) -> CanMessage:
 def _problem(message: CanMessage, marked: list[str]) -> str:
     lost = [s.name for s in message.signals if s.name in marked and s.multiplexer is None]
     if lost:
-        return f"nothing says which multiplexer brings {lost[0]}"
+        return f"signal {lost[0]} is multiplexed, but its multiplexer is not specified"
     return layout_problem(message)
 
 
@@ -326,8 +326,9 @@ def _doubts_of(message: CanMessage) -> list[str]:
     for signal in message.signals:
         if signal.is_multiplexer and (signal.scale != 1 or signal.offset != 0):
             notices.append(
-                f"{where}: multiplexer {signal.name} is scaled; its physical value picks the branch"
+                f"{where}: multiplexer {signal.name} is scaled; its physical value selects the "
+                "branch"
             )
         if signal.multiplexer is not None and not signal.branches:
-            notices.append(f"{where}: no multiplexer value brings {signal.name}; it never occurs")
+            notices.append(f"{where}: no multiplexer value selects {signal.name}; it never occurs")
     return notices

@@ -1,10 +1,10 @@
-"""Messages and signals of a DBC file, read straight from its text.
+"""Read messages and signals directly from the text of a DBC file.
 
-cantools reads everything that a DBC file may hold; frames need a tenth of it. This reader knows the
-statements that DBC editors write, in the form in which they write them, and takes from them what
-decoding needs. Whatever else it meets (a statement of another form, an escaped quote in a name, an
-identifier defined twice, an entry that nothing uses) makes it yield None: cantools then reads the
-file, or says what is wrong with it. Both come to the same messages.
+cantools reads everything that a DBC file may hold, but decoding needs a tenth of it. This reader
+accepts the statements of DBC editors in their usual form, and extracts what decoding needs. For
+anything else (a statement of another form, an escaped quote in a name, an identifier defined twice,
+an unused entry) it returns None. cantools then reads the file or reports what is wrong with it.
+Both readers produce the same messages.
 """
 
 from __future__ import annotations
@@ -71,11 +71,11 @@ _FORMATS: Final = (
     "StandardCAN", "ExtendedCAN", "reserved", "J1939PG", *["reserved"] * 10, "StandardCAN_FD",
     "ExtendedCAN_FD",
 )  # fmt: skip
-"""What the numbers of ``VFrameFormat`` mean where the file declares it as a number."""
+"""Meanings of the numbers of ``VFrameFormat``, where a file declares it as a number."""
 
 
-class _OddError(Exception):
-    """Something that is left to cantools."""
+class _UnusualError(Exception):
+    """A construct that is left to cantools."""
 
 
 class _Signal(NamedTuple):
@@ -96,7 +96,7 @@ class _Signal(NamedTuple):
 
 @dataclass(slots=True)
 class _Message:
-    """One ``BO_`` line and what other statements say of it."""
+    """One ``BO_`` line and its signals."""
 
     stored: int
     name: str
@@ -106,7 +106,7 @@ class _Message:
 
 @dataclass(slots=True)
 class _Found:
-    """What all statements said."""
+    """Contents of all statements of a file."""
 
     messages: dict[int, _Message] = field(default_factory=dict)
     choices: dict[tuple[int, str], dict[int, str]] = field(default_factory=dict)
@@ -119,17 +119,17 @@ class _Found:
 
 
 def read_dbc(text: str) -> list[CanMessage] | None:
-    """The messages as cantools would read them, signals in the order of their bits.
+    """Read messages as cantools would, with signals in the order of their bits.
 
-    Their ``source`` is the stored identifier, with its flag bit; ``problem`` is not looked for.
+    Their ``source`` is the stored identifier, with its flag bit. ``problem`` is left empty.
 
     Returns:
-        None where anything is unusual.
+        The messages, or None if the file contains anything unusual.
     """
     try:
         found = _statements(text)
         messages = [_message(one, found) for one in found.messages.values() if one.name != _UNUSED]
-    except (_OddError, ValueError, OverflowError):
+    except (_UnusualError, ValueError, OverflowError):
         return None
     is_used = not found.choices and not found.kinds and found.used <= found.attributes.keys()
     return messages if is_used else None
@@ -141,30 +141,30 @@ def _statements(text: str) -> _Found:
     at = 0
     for match in _STATEMENT.finditer(text):
         if match.start() != at:
-            raise _OddError
+            raise _UnusualError
         at = match.end()
         kind = match.lastgroup
         if kind is None:
             continue
         if kind == "unit":
             if message is None:
-                raise _OddError
+                raise _UnusualError
             message.signals.append(_signal(match))
         elif kind == "bytes":
-            message = _begun(match, found)
+            message = _new_message(match, found)
         else:
             message = None
             _ADD[kind](match, found)
     if at != len(text):
-        raise _OddError
+        raise _UnusualError
     return found
 
 
-def _begun(match: re.Match[str], found: _Found) -> _Message:
+def _new_message(match: re.Match[str], found: _Found) -> _Message:
     stored = int(match["bo"])
     message = _Message(stored, match["bo_name"], int(match["bytes"]))
     if found.messages.setdefault(stored, message) is not message:
-        raise _OddError
+        raise _UnusualError
     return message
 
 
@@ -173,7 +173,7 @@ def _signal(match: re.Match[str]) -> _Signal:
         "sg", "mux", "start", "size", "order", "sign", "scale", "offset", "min", "max", "unit"
     )
     if name in _KEYWORDS or size == "0":
-        raise _OddError
+        raise _UnusualError
     has_range = not low == high == "0"
     return _Signal(
         name,
@@ -191,7 +191,7 @@ def _signal(match: re.Match[str]) -> _Signal:
 
 
 def _number(text: str) -> float:
-    """An int where a whole number is written."""
+    """Parse a number: an int if it is written as an integer, else a float."""
     try:
         return int(text)
     except ValueError:
@@ -201,7 +201,7 @@ def _number(text: str) -> float:
 def _add_attribute(match: re.Match[str], found: _Found) -> None:
     name = match["ba"][1:-1]
     if name in _LONG_NAMES:
-        raise _OddError
+        raise _UnusualError
     found.used.add(name)
     if name == _FORMAT and match["ba_bo"]:
         found.formats[int(match["ba_bo"])] = match["ba_value"]
@@ -226,7 +226,7 @@ def _add_switch(match: re.Match[str], found: _Found) -> None:
     ]
     switches = found.switches.setdefault(int(match["mul_bo"]), {})
     if match["mul"] in switches:
-        raise _OddError
+        raise _UnusualError
     switches[match["mul"]] = match["switch"], values
 
 
@@ -237,12 +237,12 @@ def _add_default(match: re.Match[str], found: _Found) -> None:
 def _add_definition(match: re.Match[str], found: _Found) -> None:
     name = match["attribute"][1:-1]
     if name in found.attributes:
-        raise _OddError
+        raise _UnusualError
     found.attributes[name] = match["attribute_type"], match["attribute_values"]
 
 
-def _pass_over(match: re.Match[str], found: _Found) -> None:
-    """A list of nodes."""
+def _ignore(match: re.Match[str], found: _Found) -> None:
+    """Ignore a list of nodes."""
 
 
 _ADD: Final = {
@@ -252,7 +252,7 @@ _ADD: Final = {
     "ranges": _add_switch,
     "default_value": _add_default,
     "attribute_values": _add_definition,
-    "bu": _pass_over,
+    "bu": _ignore,
 }
 
 
@@ -260,10 +260,10 @@ def _message(parsed: _Message, found: _Found) -> CanMessage:
     stored = parsed.stored
     is_extended = bool(stored >> 31)
     if stored >> 32 or (stored & 0x7FFFFFFF) >> (29 if is_extended else 11):
-        raise _OddError
+        raise _UnusualError
     names = {one.name for one in parsed.signals}
     if parsed.name in _KEYWORDS or len(names) < len(parsed.signals):
-        raise _OddError
+        raise _UnusualError
     switches = found.switches.get(stored, {})
     _refuse_rings(switches)
     multiplexers = [one.name for one in parsed.signals if one.marker.endswith("M")]
@@ -308,7 +308,7 @@ def _message(parsed: _Message, found: _Found) -> CanMessage:
 def _conversion(
     one: _Signal, choices: dict[int, str] | None, is_float: bool
 ) -> tuple[float, float]:
-    """Scale and offset, as ints where cantools makes them so."""
+    """Return scale and offset, as ints where cantools returns ints."""
     scale, offset = one.scale, one.offset
     if choices is not None:
         return scale, offset
@@ -326,12 +326,12 @@ def _is_integer(number: float) -> bool:
 def _branch(
     one: _Signal, only: str | None, switches: dict[str, tuple[str, list[int]]]
 ) -> tuple[str | None, frozenset[int]]:
-    """Which multiplexer brings a signal, and with which values.
+    """Return a signal's multiplexer, and the multiplexer values that select the signal.
 
     Args:
         one: The signal.
-        only: The message's multiplexer where it has one only.
-        switches: What extended multiplexing says of the message's signals.
+        only: The message's multiplexer, if it has exactly one.
+        switches: Extended multiplexing of the message's signals.
     """
     switch, values = switches.get(one.name, (None, []))
     multiplexer = only or switch
@@ -348,11 +348,11 @@ def _refuse_rings(switches: dict[str, tuple[str, list[int]]]) -> None:
         while above in switches:
             above, steps = switches[above][0], steps + 1
             if steps > len(switches):
-                raise _OddError
+                raise _UnusualError
 
 
 def _is_fd(stored: int, found: _Found) -> bool | None:
-    """CAN FD or not, or None where the file does not tell them apart."""
+    """Return whether a message is CAN FD, or None if the file does not distinguish them."""
     if _FORMAT not in found.attributes:
         return None
     kind, values = found.attributes[_FORMAT]
@@ -363,12 +363,12 @@ def _is_fd(stored: int, found: _Found) -> bool | None:
     elif kind == "INT" and default is not None:
         choices, default = _FORMATS, f'"{_FORMATS[_index(default, _FORMATS)]}"'
     else:
-        raise _OddError
+        raise _UnusualError
     used = choices[_index(value, choices)] if value is not None else (default or "").strip('"')
     return used.endswith("CAN_FD")
 
 
 def _index(text: str, choices: tuple[str, ...]) -> int:
     if not text.isascii() or not text.isdigit() or int(text) >= len(choices):
-        raise _OddError
+        raise _UnusualError
     return int(text)

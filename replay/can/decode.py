@@ -1,4 +1,4 @@
-"""Frames of one bus to the signals of its messages, in columns, with an exact account.
+"""Decode the frames of one bus into columns of signals, and account for every frame.
 
 Each frame is looked up by its identifier and kind, checked against its message's length, and
 decoded together with all frames of that message in the block. A frame that cannot be decoded is
@@ -50,11 +50,11 @@ RARE_REASONS: Final = (
     TOO_LONG,
 )
 OTHERS: Final = (-1, False)
-"""Stands for all further identifiers once ``COUNTS_KEPT`` have been told apart."""
+"""Key for all further identifiers once ``COUNTS_KEPT`` are counted separately."""
 COUNTS_KEPT: Final = 20_000
 
 AUTO_FRAMES: Final = 16_000_000
-"""So many frames take NumPy about as long as loading Numba does (0.6 s measured)."""
+"""Number of frames that NumPy decodes in the time that loading Numba takes (measured: 0.6 s)."""
 
 EngineName: TypeAlias = Literal["auto", "numpy", "numba"]
 Wanted: TypeAlias = Collection[str] | Collection[tuple[str, str]]
@@ -63,13 +63,13 @@ CountKey: TypeAlias = tuple[int, bool, str]
 
 @dataclass(frozen=True, slots=True)
 class DecodeSettings:
-    """How strictly and by what means frames are decoded.
+    """Settings of frame decoding.
 
     Attributes:
-        allow_longer: Decode frames with more bytes than their message has, ignoring the rest; for
-            logs that pad them.
-        engine: ``numpy``; ``numba``; or ``auto``, which begins with NumPy and goes on with Numba,
-            where it is installed, after ``AUTO_FRAMES`` frames. All give the same values.
+        allow_longer: Decode frames that have more bytes than their message, and ignore the rest;
+            for logs that pad frames.
+        engine: ``numpy``; ``numba``; or ``auto``, which starts with NumPy and, if Numba is
+            installed, switches to it after ``AUTO_FRAMES`` frames. All yield the same values.
     """
 
     allow_longer: bool = False
@@ -78,7 +78,7 @@ class DecodeSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """What the decoder knows about one message of the database."""
+    """The decoder's entry for one message of the database."""
 
     message: CanMessage
     extractor: Extractor | None
@@ -86,15 +86,15 @@ class _Entry:
 
 
 class BusDecoder:
-    """Decodes the frames of one bus, a block at a time.
+    """Decoder of the frames of one bus, which processes a block at a time.
 
     Rows of a message keep the order and the times of their frames. A column is float64, or int64 or
-    uint64 where whole numbers may pass 2**53. In messages with multiplexers a signal that is not in
-    a row is NaN there; a signal whose column is an integer one is 0 there, and the bool column
-    ``SIGNAL_is_present`` says where it is real. Choices stay numbers.
+    uint64 where integers may exceed 2**53. In messages with multiplexers, a signal that is absent
+    from a row is NaN there. An integer column holds 0 there instead, and the bool column
+    ``SIGNAL_is_present`` marks the rows where the value is real. Choices remain numbers.
 
     Attributes:
-        counts: From (identifier, is extended, reason) to the frames not decoded.
+        counts: Number of frames not decoded, by (identifier, is extended, reason).
     """
 
     def __init__(
@@ -110,12 +110,12 @@ class BusDecoder:
 
         Args:
             database: The messages of this bus.
-            bus: Topic of the frames, and first part of the topics of the rows given.
+            bus: Topic of the frames, and first part of the topics of the decoded rows.
             ledger: Records every frame that is not decoded; the reader has counted those found.
             wanted: Message names, or (message, signal) pairs; None for everything.
-            settings: How strictly and by what means.
-            elsewhere: 11-bit identifiers that another decoder of this bus reads and accounts for;
-                those that the database lacks, too, are not unknown.
+            settings: Settings of decoding.
+            elsewhere: 11-bit identifiers that another decoder of this bus reads and accounts for.
+                They are not counted as unknown where the database lacks them.
 
         Raises:
             ValueError: ``wanted`` names a message or signal that the database lacks.
@@ -128,7 +128,7 @@ class BusDecoder:
         self.counts: dict[CountKey, int] = {}
         chosen = _chosen(database, wanted)
         entries = [_entry(database, message, chosen) for message in database.messages]
-        # The engines want the messages that are decoded first.
+        # The engines expect decodable messages first.
         self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
         self._refused = np.array([False, *(bool(entry.refusal) for entry in self._entries)])
         self._rules = [_rules(entry, settings) for entry in self._entries]
@@ -136,7 +136,7 @@ class BusDecoder:
         self._engine = compiled_engine(self._rules) if is_compiled else NumpyEngine(self._rules)
 
     def columns_of(self, message: str) -> dict[str, np.dtype[np.generic]]:
-        """Names and types of the columns that rows of ``message`` have.
+        """Return names and dtypes of the columns of ``message``.
 
         Raises:
             ValueError: The database has no such message, or it is not decoded.
@@ -153,10 +153,10 @@ class BusDecoder:
             block: Its rows are ``CanFrames``.
 
         Returns:
-            One block for each message present, called ``BUS/MESSAGE``.
+            One block for each message present, with topic ``BUS/MESSAGE``.
 
         Raises:
-            ValueError: The rows are something else.
+            ValueError: The rows are not ``CanFrames``.
         """
         frames = block.rows
         if not isinstance(frames, CanFrames):
@@ -190,7 +190,7 @@ class BusDecoder:
                 self._engine = compiled_engine(self._rules)
 
     def _account(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
-        """Count the frames that cannot be decoded, each under the first reason that holds."""
+        """Count the frames that cannot be decoded, each under the first reason that applies."""
         number, ids, is_data = grouped.number, frames.arbitration_id, frames.kind == DATA
         left = len(frames) - len(grouped.order)
         for identifier in np.flatnonzero(grouped.unknown).tolist():
@@ -211,13 +211,13 @@ class BusDecoder:
             self._account_rare(frames, grouped, log_ns)
 
     def _account_rare(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
-        """Count the frames of asked-for messages that do not fit, and those that are not data."""
+        """Count frames of unfit size, frames that are not data, and unknown 29-bit identifiers."""
         number, ids, is_data = grouped.number, frames.arbitration_id, frames.kind == DATA
         is_plain_unknown = (number == 0) & ~frames.is_extended & (ids < STANDARD_IDS)
         rows = np.flatnonzero(
             ~grouped.is_good & ~(is_data & (is_plain_unknown | self._refused[number]))
         )
-        which = self._which_reason(frames.take(rows), number[rows])
+        which = self._first_reason(frames.take(rows), number[rows])
         key = ids[rows].astype(np.int64)
         key |= (frames.is_extended[rows].astype(np.int64) << 32) | (which << 33)
         values, first, counts = np.unique(key, return_index=True, return_counts=True)
@@ -228,8 +228,8 @@ class BusDecoder:
             if not self._add(whose, count):
                 self._report(whose, count, log_ns, np.arange(len(log_ns)) == at)
 
-    def _which_reason(self, frames: CanFrames, number: NDArray[np.uint16]) -> Int64s:
-        """Place in ``RARE_REASONS`` of the first reason that holds for each frame."""
+    def _first_reason(self, frames: CanFrames, number: NDArray[np.uint16]) -> Int64s:
+        """Return, for each frame, the index in ``RARE_REASONS`` of the first that applies."""
         refuses_fd = np.array([False, *(rule.longest[1] < 0 for rule in self._rules)])
         shortest = np.array([0, *(rule.message.length for rule in self._rules)])
         carried = np.minimum(frames.length, frames.data.shape[1])
@@ -243,7 +243,7 @@ class BusDecoder:
         return np.select(holds, [np.int64(i) for i in range(len(holds))], np.int64(len(holds)))
 
     def _add(self, key: CountKey, count: int) -> bool:
-        """Count more frames of a kind that was reported already; False if it was not."""
+        """Count more frames of a kind already reported; return False if it was not reported."""
         if key not in self.counts:
             return False
         self.counts[key] += count
@@ -251,7 +251,7 @@ class BusDecoder:
         return True
 
     def _report(self, key: CountKey, count: int, log_ns: Int64s, rows: NDArray[np.bool_]) -> None:
-        """Count frames with a detail: only the first of a kind, or a busy bus would fill all."""
+        """Count frames and record a detail of the first of a kind, to bound the ledger's size."""
         detail = f"{spell_id(*key[:2])}, first of them"
         if len(self.counts) >= COUNTS_KEPT:
             key = (*OTHERS, key[2])
@@ -260,14 +260,14 @@ class BusDecoder:
 
 
 def compiled_engine(rules: Sequence[Rules]) -> Engine:
-    """The engine of compiled loops; importing Numba takes its time, hence only when wanted."""
+    """Return the engine of compiled loops, importing Numba only now because that is slow."""
     from .numba_engine import NumbaEngine
 
     return NumbaEngine(rules)
 
 
 class _Times:
-    """The times of a block in another order, and blocks made of runs of it."""
+    """The times of a block in another order, from which blocks of single messages are built."""
 
     def __init__(self, block: Block, order: NDArray[np.intp]) -> None:
         self._log = block.log_ns.take(order)
@@ -281,7 +281,7 @@ class _Times:
         columns: Mapping[str, NDArray[np.generic]],
         units: Mapping[str, str],
     ) -> Block:
-        """Rows of one message with their times."""
+        """Return the rows of one message with their times."""
         return Block(
             topic,
             self._log[rows],
@@ -295,7 +295,7 @@ _Chosen: TypeAlias = Mapping[tuple[int, bool], set[str]]
 
 
 def _chosen(database: CanDatabase, wanted: Wanted | None) -> _Chosen | None:
-    """From the identifier of a wanted message to the names of its wanted signals; None for all."""
+    """Return the names of the selected signals by message identifier; None for all."""
     if wanted is None:
         return None
     chosen: dict[tuple[int, bool], set[str]] = {}

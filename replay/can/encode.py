@@ -1,6 +1,6 @@
-"""Columns of physical values to payloads, by the same layouts that decode them.
+"""Encode columns of physical values as payloads, with the layouts used for decoding.
 
-A value that its bits cannot hold is refused, never clipped: a simulated drive must not look
+A value that its bits cannot hold is refused, never clipped, because a simulated drive must not look
 plausible where it is wrong.
 """
 
@@ -21,20 +21,20 @@ _REALS: Final = {16: (np.float16, np.uint16), 32: (np.float32, np.uint32)}
 
 
 def encode(message: CanMessage, columns: Mapping[str, Column]) -> NDArray[np.uint8]:
-    """Payloads of N frames of one message.
+    """Return the payloads of N frames of one message.
 
     Args:
-        message: Its layout.
-        columns: From signal name to N physical values; all signals that no multiplexer rules out in
-            every row. Values in rows where the multiplexers rule a signal out are ignored.
-            Companion columns ``SIGNAL_is_present``, as decoding writes them, are ignored too.
+        message: The layout of the message.
+        columns: N physical values by signal name. A signal may be missing only if multiplexers
+            exclude it in every row. Values in rows where multiplexers exclude a signal are ignored,
+            and so are the companion columns ``SIGNAL_is_present`` of decoded messages.
 
     Returns:
-        Shape (N, message.length), uint8; bits of no signal are zero.
+        Shape (N, message.length), uint8; unused bits are zero.
 
     Raises:
         ValueError: A column is missing, unknown, of another length or not numeric; a value is out
-            of its signal's range, not a number, or a multiplexer's value has no branch; or the
+            of its signal's range or not a number; a multiplexer's value has no branch; or the
             message's layout contradicts itself.
     """
     n = _checked_length(message, columns)
@@ -79,7 +79,7 @@ def _column(message: CanMessage, columns: Mapping[str, Column], signal: CanSigna
 def _presence(
     message: CanMessage, columns: Mapping[str, Column], n: int
 ) -> dict[str, NDArray[np.bool_]]:
-    """Which rows hold each signal, as the multiplexers' values say."""
+    """Return the rows that hold each signal, according to the multiplexers' values."""
     present: dict[str, NDArray[np.bool_]] = {}
     waiting = list(message.signals)
     while waiting:
@@ -112,7 +112,7 @@ def _refuse_strange(message: CanMessage, multiplexer: CanSignal, selector: Colum
 
 
 def _raw(message: CanMessage, signal: CanSignal, values: Column) -> NDArray[np.uint64]:
-    """Raw bits, right-aligned; bits above the signal's length may be set."""
+    """Return raw bits, right-aligned; bits above the signal's length may be set."""
     where = f"{message.name}.{signal.name}"
     if signal.is_float:
         return _raw_real(where, signal, values.astype(np.float64))
@@ -120,7 +120,7 @@ def _raw(message: CanMessage, signal: CanSignal, values: Column) -> NDArray[np.u
         return _raw_whole(where, signal, values)
     low, high = signal.raw_range
     steps = np.rint((values.astype(np.float64) - float(signal.offset)) / float(signal.scale))
-    # Both limits are powers of two, hence exact in float64; NaN is in no range.
+    # Both limits are powers of two, hence exact in float64; NaN is outside every range.
     _refuse_outside(where, signal, values, (steps >= float(low)) & (steps < float(high + 1)))
     return steps.astype(np.int64).view(np.uint64) if signal.is_signed else steps.astype(np.uint64)
 
@@ -138,7 +138,7 @@ def _raw_real(where: str, signal: CanSignal, values: NDArray[np.float64]) -> NDA
 
 
 def _raw_whole(where: str, signal: CanSignal, values: Column) -> NDArray[np.uint64]:
-    """Without floating point: the differences are right modulo 2**64, and fit."""
+    """Return raw integers without floating point: differences modulo 2**64 are exact here."""
     scale, offset = int(signal.scale), int(signal.offset)
     ends = [raw * scale + offset for raw in signal.raw_range]
     _refuse_outside(where, signal, values, (values >= min(ends)) & (values <= max(ends)))
@@ -163,11 +163,11 @@ def _refuse_outside(
     row = int(np.argmin(is_inside))
     ends = sorted(raw * signal.scale + signal.offset for raw in signal.raw_range)
     span = f"{signal.length}-bit floats" if signal.is_float else f"{ends[0]} to {ends[1]}"
-    raise ValueError(f"{where}: {values[row]} does not fit its bits, which hold {span}")
+    raise ValueError(f"{where}: {values[row]} does not fit; the signal's bits hold {span}")
 
 
 def _place(words: NDArray[np.uint64], signal: CanSignal, raw: NDArray[np.uint64]) -> None:
-    """Put the raw bits into words of shape (N, W) that count bits in the signal's direction."""
+    """Write raw bits into words of shape (N, W) that count bits in the signal's direction."""
     word, bit = divmod(signal.first_bit, 64)
     raw = raw & np.uint64(2**signal.length - 1)
     over = bit + signal.length - 64

@@ -1,9 +1,9 @@
-"""Bits of many payloads at once into columns, with NumPy.
+"""Extract the signals of many payloads at once into columns, with NumPy.
 
-A payload is read as 64-bit words: word ``k`` holds bytes ``8 k`` to ``8 k + 7``, as the number
-that they make in the signal's byte order. A signal is in one word, or in one and the next.
-Signals that lie alike (same word, byte order and kind) are taken out together, as one array of
-shape (signals, rows), since a call into NumPy costs more than the work on a few hundred rows.
+A payload is read as 64-bit words: word ``k`` holds bytes ``8 k`` to ``8 k + 7`` as one number in
+the signal's byte order. A signal is in one word or spans two consecutive words. Signals with the
+same word, byte order and kind are extracted together as one array of shape (signals, rows),
+because a call into NumPy costs more than the work on a few hundred rows.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ Column: TypeAlias = NDArray[Any]
 Number = TypeVar("Number", np.uint64, np.float64)
 
 PRESENT_SUFFIX: Final = "_is_present"
-"""Ends the name of the companion column of a signal that may be absent and cannot be NaN."""
+"""Suffix of the companion column of a signal that may be absent and cannot be NaN."""
 
 SHORT_BITS: Final = 52
-"""Integers of up to so many bits fit into the fraction of a float64."""
+"""Number of bits in the fraction of a float64."""
 EXPONENT: Final = 0x4330_0000_0000_0000
-"""Above 52 integer bits these make the float64 2**52 + integer: a conversion without a loop."""
+"""Sign and exponent of the float64 2**52 + n, where n are the 52 bits below. This converts
+integers without a loop."""
 
 _FLOATS: Final = {16: (np.uint16, np.float16), 32: (np.uint32, np.float32)}
 
 
 class _Place(NamedTuple):
-    """What signals taken out together have in common."""
+    """Common properties of the signals that are extracted together."""
 
     is_big_endian: bool
     word: int
@@ -67,8 +68,8 @@ def _place(signal: CanSignal) -> _Place:
     )
 
 
-class _Together:
-    """Signals of one place, with their shifts as columns of shape (S, 1)."""
+class _SignalGroup:
+    """Signals with one ``_Place``, with their shifts as columns of shape (S, 1)."""
 
     def __init__(self, place: _Place, signals: list[CanSignal]) -> None:
         self.place = place
@@ -79,7 +80,8 @@ class _Together:
         length = _column([s.length for s in signals], np.uint64)
         self._flip = _column([flip for flip, _ in turns], np.uint64)
         self._drop = np.uint64(64) - length
-        # Shifted left until only the wanted bits are left of it; then right, with sign or not.
+        # A left shift drops the bits above the signal; the right shift that follows drops the bits
+        # below it and extends the sign.
         self._left = bit if place.is_big_endian else np.uint64(64) - (bit + length)
         self._taken = np.uint64(64) - bit  # bits of a split signal in its first word
         self._is_below_64 = all(s.length < 64 for s in signals)
@@ -91,7 +93,7 @@ class _Together:
         self._offset = _column(offsets, np.float64) if is_moved else None
 
     def __call__(self, words: Words) -> Column:
-        """Physical values, shape (S, N)."""
+        """Return physical values, shape (S, N)."""
         raw = self._split(words) if self.place.is_split else self._whole(words)
         if self.place.is_short:
             raw ^= self._flip
@@ -99,7 +101,7 @@ class _Together:
             values -= self._bias
             return self._scaled(values)
         if self.place.is_float:
-            with np.errstate(all="ignore"):  # whatever numbers the bits make
+            with np.errstate(all="ignore"):  # the bits may be any number
                 return self._scaled(_as_float(raw, self.place.float_bits))
         if self.place.arithmetic == Arithmetic.FLOAT.name:
             return self._scaled(raw.astype(np.float64))
@@ -116,7 +118,7 @@ class _Together:
         if self.place.is_signed:
             return np.right_shift(raw.view(np.int64), self._drop.view(np.int64))
         raw >>= self._drop
-        # Conversion from int64 is the faster one; without the top bit both mean the same.
+        # Conversion from int64 is faster; without the top bit both types hold the same value.
         return raw.view(np.int64) if self._is_below_64 and not self.place.is_short else raw
 
     def _split(self, words: Words) -> Column:
@@ -139,7 +141,7 @@ class _Together:
         return values
 
     def _scaled_integers(self, raw: Column) -> Column:
-        # Sums and products modulo 2**64 are right whenever the result fits, and it does.
+        # Sums and products modulo 2**64 are exact because the result fits.
         values: Column = raw.view(np.uint64).copy()
         values *= _modulo([int(s.scale) for s in self.signals])
         values += _modulo([int(s.offset) for s in self.signals])
@@ -147,16 +149,16 @@ class _Together:
 
 
 def is_short_integer(signal: CanSignal) -> bool:
-    """Whether the conversion by ``EXPONENT`` holds for it."""
+    """Return whether a signal can be converted by ``EXPONENT``."""
     is_exact = signal.arithmetic is Arithmetic.FLOAT and not signal.is_float
     return is_exact and signal.length <= SHORT_BITS
 
 
 def flip_and_bias(signal: CanSignal) -> tuple[int, float]:
-    """What turns the raw bits of a short integer into a float64.
+    """Return the constants that convert the raw bits of a short integer to float64.
 
     Returns:
-        Bits to flip in the raw number, which then is, read as a float64, too large by the second.
+        Bits to flip in the raw number, and the bias to subtract from the result read as float64.
         The sign bit is flipped, so that two's complement becomes a count from the lowest number.
     """
     lowest = signal.raw_range[0]
@@ -164,7 +166,7 @@ def flip_and_bias(signal: CanSignal) -> tuple[int, float]:
 
 
 def _column(numbers: Sequence[float], kind: type[Number]) -> NDArray[Number]:
-    """Shape (S, 1)."""
+    """Return numbers as an array of shape (S, 1)."""
     return np.array(numbers, dtype=kind)[:, None]
 
 
@@ -180,7 +182,7 @@ def _as_float(raw: Column, bits: int) -> NDArray[np.float64]:
 
 
 def _big(raw: Column, signals: list[CanSignal]) -> NDArray[np.float64]:
-    """Value by value in Python's unbounded integers: rare, and right to the last digit."""
+    """Convert each value with Python's unbounded integers, which is exact and rarely needed."""
     rows = [
         [float(value * _plain(s.scale) + _plain(s.offset)) for value in row.tolist()]
         for s, row in zip(signals, raw, strict=True)
@@ -193,18 +195,18 @@ def _plain(number: float) -> float:
 
 
 class _Flat:
-    """Signals that are all there in every row."""
+    """Signals that are present in every row."""
 
     def __init__(self, signals: Iterable[CanSignal]) -> None:
         ordered = sorted(((_place(s), s) for s in signals), key=lambda pair: pair[0])
         self._parts = [
-            _Together(place, [s for _, s in pairs])
+            _SignalGroup(place, [s for _, s in pairs])
             for place, pairs in groupby(ordered, key=lambda pair: pair[0])
         ]
         self.is_in_order = len(self._parts) == 1
 
     def __call__(self, words: Words) -> dict[str, Column]:
-        """From signal name to its values, shape (N,)."""
+        """Return values by signal name, shape (N,)."""
         if len(self._parts) == 1:
             return dict(zip(self._parts[0].names, self._parts[0](words), strict=True))
         columns: dict[str, Column] = {}
@@ -221,7 +223,7 @@ class _Branch:
 
 @dataclass(frozen=True, slots=True)
 class _Switch:
-    """One multiplexer: which of its values are known, and what they bring."""
+    """A multiplexer with its known values and the signals that they select."""
 
     name: str
     known: tuple[int, ...]
@@ -230,17 +232,17 @@ class _Switch:
 
 @dataclass(frozen=True, slots=True)
 class _Node:
-    """Signals that come together, and the multiplexers among them."""
+    """Signals that occur together, and the multiplexers among them."""
 
     flat: _Flat
     switches: tuple[_Switch, ...]
 
 
 class Extractor:
-    """From payloads of one message to the columns of some of its signals.
+    """Extractor of some signals of one message from payloads into columns.
 
-    A signal that a row's multiplexers do not bring is NaN there; if its column is int64 or uint64
-    it is 0 there, and a companion bool column ``SIGNAL_is_present`` says where it is real.
+    A signal that a row's multiplexers do not select is NaN there. An int64 or uint64 column holds 0
+    there, and a companion bool column ``SIGNAL_is_present`` marks the rows with real values.
     """
 
     def __init__(self, message: CanMessage, wanted: Collection[str] | None = None) -> None:
@@ -248,39 +250,40 @@ class Extractor:
 
         Args:
             message: A message without ``problem``.
-            wanted: Names of the signals to give, or None for all.
+            wanted: Names of the signals to extract, or None for all.
         """
         self.message = message
         self._wanted = None if wanted is None else frozenset(wanted)
 
-    # What follows is made when the first frame comes: a bus carries few of a large database's
-    # messages, and the signals of the others need not even be read.
+    # The properties below are computed at the first frame: a bus carries few of a large database's
+    # messages, and the signals of the others need not be read.
 
     @cached_property
     def signals(self) -> tuple[CanSignal, ...]:
-        """Those to give, in the database's order."""
+        """Signals to extract, in the database's order."""
         wanted = self._wanted
         return tuple(s for s in self.message.signals if wanted is None or s.name in wanted)
 
     @cached_property
     def units(self) -> dict[str, str]:
-        """From signal name to its unit, where it has one."""
+        """Units by signal name, for the signals that have one."""
         return {s.name: s.unit for s in self.signals if s.unit}
 
     @cached_property
     def is_multiplexed(self) -> bool:
-        """Whether any signal rules others in or out."""
+        """True if any signal selects others."""
         return any(switches_on(self.message, s) for s in self.message.signals)
 
     def __call__(self, words: Words) -> tuple[dict[str, Column], NDArray[np.bool_] | None]:
         """Decode N payloads.
 
         Args:
-            words: Shape (N, W / 8); at least as many bytes as the message has.
+            words: Shape (N, W / 8), with at least as many bytes as the message.
 
         Returns:
-            Columns of length N in the database's order, and which rows hold a multiplexer value
-            without a branch (their values mean nothing), or None if no row does.
+            Columns of length N in the database's order, and a mask of the rows with a multiplexer
+            value without a branch, whose values are meaningless. The mask is None if there are no
+            such rows.
         """
         if not self.is_multiplexed:
             columns = self._root.flat(words)
@@ -344,7 +347,7 @@ def _descend(
 
 
 def is_one_of(selector: Column, values: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Rows whose multiplexer has one of ``values``, shape (N,)."""
+    """Return a mask of the rows whose multiplexer has one of ``values``, shape (N,)."""
     if selector.dtype == np.float64:
         return np.isin(np.trunc(selector), np.array(values, dtype=np.float64))
     limits = np.iinfo(selector.dtype)
@@ -353,7 +356,7 @@ def is_one_of(selector: Column, values: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def known_values(message: CanMessage, multiplexer: CanSignal) -> frozenset[int]:
-    """The values that have a branch: those of its signals, and those with a name."""
+    """Return the values that have a branch: those of its signals, and those with a name."""
     values = set(multiplexer.choices)
     for signal in message.signals:
         if signal.multiplexer == multiplexer.name:
@@ -362,7 +365,7 @@ def known_values(message: CanMessage, multiplexer: CanSignal) -> frozenset[int]:
 
 
 def switches_on(message: CanMessage, signal: CanSignal) -> bool:
-    """Whether ``signal`` rules signals in or out; a multiplexer of nothing does not."""
+    """Return whether ``signal`` is a multiplexer that selects at least one signal."""
     return signal.is_multiplexer and bool(known_values(message, signal))
 
 

@@ -1,4 +1,4 @@
-"""How frames are told apart and checked, as tables that both engines share."""
+"""Tables that assign frames to messages and check them; both engines share them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Strange: TypeAlias = NDArray[np.bool_] | None
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What the frames of one message must look like.
+    """Requirements on the frames of one message.
 
     Attributes:
         message: The message.
-        extractor: Takes its signals out, or None if it is not decoded.
-        longest: Most bytes of a classic and of an FD frame; -1 where none fits.
+        extractor: Extractor of its signals, or None if it is not decoded.
+        longest: Max bytes of a classic frame and of an FD frame; -1 where no frame fits.
     """
 
     message: CanMessage
@@ -37,15 +37,15 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """The rules of all messages as arrays; message number 0 stands for none.
+    """The rules of all messages as arrays; message number 0 means no message.
 
     Attributes:
-        standard: Shape (2049,): message number of each 11-bit identifier; the last place is for
-            whatever is larger.
+        standard: Shape (2049,): message number of each 11-bit identifier; the last element is for
+            larger identifiers.
         extended_ids: Sorted 29-bit identifiers.
-        extended_numbers: Their message numbers.
-        fits: From the width of the payload array to shape (2, M + 1, 256): whether a frame, classic
-            or FD, of this message and length can be decoded.
+        extended_numbers: Message numbers of ``extended_ids``.
+        fits: By width of the payload array: shape (2, M + 1, 256), True where a classic or FD frame
+            of this message and length can be decoded.
     """
 
     standard: NDArray[np.uint16]
@@ -77,25 +77,25 @@ class Tables:
 
 
 def _fitting_lengths(sizes: NDArray[np.int64], longest: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Shape (2, M, 256), from shapes (M,) and (2, M): which lengths messages may have."""
+    """Return a mask of the lengths that fit, shape (2, M, 256), from shapes (M,) and (2, M)."""
     length, max_length = np.arange(256), longest[:, :, None]
     fits: NDArray[np.bool_] = (length >= sizes[:, None]) & (length <= max_length)
-    # Where the log keeps no lengths there is nothing to hold against the database.
+    # A log that does not record lengths cannot contradict the database.
     fits[:, :, LENGTH_UNKNOWN] |= longest >= 0
     return fits
 
 
 @dataclass(frozen=True, slots=True)
 class Grouped:
-    """The frames of a block, put in order of their messages.
+    """The frames of a block, grouped by message.
 
     Attributes:
         number: Shape (N,): number of each frame's message, 0 for none.
-        is_good: Shape (N,): the frame can be decoded.
-        order: Shape (G,): the G good frames: those of message 1, then of message 2, ...
-        stops: Shape (M + 1,): where each message ends in ``order``; 0 for message 0.
-        seen: Shape (M + 1,): data frames of each message, good or not.
-        unknown: Shape (2048,): data frames of no message, by their 11-bit identifier.
+        is_good: Shape (N,): True if the frame can be decoded.
+        order: Shape (G,): indices of the G good frames, those of message 1 first.
+        stops: Shape (M + 1,): end of each message in ``order``; 0 for message 0.
+        seen: Shape (M + 1,): number of data frames of each message, good or not.
+        unknown: Shape (2048,): number of data frames of no message, by 11-bit identifier.
     """
 
     number: NDArray[np.uint16]
@@ -106,23 +106,23 @@ class Grouped:
     unknown: NDArray[np.intp]
 
     def rows(self, number: int) -> slice:
-        """Where a message's frames are in ``order``."""
+        """Return the slice of ``order`` that holds a message's frames."""
         return slice(int(self.stops[number - 1]), int(self.stops[number]))
 
 
 class Engine(Protocol):
-    """Groups frames and decodes the columns of each group."""
+    """Engine that groups frames and decodes the columns of each group."""
 
     def group(self, frames: CanFrames) -> Grouped:
         """Look up, check and sort frames."""
         ...
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
-        """Columns of one message of the frames grouped last, as of ``Extractor``."""
+        """Return the columns of one message of the last group of frames, like ``Extractor``."""
         ...
 
 
 def words_of(frames: CanFrames) -> Words:
-    """Payloads as little-endian words, shape (N, W / 8)."""
+    """Return payloads as little-endian words, shape (N, W / 8)."""
     words: Words = np.ascontiguousarray(frames.data).view("<u8").astype(np.uint64, copy=False)
     return words

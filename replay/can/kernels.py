@@ -1,4 +1,4 @@
-"""The loops that Numba compiles; it keeps the result for later processes where it may write.
+"""The loops that Numba compiles. Numba caches the result for later processes where it can write.
 
 Importing this module imports Numba.
 """
@@ -16,7 +16,7 @@ from crosscue.replay.columns import DATA
 
 Loop = TypeVar("Loop", bound=Callable[..., None])
 
-# What becomes of raw bits.
+# Conversions of raw bits.
 UNSIGNED: Final = 0
 SIGNED: Final = 1
 WHOLE_UNSIGNED: Final = 2
@@ -36,7 +36,7 @@ def compiled(loop: Loop) -> Loop:
     """Compile a loop at its first call, or load what an earlier process compiled."""
     try:
         return cast("Loop", njit(cache=True, nogil=True)(loop))
-    except RuntimeError:  # no folder to keep compiled code in
+    except RuntimeError:  # there is no writable folder for compiled code
         return cast("Loop", njit(nogil=True)(loop))
 
 
@@ -58,8 +58,8 @@ def look_up(
     unknown: NDArray[np.intp],
     good_rows: NDArray[np.intp],
 ) -> None:
-    """Find and check each frame's message; the last six arrays take the results."""
-    # Counting without branches: one that goes either way costs more than both its sides.
+    """Find and check each frame's message, and write the results to the last six arrays."""
+    # Counting is branch-free because an unpredictable branch costs more than both its sides.
     beyond = len(standard) - 1
     kept = 0
     for i in range(len(arbitration_id)):
@@ -92,7 +92,7 @@ def put_in_order(
     order: NDArray[np.intp],
     little: NDArray[np.uint64],
 ) -> None:
-    """Put the good frames and their words in order of their messages."""
+    """Sort the good frames and their words by message."""
     following = starts.copy()
     width = words.shape[1]
     for i in good_rows:
@@ -105,8 +105,8 @@ def put_in_order(
 
 
 @compiled
-def turn_round(words: NDArray[np.uint64], turned: NDArray[np.uint64]) -> None:
-    """Words of the other byte order."""
+def swap_bytes(words: NDArray[np.uint64], turned: NDArray[np.uint64]) -> None:
+    """Reverse the bytes of each word."""
     for r in range(len(words)):
         x = words[r]
         x = ((x & EVEN_BYTES) << np.uint64(8)) | ((x >> np.uint64(8)) & EVEN_BYTES)
@@ -115,7 +115,7 @@ def turn_round(words: NDArray[np.uint64], turned: NDArray[np.uint64]) -> None:
 
 
 @compiled
-def push_up(
+def align_left(
     words: NDArray[np.uint64],
     following: NDArray[np.uint64],
     is_big: bool,
@@ -123,7 +123,7 @@ def push_up(
     length: np.uint64,
     raw: NDArray[np.uint64],
 ) -> None:
-    """Move a signal's bits to the top of ``raw``; what is below them is dropped later."""
+    """Move a signal's bits to the top of ``raw``; the bits below them are dropped later."""
     full = np.uint64(64)
     drop = full - length
     if bit + length <= full:
@@ -149,7 +149,7 @@ def to_floats(
     offset: np.float64,
     out: NDArray[np.float64],
 ) -> None:
-    """Physical values of raw bits; in ``raw`` they are overwritten."""
+    """Convert raw bits to physical values; ``raw`` is overwritten."""
     n = len(out)
     doubles = raw.view(np.float64)
     if kind == SHORT:
@@ -186,7 +186,7 @@ def to_whole(
     offset: np.uint64,
     out: NDArray[np.uint64],
 ) -> None:
-    """Whole numbers of raw bits, modulo 2**64."""
+    """Convert raw bits to integers modulo 2**64."""
     if kind == WHOLE_SIGNED:
         for r in range(len(out)):
             out[r] = np.uint64(np.int64(raw[r]) >> np.int64(drop)) * scale + offset
@@ -196,7 +196,7 @@ def to_whole(
 
 
 @compiled
-def take_out(
+def extract_signals(
     little: NDArray[np.uint64],
     stops: NDArray[np.intp],
     counts: NDArray[np.intp],
@@ -216,7 +216,7 @@ def take_out(
     values: NDArray[np.float64],
     bits: NDArray[np.uint64],
 ) -> None:
-    """All signals of all messages; ``bits`` is the same memory as ``values``."""
+    """Extract all signals of all messages; ``bits`` shares its memory with ``values``."""
     width = little.shape[0]
     longest = counts[1:].max() if len(counts) > 1 else 0
     raw = np.empty(longest, np.uint64)
@@ -228,14 +228,14 @@ def take_out(
         row = stops[group] - n
         if is_big[first[group] : first[group + 1]].any():
             for k in range(width):
-                turn_round(little[k, row : row + n], big[k, :n])
+                swap_bytes(little[k, row : row + n], big[k, :n])
         for j in range(first[group], first[group + 1]):
             at = base[group] + (j - first[group]) * n
             k, after = word[j], min(word[j] + 1, width - 1)
-            # Rows of one word, so that the loops run over contiguous memory.
+            # One row per word, so that the loops run over contiguous memory.
             one = big[k, :n] if is_big[j] else little[k, row : row + n]
             two = big[after, :n] if is_big[j] else little[after, row : row + n]
-            push_up(one, two, is_big[j], bit[j], length[j], raw[:n])
+            align_left(one, two, is_big[j], bit[j], length[j], raw[:n])
             drop = np.uint64(64) - length[j]
             if kind[j] in (WHOLE_UNSIGNED, WHOLE_SIGNED):
                 out = bits[at : at + n]

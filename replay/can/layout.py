@@ -1,8 +1,8 @@
-"""What a CAN message carries and where its bits lie, whatever file said so.
+"""CAN messages, their signals and bit layouts, independent of the format of the database.
 
-Bits are counted as DBC files count them. A little-endian signal starts at its least significant
-bit, bit ``8 * byte + bit_in_byte``; a big-endian one at its most significant bit, with the same
-numbers, and runs down to bit 0 of a byte and on to bit 7 of the next.
+Bits are counted as in DBC files. A little-endian signal starts at its least significant bit, bit
+``8 * byte + bit_in_byte``. A big-endian signal starts at its most significant bit, with the same
+numbering, and runs down to bit 0 of a byte and on to bit 7 of the next.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _FD_LENGTHS: Final = (12, 16, 20, 24, 32, 48, 64)
 
 
 class Arithmetic(Enum):
-    """How raw bits become a physical value without losing a digit.
+    """Arithmetic that converts raw bits to a physical value without losing digits.
 
-    * ``FLOAT``: in float64; every value that can occur is exact, or the scale is a fraction.
-    * ``INT64``, ``UINT64``: whole numbers that may pass 2**53 and fit the type.
-    * ``BIG``: whole numbers that pass 64 bits on the way; the column is their nearest float64.
+    * ``FLOAT``: float64; every possible value is exact, or the scale is a fraction.
+    * ``INT64``, ``UINT64``: integers that may exceed 2**53 and fit the type.
+    * ``BIG``: integers whose computation exceeds 64 bits; the column holds the nearest float64.
     """
 
     FLOAT = "float64"
@@ -36,21 +36,21 @@ class CanSignal:
     """One signal of a message: ``value = raw * scale + offset``.
 
     Attributes:
-        name: As the database spells it.
-        start: First bit, counted as the module's text says.
-        length: Bits, 1 to 64.
-        is_big_endian: Motorola byte order.
-        is_signed: Two's complement.
-        is_float: The bits are an IEEE 754 number of 16, 32 or 64 bits.
-        scale: Physical units per raw step; an int where the file wrote a whole number.
-        offset: Physical value of raw zero; an int likewise.
-        unit: As the database spells it; empty if it has none.
+        name: Name as spelled in the database.
+        start: First bit, counted as described at the head of this module.
+        length: Number of bits, 1 to 64.
+        is_big_endian: True for Motorola byte order.
+        is_signed: True for two's complement.
+        is_float: True if the bits are an IEEE 754 number of 16, 32 or 64 bits.
+        scale: Physical units per raw step; an int if the file contains an integer.
+        offset: Physical value of raw zero; an int if the file contains an integer.
+        unit: Unit as spelled in the database; empty if unspecified.
         minimum: Smallest meaningful physical value as declared, or None. Not enforced.
-        maximum: Largest one.
-        choices: From raw value to its name.
-        is_multiplexer: Its value says which other signals are there.
-        multiplexer: Name of the signal that says whether this one is there; None if it always is.
-        branches: The multiplexer's values with which it is there; empty without a multiplexer.
+        maximum: Largest meaningful physical value as declared, or None. Not enforced.
+        choices: Names by raw value.
+        is_multiplexer: True if its value selects other signals.
+        multiplexer: Name of the signal that selects this one; None if it is always present.
+        branches: Multiplexer values that select it; empty without a multiplexer.
     """
 
     name: str
@@ -71,10 +71,11 @@ class CanSignal:
 
     @property
     def first_bit(self) -> int:
-        """The start, counted in the direction in which the signal runs.
+        """The start, counted in the signal's direction.
 
-        Little endian: from the lowest bit of byte 0 upwards, the place of the least significant
-        bit. Big endian: from the highest bit of byte 0 downwards, that of the most significant.
+        Little endian: position of the least significant bit, counted upwards from the lowest bit of
+        byte 0. Big endian: position of the most significant bit, counted downwards from the highest
+        bit of byte 0.
         """
         if self.is_big_endian:
             return 8 * (self.start // 8) + 7 - self.start % 8
@@ -94,11 +95,11 @@ class CanSignal:
 
     @property
     def arithmetic(self) -> Arithmetic:
-        """How its values are computed, which also decides the column's type."""
+        """Arithmetic of its values, which determines the column's dtype."""
         if self.is_float or not is_whole(self.scale):
             return Arithmetic.FLOAT
         if self.length <= 32 and abs(self.scale) <= 2**20 and abs(self.offset) <= 2**52:
-            return Arithmetic.FLOAT  # nearly all signals there are; what follows says the same
+            return Arithmetic.FLOAT  # a shortcut for nearly all signals
         products = [raw * int(self.scale) for raw in self.raw_range]
         if not is_whole(self.offset):
             small = _largest([*self.raw_range, *products]) <= EXACT_IN_FLOAT64
@@ -114,7 +115,7 @@ class CanSignal:
 
     @property
     def may_be_absent(self) -> bool:
-        """Whether a row may lack it: it hangs on a multiplexer."""
+        """True if a multiplexer selects it, so that rows may lack it."""
         return self.multiplexer is not None
 
 
@@ -123,16 +124,16 @@ class CanMessage:
     """One message of a database.
 
     Attributes:
-        name: As the database spells it; not always unique.
-        arbitration_id: 11 or 29 bits.
-        is_extended: 29-bit identifier; the same number as an 11-bit one is another message.
-        length: Payload bytes.
-        signals: In the database's order; from the cache of layouts they are read when first asked
-            for, since a bus carries few of a large database's messages.
-        is_fd: CAN FD frame, or None where the database does not say.
-        topic: What its decoded rows are called: ``name``, or ``name_0xID`` where several messages
-            have one name.
-        problem: Why its frames cannot be decoded, or empty.
+        name: Name as spelled in the database; not always unique.
+        arbitration_id: Identifier of 11 or 29 bits.
+        is_extended: True for a 29-bit identifier. The same number of 11 bits is another message.
+        length: Number of payload bytes.
+        signals: Signals in the database's order. Signals from the cache of layouts are read on
+            first use, because a bus carries few of a large database's messages.
+        is_fd: True for a CAN FD frame, or None where the database does not specify it.
+        topic: Topic of its decoded rows: ``name``, or ``name_0xID`` where several messages have
+            the same name.
+        problem: Reason why its frames cannot be decoded, or empty.
         source: File and line that define it.
     """
 
@@ -148,19 +149,19 @@ class CanMessage:
 
     @property
     def key(self) -> tuple[int, bool]:
-        """Identifier and its kind."""
+        """Identifier, and whether it is extended."""
         return self.arbitration_id, self.is_extended
 
     @property
     def topic_name(self) -> str:
-        """``topic``, or the name where none was given."""
+        """``topic``, or the name if the topic is empty."""
         return self.topic or self.name
 
     def signal(self, name: str) -> CanSignal:
-        """The signal called ``name``.
+        """Return the signal named ``name``.
 
         Raises:
-            ValueError: None exists; the message lists those there are.
+            ValueError: It does not exist; the message lists the existing signals.
         """
         for signal in self.signals:
             if signal.name == name:
@@ -169,13 +170,13 @@ class CanMessage:
         raise ValueError(f"{self.name} has no signal {name!r}; there are: {there}")
 
     def same_layout(self, other: CanMessage) -> bool:
-        """Both decode every frame to the same columns."""
+        """Return whether both messages decode every frame to the same columns."""
         return (self.name, self.length, self.signals) == (other.name, other.length, other.signals)
 
     def longest_frame(self, is_fd: bool) -> int:
-        """Most payload bytes of a frame that carries it.
+        """Return the max payload bytes of a frame that carries it.
 
-        A CAN FD frame has only some lengths, so a message of 10 bytes travels in 12.
+        CAN FD frames have only certain lengths, so a message of 10 bytes is sent in 12.
         """
         if not is_fd or self.length <= 8:
             return self.length
@@ -183,12 +184,12 @@ class CanMessage:
 
 
 def is_whole(number: float) -> bool:
-    """A whole number, whatever its type."""
+    """Return whether a number is an integer, regardless of its type."""
     return isinstance(number, int) or number.is_integer()
 
 
 def layout_problem(message: CanMessage) -> str:
-    """Why no frame of ``message`` can be decoded, or an empty text."""
+    """Return the reason why no frame of ``message`` can be decoded, or an empty string."""
     if not message.signals:
         return "message has no signals"
     twice = [name for name, n in Counter(s.name for s in message.signals).items() if n > 1]
@@ -196,7 +197,7 @@ def layout_problem(message: CanMessage) -> str:
         return f"message names a signal twice: {twice[0]}"
     for signal in message.signals:
         if not 1 <= signal.length <= 64:
-            return f"signal {signal.name} has {signal.length} bits, more than 64 or none"
+            return f"signal {signal.name} has {signal.length} bits; expected 1 to 64"
         if signal.is_float and signal.length not in (16, 32, 64):
             return f"signal {signal.name} is a float of {signal.length} bits"
         if signal.start < 0 or signal.end_bit > 8 * message.length:
@@ -211,16 +212,16 @@ def _multiplexing_problem(message: CanMessage) -> str:
         above = signal.multiplexer
         while above is not None:
             if above not in by_name or not by_name[above].is_multiplexer:
-                return f"signal {signal.name} hangs on {above}, which is not a multiplexer"
+                return f"signal {signal.name} depends on {above}, which is not a multiplexer"
             if above in seen:
-                return f"multiplexers depend on each other in a ring: {above}"
+                return f"multiplexers depend on each other in a cycle: {above}"
             seen.add(above)
             above = by_name[above].multiplexer
     return ""
 
 
 def overlaps(message: CanMessage) -> Iterator[tuple[str, str]]:
-    """Pairs of signals that share a bit though both can be there in one frame."""
+    """Yield pairs of signals that share a bit although both can occur in one frame."""
     owner: dict[int, list[CanSignal]] = {}
     reported: set[tuple[str, str]] = set()
     for signal in message.signals:
@@ -235,7 +236,7 @@ def overlaps(message: CanMessage) -> Iterator[tuple[str, str]]:
 
 
 def _can_meet(message: CanMessage, a: CanSignal, b: CanSignal) -> bool:
-    """No multiplexer forbids that both are in one frame."""
+    """Return whether the multiplexers allow both signals in one frame."""
     needs_a, needs_b = _needs(message, a), _needs(message, b)
     return all(needs_a[name] & needs_b[name] for name in needs_a.keys() & needs_b.keys())
 

@@ -1,12 +1,13 @@
-"""Layouts of CAN databases, kept in the user's cache folder so that a second start parses nothing.
+"""Cache of the layouts of CAN databases, in the user's cache folder, so that each is parsed once.
 
-A file's layout is kept under a hash of its text, its name and of all code that made it, cantools
-included, so that no entry ever goes out of date unnoticed. Entries are JSON behind their
-own checksum, written whole: a line for the messages, then one for the signals of each, which is
-parsed when somebody asks for them. What cannot be read or written is as good as not there: the
-cache never fails, and never answers for another file.
+The key of an entry is a hash of the database's text, its name and the code that parses it,
+including cantools, so that no entry is ever stale. An entry is JSON after its own checksum, and is
+written atomically: one line for the messages, then one line for the signals of each message. The
+lines of signals are parsed on first use. An entry that cannot be read or written is treated as
+missing, so the cache never fails.
 
-``$CROSSCUE_DBC_CACHE`` names another folder than ``~/.cache/crosscue/can_layouts``, or is ``off``.
+``$CROSSCUE_DBC_CACHE`` replaces the folder ``~/.cache/crosscue/can_layouts``; ``off`` disables the
+cache.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ _MADE_BY: Final = ("database.py", "dbc_text.py", "layout.py", "layout_cache.py",
 
 
 def cache_folder(environment: Mapping[str, str] = os.environ) -> Path | None:
-    """Where layouts are kept, or None where they are not."""
+    """Return the folder of the cache, or None if it is disabled."""
     asked = environment.get(VARIABLE)
     if asked is not None:
         return None if asked.strip().lower() in ("", "off", "0", "no") else Path(asked)
     base = Path(environment.get("XDG_CACHE_HOME", ""))
-    if not base.is_absolute():  # the XDG specification wants relative ones ignored
+    if not base.is_absolute():  # the XDG specification requires that relative paths are ignored
         try:
             base = Path.home() / ".cache"
         except RuntimeError:
@@ -48,10 +49,10 @@ def cache_folder(environment: Mapping[str, str] = os.environ) -> Path | None:
 
 
 class LayoutEntry:
-    """The place of one file's layout in the cache."""
+    """Cache entry of one file's layout."""
 
     def __init__(self, source: DatabaseText, form: str, folder: Path | None) -> None:
-        """Name the place; ``folder`` None for no cache at all."""
+        """Compute the path of the entry; ``folder`` is None if the cache is disabled."""
         self._path: Path | None = None
         made_by = _made_by() if folder else None
         if folder is None or made_by is None:
@@ -64,7 +65,7 @@ class LayoutEntry:
         self._path = folder / f"{key.hexdigest()}.json"
 
     def read(self) -> tuple[list[CanMessage], list[str]] | None:
-        """Messages and notices as ``write`` got them, or None."""
+        """Return the messages and notices passed to ``write``, or None if there is no entry."""
         if self._path is None:
             return None
         try:
@@ -83,7 +84,7 @@ class LayoutEntry:
             return None
 
     def write(self, messages: list[CanMessage], notices: list[str]) -> None:
-        """Keep a layout if the folder can be written."""
+        """Store a layout if the folder is writable."""
         if self._path is None:
             return
         heads = [_head(message) for message in messages]
@@ -97,7 +98,7 @@ class LayoutEntry:
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Write a file whole: another process sees the old one or this one."""
+    """Write a file atomically: other processes see either the old or the new content."""
     import tempfile
 
     number, name = tempfile.mkstemp(prefix=".", suffix=".partial", dir=path.parent)
@@ -111,7 +112,7 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _prune(folder: Path) -> None:
-    """Remove the oldest entries, and what killed processes left, beyond ``_ENTRIES_KEPT``."""
+    """Remove the oldest files beyond ``_ENTRIES_KEPT``, including those of killed processes."""
     entries = [(entry.stat().st_mtime, entry) for entry in folder.iterdir()]
     for _, entry in sorted(entries)[:-_ENTRIES_KEPT]:
         entry.unlink()
@@ -123,7 +124,7 @@ def _checksum(body: bytes) -> bytes:
 
 @cache
 def _made_by() -> str | None:
-    """A hash of the code that makes layouts, with cantools' version; None if it cannot be known."""
+    """Return a hash of the parsing code and cantools' version; None if it cannot be determined."""
     code = blake2b(digest_size=16)
     try:
         for name in _MADE_BY:
@@ -134,7 +135,7 @@ def _made_by() -> str | None:
 
 
 def _version_of_cantools() -> str:
-    """Its installed version, without importing it or all that reads package metadata."""
+    """Return the installed version, without the slow imports of cantools or package metadata."""
     spec = find_spec("cantools")
     if spec is None or spec.origin is None:
         raise ImportError("cantools is not installed as files")
@@ -145,7 +146,7 @@ def _version_of_cantools() -> str:
 
 
 class _StoredSignals(Sequence[CanSignal]):
-    """The signals of one message, parsed when first asked for."""
+    """The signals of one message, parsed on first use."""
 
     def __init__(self, line: bytes) -> None:
         self._line = line

@@ -1,6 +1,6 @@
-"""Groups frames and takes their signals out in loops that Numba compiles.
+"""Group frames and extract their signals with loops that Numba compiles.
 
-Loading the compiled loops takes as long as decoding some 16 million frames with NumPy.
+Loading the compiled loops takes as long as decoding about 16 million frames with NumPy.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from .layout import Arithmetic, CanSignal
 
 
 class NumbaEngine:
-    """Compiled loops; messages with multiplexers go through their extractors all the same."""
+    """Engine of compiled loops; messages with multiplexers still use their extractors."""
 
     def __init__(self, rules: Sequence[Rules]) -> None:
-        """Prepare the tables; rules without an extractor come last."""
+        """Prepare the tables; rules without an extractor must be last."""
         self._rules = rules
         self._tables = Tables.of(rules)
         simple = [_simple_signals(rule) for rule in rules]
@@ -35,7 +35,7 @@ class NumbaEngine:
         self._base: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
 
     def group(self, frames: CanFrames) -> Grouped:
-        """Look up, check and sort frames, and take out all signals."""
+        """Look up, check and sort frames, and extract all signals."""
         n, tables = len(frames), self._tables
         number = np.empty(n, dtype=np.uint16)
         is_good = np.empty(n, dtype=np.bool_)
@@ -64,19 +64,19 @@ class NumbaEngine:
         order = np.empty(n, dtype=np.intp)
         little = np.empty((words.shape[1], n), dtype=np.uint64)
         kernels.put_in_order(number, good_rows[:n], stops - counts, words, order, little)
-        self._take_out(little, counts, stops)
+        self._extract_signals(little, counts, stops)
         self._words = little.T
         self._grouped = Grouped(number, is_good, order, stops, seen, unknown[:STANDARD_IDS])
         return self._grouped
 
-    def _take_out(
+    def _extract_signals(
         self, little: NDArray[np.uint64], counts: NDArray[np.intp], stops: NDArray[np.intp]
     ) -> None:
         sizes = counts * np.diff(self._plan.first)
         self._base = np.cumsum(sizes) - sizes
         self._values = np.empty(int(sizes.sum()), dtype=np.float64)
         plan = self._plan
-        kernels.take_out(
+        kernels.extract_signals(
             little,
             stops,
             counts,
@@ -98,7 +98,7 @@ class NumbaEngine:
         )
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
-        """Columns of one message of the frames grouped last."""
+        """Return the columns of one message of the last group of frames."""
         assert self._grouped is not None
         rows, simple = self._grouped.rows(number), self._simple[number - 1]
         if simple is None:
@@ -115,11 +115,11 @@ class NumbaEngine:
 
 @dataclass(frozen=True, slots=True)
 class _Simple:
-    """A message that the compiled loops take out.
+    """A message that the compiled loops decode.
 
     Attributes:
-        names: Its columns.
-        whole: Those that hold whole numbers, and their types.
+        names: Names of its columns.
+        whole: Dtypes of its integer columns.
     """
 
     names: tuple[str, ...]
@@ -140,21 +140,21 @@ class _Simple:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """All signals of all messages as arrays, one place each.
+    """All signals of all messages as arrays with one element per signal.
 
     Attributes:
-        first: Shape (M + 2,): place of each message's first signal; one place more at the end.
-        is_big: Big endian.
-        word: Word that holds its first bit.
-        bit: That bit within the word, counted in the signal's direction.
-        length: Bits.
-        kind: One of the numbers in ``kernels``.
-        flip: Bits to flip in a short integer, as ``extract.flip_and_bias`` says.
-        bias: What to subtract then.
-        scale: Units per raw step.
-        offset: Value of raw zero.
-        whole_scale: The scale modulo 2**64, for whole numbers.
-        whole_offset: The offset likewise.
+        first: Shape (M + 2,): index of each message's first signal, and the end of the last.
+        is_big: True for big endian.
+        word: Index of the word that holds the first bit.
+        bit: First bit within the word, counted in the signal's direction.
+        length: Number of bits.
+        kind: Conversion, one of the constants in ``kernels``.
+        flip: Bits to flip in a short integer, see ``extract.flip_and_bias``.
+        bias: Bias to subtract from a short integer.
+        scale: Physical units per raw step.
+        offset: Physical value of raw zero.
+        whole_scale: Scale modulo 2**64, for integers.
+        whole_offset: Offset modulo 2**64, for integers.
     """
 
     first: NDArray[np.intp]
@@ -192,12 +192,12 @@ class _Plan:
 
 
 def _plain(column: Column) -> Column:
-    """Contiguous and writable, since Numba would compile again for every other kind of array."""
+    """Return a contiguous, writable column, because Numba recompiles for other kinds of array."""
     return np.require(column, requirements=("C", "W"))
 
 
 def _simple_signals(rule: Rules) -> Sequence[CanSignal]:
-    """The signals to take out in compiled loops; none if the extractor must do it."""
+    """Return the signals to extract with compiled loops; none if the extractor must be used."""
     extractor = rule.extractor
     if extractor is None or extractor.is_multiplexed:
         return []

@@ -1,4 +1,4 @@
-"""The text of a CAN database file: its encoding, its lines, and signs that it was cut."""
+"""The text of a CAN database file: its encoding, its lines, and signs of truncation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 from crosscue.replay.base import CanDatabaseError, Limits, LogTooLargeError, read_at_most
 
 _MAX_BITS: Final = 8 * 2048
-"""No message is longer: 1785 bytes is the longest multi-packet message there is."""
+"""Upper bound on the bits of a message; the longest multi-packet message has 1785 bytes."""
 _MAX_BRANCHES: Final = 1_000_000
 
 _MESSAGE_HEADS: Final = {
@@ -32,9 +32,9 @@ class DatabaseText:
     """One file as text.
 
     Attributes:
-        path: Where it is.
-        text: Decoded, with the line ends of the file.
-        notices: What was doubtful about its encoding.
+        path: Path of the file.
+        text: Decoded text, with the line ends of the file.
+        notices: Warnings about its encoding.
     """
 
     path: Path
@@ -42,13 +42,13 @@ class DatabaseText:
     notices: tuple[str, ...] = ()
 
     def line_at(self, position: int) -> int:
-        """Number of the line that holds the character at ``position``, from 1."""
+        """Return the number of the line that holds the character at ``position``, from 1."""
         return self.text.count("\n", 0, position) + 1
 
     def lines_of_messages(self, form: str) -> dict[str, int]:
-        """From what a message is called in a file of this format to the line that says it.
+        """Return the line numbers of message definitions in a file of this format.
 
-        In a DBC file that is the stored identifier, with its flag bit; elsewhere the name.
+        The key is the stored identifier with its flag bit in a DBC file, and the name elsewhere.
         """
         lines: dict[str, int] = {}
         line, position = 1, 0
@@ -59,7 +59,7 @@ class DatabaseText:
         return lines
 
     def multiplexed_signals(self) -> dict[str, list[str]]:
-        """Signals of a DBC file that are marked as multiplexed, by stored identifier."""
+        """Return the signals of a DBC file marked as multiplexed, by stored identifier."""
         marked: dict[str, list[str]] = {}
         for block in re.split(r"^[ \t]*BO_\s+", self.text, flags=re.MULTILINE)[1:]:
             names = re.findall(r"^[ \t]*SG_\s+(\w+)\s+m\d+M?\s*:", block, re.MULTILINE)
@@ -68,7 +68,7 @@ class DatabaseText:
         return marked
 
     def line_of_error(self, words: str) -> int:
-        """Line that a parser's error speaks of; the last line if it names none."""
+        """Return the line that a parser's error refers to; the last line if it names none."""
         if match := re.search(r"\bline (\d+)", words):
             return int(match[1])
         for name in re.findall(r"(?:VAL_|SIG_VALTYPE_) (\d+ \w+)|message (\w+)", words):
@@ -79,10 +79,10 @@ class DatabaseText:
 
 
 def read_text(path: Path, limits: Limits) -> DatabaseText:
-    """Read a file whose encoding nobody declares.
+    """Read a file without a declared encoding.
 
-    UTF-8 if it is valid, else Windows-1252, which DBC editors write; XML and byte order marks say
-    for themselves.
+    The encoding is UTF-8 if that is valid, else Windows-1252, which DBC editors write. XML
+    declarations and byte order marks take precedence.
 
     Raises:
         CanDatabaseError: It cannot be read, is empty or is binary.
@@ -90,7 +90,7 @@ def read_text(path: Path, limits: Limits) -> DatabaseText:
     """
     try:
         if not path.is_file():
-            raise CanDatabaseError(f"{path}: no such file; give a CAN database")
+            raise CanDatabaseError(f"{path}: no such file; expected a CAN database")
         stored = read_at_most(path, limits.message_bytes)
     except OSError as error:
         raise CanDatabaseError(f"{path}: {error.strerror or error}; check the path") from None
@@ -101,7 +101,9 @@ def read_text(path: Path, limits: Limits) -> DatabaseText:
         raise CanDatabaseError(f"{path}:1: empty; expected a CAN database")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise CanDatabaseError(f"{path}:{line}: holds zero bytes, so it is damaged or no text file")
+        raise CanDatabaseError(
+            f"{path}:{line}: contains zero bytes; the file is damaged or not a text file"
+        )
     return DatabaseText(path, text, notices)
 
 
@@ -124,11 +126,11 @@ def _decode(path: Path, stored: bytes) -> tuple[str, tuple[str, ...]]:
 
 
 def refuse_bombs(source: DatabaseText, form: str) -> None:
-    """Refuse numbers that would make the parser take memory without end.
+    """Refuse numbers that would make the parser allocate excessive memory.
 
     Raises:
-        LogTooLargeError: A message or signal is declared thousands of bytes long, or a multiplexer
-            range has more than a million values.
+        LogTooLargeError: A message or signal is declared as thousands of bytes long, or a
+            multiplexer range has more than a million values.
     """
     if form == "dbc":
         _refuse_over(source, r"^[ \t]*SG_\b[^:\n]*:\s*(\d{5,})\s*\|", "start bit")
@@ -167,10 +169,10 @@ def _refuse_ranges(source: DatabaseText) -> None:
 
 
 def doubts(source: DatabaseText, form: str, names: list[str]) -> list[str]:
-    """Signs that a file that parses was cut.
+    """Return signs that a file was truncated although it parses.
 
-    Only DBC and SYM files can be cut and still parse: nothing in them marks the end. A cut just
-    after the line end of a statement of the closing section cannot be seen.
+    Only DBC and SYM files can be truncated and still parse, because nothing marks their end. A
+    truncation after a complete line of the closing section cannot be detected.
     """
     if form not in ("dbc", "sym"):
         return []
@@ -180,12 +182,12 @@ def doubts(source: DatabaseText, form: str, names: list[str]) -> list[str]:
         last = names[-1]
         notices.append(
             f"{name}: ends with the definition of message {last} and has no closing section; "
-            "if messages are missing, the file was cut"
+            "if messages are missing, the file is truncated"
         )
     if not text.endswith(("\n", "\r")):
         line = text.splitlines()[-1].strip()
         notices.append(
             f"{name}:{source.line_at(len(text))}: the last line has no end ({line[-60:]!r}); "
-            "it may have been cut"
+            "the file may be truncated"
         )
     return notices

@@ -194,7 +194,7 @@ def test_64_bit_counters_keep_their_last_digit() -> None:
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        (-1.0, "-1.0 does not fit its bits, which hold 0.0 to 25.5"),
+        (-1.0, "-1.0 does not fit; the signal's bits hold 0.0 to 25.5"),
         (25.6, "25.6 does not fit"),
         (float("nan"), "nan does not fit"),
         (float("inf"), "inf does not fit"),

@@ -58,8 +58,8 @@ SG_MUL_VAL_ 2147484000 whole kind 2-2;
 
 def _by_cantools(source: DatabaseText) -> list[CanMessage]:
     parsed = database._parse(source, "dbc")
-    says_fd = database._says_fd(parsed, "dbc")
-    return [database._message(one, "dbc", says_fd) for one in parsed.messages]
+    distinguishes_fd = database._distinguishes_fd(parsed, "dbc")
+    return [database._message(one, "dbc", distinguishes_fd) for one in parsed.messages]
 
 
 def _spelled(messages: list[CanMessage]) -> list[str]:
