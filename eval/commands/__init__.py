@@ -1,1 +1,1 @@
-"""One file a command; ``crosscue.eval.cli.COMMANDS`` is the table that names them."""
+"""Commands, one module each; ``crosscue.eval.cli.COMMANDS`` lists them."""

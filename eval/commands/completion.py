@@ -1,7 +1,7 @@
 """Shell completion of commands, options, choices and files.
 
-Prints a script for the shell's start-up file. Completions come from the installed crosscue itself,
-so they never differ from it.
+Prints a script for the shell's start-up file. The script asks the installed crosscue for
+completions, so they always match its version.
 
 examples:
   crosscue completion bash >> ~/.bashrc
@@ -20,12 +20,12 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the script."""
+    """Print the completion script of a shell."""
     from argcomplete.shell_integration import shellcode
 
     print(shellcode(["crosscue"], shell=args.shell))
@@ -33,17 +33,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def complete(names: Collection[str], parser_of: Callable[[str], argparse.ArgumentParser]) -> None:
-    """Answer the shell's script, if it asks, and exit.
+    """Print the completions that the shell's script asks for, and exit.
 
     Args:
         names: All commands, of one or two words.
-        parser_of: The parser of one command; its module is imported only then.
+        parser_of: Returns the parser of one command, whose module it imports.
     """
     import argcomplete
 
     line = os.environ["COMP_LINE"][: int(os.environ["COMP_POINT"])]
     name, parser = _parser_at(line, names, parser_of)
-    # argcomplete hands the parser the words after this many.
+    # Number of leading words that argcomplete leaves out when it calls the parser.
     os.environ["_ARGCOMPLETE"] = str(1 + len(name.split()))
     argcomplete.autocomplete(parser, always_complete_options="long")
 
@@ -51,7 +51,7 @@ def complete(names: Collection[str], parser_of: Callable[[str], argparse.Argumen
 def _parser_at(
     line: str, names: Collection[str], parser_of: Callable[[str], argparse.ArgumentParser]
 ) -> tuple[str, argparse.ArgumentParser]:
-    """The words of the command before the cursor, and a parser of what follows them."""
+    """Return the command's words before the cursor, and a parser for the words after them."""
     words = _words(line)[1:]
     for count in (2, 1):
         name = " ".join(words[:count])
@@ -68,7 +68,7 @@ def _parser_at(
 
 
 def _words(line: str) -> list[str]:
-    """Whole words before the cursor; the one that is being written does not count."""
+    """Return the complete words before the cursor, without the word being typed."""
     done = line if line[-1:].isspace() else line.rpartition(" ")[0]
     try:
         return shlex.split(done)
@@ -77,7 +77,7 @@ def _words(line: str) -> list[str]:
 
 
 def _choosing(words: Collection[str], *, with_files: bool) -> argparse.ArgumentParser:
-    """A parser that takes one of a few words next, or a file."""
+    """Return a parser whose next word is one of ``words`` or, optionally, a file."""
     from argcomplete.completers import FilesCompleter
 
     parser = argparse.ArgumentParser()

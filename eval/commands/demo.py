@@ -1,9 +1,10 @@
-"""Replay a drive up to an intersection from its pictures, score it, show it.
+"""Replay a drive to an intersection from its pictures, score it, and show the result.
 
-The drive is simulated from a seed on this machine, and nothing is downloaded; it takes a few
-minutes on two cores, mostly for the pictures and the networks. With --real, it is 8 s of San
-Francisco: PandaSet's sequence 002 (Scale AI and Hesai, CC BY 4.0, 20.8 MB) with the network
-yolox-nano (3.7 MB, Apache-2.0), both fetched once and checked, and annotated by us.
+By default, the drive is simulated on this machine from a seed, and nothing is downloaded. This
+takes a few minutes on two cores, mostly for rendering and for the networks. With --real, the drive
+is 8 s of San Francisco: PandaSet's sequence 002 (Scale AI and Hesai, CC BY 4.0, 20.8 MB), annotated
+by crosscue's authors, with the network yolox-nano (3.7 MB, Apache-2.0). Both are downloaded once
+and verified.
 
 example:
   crosscue demo -o demo
@@ -29,7 +30,7 @@ from crosscue.replay.base import visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "-o",
         "--output",
@@ -37,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for drive, run and report (default: demo, or demo-real)",
     )
-    parser.add_argument("--real", action="store_true", help="replay a real drive, fetched once")
+    parser.add_argument("--real", action="store_true", help="replay a real drive, downloaded once")
     parser.add_argument(
         "--data",
         dest="source",
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fetch or simulate, replay, score, show."""
+    """Fetch or simulate a drive, then replay, score and show it."""
     _check(args)
     talk = not (args.quiet or args.json)
     layout = args.layout or "C"
@@ -103,7 +104,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     if not args.real and args.source is not None:
-        raise crosscue.UsageError("--data: for a real drive; add --real")
+        raise crosscue.UsageError("--data: applies only to a real drive; add --real")
     for name in ("layout", "run", "seed", "width") if args.real else ():
         if getattr(args, name) is not None:
-            raise crosscue.UsageError(f"--{name}: for a simulated drive; leave it or --real out")
+            raise crosscue.UsageError(
+                f"--{name}: applies only to a simulated drive; omit it or --real"
+            )

@@ -1,7 +1,7 @@
-"""What installed packages add to crosscue: detectors, cues, readers and data sets.
+"""List the detectors, cues, readers and data sets that installed packages add to crosscue.
 
-A package offers them as entry points of the groups crosscue.detectors, crosscue.cues,
-crosscue.readers and crosscue.datasets. Exit status 1 when one does not load.
+A package registers them as entry points in the groups crosscue.detectors, crosscue.cues,
+crosscue.readers and crosscue.datasets. The exit status is 1 when a plug-in does not load.
 
 example:
   crosscue plugins
@@ -17,12 +17,12 @@ from crosscue.eval.commands.shared.terminal import print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """List; 1 when one does not load."""
+    """List the plug-ins; return 1 when one does not load."""
     found = crosscue.plugins()
     if args.json:
         print_json({"plugins": [asdict(one) for one in found]})

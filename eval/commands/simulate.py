@@ -1,7 +1,7 @@
-"""Simulate drives up to intersections: a log with camera, CAN, Mobileye and compass, and its truth.
+"""Simulate drives to intersections: a log with camera, CAN, Mobileye and compass, and its truth.
 
-Layouts A to H are those of the published study; L0, L1, ... are random ones, for training. The same
-names and seeds yield the same bytes.
+Layouts A to H are those of the published study; L0, L1, ... are random layouts for training. The
+same names and seeds yield the same bytes.
 
 examples:
   crosscue simulate A --run 3 -o drives
@@ -24,7 +24,7 @@ PUBLISHED_RUNS = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "layouts",
         nargs="*",
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="layouts: A to H, or L0, L1, M0, M1 and so on",
     )
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="folder that gets one folder per drive"
+        "-o", "--output", type=Path, metavar="DIR", help="output folder, with one folder per drive"
     )
     parser.add_argument(
         "--sheet",
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate everything requested."""
+    """Simulate the requested drives."""
     layouts, runs = _wanted(args)
     if args.sheet is not None:
         return _sheet(layouts, runs, args)
@@ -118,7 +118,7 @@ def _sheet(layouts: Sequence[str], runs: Sequence[int], args: argparse.Namespace
 
 
 def _wanted(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
-    """Layouts, and runs of each."""
+    """Return the requested layouts, and the runs of each."""
     if args.all == bool(args.layouts):
         raise crosscue.UsageError(
             "simulate: give layouts (A to H, L0, L1, ..., M0, M1, ...), or --all"
@@ -128,7 +128,7 @@ def _wanted(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
             "simulate: give -o DIR for drives, or --sheet JPEG for pictures of them"
         )
     if args.run is not None and (args.runs is not None or args.all):
-        raise crosscue.UsageError("--run: not together with --runs or --all; give one of them")
+        raise crosscue.UsageError("--run: cannot be combined with --runs or --all; use one of them")
     last = args.runs if args.runs is not None else PUBLISHED_RUNS if args.all else 1
     if last < 1:
         raise crosscue.UsageError(f"--runs {last}: expected 1 or more")

@@ -1,1 +1,1 @@
-"""Commands about what went wrong in runs."""
+"""Commands that find, show and export failures of runs."""

@@ -1,8 +1,8 @@
-"""Write failures as a static site that needs no server: pictures, belief curves, filters.
+"""Write failures as a static site, which needs no server: pictures, belief curves, filters.
 
-RUN is as in crosscue failures, or a table that it wrote. Open index.html in a browser. Each
-failure shows its picture with boxes, masks and regions, the belief around it, and the command that
-opens Rerun there.
+RUN is a run folder, a folder of runs, or a table from crosscue failures. Open index.html in a
+browser. Each failure is shown with its picture (with boxes, masks and regions), the belief around
+that time, and the command that opens Rerun at that time.
 
 examples:
   crosscue browse runs -o site
@@ -26,7 +26,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "runs", nargs="+", metavar="RUN", help="run folders, folders of them, or a table"
     )
@@ -39,17 +39,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recordings",
         action="store_true",
-        help="write a recording of each moment as well; megabytes each",
+        help="also write a recording of each failure, of some megabytes each",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing site")
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of runs in parallel"
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of runs in parallel (default: 1)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the site; 3 when a run could not be examined."""
+    """Write the site; return 3 when a run could not be examined."""
     with progress_line(args, "drawing") as line:
         made = crosscue.browse(
             args.runs,

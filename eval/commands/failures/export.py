@@ -1,8 +1,8 @@
 """Export the pictures of failures for labelling, with the detections in them as pre-labels.
 
-FAILURES is a table that crosscue failures -o wrote; each frame is exported once, its picture as
-recorded. File names contain drive and time, from which crosscue truth import --export recovers
-both. Boxes that nobody has corrected are detections, not labels.
+FAILURES is a table from crosscue failures -o. Each frame is exported once, with its picture as
+recorded. File names contain drive and time, which crosscue truth import --export uses to find the
+frames again. Pre-labels are detections: correct them before you use them as labels.
 
 examples:
   crosscue failures runs --top 10 -o worst.parquet
@@ -26,7 +26,7 @@ FORMATS = ("coco", "cvat", "yolo", "fiftyone", "labelstudio")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("failures", type=Path, metavar="FAILURES", help="table of failures")
     parser.add_argument("--to", choices=FORMATS, default="coco", help="format (default: coco)")
     parser.add_argument(
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="NAME",
-        help="labels to choose from (default: those that the runs' cues are made of)",
+        help="labels to choose from (default: the labels that the runs' cues use)",
     )
     add_logs_argument(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier export")
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export; 3 when a run could not be read."""
+    """Export the pictures; return 3 when a run could not be read."""
     with progress_line(args, "exporting") as line:
         found = crosscue.export(
             args.failures,

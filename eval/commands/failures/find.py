@@ -1,10 +1,10 @@
-"""List what went wrong in runs, worst first, by kind, by feature or cue, and by cause.
+"""List the failures of runs, worst first, by kind, by feature or cue, and by cause.
 
-Five kinds: a feature or cue that exists and was missed; a feature believed only within 8 m of the
-intersection (late); one believed or found that does not exist (false); a range outside its own 95 %
-interval; a belief that was decided and then flipped. Without truth, only the last can be detected.
-Severity is in bits; docs/howto/failures.md explains it. --top picks the worst of every
-cause and run before a second of any.
+There are five kinds: a feature or cue that exists and was missed; a feature believed only within
+8 m of the intersection (late); a feature believed, or a cue found, that does not exist (false); a
+range outside its 95 % interval; and a belief that was decided and then flipped. Without truth, only
+the last kind can be detected. Severity is in bits; docs/howto/failures.md explains it. --top picks
+the worst failure of every cause and run before a second one of any.
 
 examples:
   crosscue failures runs
@@ -28,10 +28,10 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
     parser.add_argument(
-        "--where", metavar="QUERY", help="only runs that a query selects, of the one folder given"
+        "--where", metavar="QUERY", help="only runs that this query selects; RUN is then one folder"
     )
     add_truth_of_runs(parser)
     add_choice_of_failures(parser)
@@ -40,13 +40,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing table")
     parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of runs in parallel"
+        "--workers",
+        type=int,
+        default=1,
+        metavar="N",
+        help="number of runs in parallel (default: 1)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find and print; 3 when a run could not be examined."""
+    """Find and print failures; return 3 when a run could not be examined."""
     refuse_existing(args)
     runs = args.runs
     if args.where is not None:

@@ -1,1 +1,1 @@
-"""``crosscue fit ...``."""
+"""``crosscue fit ...``: fit sensors, detectors and beliefs to drives."""

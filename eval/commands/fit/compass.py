@@ -1,7 +1,7 @@
-"""Fit a compass to a drive: mounting, hard and soft iron, as far as the drive determines them.
+"""Fit a compass to a drive: its mounting angle, and hard and soft iron.
 
-The reference is the GNSS course. Parameters that a drive does not determine keep their value and
-are named: a straight drive determines the mounting alone.
+The reference is the GNSS course. Parameters that the drive does not determine keep their values and
+are listed. For example, a straight drive determines only the mounting angle.
 
 example:
   crosscue fit compass drive.mcap --vehicle car.toml -o car.toml
@@ -22,7 +22,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_log_arguments(parser)
     parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
     add_vehicle_output(parser)
@@ -30,9 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, report, and write where asked."""
+    """Fit, report, and write the vehicle file if requested."""
     if args.vehicle is not None:
-        # What is wrong with the settings is reported before a long log is opened.
+        # Errors in the settings are reported before a long log is opened.
         crosscue.load_vehicle(args.vehicle)
     with open_part(args, args.logs) as log:
         found = crosscue.fit_compass(

@@ -1,12 +1,13 @@
 """Fit thresholds and calibrations of a detector to labelled boxes, and write them into its card.
 
-Each class gets the lowest threshold that reaches the required precision, by Clopper and Pearson's
-one-sided 95 % bound, corrected for choosing among eight thresholds, and a calibration, so that a
-score is the probability that a detection is correct. The last half of each run's images is held
-out to test the result, unless --test names other runs. A class with too few labelled boxes is
-reported and keeps its values.
+Each class gets the lowest threshold that reaches the required precision. Precision is judged by
+Clopper and Pearson's one-sided 95 % bound, corrected for the choice among eight thresholds. Each
+class also gets a calibration, so that a score is the probability that a detection is correct. The
+last half of each run's images is held out to test the result, unless --test names other runs. A
+class with too few labelled boxes is reported and keeps its values.
 
-Bounds take detections as independent; those of neighbouring images are not. Fit to several drives.
+The bounds assume that detections are independent, but those of neighbouring images are not.
+Therefore, use several drives.
 
 examples:
   crosscue fit detector runs/A-01 --labels labels.json -o my.toml
@@ -24,7 +25,7 @@ from crosscue.eval.commands.shared.terminal import add_logs_argument, limits_of,
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs with detections")
     parser.add_argument(
         "--labels",
@@ -46,14 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--calibration",
         choices=("platt", "isotonic", "none"),
         default="platt",
-        help="how scores become probabilities (default: platt)",
+        help="calibration from scores to probabilities (default: platt)",
     )
     parser.add_argument(
         "--hold-out",
         type=float,
         default=0.5,
         metavar="FRACTION",
-        help="last part of each run's images, held out to test the result (default: 0.5)",
+        help="last fraction of each run's images, held out to test the result (default: 0.5)",
     )
     parser.add_argument(
         "--test",
@@ -69,18 +70,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="LABELS",
-        help="labelled boxes of each of them",
+        help="labelled boxes of each run of --test, in the same order",
     )
     parser.add_argument(
         "--card", type=Path, metavar="CARD.toml", help="the detector's card (default: the run's)"
     )
-    parser.add_argument("--date", default="", metavar="DATE", help="date of the fit, for the card")
+    parser.add_argument(
+        "--date", default="", metavar="DATE", help="date of the fit, to record in the card"
+    )
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         metavar="CARD.toml",
-        help="card to write; may be the same file (default: none)",
+        help="card to write; may be the same file (default: write none)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace another existing card")
     add_logs_argument(parser)
@@ -88,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and report; 1 when no class has a threshold, 3 when runs had dropped something."""
+    """Fit and report; return 1 when no class gets a threshold, 3 when runs have drops."""
     found = crosscue.fit_detector(
         args.runs,
         args.labels,

@@ -1,8 +1,8 @@
 """Choose the match threshold for a required false-match rate, from labelled pictures.
 
-It is chosen on half of the query pictures; the rates are measured on the other half. Pairs come
-from a CSV file query,known,same (pictures relative to its folder; same is 1 or 0), or from a drive
-with known poses and a database made from another drive.
+The threshold is chosen on half of the query pictures, and the rates are measured on the other half.
+Pairs are read from a CSV file with the columns query, known (paths relative to the file's folder)
+and same (1 or 0), or are made from a drive with known poses and a database from another drive.
 
 example:
   crosscue fit landmarks --pairs pairs.csv --false-match-rate 0.01
@@ -27,7 +27,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="recordings of one drive")
     parser.add_argument("--pairs", type=Path, metavar="FILE.csv", help="labelled pairs of images")
     parser.add_argument(
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_fraction,
         default=0.001,
         metavar="P",
-        help="max fraction of pairs from different places that match (default: 0.001)",
+        help="max fraction of pairs from different places that may match (default: 0.001)",
     )
     for flag, default, what in (
         ("--every", 5.0, "distance between the frames used, in metres"),
@@ -78,7 +78,7 @@ def _fraction(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, report, and write where asked."""
+    """Fit, report, and write the vehicle file if requested."""
     with open_part(args, args.logs) if args.logs else nullcontext() as log:
         found = crosscue.fit_landmarks(
             args.pairs,

@@ -1,8 +1,8 @@
 """Learn the reliability of each cue from annotated drives, for fusion.kind = "calibrated".
 
-Give finished runs and the truth of each, in the same order. What is learned goes into the vehicle
-file's section [fusion.calibrated]; each line carries its counts. Frames of one approach resemble
-each other, so counts and intervals use the effective number of independent frames.
+Pass finished runs and the truth of each, in the same order. The result is the section
+[fusion.calibrated] of a vehicle file, with the counts behind each line. Frames of one approach
+resemble each other, so counts and intervals use the effective number of independent frames.
 
 example:
   crosscue fit messages runs/* --truth drives/*/truth.json -o calibrated.toml
@@ -22,7 +22,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_annotated_runs(parser)
     add_file_output(parser, "TOML", "file to write the section to (default: print it)")
 

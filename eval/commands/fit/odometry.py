@@ -1,8 +1,8 @@
-"""Fit odometry to half of a drive and test it on the rest: scales, biases, delays, noise.
+"""Fit scales, biases, delays and noise of odometry to half of a drive, and test them on the rest.
 
-The positions are the log's GNSS or, with --truth, a true track. Parameters that a drive does not
-determine keep their value and are named: a straight drive determines neither the gyro's scale nor
-the steering ratio.
+The reference positions are the log's GNSS or, with --truth, a true track. Parameters that the drive
+does not determine keep their values and are listed. For example, a straight drive determines
+neither the gyro's scale nor the steering ratio.
 
 examples:
   crosscue fit odometry drive.mcap --vehicle car.toml -o car.toml
@@ -24,7 +24,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_log_arguments(parser)
     parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
     parser.add_argument(
@@ -38,9 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, test, report, and write where asked."""
+    """Fit, test, report, and write the vehicle file if requested."""
     if args.vehicle is not None:
-        # What is wrong with the settings is reported before a long log is opened.
+        # Errors in the settings are reported before a long log is opened.
         crosscue.load_vehicle(args.vehicle)
     with open_part(args, args.logs) as log:
         found = crosscue.fit_odometry(

@@ -1,9 +1,9 @@
-"""Fit a curve from an object's height in pixels to its range, with the residual by distance.
+"""Fit a curve from an object's height in pixels to its range, and report residuals by distance.
 
-Pairs come from a TABLE (CSV or Parquet with height_px and range_m, to the rear axle), from the
-annotated objects of drives (--truth), or from a run's detections (--runs beside --truth).
-All families are fitted; the one with the smallest residual is printed as a section for the vehicle
-file. --test measures that curve on other drives.
+Pairs of height and range are read from a TABLE (CSV or Parquet with the columns height_px and
+range_m, from the rear axle), from the annotated objects of drives (--truth), or from the detections
+of runs (--runs with --truth). All families of curves are fitted. The one with the smallest residual
+is printed as a section for the vehicle file. --test measures that curve on other drives.
 
 examples:
   crosscue fit ranges stop_signs.csv --cue stop_sign
@@ -23,7 +23,7 @@ from crosscue.eval.interface.fits.ranges import PUBLISHED_SD_M
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "table",
         nargs="?",
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="RUN",
         default=[],
-        help="take heights from these run folders, one per --truth",
+        help="run folders with detections to measure heights in, one per --truth",
     )
     parser.add_argument(
         "--min-score",
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="other drives to measure the curve on",
     )
-    parser.add_argument("--family", choices=FAMILIES, help="fit only this family")
+    parser.add_argument("--family", choices=FAMILIES, help="fit only this family of curves")
     parser.add_argument(
         "--bin-m",
         type=float,
@@ -77,7 +77,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="width of the distance bins (default: 10)",
     )
     parser.add_argument(
-        "--figure", type=Path, metavar="PNG", help="figure of pairs, curves and residuals to write"
+        "--figure",
+        type=Path,
+        metavar="PNG",
+        help="figure to write, with pairs, curves and residuals",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing figure")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")

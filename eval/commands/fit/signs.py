@@ -1,9 +1,9 @@
 """Choose the sign detector's threshold for a required precision, and measure it on other images.
 
-LABELS is a CSV file: picture,label,x0,y0,x1,y1 with one row for each sign (or an empty label for a
-picture without any), a COCO file as crosscue train frames writes it, or the folder of a drive with
-annotated objects. The threshold is chosen on every second picture and measured on the others,
-unless --test names other files or drives. --threshold measures a threshold instead of choosing one.
+LABELS is a CSV file with the columns picture,label,x0,y0,x1,y1 and one row per sign (an empty label
+for a picture without signs), a COCO file as crosscue train frames writes it, or the folder of a
+drive with annotated objects. The threshold is chosen on every second picture and measured on the
+others, unless --test names other files or drives. --threshold measures the given threshold instead.
 
 examples:
   crosscue fit signs labels.csv --label "do not enter" --kinds "no entry" --precision 0.95
@@ -27,7 +27,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "labels",
         type=Path,
@@ -120,7 +120,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Choose and report; 1 when no threshold is precise enough."""
+    """Choose and report; return 1 when no threshold reaches the required precision."""
     fitted = crosscue.fit_signs(
         args.labels,
         args.label,

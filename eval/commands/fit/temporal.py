@@ -1,8 +1,8 @@
 """Learn the belief over time from annotated drives, for fusion.kind = "temporal".
 
-Give finished runs and the truth of each, in the same order, including drives without an
-intersection. The result (how each cue behaves from step to step, by distance, with and without a
-road) goes into the vehicle file's section [fusion.temporal].
+Pass finished runs and the truth of each, in the same order, including drives without an
+intersection. The result is the section [fusion.temporal] of a vehicle file. It describes how each
+cue changes from step to step, by distance, with and without a road.
 
 example:
   crosscue fit temporal runs/* --truth drives/*/truth.json -o temporal.toml
@@ -22,7 +22,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_annotated_runs(parser)
     add_file_output(parser, "TOML", "file to write the section to (default: print it)")
 

@@ -1,1 +1,1 @@
-"""``crosscue landmarks ...``."""
+"""``crosscue landmarks ...``: add, list and match landmarks of a database."""

@@ -1,8 +1,8 @@
-"""Add landmarks to a database: from a log with poses, or from pictures with coordinates.
+"""Add landmarks to a database, from a log with poses or from pictures with coordinates.
 
-All pictures of one call are added, or none. Coordinates are metres in the map frame: x east, y
-north. The CSV file has the columns image,x_m,y_m,sd_m (or var_x_m2,cov_xy_m2,var_y_m2 for sd_m)
-and may have heading_rad.
+Either all pictures of a call are added, or none. Coordinates are in metres in the map frame: x
+east, y north. The CSV file has the columns image,x_m,y_m,sd_m (or var_x_m2,cov_xy_m2,var_y_m2
+instead of sd_m) and, optionally, heading_rad.
 
 example:
   crosscue landmarks add town.sqlite drive.mcap --poses runs/drive --every 10
@@ -24,7 +24,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "database", type=Path, metavar="DB", help="landmark database; created if missing"
     )
@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Add; 3 when a log was damaged."""
+    """Add landmarks; return 3 when a log is damaged."""
     given = (bool(args.logs), bool(args.poses), bool(args.images), bool(args.coordinates))
     if given == (True, True, False, False):
         with open_part(args, args.logs) as log:

@@ -1,4 +1,4 @@
-"""List the landmarks of a database, all or near a place.
+"""List all landmarks of a database, or those near a place.
 
 example:
   crosscue landmarks list town.sqlite --near=-12.5,80,50
@@ -14,7 +14,7 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("database", type=Path, metavar="DB", help="landmark database")
     parser.add_argument(
         "--near",
@@ -28,6 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List."""
+    """List the landmarks."""
     print_result(crosscue.list_landmarks(args.database, args.near, args.limit), args)
     return 0

@@ -1,4 +1,4 @@
-"""Match one picture against a database, all of it or near a place.
+"""Match one picture against all landmarks of a database, or those near a place.
 
 example:
   crosscue landmarks match town.sqlite photo.jpg --near 120,80,50
@@ -14,7 +14,7 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("database", type=Path, metavar="DB", help="landmark database")
     parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, JPEG or WebP")
     parser.add_argument(
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Match."""
+    """Match the picture."""
     found = crosscue.match_landmarks(
         args.database,
         args.image,

@@ -1,1 +1,1 @@
-"""A log: what it holds, converted, decoded, sealed."""
+"""Commands that inspect, convert, decode and seal logs."""

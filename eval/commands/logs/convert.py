@@ -6,13 +6,13 @@ examples:
   crosscue convert segment/ -o segment.mcap --topics wheels compass --compression lz4
   crosscue convert damaged.mcap -o rescued.mcap --salvage
 
-ROS 2 messages are copied byte for byte and ROS 1 messages transcribed. CAN frames become
-can_msgs/msg/Frame (CAN FD: crosscue_msgs/msg/CanFdFrame on TOPIC/fd), pictures
-sensor_msgs/msg/CompressedImage, Image or foxglove_msgs/msg/CompressedVideo, tables the standard
-type that holds all their columns, or else crosscue_msgs/msg/TOPIC with one field a column.
-The written file is read back and its messages are counted before the command reports success.
-The readable part of a damaged log is written, and the exit status is 3; --salvage prints every
-damaged place, with its byte range where the format has one.
+ROS 2 messages are copied byte for byte, and ROS 1 messages are transcribed. CAN frames become
+can_msgs/msg/Frame (CAN FD: crosscue_msgs/msg/CanFdFrame on TOPIC/fd). Pictures become
+sensor_msgs/msg/CompressedImage, Image or foxglove_msgs/msg/CompressedVideo. Tables become the
+standard type that has all their columns, or else crosscue_msgs/msg/TOPIC with one field per column.
+The written file is read back and its messages are counted before the command reports success. For a
+damaged log, the readable part is written, and the exit status is 3. --salvage prints every damaged
+place, with its byte range if the format has byte ranges.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SHOWN = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("log", metavar="LOG", help="a recording, a data-set folder or a URL")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="MCAP file to write"
@@ -50,16 +50,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--salvage",
         action="store_true",
-        help="list every damaged place where messages were dropped",
+        help="list every damaged place",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert, read back, print the account.
+    """Convert the log, read the file back, and print the numbers of messages.
 
     Returns:
-        0 when every row that was asked for is in the file, 3 when some are dropped or skipped.
+        0 when every selected row is in the file, 3 when some are dropped or skipped.
     """
     with open_part(args, [args.log]) as log, progress_line(args, "converting") as line:
         found = crosscue.convert(
@@ -86,7 +86,7 @@ def _print_damage(found: crosscue.Converted, *, salvage: bool) -> None:
         print(f"and {len(places) - len(shown)} more places", file=sys.stderr)
     if not found.ledger.is_whole and not salvage:
         print(
-            "the log is damaged; what could be read was written; crosscue convert --salvage lists "
+            "the log is damaged; its readable part was written; crosscue convert --salvage lists "
             "every damaged place",
             file=sys.stderr,
         )

@@ -1,4 +1,4 @@
-"""Decode a drive into tables: one Parquet file for each topic, CAN message and Mobileye table.
+"""Decode a drive into tables: one Parquet file per topic, CAN message and Mobileye table.
 
 example:
   crosscue decode drive.mcap --vehicle car.toml -o tables
@@ -19,7 +19,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_log_arguments(parser)
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="DIR", help="folder for the tables"
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Decode; 3 when something was dropped or the clock has gaps."""
+    """Decode; return 3 when something was dropped or the clock has gaps."""
     with open_part(args, args.logs) as log, progress_line(args, "decoding") as line:
         found = crosscue.decode(
             log,

@@ -1,14 +1,14 @@
-"""Write a hash of each MiB of a log beside it, so that later damage is detected and located.
+"""Write a hash of each MiB of a log to a seal file, so that later damage is detected and located.
 
 examples:
   crosscue seal drive.bag can0.log        writes drive.bag.seal and can0.log.seal
-  crosscue seal --check drive.bag         verifies all of it
-  crosscue seal segment/                  a folder: segment.seal, over all of its files
+  crosscue seal --check drive.bag         verifies the entire log
+  crosscue seal segment/                  writes segment.seal, for all files of the folder
 
-ROS 1 bags, .db3, candump, ASC and TRC logs, videos and .npy data sets carry no checksum: a flipped
-payload byte goes unnoticed. Seal a log once it is known to be good. Every later command that reads
-it checks what it reads and reports damaged byte ranges. A seal that no longer matches its log is
-not replaced without --overwrite: check first. URLs cannot be sealed.
+ROS 1 bags, .db3, candump, ASC and TRC logs, videos and .npy data sets contain no checksum, so a
+flipped payload byte goes unnoticed. Seal a log once it is known to be good. Every later command
+verifies the parts of the log that it reads, and reports damaged byte ranges. A seal that no longer
+matches its log is replaced only with --overwrite; run --check first. URLs cannot be sealed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MEGABYTE = 1_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("logs", nargs="+", metavar="LOG", help="recordings on this machine")
     parser.add_argument("--check", action="store_true", help="verify against the seal")
     parser.add_argument(
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     """Seal or check each log.
 
     Returns:
-        0 when all is well, 3 when a checked log differs from its seal.
+        0 on success, 3 when a checked log differs from its seal.
     """
     found = _check(args) if args.check else _seal(args)
     if args.json:

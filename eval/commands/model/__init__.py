@@ -1,1 +1,1 @@
-"""Commands about networks: the catalog, and cards for one's own."""
+"""Commands for networks: the model catalog, and model cards."""

@@ -1,4 +1,4 @@
-"""Check that a model card fits its network by running it, and draw its detections in a picture.
+"""Check a model card by running its network, and draw the detections in a picture.
 
 example:
   crosscue model check my.toml --picture street.jpg
@@ -14,20 +14,20 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
-    parser.add_argument("model", metavar="MODEL", help="a catalog's name or a card's file name")
+    """Add the options to the parser."""
+    parser.add_argument("model", metavar="MODEL", help="name in the catalog, or model card")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="run it on this picture")
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         metavar="FILE.jpg",
-        help="the picture with detections (default: CARD.PICTURE.found.jpg)",
+        help="picture with detections to write (default: CARD.PICTURE.found.jpg)",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check."""
+    """Check the card."""
     print_result(crosscue.check_card(args.model, args.picture, args.output), args)
     return 0

@@ -1,8 +1,8 @@
-"""Fetch the weights of models of the catalog, checked by their SHA-256 before they are used.
+"""Download the weights of catalog models, and verify them by their SHA-256.
 
-Files that exist below $CROSSCUE_DATA/weights are copied from there. An interrupted transfer
-continues where it stopped. $CROSSCUE_MODEL_MIRROR names a server to ask instead of the publisher,
-$CROSSCUE_MODELS the folder to keep them in.
+Files that exist below $CROSSCUE_DATA/weights are copied from there. An interrupted download
+continues where it stopped. $CROSSCUE_MODEL_MIRROR is a server to download from instead of the
+publisher's, and $CROSSCUE_MODELS is the folder to keep the weights in.
 
 example:
   crosscue model fetch yolox-nano
@@ -20,20 +20,20 @@ from crosscue.eval.commands.shared.terminal import Done, ProgressLine, print_jso
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("models", nargs="+", metavar="MODEL", help="names from crosscue model list")
     parser.add_argument(
         "--weights",
         dest="given",
         type=Path,
         metavar="FILE",
-        help="take the weights from this file, or a folder with them; no network is used",
+        help="copy the weights from this file or folder instead of downloading them",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fetch."""
+    """Fetch the models."""
     if args.given is not None and len(args.models) > 1:
         raise crosscue.UsageError("--weights: one model at a time")
     found: dict[str, object] = {}

@@ -1,8 +1,9 @@
 """Write a model card for an ONNX or OpenVINO file, or for weights of a torchvision network.
 
-The layout of the outputs, or the network, is recognised from names, shapes and metadata. What the
-file leaves open is listed in the card as an assumption to check; where several fit, all are
-listed. Weights are a state_dict (.pth, .pt) or safetensors: tensors, without code.
+The network, or the layout of its outputs, is recognised from names, shapes and metadata. Properties
+that the file does not record are listed in the card as assumptions to check. If several kinds fit,
+the error lists all of them, for --kind. Weights are a state_dict (.pth, .pt) or safetensors:
+tensors, without code.
 
 example:
   crosscue model init my.onnx --picture street.jpg
@@ -20,7 +21,7 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "weights",
         type=Path,
@@ -32,11 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         type=Path,
         metavar="CARD.toml",
-        help="the card, in the folder of the weights (default: their name, .toml)",
+        help="card to write, in the folder of the weights (default: their name with .toml)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing card")
     parser.add_argument(
-        "--kind", metavar="KIND", help="layout of its outputs or network, where several fit"
+        "--kind", metavar="KIND", help="network, or layout of its outputs, if several fit"
     )
     parser.add_argument(
         "--class-names",
@@ -51,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture",
         type=Path,
         metavar="FILE",
-        help="draw its detections in a copy of this picture, beside the card",
+        help="draw detections in a copy of this picture, next to the card",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

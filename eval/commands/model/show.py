@@ -1,4 +1,4 @@
-"""Show a model: its origin, what its classes mean to the cues, and its measurements.
+"""Show a model: its origin, the mapping of its classes to cue labels, and its measured performance.
 
 example:
   crosscue model show yolox-nano
@@ -14,12 +14,12 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
-    parser.add_argument("model", metavar="MODEL", help="a catalog's name or a card's file name")
+    """Add the options to the parser."""
+    parser.add_argument("model", metavar="MODEL", help="name in the catalog, or model card")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show."""
+    """Show the model."""
     print_result(crosscue.model(args.model), args)
     return 0

@@ -1,1 +1,1 @@
-"""A run: made, estimated again, scored, compared, merged, viewed."""
+"""Commands that make, re-estimate, score, compare, merge and view runs."""

@@ -1,18 +1,18 @@
-"""What changed between two runs, or between many runs and many: better, worse or undecided.
+"""Compare two runs, or two sets of runs: each metric is better, worse or undecided.
 
-Each metric is judged drive by drive, over the drives that both have (six or more). A metric that
-did not change gets a verdict in at most 5 % of comparisons, over all cues and conditions together.
-Each line shows the 95 % interval of the difference, how large a difference these drives would have
-shown, and how many more would decide.
+Each metric is judged drive by drive, over the drives that both sides have (six or more). A metric
+that did not change gets a verdict in at most 5 % of comparisons, over all cues and conditions
+together. Each line shows the 95 % interval of the difference, the smallest difference that these
+drives can detect, and the number of further drives needed for a decision.
 
-With --runs and --against, queries on the catalog of a folder select the runs to judge and those to
-compare them with, one of each drive.
+With --runs and --against, two queries on a folder of runs select the runs to judge and the runs to
+compare them with, one run per drive.
 
-Exit status 1 when a metric is worse by more than its tolerance (default: 0) or no longer scored,
-never for noise. A tolerance is a number in the metric's unit, a fraction of the first value (2%),
-or either for the metrics of a pattern; the last that fits counts. Two runs that were not scored:
-exit status 1 when a table differs. Folders that crosscue score -o wrote for several runs can be
-compared as well.
+The exit status is 1 when a metric is worse by more than its tolerance (default: 0), or is no longer
+scored. Noise alone never causes it. A tolerance is a number in the metric's unit or a fraction of
+the first value (2%), for all metrics or for those of a pattern. The last tolerance that matches a
+metric applies. If the two runs are not scored, the exit status is 1 when a table differs. Folders
+that crosscue score -o wrote for several runs can be compared as well.
 
 examples:
   crosscue compare runs/before runs/after
@@ -30,13 +30,15 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "first", metavar="RUN_A", help="reference run; with --runs, a folder of runs, or its URL"
     )
     parser.add_argument("second", nargs="?", metavar="RUN_B", help="run to compare with it")
-    parser.add_argument("--runs", metavar="QUERY", help="the runs to judge, of the folder RUN_A")
-    parser.add_argument("--against", metavar="QUERY", help="the runs to compare them with")
+    parser.add_argument(
+        "--runs", metavar="QUERY", help="selects the runs to judge from the folder RUN_A"
+    )
+    parser.add_argument("--against", metavar="QUERY", help="selects the runs to compare them with")
     parser.add_argument(
         "--tolerance",
         nargs="+",
@@ -45,7 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="allowed deterioration of metrics: 0.01, 2%% or PATTERN=0.01",
     )
     parser.add_argument(
-        "--junit", type=Path, metavar="XML", help="write a test case for each judged metric"
+        "--junit",
+        type=Path,
+        metavar="XML",
+        help="write a JUnit file with a test case per judged metric",
     )
     shown = parser.add_mutually_exclusive_group()
     shown.add_argument(
@@ -55,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, report, and return 1 when a metric is worse, 3 when either side has drops."""
+    """Compare and report; return 1 when a metric is worse, 3 when either side has drops."""
     found = _compared(args)
     if args.markdown and not args.quiet:
         print(found.markdown())

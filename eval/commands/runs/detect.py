@@ -1,7 +1,7 @@
-"""Run detectors over a drive's camera: detections, road fractions and cues in a run folder.
+"""Run detectors on a drive's camera and write detections, road fractions and cues to a run folder.
 
-A detector is a name, one of the vehicle file's [detectors.NAME], a module:factory, or a model card
-(.toml). Results are cached by the content of each picture, so a second run is quick.
+A detector is a built-in name, a section [detectors.NAME] of the vehicle file, a module:factory, or
+a model card (.toml). Results are cached by the content of each picture, so a second run is quick.
 
 example:
   crosscue detect drive.mcap --vehicle car.toml --detectors yolox.toml,signs -o runs/drive
@@ -24,7 +24,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_log_arguments(parser)
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="RUN", help="run folder"
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Detect; 3 when something was dropped."""
+    """Detect; return 3 when something was dropped."""
     if args.draw < 0:
         raise crosscue.UsageError(f"--draw {args.draw}: expected 0 or more")
     with (

@@ -1,6 +1,6 @@
 """Estimate pose, cues, ranges and beliefs of a run again, from its stored detections.
 
-No picture is opened, so other settings can be tried in seconds. The run's tables are replaced.
+Pictures are not read, so other settings can be tried in seconds. The run's tables are replaced.
 
 example:
   crosscue estimate runs/drive --vehicle other.toml
@@ -23,7 +23,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     parser.add_argument(
         "--vehicle",
@@ -31,13 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="V.toml",
         help="vehicle file with other settings (default: those of the run)",
     )
-    add_first_pose_arguments(parser, "as the run has it")
+    add_first_pose_arguments(parser, "as in the run")
     add_logs_argument(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate; 3 when something was dropped."""
+    """Estimate; return 3 when something was dropped."""
     run = crosscue.open_run(args.run, args.logs, limits=limits_of(args))
     with DriveLine("estimating", is_shown=is_shown(args)) as line:
         made = crosscue.estimate_run(

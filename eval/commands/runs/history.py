@@ -1,12 +1,12 @@
 """Show each metric of scored runs over commits, versions or tags, and where it changed.
 
-The page needs no network and runs no script: for each metric its value with a 95 % interval under
-each version, and change points marked. A change point is a version from which the metric differs by
-more than chance, judged drive by drive; a history without any change shows one in at most 5 % of
-cases, over all metrics together. With fewer than six drives, nothing is decided.
+The page needs no network and runs no script. For each metric, it shows the value and its 95 %
+interval under each version, and marks change points. From a change point on, the metric differs by
+more than chance, judged drive by drive. A history without any change shows a change point in at
+most 5 % of cases, over all metrics together. With fewer than six drives, nothing is decided.
 
-Versions come in the order in which their first run was made. Of several runs of a drive under one
-version the latest counts.
+Versions are ordered by the time of their first run. If a drive has several runs under one version,
+the latest counts.
 
 examples:
   crosscue history runs -o history.html
@@ -23,14 +23,14 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("folder", type=Path, metavar="RUNS", help="folder of scored runs")
     parser.add_argument("-o", "--output", type=Path, metavar="HTML", help="page to write")
     parser.add_argument(
         "--by",
         default="commit",
         metavar="WHAT",
-        help="commit or version of crosscue, or the name of a tag (default: commit)",
+        help="group runs by commit, by version of crosscue, or by this tag (default: commit)",
     )
     parser.add_argument(
         "--metrics", nargs="+", default=[], metavar="PATTERN", help="only these metrics"
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what changed, and write the page."""
+    """Print the changes, and write the page."""
     found = crosscue.history(
         args.folder, args.output, args.by, args.metrics, overwrite=args.overwrite
     )

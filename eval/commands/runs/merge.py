@@ -1,7 +1,7 @@
-"""Merge the runs of batches into one folder of tables, each row with its drive's name.
+"""Merge the runs of several batches into one folder of tables, with the drive's name in each row.
 
 The result is a set union: the order does not matter, and a run that is in two batches counts once.
-Two different runs of the same name are refused. One batch over all the drives yields the same
+Two different runs of the same name are refused. A single batch over all drives yields the same
 bytes.
 
 example:
@@ -18,7 +18,7 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "folders", nargs="+", type=Path, metavar="RUNS", help="folders of runs, or run folders"
     )
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Merge; 3 when a drive of a batch has failed."""
+    """Merge; return 3 when a drive of a batch has failed."""
     found = crosscue.merge(args.folders, args.output, overwrite=args.overwrite)
     print_result(found, args)
     return 3 if found.failures else 0

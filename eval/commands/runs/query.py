@@ -1,9 +1,9 @@
 """Query all runs below a folder with SQL.
 
 The tables are runs, approaches, cues, scores, belief, range, pose, dropped and every other table
-that runs hold; --schema lists their columns. The SQL is DuckDB's, one SELECT. It is read-only:
-no query can write anything or read any other file. Runs that cannot be read
-are named on stderr, and the exit status is 3.
+that runs contain; --schema lists their columns. The query is one SELECT in DuckDB's SQL. It is
+read-only: it can neither write anything nor read any other file. Runs that cannot be read are named
+on stderr, and the exit status is 3.
 
 examples:
   crosscue query runs "select vehicle, count(*) from runs group by vehicle"
@@ -23,7 +23,7 @@ from crosscue.eval.commands.shared.terminal import refuse_existing, warn
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("runs", metavar="RUNS", help="folder or URL of runs, or one run")
     parser.add_argument("sql", nargs="?", metavar="SQL", help="one SELECT, in quotes")
     parser.add_argument("--schema", action="store_true", help="print tables and columns instead")
@@ -31,13 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shape.add_argument("--json", action="store_true", help="print the result as JSON")
     shape.add_argument("--csv", action="store_true", help="print the result as CSV")
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", help="write it: .parquet, .csv or .json"
+        "-o", "--output", type=Path, metavar="FILE", help="file to write: .parquet, .csv or .json"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the output")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask, print or write; 3 when a run could not be read."""
+    """Run the query, print or write its rows; return 3 when a run could not be read."""
     if (args.sql is None) != args.schema:
         raise crosscue.UsageError(
             "query: expected either SQL or --schema; see crosscue query --help"

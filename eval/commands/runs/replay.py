@@ -1,13 +1,14 @@
-"""Replay a drive: run detectors over its camera, estimate pose, cues, ranges and beliefs.
+"""Replay a drive: run detectors on its camera, and estimate pose, cues, ranges and beliefs.
 
-The run folder then holds every table, and a manifest that accounts for every message. Results are
-cached by the content of each picture, so a second run is quick; --resume keeps what an interrupted
-run had finished.
+The run folder contains all tables and a manifest that accounts for every message. Detections are
+cached by the content of each picture, so a second run is quick. --resume keeps the finished parts
+of an interrupted run.
 
-Many drives (a folder of drives, a quoted pattern, @list.txt, or --each) get a run folder each below
-the one given, side by side with --workers or on a Ray cluster with --ray. One that fails does not
-stop the rest, and a second start processes only the missing ones. --shard divides them over the
-tasks of a scheduler; crosscue status shows their progress, and crosscue merge joins their results.
+With many drives (a folder of drives, a quoted pattern, @list.txt, or --each), each drive gets its
+own run folder below the output folder. They run in parallel with --workers, or on a Ray cluster
+with --ray. A drive that fails does not stop the rest, and a second start processes only the missing
+drives. --shard divides the drives among the tasks of a scheduler; crosscue status shows their
+progress, and crosscue merge joins their results.
 
 examples:
   crosscue replay drive.mcap --vehicle car.toml -o runs/drive
@@ -35,7 +36,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "logs",
         nargs="+",
@@ -49,26 +50,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar="RUN",
-        help="run folder; for many drives, the folder that gets one run folder per drive",
+        help="run folder; for many drives, the folder of their run folders",
     )
     parser.add_argument(
         "--vehicle",
         type=Path,
         metavar="V.toml",
-        help="vehicle file (default: vehicle.toml beside a drive's logs)",
+        help="vehicle file (default: vehicle.toml next to a drive's logs)",
     )
     parser.add_argument("--each", action="store_true", help="treat each LOG as a separate drive")
     parser.add_argument(
         "--shard",
         metavar="I/N",
-        help="only part I of N of the drives, by a hash of each drive's identity; auto: as "
-        "SLURM_ARRAY_TASK_ID and _COUNT say, or RANK and WORLD_SIZE",
+        help="process only part I of N of the drives, divided by a hash of each drive's identity; "
+        "auto reads SLURM_ARRAY_TASK_ID and _COUNT, or RANK and WORLD_SIZE",
     )
     parser.add_argument(
         "--workers",
         type=int,
         metavar="N",
-        help="number of drives in parallel (default: 1; with --ray, the cores of the cluster)",
+        help="number of drives in parallel (default: 1; with --ray, the cluster's cores)",
     )
     parser.add_argument(
         "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, auto, or local"
@@ -92,18 +93,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing run")
     parser.add_argument(
-        "--resume", action="store_true", help="continue an interrupted run and keep finished parts"
+        "--resume",
+        action="store_true",
+        help="continue an interrupted run and keep its finished parts",
     )
     parser.add_argument(
         "--retry-failed",
         action="store_true",
-        help="of many drives, only those whose last attempt failed",
+        help="process only the drives whose last attempt failed",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 3 when something was dropped."""
+    """Replay; return 3 when something was dropped."""
     if args.draw < 0:
         raise crosscue.UsageError(f"--draw {args.draw}: expected 0 or more")
     found = crosscue.find_drives(*args.logs, each=args.each, shard=args.shard)
@@ -111,7 +114,8 @@ def run(args: argparse.Namespace) -> int:
         return _run_many(args, found)
     if args.workers is not None or args.ray is not None or args.retry_failed:
         raise crosscue.UsageError(
-            "--workers, --ray, --retry-failed: for many drives; this is one (--each makes it many)"
+            "--workers, --ray, --retry-failed: expected many drives, found one; add --each to "
+            "treat each log as a drive"
         )
     (drive,) = found.drives
     with (
@@ -140,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
 def _run_many(args: argparse.Namespace, found: crosscue.DriveList) -> int:
     if args.first_pose is not None:
         raise crosscue.UsageError(
-            "--start: for one drive; these are many, each with a start of its own"
+            "--start: expected one drive, found many, each of which has its own start"
         )
     with DrivesLine("replaying", is_shown=is_shown(args)) as line:
         done = crosscue.replay_drives(

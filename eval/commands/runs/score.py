@@ -1,11 +1,11 @@
 """Score runs against truth: metrics, figures, report, gates.
 
-Every run gets metrics.json and figures in RUN/score. Several runs (folders, a folder of runs, a
-quoted pattern, @list.txt) are also scored together; the pooled result goes to the folder given
-by -o. A run that cannot be scored does not stop the rest. Without --truth, each run's truth is the
-truth.json beside its log.
+Metrics and figures of each run are written to RUN/score. Several runs (folders, a folder of runs, a
+quoted pattern, @list.txt) are also scored together, and the pooled result is written to the folder
+of -o. A run that cannot be scored does not stop the rest. Without --truth, each run's truth is the
+truth.json next to its log.
 
-A gate file (TOML) sets bounds on metrics; a gate that fails makes the exit status 1:
+A gate file (TOML) sets bounds on metrics. The exit status is 1 when a gate fails:
   version = 1
   [[gate]]
   metric = "cues.stop_sign.precision"
@@ -36,7 +36,7 @@ from crosscue.replay.base import CrosscueError, one_line, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="run folders, or folders of them")
     add_truth_of_runs(parser)
     add_logs_arguments(parser)
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--gate",
         type=Path,
         metavar="G.toml",
-        help="file of bounds on metrics; exit with 1 when one is violated",
+        help="file with bounds on metrics; the exit status is 1 when one is violated",
     )
     parser.add_argument(
         "--threshold",
@@ -64,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--detection",
         choices=("confirmed", "published"),
         default="confirmed",
-        help="a detection counts when confirmed by 3 frames and a range within its 95 %% interval, "
-        "or as published: from the first frame, with any range (default: confirmed)",
+        help="confirmed: a detection counts when 3 frames confirm it and its range is within its "
+        "95 %% interval; published: from the first frame, with any range (default: confirmed)",
     )
     parser.add_argument(
         "--rpe",
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--attribution",
         action="store_true",
-        help="run an ablation: estimate without each cue and report the change in every metric",
+        help="run an ablation: estimate without each cue, and report the change in every metric",
     )
     parser.add_argument(
         "--smoother",
@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--without-figures",
         dest="has_figures",
         action="store_false",
-        help="write a report without figures, in a fraction of the time",
+        help="write a report without figures, which is much faster",
     )
     parser.add_argument(
         "--mlflow",
@@ -113,8 +113,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score every run, then all together; 1 for a failed gate, 3 when anything was dropped."""
-    # Opened first: an address that is wrong is reported before anything is scored.
+    """Score each run, then all together; return 1 for a failed gate, 3 for drops."""
+    # Opened first, so that a wrong address is reported before anything is scored.
     sink = None if args.mlflow is None else crosscue.open_mlflow(args.mlflow, args.experiment)
     with progress_line(args, "scoring") as line:
 

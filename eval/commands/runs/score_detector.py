@@ -1,12 +1,12 @@
 """Score a detector's boxes in a run against labelled boxes of its images.
 
-LABELS is a COCO .json, or a folder of YOLO .txt, Pascal VOC .xml or KITTI .txt files. Images find
-their frames by file name where the log is a folder of images, else by log time (t_ns of a COCO
-file, or a name that is a time in nanoseconds), else by the number that the name ends in, the first
-frame being 0. Frames without labels are not judged.
+LABELS is a COCO .json, or a folder of YOLO .txt, Pascal VOC .xml or KITTI .txt files. Images are
+matched to frames by file name if the log is a folder of images, else by log time (t_ns of a COCO
+file, or a file name that is a time in nanoseconds), else by the frame number, from 0, at the end of
+the file name. Frames without labels are not judged.
 
-Prints AP50, AP (COCO), precision and recall above the detector's threshold, by class, size and
-range, and the calibration of scores; the page in RUN/score shows the worst images.
+Prints AP50 and AP (COCO), precision and recall above the detector's threshold, by class, size and
+range, and the calibration of scores. The page in RUN/score shows the worst images.
 
 examples:
   crosscue score detector runs/A-01 --labels labels.json
@@ -24,7 +24,7 @@ from crosscue.eval.commands.shared.terminal import add_logs_arguments, limits_of
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder with detections")
     parser.add_argument(
         "--labels", type=Path, required=True, metavar="LABELS", help="labelled boxes of its images"
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=1.0,
         metavar="S",
-        help="count images within so many seconds as one (default: 1)",
+        help="count images within this many seconds as one (default: 1)",
     )
     parser.add_argument(
         "--draw", type=int, default=8, metavar="N", help="draw the N worst images (default: 8)"
@@ -52,13 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--without-figures",
         dest="has_figures",
         action="store_false",
-        help="leave out the reliability diagram, for which matplotlib is imported",
+        help="omit the reliability diagram, which needs matplotlib",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score and report; 3 when the run had dropped something."""
+    """Score and report; return 3 when the run has drops."""
     found = crosscue.score_detector(
         args.run,
         args.labels,

@@ -1,9 +1,9 @@
 """Show the progress of batches of drives: done, running, failed, stale or waiting.
 
-A drive is stale when its worker is gone: its process has ended, or on another machine has been
-silent for two minutes. Start the same replay again, or replay --retry-failed for failures alone.
-Nothing is written, so it can run on any machine that sees the folders. Exit status 3 when a
-drive has failed or is stale.
+A drive is stale when its worker's process has ended or, on another machine, has been silent for two
+minutes. To process stale and failed drives, start the same replay again; to process only failed
+drives, use replay --retry-failed. Nothing is written, so the command can run on any machine that
+has access to the folders. The exit status is 3 when a drive has failed or is stale.
 
 examples:
   crosscue status runs
@@ -20,7 +20,7 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "folders", nargs="+", type=Path, metavar="RUNS", help="folders that replay writes runs to"
     )
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the state; 3 when a drive has failed or is stale."""
+    """Print the states; return 3 when a drive has failed or is stale."""
     found = crosscue.batch_status(*args.folders)
     print_result(found, args)
     return 0 if found.is_whole else 3

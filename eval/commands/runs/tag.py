@@ -1,8 +1,8 @@
 """Set tags of runs, remove them, or list them.
 
-A tag is a key and a value, such as weather=rain. It is kept in the run's tags.json, is a column in
-crosscue query, and stays when the run is repeated. Without KEY=VALUE and --remove, tags are
-listed.
+A tag is a key and a value, such as weather=rain. It is stored in the run's tags.json, can be
+queried with crosscue query, and is kept when the run is repeated. Without KEY=VALUE and --remove,
+tags are listed.
 
 examples:
   crosscue tag runs/drive-1f0e runs/drive-93aa weather=rain route=north
@@ -20,7 +20,7 @@ from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "words",
         nargs="+",
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Tag and list."""
+    """Change tags, and list them."""
     tags = [word for word in args.words if "=" in word and not Path(word).exists()]
     runs = [word for word in args.words if word not in tags]
     if not runs:

@@ -1,9 +1,9 @@
-"""Show a run in Rerun, or write the recording.
+"""Show a run in Rerun, or write the recording to a file.
 
---at records 6 s around a moment: the viewer plays from 2 s before it, and the moment is marked on
-the time line. (A recording cannot set Rerun's cursor, so it starts at the beginning.) --approach
-records one approach, --only some of the views: cameras, ahead, belief, ranges, cues, map, pose,
-notes. The recording contains only what is shown.
+--at records 6 s, from 2 s before a moment, and marks the moment on the time line. (A recording
+cannot set Rerun's cursor, so the viewer starts at the beginning.) --approach records one approach.
+--only records some of the views: cameras, ahead, belief, ranges, cues, map, pose, notes. The
+recording contains only what is shown.
 
 examples:
   crosscue view runs/drive                    open Rerun's viewer
@@ -33,11 +33,15 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
     how = parser.add_mutually_exclusive_group()
     how.add_argument(
-        "-o", "--output", type=Path, metavar="X.rrd", help="write the recording and open nothing"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="X.rrd",
+        help="write the recording without opening the viewer",
     )
     how.add_argument(
         "--web", action="store_true", help="serve the viewer on 127.0.0.1 for a browser"
@@ -50,21 +54,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--approach", type=int, metavar="N", help="number of an approach in belief.parquet"
     )
     parser.add_argument(
-        "--only", default="", metavar="VIEWS", help="views to show, such as cameras,belief"
+        "--only", default="", metavar="VIEWS", help="comma-separated views, such as cameras,belief"
     )
     add_logs_arguments(parser)
     parser.add_argument(
         "--truth",
         type=Path,
         metavar="T.json",
-        help="truth file, to draw the true track and ranges as well",
+        help="truth file, to also draw the true track and ranges",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing recording")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write drive.rrd into the run, or where asked, and open it; 3 when the run has drops."""
+    """Write the recording and open it; return 3 when the run has drops."""
     if args.output is not None and args.output.suffix != ".rrd":
         raise crosscue.UsageError(f"{args.output}: expected a name that ends in .rrd")
     refuse_existing(args)
@@ -90,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _open(path: Path, web: bool) -> None:
-    # Rerun's Python calls listen on every address; only its command can be bound to this machine.
+    # Rerun's Python API listens on every address; only its command can be bound to localhost.
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
     if web:
         command.append("--serve-web")
@@ -104,7 +108,7 @@ def _open(path: Path, web: bool) -> None:
     try:
         status = viewer.wait()
     finally:
-        # Rerun's command starts the viewer as a child of its own, which outlives it if let.
+        # Rerun's command starts the viewer as a child process, which could outlive it.
         with suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGTERM)
         viewer.wait()

@@ -10,19 +10,19 @@ from crosscue.detectors.result_cache import default_cache
 
 
 def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--detectors``, ``--draw``, ``--cache`` and ``--no-cache``."""
+    """Add ``--detectors``, ``--draw``, ``--cache`` and ``--no-cache``."""
     parser.add_argument(
         "--detectors",
         metavar="NAMES",
         help="comma-separated names (default: all in the vehicle file); "
-        "none estimates only the pose",
+        "'none' estimates only the pose",
     )
     parser.add_argument(
         "--draw",
         type=int,
         default=0,
         metavar="N",
-        help="write up to N camera images with detections, spread over the drive",
+        help="write up to N camera images with detections, evenly spread over the drive",
     )
     parser.add_argument(
         "--cache",
@@ -38,14 +38,14 @@ def add_detector_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def detectors_of(args: argparse.Namespace) -> Sequence[str] | None:
-    """Names as ``replay_drive`` takes them: None for the vehicle file's, empty for none."""
+    """Return detector names for ``replay_drive``: None for the vehicle file's, empty for none."""
     if args.detectors is None:
         return None
     return [] if args.detectors == "none" else str(args.detectors).split(",")
 
 
 def cache_of(args: argparse.Namespace) -> Path | None:
-    """Where results are kept: as requested, or in the user's cache folder."""
+    """Return the path of the detection cache: as requested, or in the user's cache folder."""
     if args.no_cache:
         return None
     return default_cache() if args.cache is None else Path(args.cache)

@@ -13,26 +13,26 @@ FORMATS = ("coco", "yolo", "voc", "kitti")
 
 
 def add_label_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--format``, ``--class-names``, ``--map``, ``--detector`` and ``--overlap``."""
+    """Add ``--format``, ``--class-names``, ``--map``, ``--detector`` and ``--overlap``."""
     parser.add_argument(
-        "--format", choices=FORMATS, help="format of the labels (default: recognised)"
+        "--format", choices=FORMATS, help="format of the labels (default: detected)"
     )
     parser.add_argument(
         "--class-names",
         type=Path,
         default=(),
         metavar="FILE",
-        help="class names, one per line: for YOLO in order, for VOC and KITTI all possible",
+        help="class names, one per line: for YOLO in index order, for VOC and KITTI all classes",
     )
     parser.add_argument(
         "--map",
         nargs="+",
         default=[],
         metavar="LABEL=NAME",
-        help="class that a label of the file or detector counts as; LABEL= for none",
+        help="class that a label of the file or detector counts as; LABEL= ignores it",
     )
     parser.add_argument(
-        "--detector", metavar="NAME", help="name of the detector, where several ran"
+        "--detector", metavar="NAME", help="name of the detector, if the run has several"
     )
     parser.add_argument(
         "--overlap",
@@ -44,7 +44,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def label_options(args: argparse.Namespace) -> dict[str, Any]:
-    """What these flags say, by the names that ``fit_detector`` and ``score_detector`` have for it.
+    """Return the values of these options as arguments of ``fit_detector`` and ``score_detector``.
 
     Raises:
         UsageError: ``--map`` is not ``LABEL=NAME``.
@@ -59,7 +59,7 @@ def label_options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def meanings_of(texts: Sequence[str]) -> dict[str, str]:
-    """What ``--map LABEL=NAME...`` says.
+    """Return the class of each label in ``--map LABEL=NAME...``.
 
     Raises:
         UsageError: A text is not ``LABEL=NAME``.

@@ -1,4 +1,4 @@
-"""Rows of a table as text, CSV or JSON, printed or written."""
+"""Print or write the rows of a table as text, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ UNBOUNDED: Final = 1 << 30
 
 
 def print_rows(found: pa.Table, args: argparse.Namespace) -> None:
-    """The rows on stdout: with ``--json`` or ``--csv`` so, else as a table of text."""
+    """Print the rows as JSON (``--json``), as CSV (``--csv``), or as a text table."""
     if args.json:
         print_json(_records(found))
     elif args.csv:
         print(_csv(found), end="")
     elif not args.quiet:
-        # Cells are cut to fit a terminal; what another program reads, and a schema, stay whole.
+        # Cells are cut to fit a terminal, but not in a pipe and not in a schema.
         is_cut = sys.stdout.isatty() and not args.schema
         print("\n".join(_lines(found, terminal_width() if is_cut else UNBOUNDED)))
 
 
 def write_rows(found: pa.Table, args: argparse.Namespace) -> None:
-    """The rows into the file of ``--output``, in the format of its suffix; then how many.
+    """Write the rows to the file of ``--output``, in its suffix's format; print their number.
 
     Raises:
-        UsageError: Another suffix.
-        OutputError: It cannot be written.
+        UsageError: The suffix has no format.
+        OutputError: The file cannot be written.
     """
     write = WRITERS.get(args.output.suffix.lower())
     if write is None:
-        raise UsageError(f"{args.output}: expected a name in {', '.join(WRITERS)}; rename it")
+        raise UsageError(
+            f"{args.output}: expected a name that ends in {', '.join(WRITERS)}; rename it"
+        )
     write(args.output, found)
     if args.json:
         print_json({"output": str(args.output), "rows": found.num_rows})
@@ -65,7 +67,7 @@ def _lines(found: pa.Table, width: int) -> Iterator[str]:
 
 
 def _records(found: pa.Table) -> list[dict[str, Any]]:
-    """As plain values that JSON can hold."""
+    """Return the rows as values that JSON can hold."""
     import pyarrow as pa
 
     maps = {one.name for one in found.schema if pa.types.is_map(one.type)}
@@ -105,7 +107,7 @@ def _cell(value: Any) -> str:
 
 
 def _csv(found: pa.Table) -> str:
-    """Lists and maps are JSON in their cell; what is not known is empty."""
+    """Return the rows as CSV, with lists and maps as JSON and null as an empty cell."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(found.column_names)
@@ -127,4 +129,4 @@ WRITERS: Final[dict[str, Callable[[Path, Any], None]]] = {
     ".csv": lambda path, found: write_bytes(path, _csv(found).encode()),
     ".json": lambda path, found: write_text(path, strict_json(_records(found)) + "\n"),
 }
-"""By suffix of the file."""
+"""Function that writes a table, by suffix of the file."""

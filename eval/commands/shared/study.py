@@ -1,4 +1,4 @@
-"""What the study commands share: flags, and a run with its progress and tables."""
+"""Options and output of the study commands."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ AnyStudy = TypeVar("AnyStudy", "RangeStudy", "LandmarkStudy", "FieldStudy")
 
 
 def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
-    """``-o``, ``--settings``, ``--seed``, ``--workers``, ``--overwrite`` and ``--json``."""
+    """Add ``-o``, ``--settings``, ``--seed``, ``--workers``, ``--overwrite`` and ``--json``."""
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         default=Path(folder),
         metavar="DIR",
-        help=f"folder for drives, summary, figures, page (default: {folder})",
+        help=f"folder for drives, summary, figures and page (default: {folder})",
     )
     parser.add_argument(
         "--settings", type=Path, metavar="X.toml", help="settings of your own study"
@@ -42,7 +42,7 @@ def add_study_arguments(parser: argparse.ArgumentParser, folder: str) -> None:
 
 
 def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--drives`` and ``--ray``."""
+    """Add ``--drives`` and ``--ray``."""
     parser.add_argument("--drives", type=int, metavar="N", help="drives per combination")
     parser.add_argument(
         "--ray", metavar="ADDRESS", help="run on a Ray cluster: its address, auto, or local"
@@ -50,11 +50,11 @@ def add_cluster_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:
-    """The requested study: the published one, or a file's, with flags on top.
+    """Return the settings of ``--settings`` or of the published study, with the options applied.
 
     Raises:
-        UsageError: A flag out of range.
-        StudyFileError: The file does not fit.
+        UsageError: An option is out of range.
+        StudyFileError: The file is not valid.
     """
     from pydantic import ValidationError
 
@@ -74,10 +74,10 @@ def study_of(args: argparse.Namespace, kind: type[AnyStudy]) -> AnyStudy:
 
 
 def workers_of(args: argparse.Namespace) -> int:
-    """How many threads.
+    """Return the number of threads.
 
     Raises:
-        UsageError: Fewer than one.
+        UsageError: ``--workers`` is below 1.
     """
     from crosscue.eval.studies.town.work import default_workers
 
@@ -89,7 +89,7 @@ def workers_of(args: argparse.Namespace) -> int:
 
 
 def print_study(found: crosscue.StudyResult, args: argparse.Namespace) -> None:
-    """Its tables, and where page and drives are; or its summary as JSON."""
+    """Print the tables and the paths of the page and the drives, or the summary as JSON."""
     if args.json:
         print_json(found.as_dict())
     elif not args.quiet:

@@ -1,7 +1,7 @@
-"""What commands share: options, how results are printed, and one line of progress.
+"""Shared options of commands, functions that print results, and a progress line.
 
-The line says how much is done, how fast, and how long still. rich draws it, on stderr, and removes
-it at the end; where stderr is not a terminal, or with ``--quiet``, rich is not imported.
+The line shows the amount done, the rate and the time left. rich draws it on stderr and removes it
+at the end. Without a terminal on stderr, or with ``--quiet``, rich is not imported.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 
 def add_log_arguments(parser: argparse.ArgumentParser) -> None:
-    """``LOG...``, ``--from``, ``--to`` and ``--topics``."""
+    """Add ``LOG...``, ``--from``, ``--to`` and ``--topics``."""
     parser.add_argument(
         "logs", nargs="+", metavar="LOG", help="recordings of one drive; paths or URLs"
     )
@@ -43,12 +43,12 @@ def add_log_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_part_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--from``, ``--to`` and ``--topics``."""
+    """Add ``--from``, ``--to`` and ``--topics``."""
     parser.add_argument(
         "--from",
         dest="start",
         metavar="T",
-        help="start time: seconds from the first message (12.5) or absolute nanoseconds (17...ns)",
+        help="start time: seconds from the first message (12.5), or absolute nanoseconds (17...ns)",
     )
     parser.add_argument(
         "--to", dest="end", metavar="T", help="end time, exclusive, in the same form"
@@ -58,12 +58,12 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_first_pose_arguments(parser: argparse.ArgumentParser, default: str) -> None:
-    """Declare ``--gnss`` and ``--start``."""
+    """Add ``--gnss`` and ``--start``."""
     parser.add_argument(
         "--gnss",
         choices=("start", "truth", "fuse", "off"),
-        help="what GNSS is for: the first pose and heading, truth alone, the first pose and every "
-        f"position after it, or nothing (default: {default})",
+        help="use of GNSS: for the first pose and heading, only as truth, for the first pose and "
+        f"every later position, or not at all (default: {default})",
     )
     parser.add_argument(
         "--start",
@@ -75,7 +75,7 @@ def add_first_pose_arguments(parser: argparse.ArgumentParser, default: str) -> N
 
 
 def add_annotated_runs(parser: argparse.ArgumentParser) -> None:
-    """``RUN...`` and ``--truth``, one for each."""
+    """Add ``RUN...`` and ``--truth``, which names one truth file per run."""
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folders")
     parser.add_argument(
         "--truth",
@@ -88,7 +88,7 @@ def add_annotated_runs(parser: argparse.ArgumentParser) -> None:
 
 
 def add_truth_of_runs(parser: argparse.ArgumentParser) -> None:
-    """``--truth`` and ``--any-log``, for runs that have a truth each."""
+    """Add ``--truth`` and ``--any-log``, for commands whose runs each have a truth file."""
     parser.add_argument(
         "--truth",
         type=Path,
@@ -103,31 +103,31 @@ def add_truth_of_runs(parser: argparse.ArgumentParser) -> None:
 
 
 def add_choice_of_failures(parser: argparse.ArgumentParser) -> None:
-    """``--top`` and ``--threshold``."""
+    """Add ``--top`` and ``--threshold``."""
     parser.add_argument(
         "--top",
         type=int,
         metavar="N",
-        help="only N failures, of as many causes and runs as possible (default: all)",
+        help="only N failures, from as many causes and runs as possible (default: all)",
     )
     parser.add_argument(
         "--threshold",
         type=float,
         default=0.9,
         metavar="P",
-        help="a feature is believed above this probability (default: 0.9)",
+        help="probability above which a feature counts as believed (default: 0.9)",
     )
 
 
 def add_file_output(parser: argparse.ArgumentParser, metavar: str, what: str) -> None:
-    """``-o``, ``--overwrite`` and ``--json`` of a command that writes one file."""
+    """Add ``-o``, ``--overwrite`` and ``--json``, for commands that write one file."""
     parser.add_argument("-o", "--output", type=Path, metavar=metavar, help=what)
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--max-chunk``."""
+    """Add ``--max-chunk``."""
     parser.add_argument(
         "--max-chunk",
         type=_mebibytes,
@@ -139,13 +139,13 @@ def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
-    """The limits that a log is read with."""
+    """Return the limits for reading a log."""
     return replace(DEFAULT_LIMITS, chunk_bytes=args.max_chunk)
 
 
 @contextmanager
 def open_part(args: argparse.Namespace, logs: Sequence[Path | str]) -> Iterator[crosscue.Log]:
-    """The drive, open, of which only the part is read that ``add_part_arguments`` asks for."""
+    """Open a drive's logs, restricted to the part that ``add_part_arguments`` selects."""
     from crosscue.replay.logs.log_part import part_in_words
     from crosscue.replay.logs.opening import unless_damaged
 
@@ -165,7 +165,7 @@ def _mebibytes(text: str) -> int:
 
 
 def add_logs_argument(parser: argparse.ArgumentParser) -> None:
-    """``--logs``, and ``--max-chunk`` for reading them."""
+    """Add ``--logs``, and ``--max-chunk`` for reading them."""
     add_limit_arguments(parser)
     parser.add_argument(
         "--logs",
@@ -176,7 +176,7 @@ def add_logs_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def add_logs_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--logs`` and ``--without-images``."""
+    """Add ``--logs`` and ``--without-images``."""
     add_logs_argument(parser)
     parser.add_argument(
         "--without-images",
@@ -186,29 +186,29 @@ def add_logs_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_vehicle_output(parser: argparse.ArgumentParser) -> None:
-    """``-o`` and ``--overwrite`` of a command that writes its fit into a vehicle file."""
+    """Add ``-o`` and ``--overwrite``, for commands that write a fit into a vehicle file."""
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         metavar="V.toml",
-        help="vehicle file to write: --vehicle with the fit; may be the same file",
+        help="vehicle file to write: a copy of --vehicle with the fit; may be the same file",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace another existing file")
 
 
 def refuse_existing(args: argparse.Namespace) -> None:
-    """Refuse an output that exists, without ``--overwrite``.
+    """Refuse an existing output file, unless ``--overwrite`` is set.
 
     Raises:
-        OutputError: It exists.
+        OutputError: The file exists.
     """
     if args.output is not None and args.output.exists() and not args.overwrite:
         raise OutputError(f"{args.output}: exists; give another name or --overwrite")
 
 
 def metres(text: str) -> float:
-    """A length from the command line.
+    """Parse a length in metres.
 
     Raises:
         argparse.ArgumentTypeError: Not a finite number above 0.
@@ -223,15 +223,15 @@ def metres(text: str) -> float:
 
 
 class Result(Protocol):
-    """What a function of the interface returns: printed as text, or as JSON."""
+    """Result of a public function, printed as text or as JSON."""
 
     def as_dict(self) -> object:
-        """Dictionaries, lists and scalars."""
+        """Return the result as dictionaries, lists and scalars."""
         ...
 
 
 def print_result(found: Result, args: argparse.Namespace) -> None:
-    """The result, as ``--json`` or as it prints itself; nothing with ``--quiet``."""
+    """Print the result as JSON (``--json``) or as text; print nothing with ``--quiet``."""
     if args.json:
         print_json(found.as_dict())
     elif not args.quiet:
@@ -239,23 +239,25 @@ def print_result(found: Result, args: argparse.Namespace) -> None:
 
 
 def print_json(value: object) -> None:
-    """Strict JSON on stdout: sorted keys, NaN and infinities as null."""
+    """Print strict JSON on stdout: sorted keys, NaN and infinities as null."""
     print(strict_json(value))
 
 
 def warn(sentence: str) -> None:
-    """One line on stderr, what would harm a terminal as escapes."""
+    """Print one line on stderr, with control characters escaped."""
     print(f"crosscue: {visible(sentence)}", file=sys.stderr)
 
 
 def add_schema_output(parser: argparse.ArgumentParser) -> None:
-    """``-o`` and ``--overwrite`` of commands that print a JSON Schema."""
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: print it")
+    """Add ``-o`` and ``--overwrite``, for commands that print a JSON Schema."""
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="file to write (default: print it)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace the output")
 
 
 def print_schema(schema: object, args: argparse.Namespace) -> None:
-    """A JSON Schema to stdout, or whole into the file of ``--output``.
+    """Print a JSON Schema, or write it to the file of ``--output``.
 
     Raises:
         OutputError: The file exists, or cannot be written.
@@ -268,16 +270,16 @@ def print_schema(schema: object, args: argparse.Namespace) -> None:
 
 
 EVERY_S: Final = 0.1
-"""The line is brought up to date no more often."""
+"""Shortest time between two updates of the line."""
 
 
 class Done(NamedTuple):
-    """How far the work is.
+    """Progress of a command.
 
     Attributes:
-        amount: What is done.
-        total: What there is to do; None or 0 where that is not known.
-        unit: What is counted, as a plural.
+        amount: Amount done.
+        total: Amount to do; None or 0 where unknown.
+        unit: Unit of both, as a plural noun.
     """
 
     amount: float
@@ -286,14 +288,14 @@ class Done(NamedTuple):
 
 
 class ProgressLine:
-    """The line of one command; a context manager, or ended by ``end``."""
+    """Progress line of one command; a context manager, or closed by ``end``."""
 
     def __init__(self, what: str, *, is_shown: bool) -> None:
-        """Write nothing unless ``is_shown``, and nothing before the first ``at``.
+        """Create a line that draws nothing before the first ``at``, or unless ``is_shown``.
 
         Args:
-            what: The word before the bar.
-            is_shown: Is this wanted, and stderr a terminal?
+            what: The text before the bar.
+            is_shown: True to draw on stderr, which must then be a terminal.
         """
         self.is_shown = is_shown
         self._what = what
@@ -304,7 +306,7 @@ class ProgressLine:
         self._unit = ""
 
     def at(self, done: Done, what: str = "") -> None:
-        """So far the work has come; ``what`` is another word, for another stage of it."""
+        """Show the progress; ``what`` replaces the text before the bar, for another stage."""
         now = time.monotonic()
         if not self.is_shown or now - self._shown < EVERY_S:
             return
@@ -319,11 +321,11 @@ class ProgressLine:
             amount=self._amount(done._replace(total=total)),
             left="left" if total else "",
         )
-        # Only now is there something to show.
+        # Nothing is drawn before the first progress.
         bar.start()
 
     def counting(self, unit: str, per: float = 1.0) -> Callable[[float, float | None], None]:
-        """A function to be called with what is done and the total, of which ``per`` are a unit."""
+        """Return a callback for the amount done and the total, in 1/``per`` of the shown unit."""
 
         def count(done: float, of: float | None) -> None:
             self.at(Done(done / per, None if of is None else of / per, unit))
@@ -331,7 +333,7 @@ class ProgressLine:
         return count
 
     def end(self) -> None:
-        """Take the line away."""
+        """Remove the line."""
         if self._bar is not None:
             self._bar.stop()
         self._bar = self._task = None
@@ -361,46 +363,46 @@ class ProgressLine:
 
 
 class DriveLine(ProgressLine):
-    """Of one drive: frames while detectors look at them, then seconds of the log."""
+    """Progress line of one drive: frames while detectors run, then seconds of the log."""
 
     def at_frame(self, done: int, of: int | None) -> None:
-        """So many frames are done."""
+        """Show the number of frames done."""
         self.at(Done(done, of, "frames"), "detecting")
 
     def at_time(self, done_s: float, of_s: float) -> None:
-        """So many seconds are done."""
+        """Show the seconds of the log that are done."""
         self.at(Done(done_s, of_s, "s of log"))
 
 
 class DrivesLine(ProgressLine):
-    """Of many drives."""
+    """Progress line of many drives."""
 
     def __call__(self, at: Progressed) -> None:
-        """So many drives are done."""
+        """Show the number of drives done."""
         failed = f", {at.failed} failed" if at.failed else ""
         self.at(Done(at.done, at.total - at.earlier, "drives"), f"{self._what}{failed}")
 
 
 def is_shown(args: argparse.Namespace) -> bool:
-    """Is a line wanted, and is there a terminal for it?"""
+    """Return True unless ``--quiet`` is set or stderr is not a terminal."""
     return not args.quiet and sys.stderr.isatty()
 
 
 def progress_line(args: argparse.Namespace, what: str) -> ProgressLine:
-    """The line of a command with these arguments."""
+    """Return the progress line of a command with these arguments."""
     return ProgressLine(what, is_shown=is_shown(args))
 
 
 def with_progress(
     items: Iterable[T], done: Callable[[], Done], args: argparse.Namespace, what: str
 ) -> Iterator[T]:
-    """Yield ``items``; on a terminal, keep one line with what is done, rate and time left.
+    """Yield ``items`` and, on a terminal, show a progress line with rate and time left.
 
     Args:
-        items: What is worked through.
-        done: Asked after each item.
-        args: With ``quiet``.
-        what: The word before the bar.
+        items: The items to process.
+        done: Returns the progress; called after each item.
+        args: Arguments of the command, with ``quiet``.
+        what: The text before the bar.
     """
     with progress_line(args, what) as line:
         for item in items:
@@ -421,7 +423,7 @@ def _new_bar() -> Progress:
         TextColumn("{task.fields[left]}"),
         console=Console(stderr=True),
         transient=True,
-        # Results are printed on stdout as they come; rich would print them on stderr.
+        # Results are printed on stdout during the work; rich would redirect them to stderr.
         redirect_stdout=False,
         redirect_stderr=False,
     )

@@ -1,1 +1,1 @@
-"""``crosscue study ...``."""
+"""``crosscue study ...``: simulated studies."""

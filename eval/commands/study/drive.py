@@ -1,6 +1,7 @@
-"""Simulate one drive to examine: picture, log for crosscue replay, run, Rerun recording.
+"""Simulate one drive of a study: a picture, a log for crosscue replay, a run, a Rerun recording.
 
-The seed of each drive of a study is in its drives.parquet; the same settings reproduce the drive.
+A study's drives.parquet contains the seed of each drive. The same seed and settings reproduce the
+drive.
 
 examples:
   crosscue study drive --seed 7 -o drive
@@ -20,14 +21,14 @@ STRATEGIES = ("straight to goal", "landmark to landmark", "hybrid")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         default=Path("study-drive"),
         metavar="DIR",
-        help="folder for log, truth, picture and run (default: study-drive)",
+        help="folder for the log, truth, picture and run (default: study-drive)",
     )
     parser.add_argument("--seed", type=int, default=7, metavar="N", help="random seed (default: 7)")
     parser.add_argument(
@@ -62,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive, draw, write, replay, score."""
+    """Simulate, draw, write, replay and score the drive."""
     found = crosscue.run_study_drive(
         args.output,
         args.seed,

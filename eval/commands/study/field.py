@@ -1,9 +1,9 @@
-"""Simulate the field protocol: successive goals in a 1 km2 town, through logs and the replay.
+"""Simulate the field protocol: drives to successive goals in a 1 km2 town, written as logs.
 
-33 range runs without landmarks and 10 with at most one landmark at a time, 75 minutes each, compass
-at 25 degrees. Every run is a log, a vehicle file and a truth file, replayed and scored by the same
-code as a real drive; view one with crosscue view. An interrupted study continues with the missing
-runs. A run takes seconds to a minute.
+There are 33 range runs without landmarks, and 10 runs with at most one landmark at a time. Each
+lasts up to 75 minutes, with a compass of 25 degrees. Each run is a log, a vehicle file and a truth
+file, replayed and scored by the same code as a real drive; crosscue view shows it. An interrupted
+study continues with the missing runs. A run takes between seconds and a minute to compute.
 
 examples:
   crosscue study field -o field
@@ -21,7 +21,7 @@ from crosscue.eval.commands.shared.terminal import print_json, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_study_arguments(parser, "study-field")
     parser.add_argument("--range-runs", type=int, metavar="N", help="runs without landmarks")
     parser.add_argument("--landmark-runs", type=int, metavar="N", help="runs with landmarks")
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive, replay, score, report."""
+    """Simulate, replay, score and report."""
     study = study_of(args, crosscue.FieldStudy)
     with progress_line(args, "driving and replaying") as line:
         found = crosscue.run_field_study(

@@ -1,7 +1,8 @@
-"""Repeat the published experiment on simulated drives; distances, cues and beliefs beside its own.
+"""Repeat the published experiment on simulated drives, and compare with its results.
 
-Simulates every drive, replays it from its pixels with the embedded detectors, scores it, and
-writes study.html, study.json and score/metrics.json. A second start does only the missing drives.
+Simulates each drive, replays it from its pictures with the embedded detectors, scores it, and
+writes study.html, study.json and score/metrics.json. Distances, cues and beliefs are shown next to
+the published ones. A second start processes only the missing drives.
 
 example:
   crosscue study intersections -o study --runs 10 --workers 2
@@ -19,7 +20,7 @@ from crosscue.eval.commands.shared.terminal import DrivesLine, is_shown, print_r
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "-o",
         "--output",
@@ -73,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, replay, score; 3 when a drive failed."""
+    """Simulate, replay and score; return 3 when a drive failed."""
     study = crosscue.IntersectionStudy(
         layouts=tuple(name.strip() for name in args.layouts.split(",") if name.strip()),
         runs=args.runs,

@@ -1,9 +1,9 @@
 """Measure the success rate of 3 strategies with landmarks: 52,500 simulated drives.
 
-There are 5 landmark densities by 5 detection rates by 700 drives. Results are success against the
-distance to the goal, range at 80 % success, and how much farther the strategies drive, beside the
-published numbers. An interrupted study continues where it stopped; the
-result is the same on any number of workers.
+The study has 700 drives for each of 5 landmark densities and 5 detection rates. It reports the
+success rate by distance to the goal, the range at 80 % success, and how much farther the strategies
+drive, next to the published numbers. An interrupted study continues where it stopped. The result
+does not depend on the number of workers.
 
 examples:
   crosscue study landmarks -o landmarks
@@ -27,13 +27,13 @@ from crosscue.eval.commands.shared.terminal import progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_study_arguments(parser, "study-landmarks")
     add_cluster_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive."""
+    """Run the study."""
     study = study_of(args, crosscue.LandmarkStudy)
     with progress_line(args, "driving") as line:
         found = crosscue.run_study(

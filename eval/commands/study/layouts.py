@@ -1,9 +1,9 @@
-"""Test beliefs on random simulated layouts: fitted on some, tested on the others.
+"""Fit beliefs to random simulated layouts, and test them on other layouts.
 
 There are thirteen kinds of layouts, five of them without an intersection. Every drive is rendered
 and processed by the embedded networks, and each belief is scored on layouts that it was not fitted
-to. With --perception faults, no network runs: masks are the renderer's, with simulated faults.
-Writes study.html and study.json. Drives are kept: a second start does only the missing ones.
+to. With --perception faults, no network runs: the renderer's masks are used, with simulated faults.
+Writes study.html and study.json. A second start processes only the missing drives.
 
 example:
   crosscue study layouts -o layouts --workers 2
@@ -19,7 +19,7 @@ from crosscue.eval.commands.shared.terminal import DrivesLine, is_shown, print_r
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "-o",
         "--output",
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--perception",
         choices=("pixels", "faults"),
         default="pixels",
-        help="what finds the cues (default: pixels)",
+        help="detections from networks on pixels, or from simulated faults (default: pixels)",
     )
     parser.add_argument(
         "--blocks", type=int, default=8, metavar="N", help="blocks of thirteen layouts (default: 8)"
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, replay, fit, judge; 3 when a drive failed."""
+    """Simulate, replay, fit and test; return 3 when a drive failed."""
     study = crosscue.LayoutStudy(
         perception=args.perception,
         blocks=args.blocks,

@@ -1,8 +1,8 @@
-"""Measure the range without landmarks: 4,000 simulated drives with three compasses and without one.
+"""Measure the range without landmarks: 4,000 simulated drives, with three compasses and with none.
 
-Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m. Results appear
-beside the published ones. An interrupted study continues where it stopped; the result is the same
-on any number of workers.
+Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m. Results are shown
+next to the published ones. An interrupted study continues where it stopped. The result does not
+depend on the number of workers.
 
 examples:
   crosscue study range -o range
@@ -27,7 +27,7 @@ from crosscue.eval.commands.shared.terminal import print_json, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_study_arguments(parser, "study-range")
     add_cluster_arguments(parser)
     parser.add_argument(
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive, or calibrate."""
+    """Run the study, or calibrate the compass interval."""
     study = study_of(args, crosscue.RangeStudy)
     if args.calibrate:
         interval_m = crosscue.calibrate_study(study, workers_of(args))

@@ -1,1 +1,1 @@
-"""``crosscue train ...``."""
+"""``crosscue train ...``: render training pictures, and train the built-in networks."""

@@ -1,7 +1,7 @@
-"""Render pictures of simulated intersections with COCO annotations, to train networks on.
+"""Render pictures of simulated intersections with COCO annotations, for training.
 
-Writes a few pictures of each of many runs to OUT/coco.json and OUT/images. Layouts are L and a
-number; A to H are those that crosscue is scored on, so no network may train on them.
+Writes a few pictures of each layout to OUT/images, and their annotations to OUT/coco.json. Layouts
+are L0, L1, and so on. Layouts A to H are refused, because crosscue is scored on them.
 
 examples:
   crosscue train frames L0-L299 --per-layout 8 -o frames
@@ -18,9 +18,9 @@ from crosscue.eval.commands.shared.terminal import print_result, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
-        "layouts", nargs="+", metavar="LAYOUT", help="layouts: L0, L17 or a span, L0-L99"
+        "layouts", nargs="+", metavar="LAYOUT", help="layouts: L0, L17 or a range, L0-L99"
     )
     parser.add_argument(
         "-o",
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render and write."""
+    """Render and write the pictures."""
     with progress_line(args, "rendering") as line:
         found = crosscue.render_training_frames(
             args.output,

@@ -1,8 +1,9 @@
-r"""Train a Mask R-CNN on COCO annotations: a compact one from scratch, or an existing one.
+r"""Train a Mask R-CNN on COCO annotations, either a compact one from scratch or an existing one.
 
-OUT is a checkpoint (.safetensors) for the detector mask-rcnn. Beside it lie OUT's curve (JSON and
-PNG) and, until the training ends, the state that --resume continues from. --measure trains nothing:
-it reports average precision (COCO's rules), and precision and recall at the thresholds of the cues.
+OUT is a checkpoint (.safetensors) for the detector mask-rcnn. The training curve (JSON and PNG) is
+written next to it and, until the training ends, so is the state that --resume continues from.
+With --measure, nothing is trained: a network's average precision (by COCO's rules), and its
+precision and recall at the cues' thresholds are reported.
 
 examples:
   crosscue train frames L0-L319 --per-layout 8 -o frames
@@ -25,7 +26,7 @@ from crosscue.eval.commands.shared.terminal import print_result, progress_line
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "--data", type=Path, required=True, metavar="COCO", help="annotations to train on"
     )
@@ -56,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[100],
         metavar="N",
-        help="measure with N region proposals; several values in turn (default: 100)",
+        help="measure with N region proposals; may have several values (default: 100)",
     )
     parser.add_argument(
         "--init",
@@ -75,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=["car", "stop sign", "traffic light"],
         metavar="NAME",
-        help="classes to train",
+        help="classes to train (default: car, stop sign, traffic light)",
     )
     parser.add_argument(
         "--steps", type=int, default=4000, metavar="N", help="training steps (default: 4000)"
@@ -118,14 +119,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         default=[544, 288],
         metavar=("W", "H"),
-        help="width and height of the training windows, in pixels",
+        help="width and height of the training windows, in pixels (default: 544 288)",
     )
     parser.add_argument(
         "--balance",
         type=float,
         default=1.0,
         metavar="FRACTION",
-        help="0 samples every object equally often, 1 every class",
+        help="0 samples every object equally often, 1 every class (default: 1)",
     )
     parser.add_argument(
         "--check-every",
@@ -156,12 +157,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train or measure."""
+    """Train or measure a network."""
     if args.measure is not None:
         return _measure(args)
     if args.output is None:
         raise crosscue.UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
-    # JSON is alone on standard output.
+    # With --json, stdout contains nothing but the result.
     show = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
     found = crosscue.train_mask_rcnn(
         _settings(args),
@@ -177,7 +178,7 @@ def run(args: argparse.Namespace) -> int:
 def _measure(args: argparse.Namespace) -> int:
     if args.output is not None or args.val_data is not None:
         raise crosscue.UsageError(
-            "--measure: trains nothing, so not with -o or --val-data; leave those"
+            "--measure: cannot be combined with -o or --val-data, because nothing is trained"
         )
     with progress_line(args, "measuring") as line:
         found = crosscue.measure_mask_rcnn(

@@ -1,9 +1,10 @@
 r"""Train the road network on simulated intersections or on your own images with masks.
 
-Simulated: renders --per-layout images of each layout of --layouts (L and a number) and validates on
-other layouts, --val-layouts. Layouts A to H are for --test-layouts only. Your own: a folder --data
-with images/NAME.jpg and masks/NAME.png, white where road is; every tenth image is held out.
---measure measures a network on --test-layouts or --data, without training.
+Simulated images: --per-layout images of each of --layouts (L0, L1, and so on) are rendered to train
+on, and other layouts, --val-layouts, to validate on. Layouts A to H are allowed only as
+--test-layouts. Your own images: --data is a folder with images/NAME.jpg and masks/NAME.png, white
+where there is road; every tenth image is held out. --measure measures a network on --test-layouts
+or --data, without training.
 
 examples:
   crosscue train road --layouts L400-L519 --val-layouts L600-L611 \
@@ -22,26 +23,26 @@ from crosscue.eval.commands.shared.terminal import Done, print_result, progress_
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument(
         "--layouts",
         nargs="+",
         metavar="LAYOUT",
-        help="layouts to train on: L400 or a span, L400-L519",
+        help="layouts to train on: L400 or a range, L400-L519",
     )
     parser.add_argument(
         "--val-layouts",
         nargs="+",
         metavar="LAYOUT",
         default=[],
-        help="layouts to validate on, none of them trained on",
+        help="layouts to validate on, different from --layouts",
     )
     parser.add_argument(
         "--test-layouts",
         nargs="+",
         metavar="LAYOUT",
         default=[],
-        help="further layouts to measure on at the end, such as A-H",
+        help="layouts to measure on at the end, such as A-H",
     )
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="folder with your own images/ and masks/"
@@ -92,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train or measure."""
+    """Train or measure a network."""
     with progress_line(args, "training") as line:
 
         def rendered(done: int, of: int) -> None:
@@ -101,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
         if args.measure is not None:
             if args.output is not None or args.layouts is not None:
                 raise crosscue.UsageError(
-                    "--measure: trains nothing, so not with -o or --layouts; leave those"
+                    "--measure: cannot be combined with -o or --layouts, because nothing is trained"
                 )
             found = crosscue.measure_road(
                 args.measure,

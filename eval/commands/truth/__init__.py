@@ -1,1 +1,1 @@
-"""``crosscue truth ...``."""
+"""``crosscue truth ...``: write, import and check truth files."""

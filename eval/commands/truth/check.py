@@ -1,7 +1,7 @@
 """Check that a truth file, and every file that it names, fits its log.
 
-Refused with one line: times outside the log, unknown cues and classes, overlapping approaches,
- boxes outside the picture, pictures of another size, another log's hash.
+The check fails for times outside the log, unknown cues or classes, overlapping approaches, boxes
+outside the picture, pictures of another size, and the hash of another log.
 
 example:
   crosscue truth check truth.json --log drive.mcap
@@ -17,10 +17,10 @@ from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_o
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("truth", type=Path, metavar="T.json", help="truth file")
     parser.add_argument(
-        "--log", type=Path, required=True, metavar="LOG", help="the log it belongs to"
+        "--log", type=Path, required=True, metavar="LOG", help="log that the truth belongs to"
     )
     parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file: camera topic")
     add_limit_arguments(parser)
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, and print what the truth contains."""
+    """Check the truth, and print its contents."""
     found = crosscue.check_truth(args.truth, args.log, args.vehicle, limits=limits_of(args))
     print_result(found, args)
     return 0

@@ -1,7 +1,8 @@
-"""Write a drive's own GNSS as truth: an antenna's track of stated quality.
+"""Write a drive's GNSS positions as its truth, with their standard deviations.
 
-Each pose is scored with the receiver's own s.d. (or gnss.position_sd_m of the vehicle file) and
-with gnss.course_sd_rad. Positions without a heading, before the car first moves, are left out.
+The track is that of the antenna. Scores of poses take into account the receiver's standard
+deviation (or gnss.position_sd_m of the vehicle file) and gnss.course_sd_rad. Positions before the
+car first moves have no heading and are omitted.
 
 example:
   crosscue truth from-gnss drive.mcap --vehicle car.toml -o truth/
@@ -17,7 +18,7 @@ from crosscue.eval.commands.shared.terminal import add_log_arguments, open_part,
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_log_arguments(parser)
     parser.add_argument("--vehicle", type=Path, metavar="V.toml", help="vehicle file")
     parser.add_argument(

@@ -1,14 +1,14 @@
 """Import annotated pictures of a log as its truth.
 
-Takes COCO, FiftyOne and Label Studio (.json), CVAT for images or video, XML 1.1 (.xml), and folders
-of YOLO and FiftyOne. Pictures find their frames by t_ns, by file name, or by the frame's number;
-those of an export (--export) by the export, which may be of many drives: each gets its truth file
-below DIR, and DIR/coco.json has all of them, to train with.
+Supported formats are COCO, FiftyOne and Label Studio (.json), CVAT for images or video, XML 1.1
+(.xml), and folders of YOLO and FiftyOne. Pictures are matched to frames by t_ns, by file name, or
+by frame number. With --export, they are matched by the export, which may contain many drives: the
+truth file of each is written below DIR, and DIR/coco.json contains all pictures, for training.
 
-A label that is a cue's name ("stop sign", "parked_left") means that the cue is present, and a
-picture annotated without it that it is absent; --map assigns other labels to cues. Approaches are
-not part of such files: write them into the truth file by hand (see crosscue truth schema), and
---add keeps them. Your own cues are those that the vehicle file defines under [cues.own].
+A label that is a cue's name ("stop sign", "parked_left") means that the cue is present. A picture
+annotated without it means that the cue is absent. --map assigns other labels to cues. Annotation
+files contain no approaches: write these into the truth file by hand (see crosscue truth schema),
+and use --add to keep them. Your own cues are those that the vehicle file defines under [cues.own].
 
 examples:
   crosscue truth import coco.json --log drive.mcap -o truth.json
@@ -27,7 +27,7 @@ from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_o
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("source", type=Path, metavar="ANNOTATIONS", help="file or folder")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--log", type=Path, metavar="LOG", help="the log that was annotated")
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--format",
         choices=("coco", "cvat", "yolo", "fiftyone", "labelstudio"),
-        help="format of the annotations (default: recognised)",
+        help="format of the annotations (default: detected)",
     )
     parser.add_argument(
         "-o",
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="T.json",
-        help="truth file, or its folder; with --export the folder of all",
+        help="truth file, or its folder; with --export, the folder of all truth files",
     )
     parser.add_argument(
         "--vehicle",
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="LABEL=NAME",
-        help="cue that a label counts as; LABEL= for none",
+        help="cue that a label counts as; LABEL= ignores it",
     )
     parser.add_argument(
         "--add",
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import, and print the result."""
+    """Import the annotations, and print the result."""
     if args.export is not None:
         print_result(
             crosscue.import_labels(

@@ -13,11 +13,11 @@ from crosscue.eval.commands.shared.terminal import add_schema_output, print_sche
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     add_schema_output(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print or write it."""
+    """Print or write the schema."""
     print_schema(crosscue.truth_schema(), args)
     return 0

@@ -14,7 +14,7 @@ from crosscue.eval.commands.shared.terminal import add_limit_arguments, limits_o
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("log", type=Path, metavar="LOG", help="folder of a data set")
     add_limit_arguments(parser)
     parser.add_argument(
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar="DIR",
-        help="folder for the truth file and its tracks",
+        help="folder for the truth file and its trajectory",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 

@@ -1,1 +1,1 @@
-"""``crosscue vehicle ...``."""
+"""``crosscue vehicle ...``: draft and check vehicle files."""

@@ -1,7 +1,7 @@
-"""Read part of a drive with a vehicle file; list each signal's values and any contradictions.
+"""Check a vehicle file on part of a drive: list the values of each signal, and contradictions.
 
-The page shows a picture with the horizon, metres on the road and the regions searched for road.
-Exit status 1 where signals contradict each other.
+The page shows a picture with the horizon, distances along the road, and the regions searched for
+road. The exit status is 1 when signals contradict each other.
 
 example:
   crosscue vehicle check drive.mcap --vehicle car.toml -o check.html
@@ -22,7 +22,7 @@ from crosscue.eval.commands.shared.terminal import (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
     parser.add_argument(
         "--vehicle", type=Path, required=True, metavar="V.toml", help="the vehicle file to check"
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.0,
         metavar="S",
-        help="begin this many seconds after the first row",
+        help="start this many seconds after the first message",
     )
     parser.add_argument(
         "--seconds",
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, print the table, and fail where something contradicts."""
+    """Check and print the table; return 1 when signals contradict each other."""
     with crosscue.open(*args.logs, limits=limits_of(args)) as log:
         found = crosscue.check_vehicle(
             log,

@@ -24,12 +24,12 @@ MOUNTING: Final = {
     "height-m": "height above the road",
     "pitch-deg": "angle of its axis below the horizon (default: estimated from pictures of a "
     "straight road)",
-    "yaw-deg": "angle of its axis to the left (default: likewise)",
+    "yaw-deg": "angle of its axis to the left (default: estimated, too)",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare flags."""
+    """Add the options to the parser."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="recordings of one drive")
     parser.add_argument(
         "--dbc",
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draft the file, check that it reads back, write or print it."""
+    """Draft the file, check that it can be read back, and write or print it."""
     with crosscue.open(*args.logs, limits=limits_of(args)) as log:
         found = crosscue.draft_vehicle(
             log,

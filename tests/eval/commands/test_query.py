@@ -76,7 +76,10 @@ def test_what_is_left_out_is_reported(tmp_path: Path, capsys: pytest.CaptureFixt
     [
         ([], "expected either SQL or --schema"),
         (["from runs", "--schema"], "expected either SQL or --schema"),
-        (["from runs", "-o", "x.xlsx"], "x.xlsx: expected a name in .parquet, .csv, .json"),
+        (
+            ["from runs", "-o", "x.xlsx"],
+            "x.xlsx: expected a name that ends in .parquet, .csv, .json",
+        ),
         (["select vehcle from runs"], "no column vehcle; did you mean vehicle?"),
         (["select r.vehcle from runs r"], "no column vehcle; did you mean vehicle?"),
         (["from belif"], "no table belif; did you mean belief?"),

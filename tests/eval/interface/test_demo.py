@@ -160,9 +160,9 @@ def test_a_folder_without_the_recording_or_with_another_is_wrong_usage(
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("--real --layout C", "--layout: for a simulated drive"),
-        ("--real --seed 0", "--seed: for a simulated drive"),
-        ("--data .", "--data: for a real drive; add --real"),
+        ("--real --layout C", "--layout: applies only to a simulated drive"),
+        ("--real --seed 0", "--seed: applies only to a simulated drive"),
+        ("--data .", "--data: applies only to a real drive; add --real"),
     ],
 )
 def test_options_of_the_other_demo_are_wrong_usage(
