@@ -282,7 +282,7 @@ def _yaml_names(file: Path) -> tuple[str, ...]:
 
     try:
         names = YAML(typ="safe").load("\n".join(_lines(file, is_whole=True)))["names"]
-        listed = list(names.values()) if isinstance(names, dict) else list(names)
+        listed = [names[i] for i in range(len(names))]
     except (YAMLError, KeyError, TypeError):
         raise AnnotationError(f"{file}: expected class names under names") from None
     return tuple(map(str, listed))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +31,8 @@ from .architectures import WEIGHTS_SUFFIXES
 from .card import MAX_BYTES, Input
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
+_MAX_BRACKETS: Final = 200
+"""In metadata; parsing more of them is slow."""
 DEFAULT_SIDE_PX: Final = 640
 """Of a network that takes pictures of any size and names none."""
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
@@ -43,6 +45,8 @@ _ONNX_INTEGERS: Final = frozenset((6, 7))
 """int32 and int64 as ONNX numbers them."""
 SPREAD_FRACTION: Final = 0.5
 """Of the input's sides: candidates of every cell lie all over a picture, read rightly."""
+_LABELS: Final = ["model_info", "labels"]
+"""Place of the class names in an OpenVINO file, with underscores for spaces."""
 _REFUSED: Final = {
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",
@@ -110,11 +114,49 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
         is_integer = port.element_type.get_type_name() in ("i32", "i64")
         return Tensor(names[0] if names else "output0", tuple(sides), is_integer)
 
+    metadata = _yaml_metadata(path.with_name("metadata.yaml"))
+    names = class_names(metadata)
+    if not names and model.has_rt_info(_LABELS):
+        names = tuple(model.get_rt_info(_LABELS).astype(str).split()[:_MANY_CLASSES])
     return Interface(
         tuple(tensor(port) for port in model.inputs),
         tuple(tensor(port) for port in model.outputs),
-        {},
+        metadata,
+        names,
     )
+
+
+def _yaml_metadata(path: Path) -> dict[str, str]:
+    """Metadata that Ultralytics writes next to an OpenVINO file, in the form of ONNX metadata.
+
+    Nested values are left out. The result is empty where the file is missing.
+
+    Raises:
+        UsageError: The file is damaged.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    if not path.is_file():
+        return {}
+    try:
+        content = read_at_most(path, _MAX_NAMES_CHARACTERS)
+        if content is None or content.count(b"[") + content.count(b"{") > _MAX_BRACKETS:
+            raise ValueError("larger or deeper than any real one")
+        found = YAML(typ="safe", pure=True).load(content.decode("utf-8"))
+    except (YAMLError, ValueError, RecursionError) as error:
+        why = one_line(error, 160)
+        raise UsageError(f"{path}: not readable as metadata: {why}; correct or remove it") from None
+    if not isinstance(found, dict):
+        return {}
+    return {str(key): str(value) for key, value in found.items() if _is_flat(value)}
+
+
+def _is_flat(value: object) -> bool:
+    values = value.values() if isinstance(value, dict) else value
+    if not isinstance(values, Iterable) or isinstance(values, str):
+        return True
+    return not any(isinstance(one, dict | list) for one in values)
 
 
 _READERS: Final = {".onnx": _of_onnx, ".xml": _of_openvino}

@@ -30,7 +30,7 @@ def coco(folder: Path) -> Path:
 
 
 def yolo(folder: Path) -> Path:
-    (folder / "data.yaml").write_text("names:\n  0: car\n  1: bus\n")
+    (folder / "data.yaml").write_text("names:\n  1: bus\n  0: car\n")
     (folder / "7.txt").write_text("0 0.3 0.5 0.4 0.5\n")
     return folder
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,6 +17,7 @@ from crosscue.detectors.catalog.recognise import class_names
 from crosscue.detectors.decoders.detr import DetrOutput
 from crosscue.detectors.decoders.torchvision_export import TorchvisionOutput
 from crosscue.detectors.networks.backends import load_network
+from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.weights import Weights
 from crosscue.eval.cli import run
 from support.data import shared
@@ -98,6 +101,68 @@ def test_rows_without_metadata_are_known_by_their_sizes(
     crosscue.draft_card(path, class_names=["person", "car", "stop sign"])
 
     assert read_card(tmp_path / "my.toml").output.kind == kind
+
+
+METADATA = "task: detect\nimgsz:\n- 64\n- 128\nnames:\n  0: person\n  1: car\n  2: stop sign\n"
+
+
+def _openvino_file(folder: Path, labels: list[str] | None = None) -> Path:
+    """A YOLOv8 network as an OpenVINO file, with its labels where Ultralytics writes them."""
+    if find_spec("openvino") is None:
+        pytest.skip("the extra openvino is not installed")
+    ov = import_openvino()
+    op: Any = ov.opset13
+    shape, outputs, _ = LAYOUTS["yolov8"]
+    given = op.parameter(shape, np.float32, name="images")
+    zero = op.multiply(op.reduce_max(given, op.constant([0, 1, 2, 3])), np.float32(0.0))
+    rows = op.add(op.constant(outputs["output0"]), zero)
+    rows.output(0).set_names({"output0"})
+    model = ov.Model([rows], [given])
+    if labels is not None:
+        model.set_rt_info(labels, ["model_info", "labels"])
+    path = folder / "my.xml"
+    ov.serialize(model, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("metadata", "labels", "classes"),
+    [
+        (METADATA, None, ("person", "car", "stop sign")),
+        ("rosbag2_bagfile_information: {}\n", ["cat", "stop_sign", "dog"], None),
+        (None, ["cat", "stop_sign", "dog"], None),
+    ],
+)
+def test_class_names_of_an_openvino_file_are_read(
+    tmp_path: Path, metadata: str | None, labels: list[str] | None, classes: tuple[str, ...] | None
+) -> None:
+    path = _openvino_file(tmp_path, labels)
+    if metadata is not None:
+        (tmp_path / "metadata.yaml").write_text(metadata)
+
+    crosscue.draft_card(path)
+
+    card = read_card(tmp_path / "my.toml")
+    assert card.output.classes == (classes or tuple(labels or ()))
+    assert "stop sign" in map(card.meaning, range(3))
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    ["names: [a, b", "names: " + 500 * "[" + 500 * "]", "names: {0: \xff}", "a: !!python/name:os"],
+)
+def test_damaged_metadata_beside_an_openvino_file_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], metadata: str
+) -> None:
+    path = _openvino_file(tmp_path)
+    (tmp_path / "metadata.yaml").write_text(metadata, encoding="latin-1")
+
+    assert run(["model", "init", str(path)]) == 2
+
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "metadata.yaml: not readable as metadata: " in said
+    assert not (tmp_path / "my.toml").exists()
 
 
 def test_torchvision_is_known_without_names_of_its_outputs(tmp_path: Path) -> None:
