@@ -1,4 +1,4 @@
-"""What every detector takes and returns."""
+"""The detector protocol, its input frames and its results."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from . import rle
 
 MIN_SCORE: Final = 0.5
-"""A detection is a cue above this score, where neither vehicle file nor detector says more."""
+"""Score above which a detection is a cue, where vehicle file and detector set no other."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The pixels a detector asks for; a frame is decoded no finer than that.
+    """Resolution and channels that a detector needs; a frame is decoded no finer than that.
 
     Attributes:
-        min_width_px: Any picture at least this wide will do; None for the full size.
-        is_grey: One channel instead of three.
+        min_width_px: Minimum width of the decoded picture; None for the full size.
+        is_grey: True for one channel instead of three.
     """
 
     min_width_px: int | None = None
@@ -35,9 +35,9 @@ class Frame:
     Attributes:
         t_ns: Log time.
         camera: Topic.
-        pixels: Shape (H, W, 3) blue, green, red, or (H, W) grey; uint8; perhaps smaller than the
-            picture the camera took.
-        size_px: Width and height of the picture the camera took; detections are given in these.
+        pixels: Shape (H, W, 3) blue, green, red, or (H, W) grey; uint8; may be smaller than the
+            camera's picture.
+        size_px: Width and height of the camera's picture; detections are in its pixels.
     """
 
     t_ns: int
@@ -46,14 +46,14 @@ class Frame:
     size_px: tuple[int, int]
 
     def __post_init__(self) -> None:
-        """Refuse pixels of another shape."""
+        """Reject pixels of any other shape."""
         shape = self.pixels.shape
         if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
             raise ValueError(f"pixels: expected (H, W) or (H, W, 3), got {shape}")
 
     @property
     def scale(self) -> tuple[float, float]:
-        """From decoded pixels to the camera's: along x and along y."""
+        """Factors from decoded pixels to the camera's, along x and along y."""
         height, width = self.pixels.shape[:2]
         return self.size_px[0] / width, self.size_px[1] / height
 
@@ -70,10 +70,10 @@ class Detections:
         labels: N class names.
         masks: N masks as compressed runs over the picture (``crosscue.detectors.rle``), empty
             where the detector returns only a box.
-        lenses: N names of the lit lens (``crosscue.detectors.ranging.lens``), empty for what is no
-            traffic light; no entries at all where nobody looked.
-        min_scores: Shape (N,): the score that each has to exceed to be a cue, as its detector says;
-            None where it says nothing.
+        lenses: N names of the lit lens (``crosscue.detectors.ranging.lens``), empty for objects
+            other than traffic lights; an empty tuple where lenses were not examined.
+        min_scores: Shape (N,): the score that each must exceed to be a cue, as set by its
+            detector; None where the detector sets no thresholds.
     """
 
     t_ns: int
@@ -86,10 +86,10 @@ class Detections:
     min_scores: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up, and values that are not finite.
+        """Reject columns of unequal length and values that are not finite.
 
         Raises:
-            ValueError: Naming the column, the shape wanted and the shape given.
+            ValueError: A column does not fit; names it, the expected shape and the actual shape.
         """
         n = len(self.labels)
         if self.boxes_px.shape != (n, 4):
@@ -114,18 +114,18 @@ class Detections:
         return np.asarray(self.boxes_px[:, 3] - self.boxes_px[:, 1])
 
     def mask(self, i: int) -> NDArray[np.bool_]:
-        """Pixels of one detection in the picture, shape (height, width).
+        """Decode the mask of one detection, shape (height, width).
 
         Raises:
-            ValueError: It has no mask, or not one of this picture.
+            ValueError: It has no mask, or the mask is not of this picture's size.
         """
         return rle.decode(self.masks[i], self.size_px)
 
     def column_heights_px(self, i: int) -> NDArray[np.float64] | None:
-        """Pixels of one detection in each column of the picture; None where it has no mask.
+        """Count one detection's pixels in each column of the picture; None where it has no mask.
 
         Raises:
-            ValueError: The mask is not one of this picture.
+            ValueError: The mask is not of this picture's size.
         """
         return rle.column_heights_px(self.masks[i], self.size_px) if self.masks[i] else None
 
@@ -138,23 +138,23 @@ class Detections:
         return self.taken(self.scores >= score)
 
     def are_sure(self, setting: float | None) -> NDArray[np.bool_]:
-        """Which detections are sure enough to be a cue, shape (N,).
+        """Mark the detections whose score is high enough to be a cue, shape (N,).
 
         Args:
-            setting: The vehicle file's threshold; without one the detector's holds.
+            setting: The vehicle file's threshold; None uses the detector's.
         """
         min_score = self.min_scores if setting is None else setting
         return np.asarray(self.scores > (MIN_SCORE if min_score is None else min_score))
 
     def with_min_scores(self, by_label: Mapping[str, float]) -> Self:
-        """The same detections with the thresholds that their detector has for their labels."""
+        """The same detections with their detector's thresholds, by label."""
         if not by_label:
             return self
         min_score = [by_label.get(label, MIN_SCORE) for label in self.labels]
         return replace(self, min_scores=np.array(min_score, np.float64))
 
     def taken(self, is_taken: NDArray[np.bool_]) -> Self:
-        """The detections that shape (N,) marks, in the same order."""
+        """The detections that the mask ``is_taken``, shape (N,), selects, in the same order."""
         keep = np.flatnonzero(is_taken)
         return type(self)(
             self.t_ns,
@@ -169,18 +169,19 @@ class Detections:
 
 
 def nothing_found(frame: Frame) -> Detections:
-    """An empty result."""
+    """Return an empty result for a frame."""
     return Detections(frame.t_ns, frame.size_px, np.empty((0, 4)), np.empty(0), (), ())
 
 
 @dataclass(frozen=True, slots=True)
 class RoadMask:
-    """Which pixels of one frame are road.
+    """Road pixels of one frame.
 
     Attributes:
         t_ns: Log time of the frame.
         size_px: Width and height of the picture.
-        mask: Compressed runs (``crosscue.detectors.rle``) over the whole picture, coarser than it.
+        mask: Compressed runs (``crosscue.detectors.rle``) over the whole picture, at a lower
+            resolution.
         mask_size_px: Width and height of the mask.
     """
 
@@ -190,10 +191,10 @@ class RoadMask:
     mask_size_px: tuple[int, int]
 
     def pixels(self) -> NDArray[np.bool_]:
-        """Which of the mask's pixels are road, shape (height, width).
+        """Decode the mask, shape (height, width); True where a pixel is road.
 
         Raises:
-            ValueError: The mask is not one.
+            ValueError: The mask is damaged or of another size.
         """
         return rle.decode(self.mask, self.mask_size_px)
 
@@ -202,59 +203,60 @@ Found: TypeAlias = Detections | RoadMask
 
 
 class Detector(Protocol):
-    """From frames to what is in each; no memory of earlier frames (that is a tracker).
+    """Finds objects or road in frames, without memory of earlier frames (that is a tracker).
 
-    It may have ``labels``, a tuple of all class names that it can report: none for one of road. A
-    cue whose labels no detector can report is not looked for; without ``labels`` it may be any. It
-    may have ``min_scores``, from label to the score above which a detection is a cue.
+    A detector may have two more attributes. ``labels`` is a tuple of all class names that it can
+    report, empty for a detector of road; without it, any class is possible. A cue whose labels no
+    detector can report is not evaluated. ``min_scores`` maps a label to the score above which a
+    detection is a cue.
     """
 
     @property
     def view(self) -> View:
-        """The pixels it asks for."""
+        """Resolution and channels of the frames that it needs."""
         ...
 
     @property
     def identity(self) -> str:
-        """Text that changes whenever its output could, as of version, settings or weights."""
+        """Text that changes whenever the output could: with version, settings or weights."""
         ...
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """One result for each frame, in order; an empty one is valid."""
+        """Return one result for each frame, in order; an empty result is valid."""
         ...
 
 
 def is_calibrated(detector: Detector) -> bool:
-    """Whether a detector says that its scores are probabilities (``is_calibrated = True``)."""
+    """Whether a detector declares its scores to be probabilities (``is_calibrated = True``)."""
     return bool(getattr(detector, "is_calibrated", False))
 
 
 def min_scores_of(detector: Detector) -> dict[str, float]:
-    """From label to the score above which a detection is a cue, as far as the detector says."""
+    """Map each label to the score above which it is a cue; only labels with a threshold."""
     found: Mapping[str, float] = getattr(detector, "min_scores", {})
     return dict(found)
 
 
 def calibrated_labels(detector: Detector) -> tuple[str, ...]:
-    """Labels whose scores a fitted calibration has turned into probabilities, sorted."""
+    """Labels whose scores are probabilities by a fitted calibration, sorted."""
     labels: Sequence[str] = getattr(detector, "calibrated_labels", ())
     return tuple(sorted(labels))
 
 
 def reportable(detector: Detector) -> tuple[str, ...] | None:
-    """All class names that a detector can report, sorted; None where it does not say."""
+    """All class names that a detector can report, sorted; None where it declares none."""
     labels: Sequence[str] | None = getattr(detector, "labels", None)
     return None if labels is None else tuple(sorted({*labels}))
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """One detector as requested.
+    """A requested detector, not yet built.
 
     Attributes:
-        name: What it is called in tables.
-        kind: As the module's text says.
-        settings: For its factory.
+        name: Name in tables.
+        kind: Name, ``module:factory`` or model card, as in ``crosscue.detectors.registry``.
+        settings: Keyword arguments of its factory.
     """
 
     name: str

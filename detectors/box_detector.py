@@ -1,4 +1,4 @@
-"""A detector of boxes in one picture at a time, for which a subclass writes only the search."""
+"""Base class of detectors that find boxes in one picture at a time."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from .base import Detections, Frame, View
 from .settings import Settings, identity_of, settings_of
 
 ScoredBox: TypeAlias = tuple[str, float, Sequence[float]]
-"""Label, score from 0 to 1, and x0, y0, x1, y1 in pixels of the frame as it was decoded."""
+"""Label, score from 0 to 1, and x0, y0, x1, y1 in pixels of the decoded frame."""
 
 
 class BoxDetector(Settings):
     """Base class of a detector of boxes. Its fields are its settings, typed and with defaults.
 
-    A subclass sets ``name`` and ``labels`` and writes ``boxes_in``. Its ``build`` is the factory
-    that ``--detectors module:Class.build``, a table of detectors or an entry point names.
+    A subclass sets ``name`` and ``labels`` and implements ``boxes_in``. Its ``build`` is the
+    factory for ``--detectors module:Class.build``, a table of detectors or an entry point.
 
     Attributes:
-        name: What it is called in errors.
+        name: Name in error messages.
         labels: All class names that it can report.
-        view: The pixels it asks for.
-        version: Count up when the same pixels and settings yield other boxes than before, so that
-            cached results are not used.
+        view: Resolution and channels of the frames that it needs.
+        version: Increment it when the same pixels and settings yield different boxes than before,
+            so that outdated cached results are not used.
     """
 
     name: ClassVar[str]
@@ -36,24 +36,24 @@ class BoxDetector(Settings):
 
     @abstractmethod
     def boxes_in(self, frame: Frame) -> Iterable[ScoredBox]:
-        """The boxes in one frame."""
+        """Find the boxes in one frame."""
 
     @classmethod
     def build(cls, **given: Any) -> Self:
-        """The detector with these settings.
+        """Build the detector with these settings.
 
         Raises:
-            VehicleError: An unknown setting, or a value that does not fit.
+            VehicleError: A setting is unknown or its value is invalid.
         """
         return settings_of(cls, given, f"detector {cls.name}")
 
     @property
     def identity(self) -> str:
-        """Changes with the name, the version and the settings."""
+        """Text that changes with the name, the version and the settings."""
         return identity_of(self.name, self.version, self.model_dump())
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Detections]:
-        """The detections of each frame."""
+        """Return the detections of each frame."""
         return [self._detections(frame) for frame in frames]
 
     def _detections(self, frame: Frame) -> Detections:

@@ -1,4 +1,4 @@
-"""Geometry of boxes: overlap, and suppression of double ones."""
+"""Overlap of boxes, and non-maximum suppression."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _BLOCK: Final = 128
-"""So many boxes are compared with all others at a time; a table of all pairs could be large."""
+"""Number of boxes compared with all others at a time; bounds the table of pairs."""
 
 
 def overlaps(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -27,14 +27,14 @@ def best_of(
     min_score: float,
     max_overlap: float,
 ) -> NDArray[np.int64]:
-    """Which boxes stay: good enough, and no better one of their group over them; best first.
+    """Indices of the boxes that non-maximum suppression keeps, best first.
 
     Args:
         boxes: Shape (N, 4): x0, y0, x1, y1.
         scores: Shape (N,), finite.
-        groups: Shape (N,): boxes of different groups do not compete.
-        min_score: Lower scores go.
-        max_overlap: Of two with a larger intersection over union, the better stays.
+        groups: Shape (N,): only boxes of the same group suppress each other.
+        min_score: Boxes with a lower score are removed.
+        max_overlap: Of two boxes with a larger intersection over union, only the better is kept.
     """
     left = np.flatnonzero(scores >= min_score)
     left = left[np.argsort(-scores[left], kind="stable")]
@@ -58,7 +58,7 @@ def _rivals(
     others: NDArray[np.int64],
     max_overlap: float,
 ) -> NDArray[np.bool_]:
-    """Which of the others are of each one's group and overlap it more, shape (some, others)."""
+    """Mark pairs of one group that overlap by more than ``max_overlap``, shape (some, others)."""
     mine, theirs = boxes[some, None], boxes[others]
     sides = np.minimum(mine[..., 2:], theirs[:, 2:]) - np.maximum(mine[..., :2], theirs[:, :2])
     sides = np.maximum(sides, 0.0)

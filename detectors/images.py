@@ -1,7 +1,7 @@
-"""Encoded pictures to pixels: sizes are checked before decoding, and no file name reaches OpenCV.
+"""Decode pictures safely: sizes are checked first, and no file name reaches OpenCV.
 
-A megabyte of PNG can ask for gigabytes, so the picture's own header is read first. EXIF orientation
-is ignored: calibration belongs to the pixels as the sensor gave them.
+A megabyte of PNG can decode to gigabytes, so the picture's header is read first. EXIF orientation
+is ignored: calibration refers to the pixels in the sensor's order.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from crosscue.replay.readers.images.damage import damage_of
 from .base import View
 
 MAX_PIXELS: Final = 64_000_000
-"""Largest picture decoded: 192 MB of colour."""
+"""Size of the largest picture that is decoded: 192 MB in colour."""
 _REDUCTIONS: Final = (8, 4, 2)
-"""What a JPEG decoder can leave out by itself."""
+"""Factors by which a JPEG decoder can reduce a picture while decoding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +38,8 @@ class Encoded:
 
     Attributes:
         coding: As in ``Images``.
-        content: Its bytes, not copied.
-        layout: Width, height, bytes a row and pixel format of a raw picture, else None.
+        content: The encoded bytes, not copied.
+        layout: Width, height, bytes per row and pixel format of a raw picture, else None.
     """
 
     coding: str
@@ -48,7 +48,7 @@ class Encoded:
 
 
 def encoded(images: Images, row: int) -> Encoded:
-    """One row of a block."""
+    """Return the picture in one row of a block."""
     content, coding = images.bytes_.payload(row), images.coding[row]
     columns = (images.width_px, images.height_px, images.step_bytes)
     if coding != "raw" or images.pixel_format is None:
@@ -58,12 +58,12 @@ def encoded(images: Images, row: int) -> Encoded:
 
 
 def read_file(path: Path, max_bytes: int = DEFAULT_LIMITS.message_bytes) -> Encoded:
-    """A picture file's bytes; their format is known from the first of them, not from the name.
+    """Read a picture file; its format is recognised from the content, not from the name.
 
     Raises:
-        OSError: It cannot be read.
-        LogFormatError: No picture that is known here.
-        LogTooLargeError: Larger than one encoded picture may be.
+        OSError: The file cannot be read.
+        LogFormatError: It is not a JPEG, PNG or WebP picture.
+        LogTooLargeError: It has more than ``max_bytes``.
     """
     content = read_at_most(path, max_bytes)
     if content is None:
@@ -77,11 +77,11 @@ def read_file(path: Path, max_bytes: int = DEFAULT_LIMITS.message_bytes) -> Enco
 
 
 def size_of(picture: Encoded) -> tuple[int, int]:
-    """Width and height as the picture's header says.
+    """Read width and height from the picture's header.
 
     Raises:
-        LogFormatError: It says nothing, or the coding is not decoded here.
-        LogTooLargeError: More than ``MAX_PIXELS``.
+        LogFormatError: The header has no size, or the coding is not supported.
+        LogTooLargeError: The picture has more than ``MAX_PIXELS``.
     """
     if picture.layout is not None:
         size: tuple[int, int] | None = picture.layout[:2]
@@ -104,15 +104,15 @@ WHOLE: Final = View()
 def decode(
     picture: Encoded, view: View = WHOLE, depth_bits: int = 16
 ) -> tuple[Bytes, tuple[int, int]]:
-    """The pixels a view asks for, and the width and height of the whole picture.
+    """Decode a picture; return its pixels, and width and height at full size.
 
     Args:
-        picture: Encoded.
-        view: How wide and whether grey; a JPEG is decoded at the smallest scale that serves.
-        depth_bits: How many bits of a 16-bit picture the camera uses (12 for many).
+        picture: Encoded picture.
+        view: Minimum width and channels; a JPEG is decoded at the smallest sufficient scale.
+        depth_bits: Number of bits that the camera uses in a 16-bit picture (often 12).
 
     Raises:
-        LogFormatError: Damaged, cut short, or of a coding not decoded here.
+        LogFormatError: The picture is damaged, truncated or of an unsupported coding.
         LogTooLargeError: As ``size_of``.
     """
     if not len(picture.content):
@@ -127,7 +127,7 @@ def decode(
 
 
 def reduction(width_px: int, view: View) -> int:
-    """The largest of 8, 4, 2, 1 that leaves the view's width."""
+    """Largest factor of 8, 4, 2, 1 that keeps at least the view's width."""
     if view.min_width_px is None:
         return 1
     return next((by for by in _REDUCTIONS if width_px // by >= view.min_width_px), 1)
@@ -138,7 +138,7 @@ def _compressed(
 ) -> Bytes:
     import cv2
 
-    # OpenCV numbers its modes so: grey reductions 16, 32, 64; colour 17, 33, 65.
+    # OpenCV's numbers of the modes: grey reductions 16, 32, 64; colour 17, 33, 65.
     mode = (0 if view.is_grey else 1) if by == 1 else 8 * by + (not view.is_grey)
     flags = int(mode) | cv2.IMREAD_IGNORE_ORIENTATION | (0 if by > 1 else cv2.IMREAD_ANYDEPTH)
     try:
@@ -167,7 +167,7 @@ _RAW: Final = {
     "bayer_rggb8": (1, 1, "COLOR_BayerRGGB2BGR"), "bayer_bggr8": (1, 1, "COLOR_BayerBGGR2BGR"),
     "bayer_gbrg8": (1, 1, "COLOR_BayerGBRG2BGR"), "bayer_grbg8": (1, 1, "COLOR_BayerGRBG2BGR"),
 }  # fmt: skip
-"""From a ROS encoding to channels, bytes of each, and OpenCV's conversion to blue, green, red."""
+"""Channels, bytes per channel and OpenCV's conversion to BGR, by ROS encoding."""
 
 
 def _raw(picture: Encoded, layout: tuple[int, int, int, str], view: View, bits: int) -> Bytes:
@@ -193,7 +193,7 @@ def _raw(picture: Encoded, layout: tuple[int, int, int, str], view: View, bits: 
 
 
 def channels_as(pixels: Bytes, is_grey: bool) -> Bytes:
-    """The same pixels with one channel, or with three."""
+    """Convert pixels to one channel or to three."""
     import cv2
 
     if is_grey == (pixels.ndim == 2):

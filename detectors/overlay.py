@@ -1,4 +1,4 @@
-"""Pictures with what was found drawn into them, for a person to look at."""
+"""Draw detections and cues into pictures, for visual inspection."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ BLUE: Final = (255, 140, 0)
 AMBER: Final = (90, 190, 255)
 PALE: Final = (230, 230, 230)
 MARGIN_PX: Final = 10
-"""Left and right of the cues' line."""
+"""Margin to the left and right of the line of cues."""
 
 
 @dataclass(slots=True)
 class Drawer:
-    """Writes pictures of frames, evenly along the drive, however long it turns out to be.
+    """Writes pictures of frames that are evenly spaced along a drive of unknown length.
 
-    Every frame at first; whenever there are too many, each second one goes, and half as many come.
+    It starts with every frame. Whenever there are too many pictures, it deletes every second one
+    and doubles the interval.
 
     Attributes:
-        folder: Made when first needed.
-        max_pictures: How many pictures at most.
+        folder: Created with the first picture.
+        max_pictures: Maximum number of pictures.
     """
 
     folder: Path
@@ -44,13 +45,13 @@ class Drawer:
     def __call__(
         self, t_ns: int, picture: Encoded, found: Sequence[Found], counts: Mapping[str, int]
     ) -> None:
-        """Look at one frame.
+        """Draw and write one frame if its turn has come.
 
         Args:
-            t_ns: When it was taken.
-            picture: Decoded if it is to be written.
-            found: By each detector.
-            counts: Of its cues.
+            t_ns: Log time of the frame.
+            picture: Encoded; decoded only if it is to be written.
+            found: Result of each detector.
+            counts: Number of objects of each cue.
 
         Raises:
             OutputError: A picture cannot be written.
@@ -80,13 +81,13 @@ class Drawer:
 def draw(
     pixels: Bytes, found: Sequence[Found], counts: Mapping[str, int], enlarge: float = 1.0
 ) -> Bytes:
-    """A copy with road tinted, boxes and labels, and the positive cues at the bottom.
+    """Return a copy with tinted road, boxes with labels, and the positive cues at the bottom.
 
     Args:
         pixels: Shape (H, W, 3), uint8, blue first.
-        found: By each detector.
-        counts: Of the cues that follow.
-        enlarge: Text and lines, for a picture that will be shrunk.
+        found: Result of each detector.
+        counts: Number of objects of each cue.
+        enlarge: Factor on text and lines, for a picture that will be scaled down.
     """
     canvas = _drawn(pixels, found, enlarge)
     positive = [f"{cue} {count}" for cue, count in counts.items() if count]
@@ -103,18 +104,18 @@ def draw_frame(
     regions: Callable[[tuple[int, int]], Iterable[NDArray[np.float64]]],
     width_px: int,
 ) -> Bytes:
-    """All that was found in one picture, drawn: road, masks, boxes, regions, cues.
+    """Draw all results of one frame: road, masks, boxes, regions and cues.
 
     Args:
-        picture: Of the frame.
-        found: By each detector; empty leaves the picture bare.
-        counts: Of its cues.
-        regions: Their corners in a picture of a width and height, shape (N, 2) each; they are
-            drawn where a detector looks for road.
-        width_px: That the picture will be shown in; lines and text are drawn to be read there.
+        picture: Encoded picture of the frame.
+        found: Result of each detector; without any, nothing is drawn.
+        counts: Number of objects of each cue.
+        regions: Returns the regions' corners, shape (N, 2) each, for a picture of the given width
+            and height. They are drawn only if a detector found road.
+        width_px: Displayed width of the picture; lines and text are sized to be legible there.
 
     Raises:
-        LogError: It cannot be decoded.
+        LogError: The picture cannot be decoded.
     """
     pixels, _ = decode(picture)
     size = (pixels.shape[1], pixels.shape[0])
@@ -145,7 +146,7 @@ def _line(
 
 
 def picture_of(pixels: Bytes, found: Found) -> bytes:
-    """A JPEG of a picture with what one detector found in it: boxes with labels, or road."""
+    """Encode a picture as JPEG with one detector's boxes and labels, or road, drawn in."""
     import cv2
 
     _, encoded = cv2.imencode(".jpg", _drawn(pixels, (found,), max(pixels.shape[1] / 1280, 0.6)))
@@ -164,10 +165,10 @@ def _drawn(pixels: Bytes, results: Sequence[Found], enlarge: float) -> Bytes:
 
 
 def _fitting(text: str, width_px: int, scale: float) -> float:
-    """The scale, or a smaller one at which the text is no wider than that."""
+    """Return the scale, reduced where necessary for the text to fit into ``width_px``."""
     import cv2
 
-    # Strokes are whole pixels, so a text at half the scale is not half as wide: look again.
+    # Strokes are whole pixels, so a text at half the scale is not half as wide: measure again.
     for _ in range(4):
         (wide, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale))
         scale *= min(1.0, width_px / wide)
@@ -190,17 +191,18 @@ def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
         x0, y0, x1, y1 = (round(float(side)) for side in box)
         place = (x0, max(y0 - 4, round(12 * enlarge)))
         write_label(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
-        # After the label, whose dark box reaches below the letters, with OpenCV 4 over this side.
+        # Drawn after the label: its dark box extends below the letters, in OpenCV 4 over this side.
         cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
 
 
 def write_label(
     canvas: Bytes, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
 ) -> None:
-    """Write on a dark box; ``at`` is the left end of the line that letters stand on."""
+    """Write a text on a dark box; ``at`` is the left end of its baseline."""
     import cv2
 
-    # On a box: an outline of thicker letters has other widths from OpenCV 5 on, and covers them.
+    # A box, because from OpenCV 5 on an outline of thicker letters differs in width and covers
+    # the text.
     thick = _thickness(scale)
     (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
     corners = (at[0] - 1, at[1] - high - 2), (at[0] + wide + 1, at[1] + below)
@@ -209,5 +211,5 @@ def write_label(
 
 
 def _thickness(scale: float) -> int:
-    """Of a text's strokes, pixels."""
+    """Thickness of a text's strokes in pixels."""
     return max(round(2 * scale), 1)

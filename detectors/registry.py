@@ -1,9 +1,9 @@
-"""Detectors by name, each imported only when it is used.
+"""Registry of detectors by name; each is imported only when it is used.
 
-A name is one of ``BUILTIN``, a model of the catalog (``crosscue model list``), one that an
-installed package offers under the entry point group ``crosscue.detectors``, a ``module:factory``,
-or the file name of a model card (``.toml``). A factory takes settings by name, as the vehicle file
-spells them, and returns a ``Detector``.
+A name is one of ``BUILTIN``, a model of the catalog (``crosscue model list``), an entry point of
+the group ``crosscue.detectors`` of an installed package, a ``module:factory``, or the file name of
+a model card (``.toml``). A factory accepts the settings of the vehicle file as keyword arguments
+and returns a ``Detector``.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ BUILTIN: Final[Mapping[str, str]] = {
     "road": "crosscue.detectors.networks.road.detector:build",
     "signs": "crosscue.detectors.signs.detector:build",
 }
-"""From name to ``module:factory``."""
+"""``module:factory`` of each detector, by name."""
 
 EMBEDDED: Final = "mask-rcnn,road,signs"
-"""What demo and studies run: networks that come along and know simulated scenes only."""
+"""Detectors of the demo and the studies: embedded networks, trained on simulated scenes only."""
 
 _EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoint", None)}
-"""Setting that names a network, and its default, which is the embedded one."""
+"""Setting that selects a network, and its default, which selects the embedded one."""
 
 
 def chosen(names: str, sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
-    """The detectors that a list such as ``cars,signs,my.toml,pack.mod:make`` asks for.
+    """Return the detectors of a list such as ``cars,signs,my.toml,pack.mod:make``.
 
     Args:
-        names: Comma-separated.
-        sections: The vehicle file's own, by name; they come first.
+        names: Comma-separated names.
+        sections: Detectors of the vehicle file, by name; they have precedence.
 
     Raises:
-        UsageError: None, or one twice.
+        UsageError: The list is empty or names a detector twice.
     """
     asked = [name.strip() for name in names.split(",") if name.strip()]
     if not asked:
@@ -67,7 +67,7 @@ def _choice(name: str, sections: Mapping[str, Choice]) -> Choice:
 
 
 def knows_simulated_only(choice: Choice) -> bool:
-    """Whether a detector runs a network that has seen nothing but simulated scenes."""
+    """Whether a detector runs a network that was trained on simulated scenes only."""
     if choice.kind not in _EMBEDDED_BY:
         return False
     setting, embedded = _EMBEDDED_BY[choice.kind]
@@ -75,7 +75,7 @@ def knows_simulated_only(choice: Choice) -> bool:
 
 
 def known(sections: Mapping[str, Choice]) -> list[str]:
-    """All names that can be used."""
+    """List all names that can be used."""
     offered = (point.name for point in entry_points(group=GROUP))
     return sorted({*sections, *BUILTIN, *catalog.names(), *offered})
 
@@ -84,8 +84,8 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
     """Build one detector.
 
     Raises:
-        UsageError: No such detector, or it cannot be imported.
-        VehicleError: Its settings do not fit.
+        UsageError: The detector does not exist or cannot be imported.
+        VehicleError: Its settings are invalid.
     """
     if choice.kind in catalog.names() and choice.kind not in table:
         card = str(catalog.card_path(choice.kind))

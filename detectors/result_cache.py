@@ -1,7 +1,7 @@
-"""What detectors found, kept by content: the same picture, weights and settings never run twice.
+"""Cache of detectors' results, so that a picture runs once per weights and settings.
 
-One SQLite file; the key is the picture's hash with the detector's identity. A row that fails its
-checksum is as good as none. Times are not kept: two equal pictures share their result.
+It is one SQLite file; the key is a hash of the picture and the detector's identity. A row that
+fails its checksum is ignored. Times are not stored: two equal pictures share their result.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ _SCHEMA: Final = (
 
 
 def default_cache() -> Path:
-    """Where the command line keeps results of detectors, in the user's cache folder."""
+    """Path of the command line's result cache, in the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "crosscue" / "detections.sqlite"
 
 
 def picture_key(picture: Encoded) -> bytes:
-    """A hash of everything that decides a picture's pixels."""
+    """Hash everything that determines a picture's pixels."""
     digest = hashlib.sha256(picture.content)
     digest.update(f"{picture.coding} {picture.layout}".encode())
     return digest.digest()
 
 
 class ResultCache:
-    """A cache in a file, or one that forgets (no path); a context manager."""
+    """A result cache in a file, or in memory if the path is None; a context manager."""
 
     def __init__(self, path: Path | None) -> None:
-        """Open or begin it.
+        """Open the cache, or create it.
 
         Raises:
-            OutputError: It cannot be written, or is another kind of file.
+            OutputError: The file cannot be written, or is not a cache.
         """
         self._path: Final = path
         try:
@@ -62,7 +62,7 @@ class ResultCache:
             raise OutputError(f"{path}: {error}; give another file with --cache") from None
 
     def get(self, picture: bytes, identity: str, t_ns: int) -> Found | None:
-        """What a detector found in a picture, if it is known, with the frame's time."""
+        """Return a detector's result for a picture, with the frame's time; None if not cached."""
         row = self._file.execute(
             "SELECT text, crc FROM found WHERE key = ?", (_key(picture, identity),)
         ).fetchone()
@@ -74,7 +74,7 @@ class ResultCache:
             return None
 
     def put(self, rows: Sequence[tuple[bytes, str, Found]]) -> None:
-        """Keep results of pictures by detectors, all or none of them.
+        """Store detectors' results for pictures, either all or none of them.
 
         Raises:
             OutputError: The disk is full.

@@ -1,12 +1,14 @@
-"""Masks as runs: COCO's compressed run-length text, a few hundred bytes for a car.
+"""Encode masks as COCO's compressed run-length text, a few hundred bytes for a car.
 
-Pixels are counted down the columns, from the top left; runs of background and object take turns,
-background first. The text codes the runs' lengths, from the fourth on as differences to the run two
-before, in groups of five bits (the coding that COCO annotations use, so other tools read it).
+Pixels are counted down the columns from the top left. Runs of background and object alternate,
+starting with background. The text encodes the runs' lengths in groups of five bits, from the
+fourth run on as the difference to the run two before. This is the coding of COCO annotations, so
+other tools read it.
 
-pycocotools writes the same bytes and is not used here: for a mask known in a box it wants the whole
-picture (15 to 30 times as long on 1280 x 720, to encode or to decode), and for damaged text it
-returns more pixels than the picture has, where this raises an error (benchmarks/mask_runs.py).
+pycocotools writes the same bytes but is not used here, for two reasons (benchmarks/mask_runs.py).
+For a mask known in a box it needs the whole picture, which takes 15 to 30 times as long on
+1280 x 720, to encode or to decode. For damaged text it returns more pixels than the picture has,
+where this module raises an error.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ _BASE: Final = 48
 _MORE: Final = 0x20
 _SIGN: Final = 0x10
 _LONGEST: Final = 7
-"""Groups of five bits that a run's length may have: 35 bits."""
+"""Maximum number of five-bit groups in a run's length: 35 bits."""
 
 
 def encode(mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[int, int]) -> bytes:
-    """The text for an object known only inside a box.
+    """Encode the mask of an object that is known only inside a box.
 
     Args:
         mask: Shape (h, w): object pixels inside the box.
@@ -53,12 +55,12 @@ def encode(mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[i
 
 
 def runs(text: bytes) -> NDArray[np.int64]:
-    """Lengths of the runs of background and object in turn.
+    """Decode the lengths of the alternating runs of background and object.
 
     Raises:
-        ValueError: Not such a text.
+        ValueError: The text is not a compressed mask.
     """
-    # Texts are short and many, so what counts here is how few calls it takes.
+    # There are many short texts, so speed depends on the number of calls.
     codes = np.frombuffer(text, np.uint8) - np.uint8(_BASE)
     if len(codes) == 0 or codes.max() > 63 or codes[-1] & _MORE:
         raise ValueError(f"not a compressed mask: {text[:20]!r}")
@@ -77,9 +79,10 @@ def runs(text: bytes) -> NDArray[np.int64]:
 def _prepend(
     values: NDArray[np.int64], codes: NDArray[np.uint8], places: list[int], text: bytes
 ) -> None:
-    """Put the lower groups of five bits, at ``places``, under those that end each value.
+    """Add the lower five-bit groups, at ``places``, to the group that ends each value.
 
-    Runs are mostly shorter than 16 pixels apart, so there are few: a loop beats ten calls.
+    Successive runs mostly differ by less than 16 pixels, so there are few such groups and a loop
+    is faster than ten calls.
     """
     low, groups, before = 0, 0, -1
     for number, place in enumerate(places):
@@ -96,15 +99,15 @@ def _prepend(
 
 
 def area_px(text: bytes) -> int:
-    """How many pixels the object has."""
+    """Number of the object's pixels."""
     return int(runs(text)[1::2].sum())
 
 
 def column_heights_px(text: bytes, size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """Object pixels in each column of the picture, shape (width,).
+    """Number of object pixels in each column of the picture, shape (width,).
 
     Raises:
-        ValueError: Not such a text, or not for a picture of this size.
+        ValueError: The text is not a compressed mask, or not of this size.
     """
     width, height = size_px
     lengths = runs(text)
@@ -114,8 +117,8 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> NDArray[np.float
     column = (stops - objects) // height
     if (column == (stops - 1) // height).all():
         return np.asarray(np.bincount(column, objects, width), np.float64)
-    # A run continues into the next column. Between two edges the count of object pixels grows
-    # evenly, so looking it up at the columns' borders is exact.
+    # A run continues into the next column. Between two edges the count of object pixels is
+    # linear, so interpolating it at the columns' borders is exact.
     counted = np.zeros(len(edges) + 1)
     objects.cumsum(out=counted[2::2])
     counted[3::2] = counted[2:-1:2]
@@ -124,7 +127,7 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> NDArray[np.float
 
 
 def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """The whole picture's mask, shape (height, width).
+    """Decode the mask of the whole picture, shape (height, width).
 
     Raises:
         ValueError: As ``column_heights_px``.
@@ -164,7 +167,7 @@ def _to_text(lengths: NDArray[np.int64]) -> bytes:
 def outline(
     mask: bytes, size_px: tuple[int, int], box_px: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Closed strips of shape (N, 2) around a mask, to a pixel; none for an empty mask."""
+    """Closed outlines of a mask, shape (N, 2) each, to the pixel; empty for an empty mask."""
     if not mask:
         return []
     x0, y0 = (int(v) for v in np.maximum(np.floor(box_px[:2]) - 1, 0))
@@ -173,7 +176,7 @@ def outline(
 
 
 def borders(mask: NDArray[np.bool_], corner_px: tuple[int, int]) -> list[NDArray[np.float64]]:
-    """Closed strips around the parts of a mask whose top-left pixel is ``corner_px``."""
+    """Closed outlines of the parts of a mask whose top-left pixel is ``corner_px``."""
     import cv2
 
     inside = np.ascontiguousarray(mask).view(np.uint8)

@@ -1,4 +1,4 @@
-"""From encoded pictures to what detectors found: decoded once, cached, in batches."""
+"""Run detectors over encoded pictures, in batches; each picture is decoded once and cached."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .ranging.lens import VERSION, with_lenses
 from .result_cache import ResultCache, picture_key
 
 BATCH: Final = 8
-"""Pictures held decoded at a time, and given to a detector at once."""
+"""Number of pictures decoded and passed to a detector at a time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """A detector and what it is called in tables."""
+    """A detector and its name in tables."""
 
     name: str
     detector: Detector
@@ -28,12 +28,12 @@ class Named:
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """What all detectors found in one frame.
+    """Results of all detectors for one frame.
 
     Attributes:
         t_ns: Log time of the frame.
         size_px: Width and height of the picture.
-        picture: Still encoded.
+        picture: The encoded picture.
         found: One result for each detector, in order.
     """
 
@@ -45,7 +45,7 @@ class FrameResult:
 
 @dataclass(slots=True)
 class Counts:
-    """What became of the frames, by detector name where it differs."""
+    """Account of the frames, by detector name where it differs."""
 
     frames: int = 0
     decoded: int = 0
@@ -55,7 +55,7 @@ class Counts:
 
 @dataclass(slots=True)
 class _Prepared:
-    """One picture with what is known and the pixels for what is not."""
+    """One picture with its cached results, and its pixels for the detectors yet to run."""
 
     t_ns: int
     picture: Encoded
@@ -71,12 +71,12 @@ class Runner:
 
     Attributes:
         detectors: In the order of results.
-        cache: Asked first.
+        cache: Results of earlier runs; only missing results are computed.
         camera: Topic.
-        depth_bits: Of 16-bit pictures.
+        depth_bits: Number of bits that the camera uses in a 16-bit picture.
         on_skip: Called with the time and reason of each picture that cannot be decoded.
         light_labels: Labels of traffic lights, whose lenses are examined.
-        counts: Grow as it works.
+        counts: Account of all frames so far.
     """
 
     detectors: Sequence[Named]
@@ -88,7 +88,7 @@ class Runner:
     counts: Counts = field(default_factory=Counts)
 
     def __call__(self, block: Block) -> Iterator[FrameResult]:
-        """Results of a block's pictures, in order; those that do not decode are left out.
+        """Yield the results of a block's pictures in order, without those that do not decode.
 
         Raises:
             UsageError: A detector returned more or fewer results than frames.
@@ -103,7 +103,7 @@ class Runner:
             ahead: Future[list[_Prepared]] | None = None
             for i, part in enumerate(parts):
                 prepared = self._decoded(part) if ahead is None else ahead.result()
-                # Decoding needs no Python while it runs, so it overlaps with the networks.
+                # Decoding releases the interpreter's lock, so it overlaps with the networks.
                 ahead = pool.submit(self._decoded, parts[i + 1]) if i + 1 < len(parts) else None
                 yield from self._run(prepared)
 
@@ -173,7 +173,7 @@ class Runner:
         ]
 
     def _identity(self, named: Named) -> str:
-        """Of all that decides a result: the detector, and the rule that examines its lights."""
+        """Identify all that determines a result: the detector, and the rule for its lights."""
         return f"{named.detector.identity} lens {VERSION} {' '.join(self.light_labels)}"
 
     def _count(self, name: str, ran: int, from_cache: int) -> None:

@@ -1,4 +1,4 @@
-"""What settings of detectors share: typed, frozen, unknown keys refused."""
+"""Base of detectors' settings: typed, frozen, and without unknown keys."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class Settings(BaseModel):
-    """Base of every detector's settings."""
+    """Base class of every detector's settings."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
@@ -28,15 +28,15 @@ S = TypeVar("S", bound=Settings)
 
 
 def settings_of(kind: type[S], given: Mapping[str, Any], where: str) -> S:
-    """Settings with defaults for what is not given.
+    """Validate settings and fill in defaults.
 
     Args:
-        kind: Their type.
-        given: As the vehicle file has them.
-        where: What to call the place in an error.
+        kind: Type of the settings.
+        given: Settings as in the vehicle file.
+        where: Name of the place in error messages.
 
     Raises:
-        VehicleError: An unknown name, or a value that does not fit.
+        VehicleError: A name is unknown or a value is invalid.
     """
     try:
         return kind.model_validate(dict(given))
@@ -62,6 +62,6 @@ def _explained(error: ValidationError, kind: type[BaseModel], where: str) -> str
 
 
 def identity_of(name: str, *parts: object) -> str:
-    """A short text that changes with any of ``parts``, which JSON must be able to hold."""
+    """Return a short text that changes with any of ``parts``; they must be JSON serialisable."""
     text = json.dumps(parts, sort_keys=True, default=str)
     return f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"

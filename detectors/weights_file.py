@@ -1,7 +1,8 @@
-"""Weights and their description as one safetensors file, with a sum by which damage is seen.
+"""Store weights and their description as one safetensors file with a checksum.
 
-Safetensors has no checksum: a flipped bit would be another network. The sum is over description
-and weights, and is in the file's own header; files that came with crosscue are known whole.
+Safetensors has no checksum of its own, and a flipped bit would silently change the network. The
+checksum covers description and weights and is stored in the file's header. For the embedded files
+the hash of the whole file is known.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ EMBEDDED: Final[Mapping[str, str]] = {
     ),
     "road.safetensors": "a1323a9f1f04962a6b6a4af7db8800d3c22e304c48a561c4ffbf808a75fafdc6",
 }
-"""SHA-256 of the files that come with crosscue."""
+"""SHA-256 of the files that are part of the crosscue package."""
 
 
 def embedded(name: str) -> Path:
-    """Where one of ``EMBEDDED`` lies."""
+    """Path of one of the ``EMBEDDED`` files."""
     return Path(__file__).with_name("checkpoints") / name
 
 
 def packed(tensors: Mapping[str, Tensor], key: str, description: str) -> bytes:
-    """The file's bytes.
+    """Return the bytes of a file with weights and description.
 
     Args:
-        tensors: On the CPU, contiguous.
-        key: Under which the description stands.
+        tensors: Weights, on the CPU and contiguous.
+        key: Header key of the description.
         description: Any text.
     """
     from safetensors.torch import save
@@ -46,9 +47,9 @@ def packed(tensors: Mapping[str, Tensor], key: str, description: str) -> bytes:
 
 
 def serialised(tensors: Mapping[str, Tensor], words: Mapping[str, str]) -> bytes:
-    """Tensors and words as a safetensors file; the same ones are the same bytes.
+    """Serialise tensors and header entries as safetensors; equal input yields equal bytes.
 
-    The library writes the words in an order that differs from process to process.
+    The library itself writes the entries in an order that differs between processes.
     """
     from safetensors.torch import save
 
@@ -62,10 +63,10 @@ def serialised(tensors: Mapping[str, Tensor], words: Mapping[str, str]) -> bytes
 
 
 def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str, Tensor]]:
-    """Description and weights; no description where the file has none under ``key``.
+    """Return description and weights; the description is None if ``key`` is missing.
 
     Raises:
-        VehicleError: Damaged, or no safetensors.
+        VehicleError: The file is damaged or not safetensors.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -101,5 +102,5 @@ def _sum(description: str, content: bytes) -> str:
 
 
 def _start(content: bytes) -> int:
-    """Where the weights begin: behind the header, whose length stands first."""
+    """Offset of the weights: after the header, whose length is stored first."""
     return 8 + int.from_bytes(content[:8], "little")

@@ -1,1 +1,1 @@
-"""Model cards: what a network needs as input and what its output means."""
+"""Model cards, which describe a network's input and the meaning of its output."""

@@ -1,4 +1,4 @@
-"""Torchvision's detection networks, of which a file of weights has only names and shapes."""
+"""Table of torchvision's detection networks: properties that a weights file does not record."""
 
 from __future__ import annotations
 
@@ -19,24 +19,25 @@ ArchitectureName = Literal[
     "ssd300_vgg16",
     "ssdlite320_mobilenet_v3_large",
 ]
-"""Functions of ``torchvision.models.detection``."""
+"""Names of functions of ``torchvision.models.detection``."""
 WEIGHTS_SUFFIXES: Final = (".pth", ".pt", ".safetensors")
 
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
-    """What of a network its weights do not say, or say only in one place.
+    """Properties of an architecture that a weights file does not record.
 
     Attributes:
-        size_px: The longest side and the shortest that the network scales pictures to; width and
-            height where it stretches them.
-        head: The tensor whose first axis counts classes.
-        per_class: How many of its rows each class has.
+        size_px: Longest and shortest side to which the network scales pictures; width and height
+            if it stretches them.
+        head: Name of the tensor whose first axis counts classes.
+        per_class: Number of that tensor's rows per class.
         first_class: Number of the first class that a detection can have; 1 where 0 is the
             background.
-        is_masked: It reports masks.
-        is_frozen: Its normalisation is frozen where torchvision's weights are trained further.
-        is_stretched: It scales pictures to one size, without keeping their proportions.
+        is_masked: True if the network returns masks.
+        is_frozen: True if training from torchvision's weights keeps the normalisation frozen.
+        is_stretched: True if the network scales pictures to one size, regardless of their
+            proportions.
     """
 
     size_px: tuple[int, int]

@@ -1,4 +1,4 @@
-"""Model cards: the input that a network expects and what its numbers mean, as a TOML file.
+"""Model cards: TOML files that describe a network's input and the meaning of its output.
 
 version = 1
 weights = "yolox_nano.onnx"      # next to the card; .onnx, .xml (OpenVINO), .tflite, or tensors
@@ -36,7 +36,7 @@ from .architectures import WEIGHTS_SUFFIXES, ArchitectureName
 from .class_scores import ClassScores
 
 MAX_BYTES: Final = 2048 * MIB
-"""Largest weights read."""
+"""Maximum size of a weights file."""
 MAX_CARD_BYTES: Final = 1 * MIB
 Side = Annotated[int, Field(gt=0, le=8192)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -45,7 +45,7 @@ Hash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class Input(Settings):
-    """From pixels to the network's input: (pixel - mean) * scale, both in ``colour`` order."""
+    """The network's input: (pixel - mean) * scale, with both in ``colour`` order."""
 
     width_px: Side
     height_px: Side
@@ -53,34 +53,35 @@ class Input(Settings):
     mean: Colour = (0.0, 0.0, 0.0)
     scale: Colour = (1.0, 1.0, 1.0)
     fit: Literal["stretch", "letterbox", "letterbox-center", "crop", "network"] = "stretch"
-    """Letterbox: proportions kept, at the top left or in the center, the rest filled with ``pad``;
-    crop: proportions kept, the middle of the picture; network: it scales the picture itself, the
-    shorter side to the smaller of width and height, the longer one to at most the larger, as
-    torchvision's do."""
+    """How a picture is fitted into the input. Stretch: scaled regardless of its proportions.
+    Letterbox: proportions kept, at the top left or in the center, and the rest filled with
+    ``pad``. Crop: proportions kept, the middle of the picture. Network: the network scales the
+    picture itself, as torchvision's do: the shorter side to the smaller of width and height, the
+    longer side to at most the larger."""
     pad: Annotated[int, Field(ge=0, le=255)] = 114
     decode: Literal["reduced", "full"] = "reduced"
-    """Reduced: a JPEG is decoded no finer than the input needs, which averages pixels and saves
-    time. Full: at its own size and then interpolated, as most published scripts do; where the
-    picture is more than twice as wide as the input, interpolation skips most pixels."""
+    """Resolution at which a JPEG is decoded. Reduced: no finer than the input needs, which averages
+    pixels and saves time. Full: at full size and then interpolated, as most published scripts do;
+    if the picture is more than twice as wide as the input, interpolation skips most pixels."""
     layout: Literal["nchw", "nhwc", "chw"] = "nchw"
     """``chw`` has no batch axis, as torchvision exports its detectors."""
     dtype: Literal["float32", "uint8"] = "float32"
     is_resizable: bool = False
-    """A network without fully connected layers runs at other sizes than its file declares, and
-    then returns as many candidates more."""
+    """True for a network without fully connected layers. It runs at other sizes than its file
+    declares, and then returns more or fewer candidates accordingly."""
     max_batch: Annotated[int, Field(gt=0, le=64)] = 1
-    """Pictures given to the network at once, where its batch axis is free."""
+    """Number of pictures per batch, where the network's batch axis is variable."""
 
 
 class Tiles(Settings):
-    """Besides the whole picture, tiles of the input's size at the picture's own resolution."""
+    """Tiles at the picture's full resolution, examined in addition to the whole picture."""
 
     top: Proportion = 0.3
-    """Upper edge of the band covered, as a fraction of the picture's height."""
+    """Upper edge of the covered band, as a fraction of the picture's height."""
     bottom: Proportion = 0.7
-    """Its lower edge."""
+    """Lower edge of the covered band."""
     overlap: Annotated[float, Field(ge=0.0, lt=0.9)] = 0.2
-    """Of neighbouring tiles, as a fraction of their size."""
+    """Overlap of neighbouring tiles, as a fraction of their size."""
 
 
 class SegmentationOutput(Settings):
@@ -90,21 +91,20 @@ class SegmentationOutput(Settings):
     name: str | None = None
     classes: tuple[str, ...]
     road: tuple[str, ...] = ("road",)
-    """Names of the classes that one can drive on."""
+    """Names of the classes that are drivable."""
 
 
 class TorchNetwork(Settings):
-    """What to build for weights that are tensors alone, by torchvision."""
+    """A torchvision network, for weights files that contain only tensors."""
 
     architecture: ArchitectureName
     norm_epsilon: Annotated[float, Field(ge=0.0, le=0.1)] | None = None
-    """Added to the variances of its normalisation; left out, as torchvision builds it. 0 for
-    networks trained further from torchvision's COCO weights of the first versions, whose
-    normalisation is frozen."""
+    """Value added to the variances in normalisation; torchvision's value by default. It is 0 for
+    networks fine-tuned from torchvision's first COCO weights, whose normalisation is frozen."""
 
 
 class WeightFile(Settings):
-    """A file that the publisher offers, for ``crosscue model fetch``."""
+    """A published weights file, for ``crosscue model fetch``."""
 
     name: Annotated[str, Field(pattern=r"^[\w.-]+$")]
     url: Annotated[str, Field(pattern="^https?://")]
@@ -113,58 +113,58 @@ class WeightFile(Settings):
 
 
 class Evidence(Settings):
-    """One measurement of the network: on which pictures, with which result."""
+    """One measurement of the network: its pictures and its result."""
 
     pictures: str
-    """Which, how many, by whom labelled."""
+    """The pictures, their number and their annotators."""
     boxes: Annotated[int, Field(ge=0)] | None = None
-    """Labelled objects, or boxes found, that were counted."""
+    """Number of annotated objects or detected boxes that were counted."""
     input: str = ""
-    """At which size of the network's input, where it runs at several."""
+    """Input size of the network, where it runs at several."""
     metric: str
     value: Finite
     low: Finite | None = None
-    """Lower end of the 95 % interval."""
+    """Lower bound of the 95 % interval."""
     high: Finite | None = None
     measured: str = ""
-    """When, with which version: a date and a commit."""
+    """Date and commit of the measurement."""
     note: str = ""
 
 
 class ModelCard(Settings):
-    """A whole card."""
+    """A complete model card."""
 
     version: Literal[1]
     about: str = ""
-    """What the network is, in a line."""
+    """One-line description of the network."""
     weights: str
     sha256: Hash
     sha256_bin: Hash | None = None
-    """Of the .bin file next to an OpenVINO .xml."""
+    """SHA-256 of the .bin file next to an OpenVINO .xml."""
     licence: str = ""
     source: str = ""
     input: Input
     output: Annotated[AnyBoxOutput | SegmentationOutput, Field(discriminator="kind")]
     network: TorchNetwork | None = None
-    """For weights that are tensors alone: .pth, .pt and .safetensors."""
+    """The architecture, for weights files that contain only tensors: .pth, .pt, .safetensors."""
     labels: dict[str, str] = Field(default_factory=dict)
-    """What a class means to crosscue, where its own name says something else: the cues count
-    "stop sign", "traffic light", "car", "truck", "bus", "one way left" and so on."""
+    """Labels of classes whose names differ from crosscue's. The cues count "stop sign",
+    "traffic light", "car", "truck", "bus", "one way left" and so on."""
     scores: dict[str, ClassScores] = Field(default_factory=dict)
-    """By label, that is by the class's meaning: thresholds and calibrations, as fitted."""
+    """Fitted thresholds and calibrations, by label."""
     is_calibrated: bool = False
-    """Its scores are probabilities: so often a detection is right. Of an object that two detectors
-    found, a calibrated score is kept before one that is not."""
+    """True if the scores are probabilities: the fraction of such detections that are correct. If
+    two detectors find the same object, a calibrated score is preferred."""
     tiles: Tiles | None = None
-    """Left out: the whole picture only."""
+    """Tiles to examine; by default only the whole picture is examined."""
     files: tuple[WeightFile, ...] = ()
-    """Where the weights can be had; the first is ``weights``."""
+    """Published files; the first is ``weights``."""
     evidence: tuple[Evidence, ...] = ()
-    """What was measured, for ``crosscue model show``."""
+    """Measurements of the network, for ``crosscue model show``."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        """Refuse labels of classes that are not listed, no classes, and one class twice."""
+        """Reject an empty list of classes, and labels and scores of unlisted classes."""
         classes = self.output.classes
         if not classes:
             raise ValueError("output.classes is empty; list the network's classes in their order")
@@ -179,28 +179,30 @@ class ModelCard(Settings):
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Self:
-        """Refuse tensors without a network, and a network whose pictures the card scales."""
+        """Reject tensors without [network], and [network] with an input that does not fit it."""
         is_tensors = self.weights.lower().endswith(WEIGHTS_SUFFIXES)
         if is_tensors != (self.network is not None):
             raise ValueError(
-                "network.architecture is for tensors alone (.pth, .pt, .safetensors), and they "
-                "need it"
+                "network.architecture is required for files of tensors (.pth, .pt, .safetensors) "
+                "and not allowed for others"
             )
         given = self.input
         if is_tensors != (given.fit == "network"):
-            raise ValueError('input.fit = "network" goes with [network], and only with it')
+            raise ValueError(
+                'input.fit = "network" is required with [network] and only allowed there'
+            )
         if is_tensors and (
             (given.colour, given.layout, given.dtype) != ("rgb", "chw", "uint8")
             or self.output.kind != "torchvision"
         ):
             raise ValueError(
-                'networks of torchvision need colour = "rgb", layout = "chw", dtype = "uint8" in '
+                'torchvision networks need colour = "rgb", layout = "chw", dtype = "uint8" in '
                 '[input], and kind = "torchvision" in [output]'
             )
         return self
 
     def meaning(self, number: int) -> str:
-        """The label that a detection of a class gets."""
+        """Return the label of a class, by its number."""
         name = self.output.classes[number]
         return self.labels.get(name, name)
 
@@ -209,7 +211,7 @@ def read_card(path: Path) -> ModelCard:
     """Read and check a card.
 
     Raises:
-        VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
+        VehicleError: The file is missing or not TOML, or a key or value is invalid.
     """
     try:
         content = read_at_most(path, MAX_CARD_BYTES)
@@ -231,10 +233,10 @@ def read_card(path: Path) -> ModelCard:
 
 
 def read_weights(card: ModelCard, folder: Path) -> Weights:
-    """The card's weights, their hashes compared.
+    """Read the card's weights and compare their hashes.
 
     Raises:
-        VehicleError: Not there, too large, or not the file that the card was written for.
+        VehicleError: The weights are missing, too large, or do not match the card's hash.
     """
     path = folder / card.weights
     content = _verified(path, card.sha256, "sha256")
@@ -256,7 +258,7 @@ def _verified(path: Path, want: str, key: str) -> bytes:
     found = hashlib.sha256(content).hexdigest()
     if found != want:
         raise VehicleError(
-            f"{path}: SHA-256 {found}, the card's {key} says {want}; fetch the weights again, or "
-            "write a card for these"
+            f"{path}: SHA-256 {found}; the card's {key} is {want}; fetch the weights again, or "
+            "write a card for this file"
         )
     return content

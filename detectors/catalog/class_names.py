@@ -1,4 +1,4 @@
-"""COCO's class names, and what class names of other vocabularies mean to crosscue's cues."""
+"""COCO's class names, and the labels of crosscue's cues for names of other vocabularies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COCO_80: Final = (
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
 _GAPS: Final = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-"""Numbers below 91 that COCO's numbering of its 80 classes leaves out."""
+"""Numbers below 91 that COCO's numbering of its 80 classes skips."""
 
 
 def _coco_90() -> tuple[str, ...]:
@@ -27,7 +27,7 @@ def _coco_90() -> tuple[str, ...]:
 
 
 COCO_90: Final = _coco_90()
-"""Number n of COCO's own numbering, which has gaps, at place n - 1."""
+"""Class names by COCO's own numbers, which have gaps: number n is at index n - 1."""
 
 CUE_LABELS: Final = (
     "stop sign",
@@ -61,7 +61,7 @@ _MEANINGS: Final = {
 
 
 def meaning_of(name: str) -> str | None:
-    """The cue label that a class name of another vocabulary means; None where none is plain."""
+    """Return the cue label for a class name of another vocabulary; None if unknown."""
     bare = re.sub(r"[^a-z]", "", name.lower())
     by_spelling = {re.sub(r"[^a-z]", "", label): label for label in CUE_LABELS}
     return by_spelling.get(bare) or _MEANINGS.get(bare)

@@ -1,4 +1,4 @@
-"""What a card knows of one class's scores: a threshold for cues, and what a score is worth.
+"""A model card's settings for the scores of one class: threshold and calibration.
 
 Both are written by ``crosscue fit detector``:
 
@@ -18,25 +18,25 @@ from pydantic import Field, model_validator
 from crosscue.detectors.settings import Proportion, Settings
 
 ORDER: Final = 1e-6
-"""So much of the network's score is kept by ``Isotonic``, so that no two scores become equal."""
+"""Weight of the network's score in ``Isotonic``, so that no two scores become equal."""
 
 
 class Platt(Settings):
-    """The logit of the fraction right is ``slope * logit(score) + offset`` (Platt 1999)."""
+    """Platt scaling: logit of the correct fraction = ``slope * logit(score) + offset`` (1999)."""
 
     kind: Literal["platt"]
     slope: Annotated[float, Field(gt=0.0, le=100.0)]
     offset: Annotated[float, Field(ge=-100.0, le=100.0)]
 
     def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The fraction of detections with such a score that are right, shape (N,)."""
+        """Return the fraction of detections with each score that are correct, shape (N,)."""
         kept = np.clip(scores, 1e-9, 1.0 - 1e-9)
         logit = self.slope * np.log(kept / (1.0 - kept)) + self.offset
         return np.asarray(1.0 / (1.0 + np.exp(-logit)), np.float64)
 
 
 class Isotonic(Settings):
-    """Straight lines between points, which rise; level before the first and after the last."""
+    """Isotonic calibration: increasing, piecewise linear, and constant outside the points."""
 
     kind: Literal["isotonic"]
     scores: Annotated[tuple[Proportion, ...], Field(min_length=1, max_length=1000)]
@@ -51,15 +51,16 @@ class Isotonic(Settings):
         return self
 
     def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As ``Platt``."""
+        """As ``Platt.probabilities``."""
         found = np.interp(scores, self.scores, self.fractions)
         return np.asarray((1.0 - ORDER) * found + ORDER * scores, np.float64)
 
 
 class ClassScores(Settings):
-    """Of one class."""
+    """Threshold and calibration of one class."""
 
     threshold: Proportion | None = None
-    """A detection is a cue above this score, after calibration; the vehicle file may say more."""
+    """Score after calibration above which a detection is a cue; the vehicle file can override it.
+    """
     calibration: Annotated[Platt | Isotonic, Field(discriminator="kind")] | None = None
-    """From the network's score to the fraction of such detections that are right."""
+    """Maps the network's score to the fraction of such detections that are correct."""

@@ -1,4 +1,4 @@
-"""A first card for a model file: what the file says, and what had to be assumed."""
+"""Draft a model card from a model file, with a list of what had to be assumed."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .recognise import size_in
 
 _LINE: Final = 100
 _NOTHING: Final = ("background", "bg")
-"""Names of a first class that detections never have."""
+"""Names of a background class, which no detection has."""
 
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A card's text, and what a person should look at.
+    """A card's text, with the facts and the assumptions behind it.
 
     Attributes:
-        text: TOML.
-        kind: Of its output.
-        certain: What the file says.
-        assumed: What it does not.
+        text: The card in TOML.
+        kind: Kind of the output.
+        certain: Facts from the file.
+        assumed: Assumptions, for the user to check.
     """
 
     text: str
@@ -45,17 +45,17 @@ def draft(
     names: Sequence[str] = (),
     size_px: tuple[int, int] | None = None,
 ) -> Draft:
-    """Write a card.
+    """Draft a card.
 
     Args:
         path: The model file.
-        model: What it says of itself.
-        guess: Its layout.
+        model: The interface that the file declares.
+        guess: The layout of its output.
         names: Class names, where the file has none.
-        size_px: Width and height of the input, where the file leaves them open or allows others.
+        size_px: Width and height of the input, where they are variable.
 
     Raises:
-        UsageError: There are no class names, or not as many as the output has.
+        UsageError: The class names are missing, or their number differs from the output's.
     """
     certain, assumed = list(guess.reasons), list(guess.assumptions)
     classes = _classes(path, model, guess, names, certain, assumed)
@@ -64,7 +64,7 @@ def draft(
     labels = {name: label for name in classes if (label := meaning_of(name)) and label != name}
     lines = [
         f"# Written by crosscue model init for {path.name}.",
-        *(f"# The file says: {reason}." for reason in certain),
+        *(f"# Found in the file: {reason}." for reason in certain),
         *(f"# Assumed, please check: {one}." for one in assumed),
         "version = 1",
         f"weights = {_value(path.name)}",
@@ -105,7 +105,7 @@ def _classes(
         names = names[1:]
     if names:
         if count is not None and len(names) != count:
-            raise UsageError(f"{path}: {count} classes, but {len(names)} names are given")
+            raise UsageError(f"{path}: {count} classes, but {len(names)} class names were passed")
         return tuple(names)
     if model.class_names:
         certain.append(f"{len(model.class_names)} class names in its metadata")
@@ -119,7 +119,7 @@ def _classes(
         assumed.append("the 91 classes are COCO's numbers, 0 unused")
         return ("unused 0", *COCO_90)
     raise UsageError(
-        f"{path}: {count} classes and no names in the file; give one per line: --class-names FILE"
+        f"{path}: {count} classes without names; list the names, one per line: --class-names FILE"
     )
 
 
@@ -147,7 +147,7 @@ def _input(
         certain.append(f"its input is {width} x {height}")
     else:
         width, height = size_in(model.metadata) or guess.usual_size_px
-        assumed.append(f"its size is open; {width} x {height} (--size WxH)")
+        assumed.append(f"its input size is variable; {width} x {height} (--size WxH)")
     usual.pop("layout", None)
     if "colour" in usual and not model.class_names:
         assumed.append(f"colours are {usual['colour']}, pictures fitted by {usual.get('fit')}")
@@ -163,7 +163,7 @@ def _layout(shape: Sequence[int | str | None]) -> str | None:
 
 
 def _value(value: object) -> str:
-    """A TOML value; long lists over several lines."""
+    """Format a TOML value; long lists are broken into several lines."""
     if isinstance(value, tuple | list):
         items = [_value(one) for one in value]
         line = f"[{', '.join(items)}]"

@@ -1,4 +1,4 @@
-"""The models of the catalog: their cards, and the folders with their weights."""
+"""Cards of the catalog's models, and the folders of their weights."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from .places import cache_folder, card_path
 
 
 def entry(name: str) -> ModelCard:
-    """A model's card.
+    """Read a model's card.
 
     Raises:
-        UsageError: No such model.
+        UsageError: The catalog has no such model.
     """
     return read_card(card_path(name))
 
 
 def place_of(card: ModelCard, file: WeightFile) -> Path:
-    """Where a file of a model's weights is, or would be, in the cache."""
+    """Path of a weights file in the cache, whether or not it exists."""
     return cache_folder() / card.sha256[:16] / file.name
 
 
 def weights_folder(card: ModelCard, path: Path) -> Path:
-    """The folder with a card's weights: beside the card, or the cache for a catalog's model.
+    """Return the folder of a card's weights: the card's, or the cache for a catalog's model.
 
     Raises:
-        VehicleError: They are not fetched yet; with size, licence and the command.
+        VehicleError: They are not fetched yet; the message has size, licence and command.
     """
     if not card.files or (path.parent / card.weights).exists():
         return path.parent

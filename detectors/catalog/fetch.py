@@ -1,7 +1,7 @@
-"""Weights from their publisher, a mirror, a folder or a file, checked before they are kept.
+"""Fetch weights from their publisher, a mirror, a folder or a file, and verify their hashes.
 
-``$CROSSCUE_MODEL_MIRROR`` names a server that is asked instead of the publisher, for
-``MIRROR/NAME``; ``$CROSSCUE_DATA`` a folder whose ``weights`` are searched.
+``$CROSSCUE_MODEL_MIRROR`` names a server that is used instead of the publisher, with addresses
+``MIRROR/NAME``. ``$CROSSCUE_DATA`` names a folder whose subfolder ``weights`` is searched.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OTHERWISE: Final = f"give it with --weights FILE, or name a mirror in {MIRROR}"
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """Where a model's file is now, and where it came from."""
+    """Location of a model's file, and its source."""
 
     path: Path
     came_from: str
@@ -37,22 +37,22 @@ def fetch(
     on_progress: Progress = lambda name, done, total: None,
     environment: Mapping[str, str] = os.environ,
 ) -> list[Fetched]:
-    """Bring all files of a catalog's model into the cache.
+    """Fetch all files of a catalog's model into the cache.
 
     Args:
         name: As ``crosscue model list`` prints it.
-        given: A file, or a folder with the files, to take them from; no network is used.
+        given: A file, or a folder with the files, to copy; no network is used.
         on_progress: Called after each piece.
-        environment: For the variables named above.
+        environment: Environment variables.
 
     Raises:
-        UsageError: No such model, or ``given`` is not there or another file.
-        CrosscueError: It cannot be had, or is not the file that the catalog means.
+        UsageError: The model does not exist, or ``given`` is missing or a different file.
+        CrosscueError: The download fails, or the file's hash is not the catalog's.
         OutputError: The cache cannot be written.
     """
     card = entry(name)
     if not card.files:
-        raise UsageError(f"model {name}: comes with crosscue; there is nothing to fetch")
+        raise UsageError(f"model {name}: part of crosscue; there is nothing to fetch")
     return [_fetched(name, card, file, given, on_progress, environment) for file in card.files]
 
 
@@ -71,7 +71,7 @@ def _fetched(
         source = given / file.name if given.is_dir() else given
         take(source, file, place, owner)
         return Fetched(place, str(source))
-    for source in _at_hand(file, environment):
+    for source in _local_copies(file, environment):
         if is_there(file, source):
             take(source, file, place, owner)
             return Fetched(place, str(source))
@@ -81,8 +81,8 @@ def _fetched(
     return Fetched(place, url)
 
 
-def _at_hand(file: WeightFile, environment: Mapping[str, str]) -> Iterator[Path]:
-    """Files of that name below ``$CROSSCUE_DATA/weights``."""
+def _local_copies(file: WeightFile, environment: Mapping[str, str]) -> Iterator[Path]:
+    """Yield the files of that name below ``$CROSSCUE_DATA/weights``."""
     folder = environment.get(DATA)
     if folder:
         yield from sorted(Path(folder, "weights").glob(f"*/{file.name}"))

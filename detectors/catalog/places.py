@@ -1,8 +1,8 @@
-"""The catalog: known models, one card each in ``models``, and where their weights are kept.
+"""Paths of the catalog: one card per model in ``models``, and the cache of their weights.
 
-Weights of others are never in this repository. ``crosscue model fetch`` puts them below the cache
-folder (``$CROSSCUE_MODELS``, else the user's cache), under their hash, so that two versions of a
-model lie side by side.
+This repository does not contain other publishers' weights. ``crosscue model fetch`` stores them
+below the cache folder (``$CROSSCUE_MODELS``, else the user's cache), in a folder named by their
+hash, so that two versions of a model can coexist.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ VARIABLE: Final = "CROSSCUE_MODELS"
 
 
 def cache_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where fetched weights are kept.
+    """Folder of fetched weights.
 
     Raises:
-        UsageError: No such place can be named: the machine has no home folder.
+        UsageError: The user has no home folder.
     """
     asked = environment.get(VARIABLE)
     return Path(asked) if asked else user_cache(VARIABLE, environment) / "models"
 
 
 def user_cache(variable: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """The user's cache folder of crosscue.
+    """The user's cache folder for crosscue.
 
     Args:
-        variable: That names another place, for errors.
-        environment: For ``$XDG_CACHE_HOME``.
+        variable: Environment variable that can name another folder, for the error message.
+        environment: Environment variables; ``$XDG_CACHE_HOME`` is used.
 
     Raises:
-        UsageError: No such place can be named: the machine has no home folder.
+        UsageError: The user has no home folder.
     """
     base = Path(environment.get("XDG_CACHE_HOME", ""))
     try:
         base = base if base.is_absolute() else Path.home() / ".cache"
     except RuntimeError:
         raise UsageError(
-            f"no home folder to keep files in; name one in the variable {variable}"
+            f"no home folder for the cache; name another folder in the variable {variable}"
         ) from None
     return base / "crosscue"
 
 
 @cache
 def names() -> tuple[str, ...]:
-    """Of all models, sorted."""
+    """Names of all models, sorted."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
 
 
 def card_path(name: str) -> Path:
-    """The card of a model in the catalog.
+    """Path of the card of a model in the catalog.
 
     Raises:
-        UsageError: No such model; the nearest is named.
+        UsageError: The catalog has no such model; the message suggests the nearest name.
     """
     if name not in names():
         close = difflib.get_close_matches(name, names(), n=1)
@@ -70,9 +70,9 @@ def card_path(name: str) -> Path:
 
 
 def card_named(name: str) -> Path:
-    """A card's file, from its name, which ends in ``.toml``, or from the catalog's.
+    """Path of a card, from a file name that ends in ``.toml`` or a model name of the catalog.
 
     Raises:
-        UsageError: The catalog has no such model; the nearest is named.
+        UsageError: The catalog has no such model; the message suggests the nearest name.
     """
     return Path(name) if name.endswith(".toml") else card_path(name)

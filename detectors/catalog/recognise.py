@@ -1,4 +1,4 @@
-"""What a model file says of itself, and the layouts that it may have."""
+"""Read the interface that a model file declares, and infer the layout of its output."""
 
 from __future__ import annotations
 
@@ -34,19 +34,22 @@ _MAX_NAMES_CHARACTERS: Final = 100_000
 _MAX_BRACKETS: Final = 200
 """In metadata; parsing more of them is slow."""
 DEFAULT_SIDE_PX: Final = 640
-"""Of a network that takes pictures of any size and names none."""
+"""Default side of a network's input, where the file declares no size."""
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
-"""Of one input that a file declares: the largest picture that a card may name."""
+"""Maximum number of values of one input: the largest picture that a card may specify."""
 _MANY_CLASSES: Final = 10_000
-"""Where the shapes leave open how many a network has."""
+"""Number of classes to assume where the shapes do not determine it."""
 SENSIBLE_FRACTION: Final = 0.99
-"""Of boxes that a network finds in noise, where their layout is read rightly."""
+"""Minimum fraction of boxes found in noise that are of sensible size if the layout is correct."""
 _ONNX_INTEGERS: Final = frozenset((6, 7))
-"""int32 and int64 as ONNX numbers them."""
+"""ONNX's numbers of int32 and int64."""
 SPREAD_FRACTION: Final = 0.5
-"""Of the input's sides: candidates of every cell lie all over a picture, read rightly."""
+"""Minimum spread of candidates, as a fraction of the input's sides.
+
+If the layout is correct, the candidates of all cells are spread over the whole picture.
+"""
 _LABELS: Final = ["model_info", "labels"]
-"""Place of the class names in an OpenVINO file, with underscores for spaces."""
+"""Path of the class names in an OpenVINO file, with underscores for spaces."""
 _REFUSED: Final = {
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",
@@ -54,17 +57,17 @@ _REFUSED: Final = {
 
 
 def read_interface(path: Path) -> Interface:
-    """Inputs, outputs and metadata of an ONNX file or an OpenVINO .xml.
+    """Read inputs, outputs and metadata of an ONNX file or an OpenVINO .xml.
 
     Raises:
-        UsageError: Another kind of file, damaged, or the package that reads it is missing.
+        UsageError: The file is of another kind or damaged, or the package to read it is missing.
     """
     suffix = path.suffix.lower()
     if suffix in _REFUSED:
         raise UsageError(f"{path}: {_REFUSED[suffix]}")
     if suffix not in _READERS:
         raise UsageError(
-            f"{path}: expected {', '.join(_READERS)}, or weights of a network of torchvision's: "
+            f"{path}: expected {', '.join(_READERS)}, or weights of a torchvision network: "
             f"{', '.join(WEIGHTS_SUFFIXES)}"
         )
     try:
@@ -77,7 +80,7 @@ def read_interface(path: Path) -> Interface:
     except UsageError:
         raise
     except Exception as error:
-        raise UsageError(f"{path}: not a whole model file: {one_line(error, 160)}") from None
+        raise UsageError(f"{path}: not a complete model file: {one_line(error, 160)}") from None
 
 
 def _of_onnx(content: bytes, path: Path) -> Interface:
@@ -168,12 +171,12 @@ def _need(package: str, path: Path) -> None:
 
 
 def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:
-    """Class names that an exporter left under ``names``, as Ultralytics does; else empty."""
+    """Class names that an exporter stored under ``names``, as Ultralytics does; else empty."""
     text = metadata.get("names", "")
     if not text or len(text) > _MAX_NAMES_CHARACTERS:
         return ()
     try:
-        # Only literals: this runs nothing.
+        # Parses literals only; no code is run.
         found = ast.literal_eval(text)
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         return ()
@@ -185,15 +188,15 @@ def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Interface:
-    """The interface with sizes that the file leaves open, from running the network once.
+    """Fill in sizes that the file does not declare, by running the network once.
 
     Args:
         path: The model file.
-        model: What it says of itself.
-        size_px: Width and height to run at, where the file leaves them open.
+        model: The interface that the file declares.
+        size_px: Width and height of the input, where the file does not declare them.
 
     Raises:
-        UsageError: The network does not run at that size, or the size is not a sensible one.
+        UsageError: The network does not run at that size, or the size exceeds the limit.
     """
     if all(isinstance(side, int) for out in model.outputs for side in out.shape):
         return model
@@ -230,7 +233,7 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
 
 
 def size_in(metadata: Mapping[str, str]) -> tuple[int, int] | None:
-    """Width and height that an exporter left as ``imgsz``: height first."""
+    """Width and height that an exporter stored as ``imgsz``, which has the height first."""
     try:
         height, width = ast.literal_eval(metadata.get("imgsz", "")[:100])
         return int(width), int(height)
@@ -248,10 +251,12 @@ def _weights(path: Path) -> Weights:
 
 
 def plausible(path: Path, model: Interface, found: list[Guess]) -> list[Guess]:
-    """Those layouts by which the network's answer to noise is boxes of sensible sizes.
+    """Return the layouts that decode the network's output for noise to sensible boxes.
+
+    If no layout does, all are returned.
 
     Raises:
-        VehicleError: The network does not run at all.
+        VehicleError: The network does not run.
     """
     network = load_network(_weights(path))
     kept = [guess for guess in found if _is_plausible(network, model, guess)]
@@ -274,7 +279,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     except ValueError:
         return False
     size = np.array([width, height])
-    # Exports with built-in suppression fill up with zeros.
+    # Exports with built-in suppression pad their output with zeros.
     boxes_px = found.boxes_px[found.boxes_px.any(axis=1)]
     sides = boxes_px[:, 2:] - boxes_px[:, :2]
     is_sensible = (sides >= 0.0) & (sides <= 4.0 * size)
@@ -289,7 +294,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
 
 
 def guesses(model: Interface) -> list[Guess]:
-    """All layouts that a model file may have, in the order of the table."""
+    """List all layouts that a model file may have, in the order of the table."""
     if not model.inputs or not model.outputs:
         return []
     return [guess for decoder in DECODERS if (guess := decoder.recognise(model)) is not None]

@@ -1,4 +1,4 @@
-"""Which of torchvision's networks a file of tensors is for, from their names and shapes."""
+"""Recognise the torchvision network of a file of tensors by their names and shapes."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ _HEADER_BYTES: Final = 65_536
 def recognise_weights(
     path: Path, kind: str | None, size_px: tuple[int, int] | None = None
 ) -> tuple[Interface, Guess]:
-    """The network whose tensors have these very names and shapes.
+    """Find the network whose tensors have exactly these names and shapes.
 
     Args:
         path: A ``state_dict`` (.pth, .pt) or safetensors.
         kind: The architecture, where several have the same tensors.
-        size_px: Longest and shortest side that pictures are scaled to; torchvision's own, if left
-            out.
+        size_px: Longest and shortest side to which pictures are scaled; torchvision's by default.
 
     Raises:
-        UsageError: It cannot be read, no network has these tensors, or several have.
-        VehicleError: It holds more than tensors, or is damaged.
+        UsageError: The file cannot be read, or its tensors match no network or several.
+        VehicleError: The file holds more than tensors, or is damaged.
     """
     try:
         content = read_at_most(path, MAX_BYTES)
@@ -46,8 +45,8 @@ def recognise_weights(
         raise UsageError(f"{path}: over {MAX_BYTES >> 20} MiB; not read")
     if path.suffix == ".safetensors" and _OURS in content[:_HEADER_BYTES]:
         raise UsageError(
-            f"{path}: written by crosscue train; it needs no card: set network = {path.name!r} of "
-            "the detector mask-rcnn"
+            f"{path}: written by crosscue train, so it needs no card; set network = {path.name!r} "
+            "in the settings of the detector mask-rcnn"
         )
     state = read_state_dict(content, str(path))
     counts = {name: class_count(state.tensors, name) for name in _NAMES}
@@ -97,7 +96,7 @@ def _guess(
     width, height = size_px or shape.size_px
     if shape.is_stretched and (width, height) != shape.size_px:
         own = f"{shape.size_px[0]}x{shape.size_px[1]}"
-        raise UsageError(f"{path}: {name} takes pictures of {own} only; leave --size out")
+        raise UsageError(f"{path}: {name} accepts pictures of {own} only; leave --size out")
     classes = count - shape.first_class
     background = " and the background" if shape.first_class else ""
     certain = [
@@ -117,8 +116,8 @@ def _guess(
     if shape.is_frozen and state.is_frozen:
         network["norm_epsilon"] = 0.0
         assumed.append(
-            "its normalisation was frozen: trained further from torchvision's COCO weights, so "
-            "norm_epsilon is 0; remove it if only the backbone was trained before"
+            "its normalisation was frozen: fine-tuned from torchvision's COCO weights, so "
+            "norm_epsilon is 0; remove it if only the backbone was pretrained"
         )
     if not shape.first_class:
         assumed.append("class numbers begin at 0")

@@ -1,9 +1,10 @@
-"""Detectors that read label images: pictures in which a pixel names its object instead of a colour.
+"""Detectors that read label images, whose pixels encode an object instead of a colour.
 
-A label image is what somebody else's segmentation left in a log, or what a simulator draws in its
-place. Red holds the class (its place in ``CLASSES``, from 1) and in its highest bit whether the
-pixel is road; green tells objects of one picture apart; blue is the score, 255 for 1. It has to be
-coded without loss. Use them as ``crosscue.detectors.label_images:objects`` and ``:road``.
+A label image is recorded by another program's segmentation or drawn by a simulator. Red holds the
+class (its position in ``CLASSES``, counted from 1) and, in its highest bit, whether the pixel is
+road. Green distinguishes the objects of one picture. Blue is the score, 255 for 1. The image must
+be compressed without loss. The detectors' names are ``crosscue.detectors.label_images:objects`` and
+``:road``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ CLASSES: Final = (
 )  # fmt: skip
 ROAD_BIT: Final = 128
 MAX_OBJECTS: Final = 255
-"""In one picture; green has no more values."""
+"""Maximum number of objects in one picture, limited by the values of green."""
 
 
 class LabelledObject(NamedTuple):
@@ -32,7 +33,7 @@ class LabelledObject(NamedTuple):
     Attributes:
         label: One of ``CLASSES``.
         score: 0 to 1.
-        corner_px: Column and row of its mask's top-left pixel; the mask may reach out of the image.
+        corner_px: Column and row of the mask's top-left pixel; the mask may exceed the image.
         mask: Shape (h, w).
     """
 
@@ -43,7 +44,7 @@ class LabelledObject(NamedTuple):
 
 
 def label_image(road: NDArray[np.bool_], objects: Sequence[LabelledObject]) -> NDArray[np.uint8]:
-    """The image, shape (H, W, 3), red, green, blue; later objects hide earlier ones.
+    """Draw a label image, shape (H, W, 3), red, green, blue; later objects hide earlier ones.
 
     Args:
         road: Shape (H, W).
@@ -65,11 +66,11 @@ def label_image(road: NDArray[np.bool_], objects: Sequence[LabelledObject]) -> N
 
 @dataclass(frozen=True, slots=True)
 class LabelledObjects:
-    """Objects of a label image, each with its mask."""
+    """Detector of the objects of a label image, each with its mask."""
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """All of them."""
+        """All classes of label images."""
         return CLASSES
 
     @property
@@ -79,11 +80,11 @@ class LabelledObjects:
 
     @property
     def identity(self) -> str:
-        """There is nothing to set."""
+        """Constant, because the detector has no settings."""
         return "label-objects 1"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Read."""
+        """Return the objects of each label image."""
         return [_objects_of(frame) for frame in frames]
 
 
@@ -118,11 +119,11 @@ def _objects_of(frame: Frame) -> Detections:
 
 @dataclass(frozen=True, slots=True)
 class LabelledRoad:
-    """Road pixels of a label image."""
+    """Detector of the road pixels of a label image."""
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """None: road is not an object."""
+        """Empty: road is not an object."""
         return ()
 
     @property
@@ -132,11 +133,11 @@ class LabelledRoad:
 
     @property
     def identity(self) -> str:
-        """There is nothing to set."""
+        """Constant, because the detector has no settings."""
         return "label-road 1"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Read."""
+        """Return the road pixels of each label image."""
         return [
             RoadMask(
                 frame.t_ns,
@@ -149,10 +150,10 @@ class LabelledRoad:
 
 
 def objects() -> LabelledObjects:
-    """The detector of objects."""
+    """Build the detector of objects."""
     return LabelledObjects()
 
 
 def road() -> LabelledRoad:
-    """The detector of road."""
+    """Build the detector of road."""
     return LabelledRoad()

@@ -1,8 +1,8 @@
-"""One-way and do-not-enter signs: pyramid, ORB, ratio test, votes in windows (eq. 17).
+"""Detect one-way and do-not-enter signs: pyramid, ORB, ratio test, votes in windows (eq. 17).
 
-The source runs ORB in every window of every level. Here points are found once for a level; each
-that looks like a point of a drawing votes for the place where the sign's middle would then be, and
-a window counts the different points of the drawing that vote for it.
+The dissertation runs ORB in every window of every level. Here points are found once per level.
+Each point that matches a point of a drawing votes for the position of the sign's centre that the
+match implies. A window counts the distinct points of the drawing that vote for it.
 """
 
 from __future__ import annotations
@@ -23,52 +23,55 @@ from .templates import AMERICAN, LABELS, Drawing, Kind, drawings
 
 VERSION: Final = 1
 POINTS_DRAWN: Final = 500
-"""More than any drawing has."""
+"""Maximum number of points of a drawing; more than any has."""
 MIN_SIDE_PX: Final = 32
-"""Of a level; ORB's border of 8 pixels and patch of 16 leave next to nothing of less."""
+"""Minimum side of a pyramid level; ORB's border of 8 pixels and patch of 16 leave too little of a
+smaller one."""
 _CELL_PX: Final = 4
-"""Side of the squares that votes are counted in."""
+"""Side of the cells in which votes are counted."""
 _SAME_SIGN: Final = 0.5
-"""Windows that overlap more (intersection over union) are the same sign."""
+"""Intersection over union above which two windows are the same sign."""
 
 
 class SignSettings(Settings):
-    """Numbers of the search; ``crosscue fit signs`` chooses ``min_score``."""
+    """Settings of the search; ``crosscue fit signs`` fits ``min_score``."""
 
     kinds: tuple[Kind, ...] = AMERICAN
-    """The international disc has few corners and needs a threshold of its own: search it alone."""
+    """Kinds of signs to detect. The international disc has few corners and needs its own threshold,
+    so search for it alone."""
     heights_px: tuple[Annotated[int, Field(ge=16, le=256)], ...] = (48, 64)
-    """Sizes of the drawings, in pixels of a pyramid level."""
+    """Heights of the drawings, in pixels of a pyramid level."""
     levels: Annotated[int, Field(ge=1, le=16)] = 14
-    """Up to 460 pixels high: a sign of 0.75 m so high is 3 m away where the focal length is 1970
-    pixels. Nine found none above 190."""
+    """Number of pyramid levels. 14 levels find signs up to 460 pixels high, which is a sign of
+    0.75 m at 3 m for a focal length of 1970 pixels. Nine levels found no sign above 190 pixels."""
     factor: Annotated[float, Field(gt=1.0, le=2.0)] = 1.25
-    """From one level of the pyramid to the next."""
+    """Scale factor between successive levels of the pyramid."""
     enlarge: Annotated[float, Field(ge=1.0, le=4.0)] = 2.5
-    """The first level, for signs smaller than the drawings."""
+    """Enlargement of the first level, for signs smaller than the drawings."""
     points: Annotated[int, Field(ge=50, le=20000)] = 4000
-    """Kept at a level."""
+    """Maximum number of points per level."""
     drawing_fast: Annotated[int, Field(ge=1, le=100)] = 6
-    """Least contrast of a drawing's point (FAST)."""
+    """Minimum contrast of a point in a drawing (FAST threshold)."""
     ratio: Proportion = 0.9
     fast: Annotated[int, Field(ge=1, le=100)] = 6
-    """The same of a picture's."""
+    """Minimum contrast of a point in a picture (FAST threshold)."""
     reach: Proportion = 0.1
-    """A vote may miss the middle by this fraction of the sign's height."""
+    """Tolerance of a vote around the sign's centre, as a fraction of the sign's height."""
     crop_top: Proportion = 0.0
-    """Fraction of the picture without signs above."""
+    """Fraction of the picture to crop at the top."""
     crop_bottom: Proportion = 0.25
-    """And below."""
+    """Fraction of the picture to crop at the bottom."""
     max_bits: Annotated[int, Field(ge=1, le=256)] = 64
-    """Two points are alike only if their descriptors differ in fewer bits of 256."""
+    """Number of differing bits of 256 below which two descriptors can match."""
     min_votes: Annotated[int, Field(ge=2)] = 4
-    """Different points that must agree."""
+    """Minimum number of distinct points that vote for a sign."""
     min_fraction: Proportion = 0.25
-    """And the fraction of the drawing's points that they must be."""
+    """Minimum fraction of the drawing's points that vote for a sign."""
     min_score: Proportion = 0.065
-    """For precision 0.95 on simulated layouts L800 to L838; your camera needs its own."""
+    """Minimum score of a sign. The default is for precision 0.95 on simulated layouts L800 to L838;
+    fit it to your camera."""
     overlap: Proportion = 0.2
-    """Of two signs that overlap more, the better stays."""
+    """Overlap of two signs above which only the better is kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +79,8 @@ class Points:
     """ORB points of a picture or of drawings, as columns of length N.
 
     Attributes:
-        at_px: Shape (N, 2), float64.
-        words: Shape (N, 4), uint64: descriptors.
+        at_px: Positions, shape (N, 2), float64.
+        words: Descriptors, shape (N, 4), uint64.
     """
 
     at_px: NDArray[np.float64]
@@ -85,18 +88,19 @@ class Points:
 
 
 def orb_points(grey: NDArray[np.uint8], max_points: int, fast: int = 10) -> Points:
-    """Points with upright descriptors; patches small enough for signs of fifty pixels.
+    """Find points with upright descriptors, in patches small enough for signs of 50 pixels.
 
-    Signs stand upright. Descriptors turned with the picture would take a left arrow for a right one
-    turned round, and the ends of a bar for each other, which the ratio test then drops.
+    Signs are upright. Rotation-invariant descriptors would confuse a left arrow with a right one,
+    and the two ends of a bar with each other; the ratio test then removes both ends.
     """
     import cv2
 
-    # OpenCV's defaults leave no point in a window of 64 pixels: border and patch of 31.
+    # OpenCV's defaults, a border and a patch of 31 pixels, leave no point in a window of 64.
     orb = cv2.ORB.create(
         nfeatures=max_points, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=fast
     )
-    # ORB's detection is FAST, then a choice of the best and angles: needless where all may stay.
+    # ORB detects with FAST, then selects the best points and computes angles. Neither is needed
+    # if all points are kept.
     keypoints = cv2.FastFeatureDetector.create(fast).detect(grey, None)
     if len(keypoints) > max_points:
         keypoints = orb.detect(grey, None)
@@ -111,7 +115,7 @@ def orb_points(grey: NDArray[np.uint8], max_points: int, fast: int = 10) -> Poin
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Gallery:
-    """All drawings' points, one after the other."""
+    """Points of all drawings, concatenated."""
 
     drawn: tuple[Drawing, ...]
     points: Points
@@ -134,10 +138,10 @@ def _gallery(settings: SignSettings) -> _Gallery:
 
 
 def build(**given: Any) -> Detector:
-    """The detector with settings by name.
+    """Build the detector from settings by name.
 
     Raises:
-        VehicleError: A setting that does not fit.
+        VehicleError: A setting is unknown or invalid.
     """
     settings = settings_of(SignSettings, given, "detector signs")
     return SignDetector(settings, _gallery(settings))
@@ -145,30 +149,30 @@ def build(**given: Any) -> Detector:
 
 @dataclass(frozen=True, slots=True)
 class SignDetector:
-    """Finds signs that look like our drawings."""
+    """Finds signs that match the stored drawings."""
 
     settings: SignSettings
     gallery: _Gallery
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the kinds that it has drawings of."""
+        """Labels of the kinds that it searches for."""
         return tuple(LABELS.get(kind, kind) for kind in self.settings.kinds)
 
     @property
     def view(self) -> View:
-        """Full size, grey: signs are small."""
+        """Full size, because signs are small, and grey."""
         return View(is_grey=True)
 
     @property
     def identity(self) -> str:
-        """Of settings and OpenCV's version."""
+        """Text that changes with the settings and OpenCV's version."""
         import cv2
 
         return identity_of("signs", VERSION, self.settings.model_dump(mode="json"), cv2.__version__)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Detect."""
+        """Return the signs in each frame."""
         return [self._one(frame) for frame in frames]
 
     def _one(self, frame: Frame) -> Detections:
@@ -212,7 +216,7 @@ class SignDetector:
         for k, drawing in enumerate(self.gallery.drawn):
             which = np.flatnonzero(matched[k] >= 0)
             at = matched[k, which]
-            # Small numbers sort by radix.
+            # Small integers allow numpy's radix sort.
             order = np.argsort((at - self.gallery.first[k]).astype(np.uint16), kind="stable")
             which, at = which[order], at[order]
             votes = points.at_px[which] + self.gallery.to_middle_px[at]
@@ -248,7 +252,7 @@ class SignDetector:
 def _is_peak(counts: Counts, reach: int) -> NDArray[np.bool_]:
     import cv2
 
-    # A window that no other within reach beats; OpenCV's dilation gives the largest near by.
+    # A peak is the maximum within reach; OpenCV's dilation computes that maximum.
     around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     values = counts.astype(np.float32)
     return np.asarray(values >= cv2.dilate(values, around), np.bool_)
@@ -257,11 +261,11 @@ def _is_peak(counts: Counts, reach: int) -> NDArray[np.bool_]:
 def _apart(
     candidates: list[tuple[float, Kind, NDArray[np.float64]]], overlap: float
 ) -> list[tuple[float, Kind, NDArray[np.float64]]]:
-    """The best windows, without those that lie over a better one, of whatever kind.
+    """Keep the best windows, without those that overlap a better one of any kind.
 
-    A sign is found on neighbouring levels and by drawings of several sizes, a chance likeness
-    hardly ever. So a window's score is its fraction of the drawing's points, times
-    S / (S + 1), where S sums the fractions of all windows of its kind over the same place.
+    A sign is found on neighbouring levels and by drawings of several sizes, a chance match rarely
+    is. So a window's score is its fraction of the drawing's points, times S / (S + 1), where S is
+    the sum of the fractions of all overlapping windows of its kind.
     """
     from crosscue.detectors.boxes import overlaps
 

@@ -1,8 +1,8 @@
-"""Points of a picture compared with those of drawings; likenesses vote for where a sign would be.
+"""Match points of a picture with points of drawings, and count the matches' votes for a sign.
 
 Two binary descriptors are compared by the number of bits in which they differ (Rublee et al., ORB,
-2011). A point counts when its nearest descriptor in a drawing is much nearer than the second (the
-ratio test; Lowe, 2004). Signs stand upright, and so do the descriptors.
+2011). A point matches if its nearest descriptor in a drawing is much nearer than the second
+nearest (the ratio test; Lowe, 2004). Signs are upright, and so are the descriptors.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Counts = NDArray[np.int32]
 _BITS_AT: Final = np.uint64(32)
 _PLACE: Final = np.uint64(0xFFFFFFFF)
 _NONE: Final = np.uint64(257 << 32)
-"""More bits than a descriptor has."""
+"""A key without a match: more differing bits than a descriptor has."""
 
 
 @njit(cache=True)
 def _ones(word: np.uint64) -> np.uint64:
-    # The pattern that LLVM knows as one machine instruction, several words at a time.
+    # LLVM compiles this pattern to one machine instruction, for several words at a time.
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + (
         (word >> np.uint64(2)) & np.uint64(0x3333333333333333)
@@ -34,7 +34,7 @@ def _ones(word: np.uint64) -> np.uint64:
 
 @njit(cache=True)
 def _keys(point: Words, a: Words, b: Words, c: Words, d: Words, keys: Words) -> None:
-    # Bits that differ, then the place: no two keys are equal, and the least is the first.
+    # The number of differing bits, then the index: keys are unique, and ties go to the first.
     p, q, r, s = point[0], point[1], point[2], point[3]
     for j in range(keys.size):
         bits = _ones(p ^ a[j]) + _ones(q ^ b[j]) + _ones(r ^ c[j]) + _ones(s ^ d[j])
@@ -61,14 +61,14 @@ def _smallest(keys: Words) -> np.uint64:
 def nearest(
     points: Words, drawn: Words, first: NDArray[np.int64], ratio: float, max_count: int
 ) -> NDArray[np.int64]:
-    """For each drawing and point the drawing's descriptor that passes the ratio test, else -1.
+    """Index of the drawing's descriptor that passes the ratio test, per drawing and point, or -1.
 
     Args:
         points: Shape (N, 4), uint64: descriptors of the picture.
-        drawn: Shape (M, 4): descriptors of all drawings, one after the other.
-        first: Shape (K + 1,): where each drawing's descriptors begin.
-        ratio: Nearest over second nearest must be below.
-        max_count: Bits in which the nearest may differ.
+        drawn: Shape (M, 4): descriptors of all drawings, concatenated.
+        first: Shape (K + 1,): start of each drawing's descriptors.
+        ratio: Upper bound of nearest over second nearest distance.
+        max_count: Maximum number of bits in which the nearest differs.
 
     Returns:
         Shape (K, N), int64.
@@ -94,16 +94,16 @@ def nearest(
 def window_counts(
     at_cell: NDArray[np.int64], drawn: NDArray[np.int64], rows: int, columns: int, reach: int
 ) -> Counts:
-    """How many different points of one drawing vote for the window around each cell of a grid.
+    """Count the distinct points of one drawing that vote for the window around each cell.
 
     A texture that repeats one point of the drawing a hundred times still counts once.
 
     Args:
         at_cell: Shape (V, 2): column and row of each vote's cell.
-        drawn: Shape (V,): which of the drawing's points voted; equal ones stand together.
-        rows: Of the grid.
-        columns: Of the grid.
-        reach: Cells to each side of the middle one that belong to a window.
+        drawn: Shape (V,): index of the drawing's point that voted; equal indices are adjacent.
+        rows: Number of rows of the grid.
+        columns: Number of columns of the grid.
+        reach: Number of cells of a window to each side of its centre.
 
     Returns:
         Shape (rows, columns), int32.

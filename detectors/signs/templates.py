@@ -1,8 +1,7 @@
-"""Our own drawings of the signs that rule a turn out, in grey, as an ORB matcher needs them.
+"""Grey drawings of the signs that prohibit a turn, as templates of an ORB matcher.
 
-They are read from files, as each version of OpenCV has letters of its own.
-
-One-way arrows (US R6-1), do not enter (US R5-1) and the international no-entry disc (Vienna C1).
+The signs are one-way arrows (US R6-1), do not enter (US R5-1) and the international no-entry disc
+(Vienna C1). The drawings are stored as files, because versions of OpenCV draw letters differently.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ Kind = Literal["one way left", "one way right", "do not enter", "no entry"]
 KINDS: Final[tuple[Kind, ...]] = ("one way left", "one way right", "do not enter", "no entry")
 AMERICAN: Final[tuple[Kind, ...]] = KINDS[:3]
 LABELS: Final = {"no entry": "do not enter"}
-"""The international disc says what the American sign says."""
+"""Labels that differ from the kind; the international disc means the same as the American sign."""
 MARGIN_PX: Final = 12
-"""Grey around a drawing, so that points at its edge have a neighbourhood."""
+"""Width of the grey margin around a drawing, so that points at its edge have a neighbourhood."""
 _AROUND: Final = 140
 FILES_PX: Final = (48, 64, 512)
-"""Heights of the stored drawings: the usual ones, and one to shrink to any other."""
+"""Heights of the stored drawings: the default heights, and one to scale down to any other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +31,7 @@ class Drawing:
     """One sign at one size.
 
     Attributes:
-        kind: Which.
+        kind: Kind of sign.
         grey: Shape (h, w), uint8, with ``MARGIN_PX`` around the sign.
         size_px: Width and height of the sign itself.
     """
@@ -43,15 +42,15 @@ class Drawing:
 
 
 def drawings(kinds: Sequence[Kind] = KINDS, heights_px: Sequence[int] = (48, 64)) -> list[Drawing]:
-    """Each kind at each height; one-way signs at half the height and thrice as wide."""
+    """Return the drawing of each kind at each height, where ``size_of`` is the size."""
     return [draw(kind, height) for kind in kinds for height in heights_px]
 
 
 def draw(kind: Kind, height_px: int) -> Drawing:
-    """One sign; at a height without a file, the largest one shrunk.
+    """Return the drawing of a sign; for a height without a file, the largest is scaled down.
 
     Raises:
-        ValueError: Too small to show anything, or larger than the largest file.
+        ValueError: The height is below 16 pixels or above the largest file's.
     """
     if not 16 <= height_px <= FILES_PX[-1]:
         raise ValueError(f"height_px: expected 16 to {FILES_PX[-1]}, got {height_px}")
@@ -67,14 +66,17 @@ def draw(kind: Kind, height_px: int) -> Drawing:
 
 
 def size_of(kind: Kind, height_px: int) -> tuple[int, int]:
-    """Width and height of a sign; a one-way sign is half as high and thrice as wide as that."""
+    """Width and height of a sign.
+
+    A one-way sign has half of ``height_px`` as its height and is three times as wide as high.
+    """
     if kind.startswith("one way"):
         return height_px * 3 // 2, height_px // 2
     return height_px, height_px
 
 
 def file_name(kind: Kind, height_px: int) -> str:
-    """Of a stored drawing."""
+    """File name of a stored drawing."""
     return f"{kind.replace(' ', '_')}_{height_px}.png"
 
 

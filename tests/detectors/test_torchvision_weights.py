@@ -312,7 +312,7 @@ def test_weights_of_our_own_training_need_no_card(
             "ssdlite320_mobilenet_v3_large",
         ),
         ("width_px = 320", "width_px = 321", "takes pictures of 320 x 320"),
-        ('fit = "network"', 'fit = "stretch"', 'input.fit = "network" goes with [network]'),
+        ('fit = "network"', 'fit = "stretch"', 'input.fit = "network" is required with [network]'),
         ('colour = "rgb"', 'colour = "bgr"', 'need colour = "rgb"'),
     ],
 )

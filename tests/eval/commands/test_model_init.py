@@ -340,7 +340,7 @@ def test_what_the_file_does_not_say_is_assumed_aloud(
     names.write_text("person\ncar\nstop sign\n", encoding="utf-8")
 
     assert run(["model", "init", str(path)]) == 2
-    assert "3 classes and no names in the file" in capsys.readouterr().err
+    assert "3 classes without names" in capsys.readouterr().err
     assert run(["model", "init", str(path), "--class-names", str(names)]) == 0
 
     said = capsys.readouterr().out
@@ -402,7 +402,7 @@ def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("my.onnx", b"not a model", "not a whole model file"),
+        ("my.onnx", b"not a model", "not a complete model file"),
         ("my.pkl", b"", "a pickle runs code when it is read"),
         ("my.torchscript", b"", "a TorchScript archive carries code"),
         ("my.bin", b"", "expected .onnx, .xml, or weights"),

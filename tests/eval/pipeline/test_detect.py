@@ -256,7 +256,7 @@ def test_an_unknown_setting_is_refused_with_a_suggestion(
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"sha256": '"' + "0" * 64 + '"'}, "the card's sha256 says 0000"),
+        ({"sha256": '"' + "0" * 64 + '"'}, "the card's sha256 is 0000"),
         (
             {"classes": '["car"]'},
             "expected (1, 3549, 6) for 1 classes at 416 x 416",
