@@ -1,1 +1,1 @@
-"""Many drives: lists, worker processes, Ray, merging."""
+"""Batches of many drives: drive lists, worker processes, Ray and merging of runs."""

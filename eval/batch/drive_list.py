@@ -1,15 +1,16 @@
-"""Which drives a command line means.
+"""Drives that the LOG arguments of a command line name.
 
-Logs named one by one are the logs of one drive, merged by time. Many drives are meant by
+Logs named one by one are the logs of one drive, merged by time. Many drives are named by
 
 * a folder that holds drives: a sub-folder for each, or recordings side by side;
-* a pattern that the shell left alone (``'drives/*/drive.mcap'``, ``'s3://bucket/**/*.mcap'``):
-  each match is a drive;
-* ``@drives.txt``: a line for each drive, its logs as words, relative to the list's folder;
+* a quoted pattern (``'drives/*/drive.mcap'``, ``'s3://bucket/**/*.mcap'``): each match is a drive;
+* ``@drives.txt``: a line for each drive, its logs separated by spaces, relative to the list's
+  folder;
 * ``each``: every argument is a drive, or a folder of drives.
 
-One of these makes drives of its neighbors, too. A folder with ``vehicle.toml`` or ``truth.json``
-beside its recordings, as ``crosscue simulate`` writes, is one drive, and brings those files along.
+If any argument has one of these forms, every other argument is a drive, too. A folder with
+``vehicle.toml`` or ``truth.json`` next to its recordings, as ``crosscue simulate`` writes it, is
+one drive and uses those files.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ VEHICLE: Final = "vehicle.toml"
 TRUTH: Final = "truth.json"
 LIST_BYTES: Final = 64 * MIB
 DEPTH: Final = 8
-"""Of folders within folders of drives."""
+"""Max nesting of folders of drives."""
 NAME_LENGTH: Final = 150
 SAYS_NOTHING: Final = frozenset(
     {
@@ -65,19 +66,19 @@ SAYS_NOTHING: Final = frozenset(
         "video",
     }
 )
-"""Names of logs that distinguish no drive from another."""
+"""File names of logs that do not identify a drive."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveInput:
-    """One drive that a command line means.
+    """One drive named on a command line.
 
     Attributes:
-        name: A readable stem and 8 hex digits of the logs' identity, whatever else is in the
-            batch; letters, digits and ``._+=@-`` only.
-        logs: Paths or URLs, as given, sorted by name: their order changes nothing.
-        vehicle: The vehicle file that is beside its logs, if any.
-        truth: The truth that is beside its logs, if any.
+        name: A readable stem and 8 hex digits of the logs' identity, independent of the rest of
+            the batch; letters, digits and ``._+=@-`` only.
+        logs: Paths or URLs, as entered, sorted by name because their order has no effect.
+        vehicle: The vehicle file next to its logs, if any.
+        truth: The ground-truth file next to its logs, if any.
     """
 
     name: str
@@ -87,19 +88,19 @@ class DriveInput:
 
     @property
     def identity(self) -> str:
-        """Of its logs, wherever they are."""
+        """Identity of its logs, independent of their location."""
         return self.name[-SHORT:]
 
 
 @dataclass(frozen=True, slots=True)
 class DriveList:
-    """What a command line means.
+    """Drives named on a command line.
 
     Attributes:
-        drives: At least one, or those of a shard, which may be none.
-        is_many: Does each get a run folder of its own below the one asked for?
-        shard: Which part of the drives named these are; None for all.
-        of: How many drives were named.
+        drives: At least one, or those of a shard, which may be empty.
+        is_many: True if each drive gets its own run folder below the output folder.
+        shard: The shard that these drives belong to; None for all drives.
+        of: Number of drives named, in all shards.
     """
 
     drives: tuple[DriveInput, ...]
@@ -108,14 +109,14 @@ class DriveList:
     of: int = 0
 
     def part(self, shard: Shard) -> DriveList:
-        """The drives of one shard.
+        """Return the drives of one shard.
 
         Raises:
-            UsageError: It is a single drive.
+            UsageError: The list is a single drive.
         """
         if not self.is_many:
             raise UsageError(
-                f"--shard {shard}: for many drives; this is one (--each makes it many)"
+                f"--shard {shard}: expected many drives, found one (--each makes it many)"
             )
         mine = tuple(one for one in self.drives if shard.holds(one.identity))
         return replace(self, drives=mine, shard=shard, of=len(self.drives))
@@ -126,8 +127,8 @@ class _Found:
     """A drive before it has a name.
 
     Attributes:
-        logs: As in ``DriveInput``, in the order met.
-        beside: The folder that may hold its vehicle file and truth, or None.
+        logs: As in ``DriveInput``, in the order found.
+        beside: The folder that may hold its vehicle file and ground truth, or None.
     """
 
     logs: tuple[str, ...]
@@ -137,17 +138,17 @@ class _Found:
 def drives_of(
     arguments: Sequence[str], *, each: bool = False, shard: str | None = None
 ) -> DriveList:
-    """The drives that LOG arguments mean; see the head of this file.
+    """Return the drives that LOG arguments name, by the rules of the module docstring.
 
     Args:
         arguments: At least one.
-        each: Every one is a drive, or a folder of drives.
-        shard: Which part of the drives, see ``read_shard``; None for all.
+        each: Every argument is a drive, or a folder of drives.
+        shard: The shard to return, in a form that ``read_shard`` accepts; None for all drives.
 
     Raises:
-        UsageError: Nothing matches, a list that cannot be read, a drive named twice, or a folder
-            that may be one drive or several.
-        LogError: A place that is not there or may not be looked into.
+        UsageError: Nothing matches, a list cannot be read, a drive is named twice, or a folder
+            may be one drive or several.
+        LogError: A location does not exist or cannot be read.
     """
     part = None if shard is None else read_shard(shard, os.environ)
     found = _all_of(arguments, each=each)
@@ -173,7 +174,7 @@ def _is_pattern(text: str) -> bool:
 
 
 def _is_collection(text: str) -> bool:
-    """A folder that is neither a recording nor one drive's."""
+    """Return whether an argument is a folder that is neither a recording nor a single drive."""
     place = Path(text)
     return not is_remote(text) and place.is_dir() and not _is_drive(place) and not _format(place)
 
@@ -194,7 +195,7 @@ def _plain(text: str) -> _Found:
 
 
 def _stem(name: str) -> str:
-    """A recording's name without its suffix; a folder's may hold dots."""
+    """Return a recording's name without its suffix; a folder's name may contain dots."""
     suffix = Path(name).suffix
     known = any(suffix.lower() in one.suffixes for one in known_formats().values())
     return name[: -len(suffix)] if known else name
@@ -204,10 +205,12 @@ def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
     try:
         content = read_at_most(path, LIST_BYTES)
         if content is None:
-            raise UsageError(f"@{path}: larger than {LIST_BYTES // MIB} MiB; give a list of logs")
+            raise UsageError(
+                f"@{path}: larger than {LIST_BYTES // MIB} MiB; expected a list of logs"
+            )
         lines = content.decode("utf-8", "surrogateescape").splitlines()
     except OSError as error:
-        raise UsageError(f"@{path}: {error.strerror}; give a text file") from None
+        raise UsageError(f"@{path}: {error.strerror}; expected a text file") from None
     count = 0
     for number, line in enumerate(lines, 1):
         try:
@@ -221,7 +224,7 @@ def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
             yield replace(_plain(logs[0]), logs=tuple(logs))
         count += bool(logs)
     if not count:
-        raise UsageError(f"@{path}: names no drive; give a line for each")
+        raise UsageError(f"@{path}: names no drive; expected a line for each")
 
 
 def _matched(pattern: str) -> Iterator[_Found]:
@@ -239,7 +242,7 @@ def _matched(pattern: str) -> Iterator[_Found]:
 
 
 def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
-    """The folder as a drive, or the drives in it."""
+    """Yield the folder as one drive, or the drives in it."""
     is_split = _format(folder) == "rosbag2" and not folder.joinpath("metadata.yaml").exists()
     if _is_drive(folder):
         yield _drive_folder(folder)
@@ -249,19 +252,19 @@ def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
         found = list(_walk(folder, 1))
         if not found:
             raise UnknownFormatError(
-                f"{folder}: no drive in it; give recordings or folders of them"
+                f"{folder}: no drive found; expected recordings or folders of recordings"
             )
         yield from found
 
 
 def _walk(folder: Path, depth: int) -> Iterator[_Found]:
-    """Drives in a folder of drives."""
+    """Yield the drives in a folder of drives."""
     recordings = _recordings(folder)
     formats = {_format(one) for one in recordings if one.is_file()}
     if len(formats) > 1:
         raise UsageError(
             f"{folder}: recordings of several formats ({', '.join(sorted(formats))}): one drive or "
-            f"many? put a {VEHICLE} beside those of one drive, or name them in a list (@drives.txt)"
+            f"many? put a {VEHICLE} next to those of one drive, or list them (@drives.txt)"
         )
     for entry in _entries(folder):
         if entry.is_file() and entry in recordings:
@@ -280,7 +283,7 @@ def _drive_folder(folder: Path) -> _Found:
 
 
 def _is_drive(folder: Path) -> bool:
-    """What belongs to one drive, beside recordings that can be those of one."""
+    """Return whether a folder holds a drive's own files and recordings that fit one drive."""
     if not any(folder.joinpath(mark).is_file() for mark in (VEHICLE, TRUTH)):
         return False
     found = _recordings(folder)
@@ -288,7 +291,7 @@ def _is_drive(folder: Path) -> bool:
 
 
 def _recordings(folder: Path) -> list[Path]:
-    """Recordings right in a folder."""
+    """Return the recordings directly in a folder."""
     found = [one for one in _entries(folder) if _format(one)]
     return [one for one in found if not one.joinpath(MANIFEST).exists()]
 
@@ -301,7 +304,7 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def _format(place: Path) -> str:
-    """Of a recording; empty for anything else."""
+    """Return the format of a recording; empty for anything else."""
     try:
         return format_of(place)
     except UnknownFormatError:
@@ -313,10 +316,10 @@ def _format(place: Path) -> str:
 
 
 def _named(found: Sequence[_Found]) -> list[DriveInput]:
-    """Each drive with a name that its own logs alone decide.
+    """Return each drive with a name that depends on its own logs alone.
 
     Raises:
-        UsageError: One drive is named twice, perhaps as a copy.
+        UsageError: A drive is named twice, or two drives are copies of each other.
     """
     drives: dict[str, DriveInput] = {}
     for one in found:
@@ -337,9 +340,9 @@ def _name(logs: tuple[str, ...]) -> str:
 
 
 def _readable(logs: tuple[str, ...]) -> str:
-    """What a person calls the drive: its folder if that is one drive's, else its first log.
+    """Return a readable name: the folder's if it holds one drive, else the first log's.
 
-    A log of a name that says nothing (``drive``, ``40``) is called by its folder.
+    A log with a generic name (``drive``, ``40``) is named after its folder.
     """
     parts = [part for part in _parts(logs[0]) if part != "/"]
     if len(logs) > 1 and all(_parts(log)[:-1] == _parts(logs[0])[:-1] for log in logs):
@@ -355,7 +358,7 @@ def _readable(logs: tuple[str, ...]) -> str:
 
 
 def _parts(log: str) -> tuple[str, ...]:
-    """Of a log's absolute place, the last one without its suffix."""
+    """Return the parts of a log's absolute path or URL, the last one without its suffix."""
     if is_remote(log):
         parts = tuple(part for part in re.split(r"[:/]+", log) if part)
     else:
@@ -364,7 +367,10 @@ def _parts(log: str) -> tuple[str, ...]:
 
 
 def _identity(logs: tuple[str, ...]) -> str:
-    """Of the logs; of a log that cannot be read, of its place: it will fail, but by this name."""
+    """Return the identity of the logs.
+
+    A log that cannot be read is identified by its path, so that its failure has a stable name.
+    """
     try:
         return identity_of_all([identity_of(log) for log in logs]).short
     except LogError:

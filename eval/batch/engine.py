@@ -1,4 +1,4 @@
-"""Where many drives are worked on: processes of this machine, or a Ray cluster."""
+"""Choice of the engine that processes many drives: local worker processes or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ def engine_of(
     cores: int | None = None,
     memory_gib: float | None = None,
 ) -> Engine:
-    """Where many drives are worked on.
+    """Return the engine that the options of a command select.
 
     Args:
-        workers: Drives side by side.
-        ray: Address of a cluster.
-        cores: Of each drive on the cluster; one if left out.
-        memory_gib: Of each drive on the cluster; two if left out.
+        workers: Number of drives processed in parallel.
+        ray: Address of a Ray cluster; None selects local processes.
+        cores: Cores of each drive on the cluster; default 1.
+        memory_gib: Memory of each drive on the cluster; default 2.
 
     Raises:
-        UsageError: Too few of any, or cores and memory without a cluster.
+        UsageError: A number is too small, or cores or memory are set without a cluster.
     """
     if ray is None and (cores is not None or memory_gib is not None):
-        raise UsageError("--cores-per-drive, --memory-per-drive: for --ray; give its address")
+        raise UsageError("--cores-per-drive, --memory-per-drive: need --ray with an address")
     if (cores is not None and cores < 1) or (memory_gib is not None and not memory_gib > 0.0):
         raise UsageError(
             f"--cores-per-drive {cores}, --memory-per-drive {memory_gib}: expected 1 core or more "

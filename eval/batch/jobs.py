@@ -1,10 +1,11 @@
-"""Many drives, one after another or side by side; one that fails costs only itself.
+"""Processing of many drives, in turn or in parallel; a drive that fails does not stop the others.
 
-A drive is a ``Job``: its logs, its run folder and a fingerprint of every setting. Engines work
-through jobs: ``in_turn`` in this process, ``processes.Processes`` on this machine's cores,
-``ray_jobs.OnRay`` on a Ray cluster. What has been done is recorded in a ``journal`` beside the run
-folders, written before and after each drive, so that a second start does only what is missing,
-however the first one ended. Why a drive failed is recorded in ``failure.log`` in its run folder.
+A drive is a ``Job``: its logs, its run folder and a fingerprint of every setting. Engines process
+jobs: ``in_turn`` in this process, ``processes.Processes`` on this machine's cores,
+``ray_jobs.OnRay`` on a Ray cluster. Progress is recorded in a ``journal`` next to the run folders,
+which is written before and after each drive. A second start therefore does only what is missing,
+however the first one ended. The reason of a failure is recorded in ``failure.log`` in the drive's
+run folder.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MAX_LOCK_BYTES: Final = 4096
 
 
 class Result(Protocol):
-    """What the work on a drive returns: something that can be pickled."""
+    """Result of processing a drive; it must be picklable."""
 
     @property
     def exit_status(self) -> int:
@@ -54,15 +55,15 @@ R = TypeVar("R", bound=Result)
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One drive to work on.
+    """One drive to process.
 
     Attributes:
-        name: Unique among the jobs, and a file name.
+        name: Unique among the jobs, and valid as a file name.
         logs: Paths or URLs of the drive's logs.
         run: The run folder.
-        fingerprint: Of all settings that decide the result, see ``fingerprint_of``.
+        fingerprint: Hash of all settings that affect the result, see ``fingerprint_of``.
         vehicle: The drive's own vehicle file, if it has one.
-        truth: The drive's own truth, if it has one.
+        truth: The drive's own ground truth, if it has one.
     """
 
     name: str
@@ -79,13 +80,13 @@ class Done(Generic[R]):
 
     Attributes:
         job: The job.
-        exit_status: As the command would have ended for this drive alone.
-        error: One line, or None.
-        result: What the work returned; None after an error, and for an earlier run.
+        exit_status: The status with which the command would have exited for this drive alone.
+        error: Error message of one line, or None.
+        result: Return value of the work; None after an error, and for an earlier run.
         seconds: Wall time of the last attempt.
-        attempts: How often it was begun; 0 for an earlier run.
-        losses: Met where no account is kept, see ``replay.losses``; the process that asked warns
-            of them.
+        attempts: Number of attempts; 0 for an earlier run.
+        losses: Losses outside any ledger, see ``replay.losses``; the parent process warns of
+            them.
     """
 
     job: Job
@@ -98,7 +99,7 @@ class Done(Generic[R]):
 
     @property
     def is_earlier(self) -> bool:
-        """Was it done before this start?"""
+        """True if the job was done before this start."""
         return self.attempts == 0 and self.error is None
 
 
@@ -106,10 +107,10 @@ Events: TypeAlias = Generator[Done[R] | None, None, None]
 
 
 class Engine(Protocol):
-    """How jobs are worked through."""
+    """Strategy that processes jobs."""
 
     def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
-        """Yield each job once, as it ends, and None about once a second in between.
+        """Yield each job once, when it ends, and None about once a second in between.
 
         Closing the generator stops all work within seconds and leaves no process behind.
         """
@@ -118,14 +119,14 @@ class Engine(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far many drives have come.
+    """Progress of a batch of drives.
 
     Attributes:
-        total: Jobs in all.
-        earlier: Done before this start.
-        done: Done now, failures included.
-        failed: How many of them failed.
-        seconds: Since the start.
+        total: Number of jobs.
+        earlier: Jobs done before this start.
+        done: Jobs done since this start, including failures.
+        failed: Number of ``done`` that failed.
+        seconds: Seconds since the start.
     """
 
     total: int
@@ -136,7 +137,7 @@ class Progress:
 
 
 class State(StrEnum):
-    """What is in a job's run folder."""
+    """Content of a job's run folder."""
 
     MISSING = "nothing there"
     CUT_SHORT = "cut short"
@@ -152,21 +153,21 @@ def run_many(
     overwrite: bool = False,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> tuple[Done[R], ...]:
-    """Work on every drive that is not done yet.
+    """Process every drive that is not done yet.
 
     Args:
-        jobs: Drives, their names unique.
-        work: What to do with one; an importable function, or a ``partial`` of one. It clears the
-            run folder itself and writes its manifest last.
-        engine: Where to work.
+        jobs: Drives with unique names.
+        work: Function that processes one drive; an importable function, or a ``partial`` of one.
+            It clears the run folder itself and writes its manifest last.
+        engine: Engine that runs the work.
         overwrite: Replace run folders that hold a run of other logs or settings.
         on_progress: Called about once a second.
 
     Returns:
-        One for each job, in the order of ``jobs``.
+        One outcome for each job, in the order of ``jobs``.
 
     Raises:
-        UsageError: Two jobs have one name or one run folder.
+        UsageError: Two jobs have the same name or the same run folder.
     """
     _check_unique(jobs)
     began = time.monotonic()
@@ -181,33 +182,36 @@ def run_many(
     earlier_count = len(found)
     refused = failed = sum(done.error is not None for done in found.values())
 
-    def tell() -> None:
+    def report() -> None:
         now = time.monotonic() - began
         done_now = len(found) - earlier_count
         on_progress(Progress(len(jobs), earlier_count - refused, done_now, failed, now))
 
     if missing:
-        # Closed here and now whatever happens, so that no worker outlives an interrupt.
+        # Close the engine explicitly, so that no worker outlives an interrupt.
         with closing(engine(missing, work)) as events:
             for done in events:
                 if done is not None:
                     found[done.job.name] = done
                     warn_again(done.losses)
                     failed += done.error is not None
-                tell()
+                report()
     return tuple(found[job.name] for job in jobs)
 
 
 def planned(
     folder: Path, jobs: Sequence[Job], part: str, *, retry_failed: bool = False
 ) -> Sequence[Job]:
-    """The jobs that a start is about to work on, written down so that others see what is left.
+    """Record the jobs that a start is about to process, so that others see what is left.
 
     Args:
-        folder: Of the run folders.
-        jobs: All of them.
-        part: ``all``, or which shard they are.
-        retry_failed: Only those whose last attempt failed; what was planned stays so.
+        folder: The folder of the run folders.
+        jobs: All jobs.
+        part: ``all``, or the name of the shard.
+        retry_failed: Select only the jobs whose last attempt failed, and keep the recorded plan.
+
+    Returns:
+        The jobs to process.
     """
     if retry_failed:
         return [job for job in jobs if error_of(job.run) is not None]
@@ -216,16 +220,16 @@ def planned(
 
 
 def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
-    """The simplest engine: here, one after another; a crash in a library ends it all."""
+    """Process jobs in turn in this process; a crash in a library ends the whole batch."""
     for job in jobs:
         yield attempt(work, job)
 
 
 def exit_status_of(results: Iterable[Done[R]]) -> int:
-    """One exit status for many drives.
+    """Return one exit status for many drives.
 
-    0 when all are whole; 3 when something was dropped or some drives failed; when all failed, the
-    status that they share, or 1.
+    0 when all are complete; 3 when rows were dropped or some drives failed; when all failed, their
+    common status, or 1.
     """
     results = tuple(results)
     failures = {done.exit_status for done in results if done.error is not None}
@@ -235,16 +239,16 @@ def exit_status_of(results: Iterable[Done[R]]) -> int:
 
 
 def fingerprint_of(*settings: object) -> str:
-    """A hash of everything that decides a result besides the logs: settings, flags, versions.
+    """Return a hash of everything besides the logs that affects a result.
 
     Args:
-        settings: Values that JSON can hold, as for a manifest.
+        settings: Settings, flags and versions; values that JSON can represent.
     """
     return hashlib.sha256(strict_json(settings).encode()).hexdigest()
 
 
 def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
-    """Work on one drive here and now, keeping the journal; engines call this in their workers."""
+    """Process one drive in this process and keep its journal; engines call this in workers."""
     began = time.monotonic()
     with losses_heard() as losses:
         done = _attempted(work, job, losses)
@@ -255,7 +259,7 @@ def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Don
     try:
         _check_free(job)
     except (CrosscueError, OSError) as error:
-        # The drive is another's, and so is its entry.
+        # Another process works on the drive and owns its entry.
         return Done(job, *reported_error(error))
     inputs: dict[str, object] | None = None
     try:
@@ -274,12 +278,12 @@ def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Don
 
 
 def _check_free(job: Job) -> None:
-    """Refuse a drive that a worker of another machine is at; take over from one that has died.
+    """Refuse a drive that a worker on another machine is processing, unless that worker died.
 
-    Its process cannot be seen from here, but while it lives it touches its entry.
+    The worker's process is not visible from here, but while it lives it touches its entry.
 
     Raises:
-        RunError: It was heard of lately.
+        RunError: The worker touched its entry recently.
     """
     worker, lock = str((read_entry(job.run) or {}).get("worker", "")), job.run / LOCK
     if not worker or is_alive(worker) is not None or not lock.exists():
@@ -296,12 +300,12 @@ def _check_free(job: Job) -> None:
 
 
 def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: str) -> None:
-    """Write why a drive failed into its journal entry and its run folder, where that is possible.
+    """Record a failure in the drive's journal entry and, if possible, in its run folder.
 
     Args:
-        failed: With its error.
-        inputs: What decides the result, as far as it is known.
-        details: A traceback, or how its worker ended.
+        failed: The outcome with its error.
+        inputs: Identity of the logs and the settings, where known.
+        details: A traceback, or how the worker ended.
     """
     job = failed.job
     lines = {
@@ -314,7 +318,7 @@ def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: s
         "error": str(failed.error),
     }
     text = "".join(f"{name:10}{value}\n" for name, value in lines.items())
-    # The disk may be full or gone, and what led here matters more.
+    # The disk may be full or unmounted; the original error matters more than this one.
     with suppress(CrosscueError, OSError):
         write_text(job.run / FAILURE, f"{text}\n{details.rstrip()}\n")
     with suppress(CrosscueError, OSError):
@@ -323,7 +327,7 @@ def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: s
 
 
 def reported_error(error: Exception) -> tuple[int, str]:
-    """For any error the exit status that a command of its own would give, and one line."""
+    """Return the exit status of a command that fails with this error, and a message of one line."""
     if isinstance(error, CrosscueError):
         return error.exit_status, one_line(error)
     if isinstance(error, MemoryError):
@@ -336,7 +340,7 @@ def reported_error(error: Exception) -> tuple[int, str]:
 
 
 def state_of(job: Job) -> State:
-    """What a start finds in the job's run folder.
+    """Return the state of the job's run folder.
 
     Raises:
         CrosscueError: A log cannot be examined.
@@ -359,7 +363,7 @@ def state_of(job: Job) -> State:
 
 
 def is_done(job: Job) -> bool:
-    """Is there a whole run of the same logs, as they are now, with the same settings?"""
+    """Return whether a complete run of the same, unchanged logs and settings exists."""
     return state_of(job) is State.DONE
 
 
@@ -368,12 +372,12 @@ def _check_unique(jobs: Sequence[Job]) -> None:
         seen: set[str] = set()
         for job in jobs:
             if of(job) in seen:
-                raise UsageError(f"{of(job)}: two drives of this name; name their folders apart")
+                raise UsageError(f"{of(job)}: two drives have this name; rename a folder")
             seen.add(of(job))
 
 
 def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
-    """The job as ended before this start, or None where there is work to do."""
+    """Return the outcome of an earlier start, or None if the job must be processed."""
     try:
         state = state_of(job)
         if state is State.DONE:
@@ -391,7 +395,7 @@ def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
 
 
 def _inputs(job: Job) -> dict[str, object]:
-    """What decides the result: the logs' identity and the settings."""
+    """Return what determines the result: the identity of the logs and the settings."""
     identity = identity_of_all([identity_of(log) for log in job.logs])
     return {"fingerprint": job.fingerprint, "identity": as_row(identity)}
 
@@ -406,7 +410,7 @@ def _holds_anything(folder: Path) -> bool:
 
 
 def worker_crashed(done: Done[R], attempts: int, how: str) -> Done[R]:
-    """A job whose worker died as often as it may: a failure with a line of its own."""
+    """Return the failure of a job whose worker died in every allowed attempt, and record it."""
     line = f"{done.job.name}: its worker {how}, {attempts} times; replay this drive alone"
     failed = replace(done, error=line, attempts=attempts)
     record_failure(failed, None, f"its worker {how}: it left no traceback")

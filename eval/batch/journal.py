@@ -1,8 +1,8 @@
-"""What becomes of each drive of a batch, in a file each beside the run folders.
+"""Journal of a batch: one file for each drive, next to the run folders.
 
-An entry is written when a drive is begun and again when it ends. In between the worker touches it
-every few seconds, so that anyone who sees the folder, on whatever machine, knows it is alive. The
-time of an end is that of the file: it contains no clock.
+An entry is written when a drive starts and again when it ends. In between, the worker touches the
+file every few seconds, so that every machine that shares the folder can see that the worker is
+alive. The end time of a drive is the modification time of its file; entries contain no time.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ PLANS: Final = "plans"
 FORMAT_VERSION: Final = 2
 BEAT_S: Final = 10.0
 STALE_S: Final = 12.0 * BEAT_S
-"""A worker of another machine that has been silent so long is taken for dead."""
+"""Silence after which a worker of another machine is considered dead, seconds."""
 
 
 def entry_path(run: Path) -> Path:
-    """Where the entry of a drive with this run folder is."""
+    """Return the path of the entry of the drive with this run folder."""
     return run.parent / JOURNAL / f"{run.name}.json"
 
 
 def write_entry(run: Path, entry: dict[str, object]) -> None:
-    """Write a drive's entry, whole."""
+    """Write a drive's entry atomically."""
     write_text(entry_path(run), strict_json({"format_version": FORMAT_VERSION, **entry}) + "\n")
 
 
 def read_entry(run: Path) -> dict[str, Any] | None:
-    """A drive's entry; None where none exists, or none that can be believed."""
+    """Return a drive's entry; None if it does not exist or is damaged."""
     try:
         entry = json_tree(entry_path(run).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -46,19 +46,19 @@ def read_entry(run: Path) -> dict[str, Any] | None:
 
 
 def error_of(run: Path) -> str | None:
-    """Why a drive has no run, where its last attempt failed."""
+    """Return the error of a drive's last attempt, or None if that did not fail."""
     entry = read_entry(run) or {}
     error = entry.get("error")
     return error if isinstance(error, str) else None
 
 
 def has_journal(folder: Path) -> bool:
-    """Has a batch of drives written into this folder of runs?"""
+    """Return whether a batch of drives has written to this folder of runs."""
     return (folder / JOURNAL).is_dir()
 
 
 def names_in(folder: Path) -> set[str]:
-    """Of drives that have an entry in a folder of runs, or that a start there has planned."""
+    """Return the names of the drives that have an entry or are planned in a folder of runs."""
     journal = folder / JOURNAL
     planned = {name for path in journal.glob(f"{PLANS}/*.json") for name in _planned(path)}
     return planned | {path.stem for path in journal.glob("*.json")}
@@ -74,19 +74,19 @@ def _planned(path: Path) -> list[str]:
 
 
 def write_plan(folder: Path, names: Sequence[str], part: str) -> None:
-    """Write down which drives a start is about to do; a later start of this part replaces it.
+    """Record which drives a start plans to process; a later start of this part replaces it.
 
     Args:
         folder: The folder of run folders.
-        names: Of the drives.
-        part: ``all``, or which shard.
+        names: Names of the drives.
+        part: ``all``, or the name of the shard.
     """
     path = folder / JOURNAL / PLANS / f"{part.replace('/', '-of-')}.json"
     write_text(path, strict_json({"format_version": FORMAT_VERSION, "drives": [*names]}) + "\n")
 
 
 def started_s(folder: Path) -> float | None:
-    """When the first of the plans in a folder was written, in seconds since 1970."""
+    """Return when the first plan in a folder was written, in seconds since 1970."""
     times = []
     for path in folder.glob(f"{JOURNAL}/{PLANS}/*.json"):
         with suppress(OSError):
@@ -95,7 +95,7 @@ def started_s(folder: Path) -> float | None:
 
 
 def silent_s(run: Path) -> float:
-    """Seconds since a drive's entry was written or touched."""
+    """Return the seconds since a drive's entry was written or touched."""
     try:
         return max(0.0, time.time() - entry_path(run).stat().st_mtime)
     except OSError:

@@ -1,9 +1,9 @@
-"""The runs of many drives as one folder of tables, each row with its drive's name.
+"""Merging of the runs of many drives into one run folder whose rows carry the drive's name.
 
-Tables are streamed, so memory does not grow with the number of drives. The merged manifest reports
-which drives are in it, which failed and why, and adds up every topic's account. Merging is a set
-union: the order does not matter, a run that is met twice counts once, and what comes out is the
-same bytes however the drives were spread over batches.
+Tables are streamed, so memory does not grow with the number of drives. The merged manifest lists
+the drives, the failed drives with their errors, and the sums of every topic's account. Merging is a
+set union: the order does not matter, and a run that is found twice counts once. The output has the
+same bytes however the drives were distributed over batches.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ FOLDER: Final = MERGED
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """What was merged.
+    """Summary of a merge.
 
     Attributes:
-        run: The folder that holds all drives' rows.
-        drives: How many.
-        rows: By table.
-        drive_seconds: Log time of all drives, from first to last pose.
+        run: The folder that holds the rows of all drives.
+        drives: Number of drives.
+        rows: Number of rows by table.
+        drive_seconds: Log time of all drives, each from its first to its last pose.
     """
 
     run: RunFolder
@@ -72,7 +72,7 @@ class _Drive:
 
     @property
     def seconds(self) -> float:
-        """From first to last pose."""
+        """Log time from the first to the last pose."""
         if self.first_ns is None or self.last_ns is None:
             return 0.0
         return (self.last_ns - self.first_ns) * 1e-9
@@ -84,12 +84,12 @@ def merge_runs(
     """Write one table of each kind with a ``drive`` column, and a manifest.
 
     Args:
-        runs: By name; rows come in the order of names.
-        out: Where to; cleared first.
-        failures: By name of the drive, why there is no run of it.
+        runs: Runs by drive name; rows are in the order of names.
+        out: Output folder; cleared first.
+        failures: Reason why a drive has no run, by drive name.
 
     Raises:
-        RunError: A run is damaged, or two have columns of one name and different types.
+        RunError: A run is damaged, or a column has different types in two runs.
         OutputError: The disk is full.
     """
     drives = [_Drive(name, run, run.drive_manifest()) for name, run in sorted(runs.items())]
@@ -133,7 +133,7 @@ def _named(batch: pa.RecordBatch, drive: str, schema: pa.Schema) -> dict[str, ob
 
 
 def _schema(kind: str, holding: Sequence[_Drive]) -> pa.Schema:
-    """All columns that any drive has, the drive's name first."""
+    """Return the columns of all drives, preceded by the drive's name."""
     import pyarrow as pa
 
     whole = pa.schema([(DRIVE, pa.string())])
@@ -186,7 +186,7 @@ def _settings_hash(manifest: DriveManifest) -> str:
 
 
 def _tables_hash(run: RunFolder) -> str:
-    """Of a run's tables."""
+    """Return a hash of a run's tables."""
     digest = hashlib.sha256()
     for path in sorted(run.path.glob("*.parquet")):
         with path.open("rb") as file:
@@ -198,18 +198,18 @@ def _tables_hash(run: RunFolder) -> str:
 def gathered(
     folders: Sequence[Path],
 ) -> tuple[dict[str, RunFolder], dict[str, str]]:
-    """All runs of batches, and why drives that none of them has a run of have none.
+    """Return all runs of batches, and the reasons why other drives have no run.
 
-    A drive that was planned and not done is among these, too, so that none is dropped in silence.
+    A drive that was planned but not done is among the latter, so that no drive is omitted silently.
 
     Args:
-        folders: Run folders, or folders of them, as ``replay`` of many drives writes.
+        folders: Run folders, or folders of run folders as ``replay`` of many drives writes them.
 
     Returns:
-        Runs by name, and by name of a drive why there is no run of it.
+        Runs by drive name, and the reason by name of each drive without a run.
 
     Raises:
-        UsageError: Two different runs have one name, or one run has different tags.
+        UsageError: Two different runs have one name, or copies of a run have different tags.
         RunError: A run is damaged or of another version.
     """
     runs: dict[str, RunFolder] = {}
@@ -219,24 +219,24 @@ def gathered(
         for run in _finished(folder):
             path = run.path
             if path.name in missing:
-                # It is of other settings: the last attempt, which should replace it, has failed.
+                # The run has other settings: the last attempt, meant to replace it, failed.
                 continue
             first = runs.setdefault(path.resolve().name, run)
             if first is not run and _content(first) != _content(run):
                 raise UsageError(
-                    f"{first.path} and {path}: two different runs of one name; merging would "
-                    "drop one: rename it, or replay it as the other was"
+                    f"{first.path} and {path}: two different runs have one name, and merging would "
+                    "drop one; rename it, or replay both with the same settings"
                 )
             if read_tags(first.path) != read_tags(path):
                 raise UsageError(
-                    f"{first.path} and {path}: one run with different tags; merging would drop "
-                    "some: set the same with crosscue tag"
+                    f"{first.path} and {path}: one run with different tags, and merging would drop "
+                    "some; set the same tags with crosscue tag"
                 )
         merged = _merged_in(RunFolder(folder / FOLDER))
         reported = {} if merged is None else merged.failures
         for name, why in (reported | missing).items():
             reasons.setdefault(name, set()).add(why)
-    # Whichever folder came first, and an error before the want of one.
+    # Independent of the order of folders; an error takes precedence over "no run yet".
     chosen = {
         name: min(whys, key=lambda why: (why.startswith(NO_RUN), why))
         for name, whys in reasons.items()
@@ -246,18 +246,16 @@ def gathered(
 
 
 def _finished(folder: Path) -> Iterator[RunFolder]:
-    """Runs of single drives in a folder, which may be one itself; each manifest is read once."""
+    """Yield the single-drive runs in a folder, or the folder itself; read each manifest once."""
     if folder.joinpath(MANIFEST).exists():
         if is_merged(RunFolder(folder)):
-            raise UsageError(
-                f"{folder}: tables that were merged before; give the folder that holds the runs"
-            )
+            raise UsageError(f"{folder}: already merged; expected the folder that holds the runs")
         yield open_run(folder)
         return
     try:
         inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError as error:
-        raise UnreadableRunError(f"{folder}: {error.strerror}; give a folder of runs") from None
+        raise UnreadableRunError(f"{folder}: {error.strerror}; expected a folder of runs") from None
     for entry in inside:
         run = RunFolder(entry)
         if entry.joinpath(MANIFEST).exists() and not is_merged(run):
@@ -265,7 +263,7 @@ def _finished(folder: Path) -> Iterator[RunFolder]:
 
 
 def _content(run: RunFolder) -> tuple[str, ...]:
-    """What makes two runs the same: logs, settings and every table."""
+    """Return what identifies equal runs: logs, settings and the content of every table."""
     manifest = run.drive_manifest()
     logs = sorted(log.identity.digest for log in manifest.logs)
     return (*logs, _settings_hash(manifest), _tables_hash(run))
@@ -276,7 +274,7 @@ def _notices(one: _Drive) -> set[str]:
 
 
 def _versions(drives: Sequence[_Drive]) -> dict[str, tuple[str, ...]]:
-    """All that were used: more than one of a library is worth checking."""
+    """Return all versions of each library; more than one is worth checking."""
     found: dict[str, set[str]] = {}
     for one in drives:
         for library, version in one.manifest.versions.items():
@@ -285,10 +283,10 @@ def _versions(drives: Sequence[_Drive]) -> dict[str, tuple[str, ...]]:
 
 
 def is_merged(run: RunFolder) -> bool:
-    """Does it hold many drives?
+    """Return whether a run folder holds many drives.
 
     Raises:
-        RunError: It has no manifest that can be read.
+        RunError: It has no readable manifest.
     """
     return _merged_in(run) is not None
 

@@ -1,8 +1,8 @@
-"""Drives side by side in processes of this machine.
+"""Processing of drives in parallel worker processes on this machine.
 
-Each worker has a pipe of its own, so that a worker which dies (killed, out of memory, a crash in a
-library) is known with the drive it was at: that drive is begun again in a fresh process, and given
-up when that one dies, too. The standard library's pool would lose every drive under way.
+Each worker has its own pipe. When a worker dies (killed, out of memory, a crash in a library), its
+drive is therefore known: it is started again in a fresh process, and fails if that process dies,
+too. The standard library's pool would lose every drive in progress.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
 
 TICK_S: Final = 1.0
 GRACE_S: Final = 5.0
-"""For a worker to take its half-written files away."""
+"""Time for a stopped worker to remove its incomplete files, seconds."""
 THREAD_VARIABLES: Final = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -44,9 +44,9 @@ class Processes:
     """An engine of worker processes.
 
     Attributes:
-        workers: How many drives at a time.
-        attempts: How often a drive is begun when its worker dies.
-        threads: For each worker's numerical libraries; None shares the machine's cores.
+        workers: Number of drives processed at the same time.
+        attempts: Max number of attempts when a drive's worker dies.
+        threads: Threads of each worker's numerical libraries; None divides the machine's cores.
     """
 
     workers: int
@@ -63,7 +63,7 @@ class Processes:
             raise ValueError(f"expected counts of 1 or more, got {self}")
 
     def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
-        """Work; see ``many_drives.Engine``."""
+        """Process jobs, see ``jobs.Engine``."""
         waiting = deque((job, 1) for job in jobs)
         threads = self.threads or max(1, (os.cpu_count() or 1) // self.workers)
         idle: list[_Worker] = []
@@ -92,7 +92,7 @@ class Processes:
 
 
 class _Worker:
-    """A process and the job it is at."""
+    """A process and its current job."""
 
     def __init__(self, work: Callable[[Job], Any], threads: int) -> None:
         context = multiprocessing.get_context("spawn")
@@ -107,7 +107,7 @@ class _Worker:
         self.number = 0
 
     def begin(self, job: Job, number: int) -> None:
-        """Hand over a job, begun for the ``number``-th time."""
+        """Send a job to the process as attempt ``number``."""
         is_first = self.number == 0
         self.job, self.number = job, number
         try:
@@ -115,21 +115,21 @@ class _Worker:
                 self.pipe.send(self._work)
             self.pipe.send(job)
         except OSError:
-            # It is dead already; ``take`` finds that out.
+            # The process is already dead; ``take`` reports that.
             return
 
     def take(self) -> Done[Any] | str:
-        """What it did, or how it died."""
+        """Return the job's outcome, or how the process died."""
         try:
             done = self.pipe.recv()
         except (EOFError, OSError):
             self.pipe.close()
             self.process.join(GRACE_S)
-            return _how(self.process.exitcode)
+            return _cause_of_death(self.process.exitcode)
         return replace(done, attempts=self.number) if isinstance(done, Done) else str(done)
 
 
-def _how(code: int | None) -> str:
+def _cause_of_death(code: int | None) -> str:
     if code is not None and code < 0:
         why = " (out of memory?)" if code == -signal.SIGKILL else ""
         return f"was killed by {signal.Signals(-code).name}{why}"
@@ -137,7 +137,7 @@ def _how(code: int | None) -> str:
 
 
 def _stop(idle: Sequence[_Worker], busy: Sequence[_Worker]) -> None:
-    """End every process: idle ones by closing their pipe, others by a signal, late ones hard."""
+    """Stop all processes: idle ones by closing their pipe, busy ones by SIGTERM, then SIGKILL."""
     for worker in busy:
         worker.process.terminate()
     for worker in idle:
@@ -153,7 +153,7 @@ def _stop(idle: Sequence[_Worker], busy: Sequence[_Worker]) -> None:
 
 
 class _StoppedError(BaseException):
-    """The pool stops; a BaseException, so that files are taken away and nothing keeps us."""
+    """Raised in a worker on SIGTERM; a BaseException, so that only cleanup code handles it."""
 
 
 def _raise_stopped(number: int, frame: FrameType | None) -> NoReturn:
@@ -161,10 +161,10 @@ def _raise_stopped(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _serve(pipe: Connection, threads: int) -> None:
-    """A worker's life."""
+    """Process jobs from the pipe until it closes; the main function of a worker."""
     # Libraries read these when loaded; nothing numerical has been loaded here yet.
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
-    # Ctrl-C reaches the whole foreground group; the parent decides what that means.
+    # Ctrl-C reaches the whole foreground process group; only the parent reacts to it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _raise_stopped)
     threading.Thread(target=_leave_with_parent, daemon=True).start()

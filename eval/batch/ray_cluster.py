@@ -1,8 +1,8 @@
-"""Joining a Ray cluster, or starting one on this machine, without Ray's own habits.
+"""Connection to a Ray cluster, or a local cluster, without unwanted defaults of Ray.
 
-Ray reports its use to its makers, takes SIGTERM for itself and reports dead workers on stdout;
-none of that is wanted here. ``local`` starts a cluster on this machine and ends it; Ray opens ports
-on all of the machine's addresses, guarded by a token.
+By default Ray sends usage statistics, handles SIGTERM itself and reports dead workers on stdout;
+all three are turned off. ``local`` starts a cluster on this machine and stops it at the end; Ray
+opens ports on all of the machine's addresses, protected by a token.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ GIB: Final = 1 << 30
 LOCAL: Final = "local"
 WAIT_S: Final = 5.0
 STORE_BYTES: Final = 96 << 20
-"""Results are small; what a local cluster sets aside for them."""
+"""Size of a local cluster's object store; results are small."""
 
 
 @contextmanager
 def joined(address: str, workers: int | None = None) -> Iterator[Any]:
-    """The module ``ray``, connected; left again at the end if it was not connected before.
+    """Yield the module ``ray``, connected; disconnect at the end unless it was connected before.
 
     Args:
-        address: As Ray's clients take it (``auto``, ``10.0.0.1:6379``), or ``local``.
-        workers: Cores of a local cluster; None takes all there are.
+        address: An address of Ray's clients (``auto``, ``10.0.0.1:6379``), or ``local``.
+        workers: Cores of a local cluster; None uses all cores.
 
     Raises:
         UsageError: Ray is not installed.
@@ -52,10 +52,10 @@ def joined(address: str, workers: int | None = None) -> Iterator[Any]:
 
 
 def check_fits(ray: Any, address: str, cores: int, memory_bytes: int) -> None:
-    """Refuse what no node can hold: Ray would wait for such a node forever.
+    """Refuse requirements that no node meets, because Ray would wait for such a node indefinitely.
 
     Raises:
-        CrosscueError: Naming what a drive needs and what the largest nodes have.
+        CrosscueError: No node is large enough; states the needs of a drive and the largest nodes.
     """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     has = [(int(one.get("CPU", 0)), int(one.get("memory", 0))) for one in nodes]
@@ -70,10 +70,10 @@ def check_fits(ray: Any, address: str, cores: int, memory_bytes: int) -> None:
 
 
 def _check_reachable(address: str) -> None:
-    """Refuse an address where nobody listens: Ray itself tries for many minutes.
+    """Refuse an address that accepts no connection, because Ray itself retries for minutes.
 
     Raises:
-        CrosscueError: Nobody listens there.
+        CrosscueError: The address accepts no connection.
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdecimal()):
@@ -82,8 +82,8 @@ def _check_reachable(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), WAIT_S).close()
     except (OSError, OverflowError) as error:
         raise CrosscueError(
-            f"--ray {address}: nobody listens there ({one_line(error)}); start a cluster with ray "
-            f"start, or give {LOCAL}"
+            f"--ray {address}: no connection ({one_line(error)}); start a cluster with ray start, "
+            f"or use {LOCAL}"
         ) from None
 
 
@@ -103,12 +103,12 @@ def _connect(ray: Any, address: str, workers: int | None) -> None:
         ray.init(address=address, **options)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         raise CrosscueError(
-            f"--ray {address}: no cluster ({one_line(error)}); start one with ray start, or give "
+            f"--ray {address}: no cluster ({one_line(error)}); start one with ray start, or use "
             f"{LOCAL}"
         ) from None
     finally:
         if is_main:
-            # Ray installs a handler of its own, which would hide a SIGTERM from the command.
+            # Ray installs its own handler, which would hide SIGTERM from the command.
             signal.signal(signal.SIGTERM, before)
-    # Of workers that die Ray reports on stdout, which belongs to results; we report it ourselves.
+    # Ray reports dead workers on stdout, which is reserved for results; we report them ourselves.
     ray._private.worker._worker_logs_enabled = False

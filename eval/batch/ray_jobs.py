@@ -1,10 +1,10 @@
-"""Drives on a Ray cluster, with the interface of ``worker_pool``.
+"""Processing of drives on a Ray cluster, an engine like ``processes.Processes``.
 
 Every node needs this version of crosscue, and sees logs and run folders under the same paths (a
 shared file system, or logs on an object store). A drive is one task that declares its cores and
-memory, so that no node gets more drives than it holds. A node that is lost costs the drives that
-were running there, which are begun again on others. Ray's own retries are off: a drive whose worker
-died is begun again here, so that its lock is taken away first and the count of attempts is true.
+memory, so that no node receives more drives than fit. When a node is lost, its drives are started
+again on other nodes. Ray's own retries are off: a drive whose worker died is restarted here, so
+that its lock is removed first and the number of attempts is correct.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .processes import GRACE_S, THREAD_VARIABLES, TICK_S
 from .ray_cluster import GIB, LOCAL, check_fits, joined
 
 MEMORY_BYTES: Final = 2 * GIB
-"""Of a drive with a camera and a network, on one core."""
+"""Memory of a drive with a camera and a neural network, on one core."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +32,11 @@ class OnRay:
     """An engine on a Ray cluster.
 
     Attributes:
-        address: As Ray's clients take it (``auto``, ``10.0.0.1:6379``), or ``local``.
-        workers: At most so many drives at a time; None takes all cores there are.
-        attempts: How often a drive is begun when its worker dies.
-        cores: Of each drive.
-        memory_bytes: Of each drive.
+        address: An address of Ray's clients (``auto``, ``10.0.0.1:6379``), or ``local``.
+        workers: Max number of drives at the same time; None uses all cores.
+        attempts: Max number of attempts when a drive's worker dies.
+        cores: Cores of each drive.
+        memory_bytes: Memory of each drive.
     """
 
     address: str
@@ -46,7 +46,7 @@ class OnRay:
     memory_bytes: int = MEMORY_BYTES
 
     def __call__(self, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
-        """Work; see ``many_drives.Engine``.
+        """Process jobs, see ``jobs.Engine``.
 
         Raises:
             UsageError: Ray is not installed.
@@ -78,8 +78,8 @@ class OnRay:
                     if isinstance(done, Done):
                         yield replace(done, attempts=number)
                     elif number < self.attempts:
-                        # The dead worker may have been on another machine, whose processes cannot
-                        # be seen from here; nobody else was given this drive.
+                        # The dead worker may have been on another machine, whose processes are
+                        # not visible from here; no other worker has this drive.
                         job.run.joinpath(LOCK).unlink(missing_ok=True)
                         waiting.appendleft((job, number + 1))
                     else:
@@ -90,17 +90,17 @@ class OnRay:
             _cancel(ray, list(running))
 
     def _environment(self) -> dict[str, str]:
-        """Of a worker; on this machine it finds the modules that this process finds."""
+        """Environment of a worker; a local one finds the same modules as this process."""
         found = dict.fromkeys(THREAD_VARIABLES, str(self.cores))
         return found | ({"PYTHONPATH": os.pathsep.join(sys.path)} if self.address == LOCAL else {})
 
 
 def _taken(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
-    """What a task returned, or how its worker died."""
+    """Return the outcome of a task, or how its worker died."""
     try:
         done: Done[Any] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
-        # ``attempt`` answers for the drive's own errors; this is one of Ray's way to and from it.
+        # ``attempt`` handles the drive's own errors; this is an error of Ray's transport.
         return Done(job, *reported_error(RuntimeError(str(error.cause).strip().splitlines()[-1])))
     except ray.exceptions.OutOfMemoryError:
         return "was killed by Ray, since its machine ran out of memory"
@@ -111,7 +111,7 @@ def _taken(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
 
 
 def _cancel(ray: Any, references: Sequence[Any]) -> None:
-    """Interrupt what still runs, so that half-written files are taken away; then end it."""
+    """Interrupt running tasks, so that incomplete files are removed; then end them."""
     for reference in references:
         with suppress(Exception):
             ray.cancel(reference, force=False)

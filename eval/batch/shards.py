@@ -1,7 +1,7 @@
-"""Which part of many drives a task of a scheduler works on.
+"""Shards: the part of many drives that one task of a scheduler processes.
 
-A drive belongs to the shard that a hash of its identity says: not its place in a list, so that
-drives may be added, removed or named in another order, and every other drive stays in its shard.
+A hash of a drive's identity selects its shard, not its position in a list. Drives can therefore be
+added, removed or named in another order, and every other drive stays in its shard.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from crosscue.replay.errors import UsageError
 AUTO: Final = "auto"
 SLURM: Final = "SLURM_ARRAY_TASK_"
 RANKS: Final = ("RANK", "WORLD_SIZE")
-"""As torchrun, MPI launchers for PyTorch and many schedulers set them; counted from 0."""
+"""Variables that torchrun, MPI launchers for PyTorch and many schedulers set; ranks start at 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,15 +25,15 @@ class Shard:
     """One of several parts; written ``2/4``.
 
     Attributes:
-        number: From 1.
-        count: Of all parts.
+        number: Index of the part, from 1.
+        count: Number of parts.
     """
 
     number: int
     count: int
 
     def holds(self, identity: str) -> bool:
-        """Does the drive of this identity belong to it? Of all parts exactly one says so."""
+        """Return whether the drive of this identity belongs to this part, and so to no other."""
         digest = hashlib.sha256(identity.encode()).digest()
         return int.from_bytes(digest, "big") % self.count == self.number - 1
 
@@ -42,15 +42,15 @@ class Shard:
 
 
 def read_shard(text: str, environment: Mapping[str, str]) -> Shard:
-    """``2/4``, or ``auto`` for what the scheduler's variables say.
+    """Parse ``2/4``, or read a scheduler's variables for ``auto``.
 
     Args:
-        text: Of ``--shard``.
-        environment: Variables by name.
+        text: Value of ``--shard``.
+        environment: Environment variables by name.
 
     Raises:
-        UsageError: Neither; no such variables, those of two schedulers, or array tasks that are
-            not numbered in equal steps.
+        UsageError: The text has neither form, the variables are missing or belong to two
+            schedulers, or array tasks are not numbered in equal steps.
     """
     if text == AUTO:
         return _of_scheduler(environment)
@@ -66,32 +66,32 @@ def _of_scheduler(environment: Mapping[str, str]) -> Shard:
     is_ranked = all(name in environment for name in RANKS)
     if is_array and is_ranked:
         raise UsageError(
-            f"--shard {AUTO}: both {SLURM}ID and {RANKS[0]} are set; give --shard i/n instead"
+            f"--shard {AUTO}: both {SLURM}ID and {RANKS[0]} are set; use --shard i/n instead"
         )
     if is_array:
         return _of_array(environment)
     if not is_ranked:
         raise UsageError(
             f"--shard {AUTO}: neither {SLURM}ID nor {' and '.join(RANKS)} is set; run it as a task "
-            "of a scheduler, or give --shard i/n"
+            "of a scheduler, or use --shard i/n"
         )
     rank, size = (_number(environment, name) for name in RANKS)
     return _checked(rank + 1, size, f"{RANKS[0]}={rank}, {RANKS[1]}={size}")
 
 
 def _of_array(environment: Mapping[str, str]) -> Shard:
-    """Of a SLURM job array, whatever its numbers begin with and step by."""
+    """Return the shard of a SLURM array task, for any first number and step."""
     here, count = (_number(environment, SLURM + name) for name in ("ID", "COUNT"))
     first = _number(environment, f"{SLURM}MIN", 0)
     step = max(_number(environment, f"{SLURM}STEP", 1), 1)
     last = _number(environment, f"{SLURM}MAX", first + (count - 1) * step)
-    said = f"{SLURM}ID={here}, MIN={first}, MAX={last}, STEP={step}, COUNT={count}"
-    # A list such as --array=1,3,7 does not say which of its tasks comes where.
+    values = f"{SLURM}ID={here}, MIN={first}, MAX={last}, STEP={step}, COUNT={count}"
+    # A list such as --array=1,3,7 does not determine the index of a task.
     if last - first != (count - 1) * step or (here - first) % step:
         raise UsageError(
-            f"--shard {AUTO}: {said}: expected array tasks in equal steps, such as --array=1-8"
+            f"--shard {AUTO}: {values}: expected array tasks in equal steps, such as --array=1-8"
         )
-    return _checked((here - first) // step + 1, count, said)
+    return _checked((here - first) // step + 1, count, values)
 
 
 def _number(environment: Mapping[str, str], name: str, default: int | None = None) -> int:
@@ -101,7 +101,7 @@ def _number(environment: Mapping[str, str], name: str, default: int | None = Non
     return int(text)
 
 
-def _checked(number: int, count: int, said: str) -> Shard:
+def _checked(number: int, count: int, values: str) -> Shard:
     if not 1 <= number <= count:
-        raise UsageError(f"--shard {AUTO}: {said}: outside its own count; give --shard i/n")
+        raise UsageError(f"--shard {AUTO}: {values}: outside its own range; use --shard i/n")
     return Shard(number, count)

@@ -1,4 +1,4 @@
-"""How far the drives of a folder of runs have come, as its files say; nothing is written."""
+"""Progress of the drives in a folder of runs, read from its files; nothing is written."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from crosscue.replay.base import UnreadableRunError
 from .journal import STALE_S, has_journal, names_in, read_entry, silent_s, started_s
 
 MERGED: Final = "merged"
-"""What the merged run is called among those that it was made of."""
+"""Name of the merged run's folder."""
 WINDOW_S: Final = 3600.0
-"""The rate is that of the last hour, or since the start."""
+"""Time over which the rate is measured, seconds; less if the batch started later."""
 NO_RUN: Final = "no run yet"
 
 
 class DriveState(StrEnum):
-    """How far a drive has come."""
+    """Progress of a drive."""
 
     DONE = "done"
     RUNNING = "running"
@@ -37,10 +37,10 @@ class DriveStatus:
 
     Attributes:
         run: Its run folder.
-        state: ``stale``: begun by a worker that is gone. ``waiting``: not begun yet.
-        silent_s: Since its worker was last heard of, or since it ended; infinite if never.
-        error: Why it failed, or None.
-        host: Machine of the worker that began it and has not ended it; empty without.
+        state: ``stale``: its worker died before it ended. ``waiting``: not started yet.
+        silent_s: Seconds since its worker was last active, or since it ended; infinite if never.
+        error: Error message of a failed drive, or None.
+        host: Machine of the worker that is processing it; empty if none is.
     """
 
     run: Path
@@ -51,18 +51,18 @@ class DriveStatus:
 
     @property
     def log(self) -> Path | None:
-        """What is known of its failure, or None."""
+        """File with the details of its failure, or None."""
         path = self.run / FAILURE
         return path if self.error is not None and path.exists() else None
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast drives end.
+    """Rate at which drives end.
 
     Attributes:
-        per_hour: Of those that ended, done or failed; NaN where none has.
-        left_s: Until the last one ends at this rate; NaN where nobody works on any.
+        per_hour: Drives per hour that ended, done or failed; NaN if none has.
+        left_s: Seconds until the last drive ends at this rate; NaN if no worker is active.
     """
 
     per_hour: float
@@ -70,34 +70,36 @@ class Pace:
 
 
 def drives_of_folder(folder: Path) -> tuple[DriveStatus, ...]:
-    """Every drive that a batch in this folder has planned, begun or ended, and other runs, by name.
+    """Return every planned, started or ended drive and every other run of a folder, by name.
 
-    A shard may have none.
+    The result may be empty, because a shard may have no drives.
 
     Raises:
-        UnreadableRunError: It is not there, or no batch has written into it.
+        UnreadableRunError: The folder does not exist, or no batch has written to it.
     """
     if not folder.is_dir():
-        raise UnreadableRunError(f"{folder}: no such folder; give the one that replay writes to")
-    whole = {path.parent.name for path in folder.glob(f"*/{MANIFEST}")} - {MERGED}
-    if not (whole or has_journal(folder)):
         raise UnreadableRunError(
-            f"{folder}: no batch of drives; give the folder that replay of many drives writes to"
+            f"{folder}: no such folder; expected the one that replay writes to"
         )
-    return tuple(drive_status(folder / name) for name in sorted(whole | names_in(folder)))
+    complete = {path.parent.name for path in folder.glob(f"*/{MANIFEST}")} - {MERGED}
+    if not (complete or has_journal(folder)):
+        raise UnreadableRunError(
+            f"{folder}: no batch of drives; expected the folder that replay writes many drives to"
+        )
+    return tuple(drive_status(folder / name) for name in sorted(complete | names_in(folder)))
 
 
 def drive_status(run: Path) -> DriveStatus:
-    """How far the drive of a run folder has come."""
+    """Return the progress of the drive of a run folder."""
     entry = read_entry(run)
-    is_whole = (run / MANIFEST).exists()
+    is_complete = (run / MANIFEST).exists()
     silent = silent_s(run)
     if entry is None:
-        return DriveStatus(run, DriveState.DONE if is_whole else DriveState.WAITING, silent)
+        return DriveStatus(run, DriveState.DONE if is_complete else DriveState.WAITING, silent)
     if isinstance(entry.get("error"), str):
         return DriveStatus(run, DriveState.FAILED, silent, entry["error"])
     if "manifest" in entry:
-        return DriveStatus(run, DriveState.DONE if is_whole else DriveState.STALE, silent)
+        return DriveStatus(run, DriveState.DONE if is_complete else DriveState.STALE, silent)
     worker = str(entry.get("worker", ""))
     alive = is_alive(worker)
     is_running = silent <= STALE_S if alive is None else alive
@@ -106,7 +108,7 @@ def drive_status(run: Path) -> DriveStatus:
 
 
 def pace_of(drives: Sequence[DriveStatus], folder: Path) -> Pace:
-    """The rate at which the drives of a folder end, and how long the others take at this rate."""
+    """Return the rate at which the drives of a folder end, and the time left at this rate."""
     began = started_s(folder)
     window_s = WINDOW_S if began is None else min(max(time.time() - began, 1.0), WINDOW_S)
     ended = (DriveState.DONE, DriveState.FAILED)
@@ -120,7 +122,7 @@ def pace_of(drives: Sequence[DriveStatus], folder: Path) -> Pace:
 
 
 def unfinished(folder: Path) -> dict[str, str]:
-    """By name of a drive that has no run here, why."""
+    """Return the reason why a drive has no run here, by drive name."""
     found = {}
     for name in names_in(folder):
         one = drive_status(folder / name)

@@ -1,1 +1,1 @@
-"""Runs below a folder: finding, comparing, decoded logs."""
+"""Finding and comparing the runs below a folder, and tables of decoded logs."""

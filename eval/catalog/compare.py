@@ -1,7 +1,7 @@
-"""Two runs side by side: what changed in versions, settings, tables and metrics, and what is worse.
+"""Comparison of two runs: changes of versions, settings, tables and metrics.
 
-Metrics are judged drive by drive (``paired``). Where a run was not scored, every difference of a
-table counts instead.
+Metrics are judged drive by drive (``paired``). If a run was not scored, any difference in a table
+counts as a change for the worse.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ COMPARED: Final = {
     "logs",
     "landmarks",
 }
-"""Parts of a manifest."""
+"""Parts of a manifest that are compared."""
 MAX_BYTES: Final = 256 * MIB
 MAX_LINES: Final = 20
-"""Of settings, and of metrics, in the printed comparison."""
+"""Max lines of settings, and of metrics, in the printed comparison."""
 
 
 class Tolerance(NamedTuple):
-    """How much worse the metrics of a pattern may be; a fraction of the first run's value if so."""
+    """Allowed loss of the metrics that match a pattern, absolute or relative to the first run."""
 
     pattern: str
     by: float
     is_fraction: bool
 
     def allowed(self, before: float) -> float:
-        """In the metric's own unit."""
+        """Return the allowed loss in the metric's own unit."""
         return self.by * abs(before) if self.is_fraction else self.by
 
 
@@ -83,10 +83,10 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class ColumnChange:
-    """How far a column differs.
+    """Differences in one column.
 
     Attributes:
-        rows: With another value.
+        rows: Number of rows whose values differ.
         largest: Largest absolute difference of numbers; NaN for other columns.
     """
 
@@ -99,11 +99,11 @@ class TableChange:
     """A table that differs.
 
     Attributes:
-        name: Without its suffix.
-        what: In one phrase.
-        rows_before: None where it is not there.
-        rows_after: The same.
-        columns: Those that differ; empty where rows cannot be compared one by one.
+        name: File name without its suffix.
+        what: Description in one phrase.
+        rows_before: Rows in the first run; None if it lacks the table.
+        rows_after: Rows in the second run; None if it lacks the table.
+        columns: Columns that differ; empty if rows cannot be compared one by one.
     """
 
     name: str
@@ -124,20 +124,20 @@ class MetricChange:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Comparison:
-    """Everything that differs between two runs; printed as ``crosscue compare`` prints it.
+    """Everything that differs between two runs; its ``repr`` is the output of ``crosscue compare``.
 
     Attributes:
-        changes: Versions, settings, detectors, selection, logs.
+        changes: Differing versions, settings, detectors, selection and logs.
         tables: Tables that differ.
-        judged: Metrics that both runs have and that have a good direction, differing or not.
+        judged: Metrics of both runs that have a good direction, whether they differ or not.
         metrics: Other metrics that differ.
-        no_longer_scored: Metrics that only the first run has, or of which nothing is scored now.
-        tables_same: How many tables are equal.
-        drives: Drives in both runs, only in the first, only in the second.
-        why_no_metrics: Empty where both runs were scored.
-        is_whole: Nothing was dropped in either.
-        left_out: Of comparisons of many runs, by run why it takes no part.
-        is_many: Is it of many runs against many?
+        no_longer_scored: Metrics that the second run lacks or has no rows for.
+        tables_same: Number of equal tables.
+        drives: Number of drives in both runs, only in the first, and only in the second.
+        why_no_metrics: Reason why metrics were not compared; empty if both runs were scored.
+        is_whole: True if no rows were dropped in either run.
+        left_out: When many runs are compared, the reason why a run was left out, by run.
+        is_many: True if sets of runs are compared.
     """
 
     changes: tuple[Change, ...]
@@ -159,7 +159,7 @@ class Comparison:
 
     @property
     def is_passed(self) -> bool:
-        """Nothing is worse; of runs that were not scored, no table differs."""
+        """True if nothing is worse, or, for runs that were not scored, if no table differs."""
         return not (self.worse or (self.why_no_metrics and self.tables))
 
     def of(self, verdict: Verdict) -> tuple[str, ...]:
@@ -167,18 +167,18 @@ class Comparison:
         return tuple(one.path for one in self.judged if one.verdict == verdict)
 
     def cases(self) -> tuple[tuple[str, str], ...]:
-        """For CI: by name of what is judged, why it fails, or nothing."""
+        """Test cases for CI: the name of each metric and its failure message, empty if passed."""
         judged = [(one.path, _failure(one)) for one in self.judged]
         missing = [(path, "no longer scored") for path in self.no_longer_scored]
         tables = [(one.name, one.what) for one in self.tables] if self.why_no_metrics else []
         return (*judged, *missing, *tables)
 
     def markdown(self) -> str:
-        """A short table of what is better, worse and undecided, for a pull request."""
+        """Return a short table of better, worse and undecided metrics for a pull request."""
         return "\n".join(_markdown_lines(self))
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue compare --json`` prints."""
+        """Return the object that ``crosscue compare --json`` prints."""
         tree = asdict(self)
         del tree["is_whole"], tree["is_many"]
         return tree | {"worse": self.worse, "better": self.of("better")}
@@ -188,10 +188,10 @@ class Comparison:
 
 
 def read_tolerance(text: str) -> Tolerance:
-    """``0.01``, ``2%`` or ``PATTERN=0.01`` as a tolerance.
+    """Parse ``0.01``, ``2%`` or ``PATTERN=0.01``.
 
     Raises:
-        UsageError: Neither.
+        UsageError: The text has none of these forms.
     """
     pattern, _, number = text.rpartition("=")
     is_fraction = number.endswith("%")
@@ -213,9 +213,10 @@ def compare_runs(
     """Compare two finished runs, or the pooled scores of several.
 
     Args:
-        first: The one that was good; see ``open_scored``.
-        second: The one to judge.
-        tolerances: The last one whose pattern fits a metric counts; without any, none.
+        first: The reference run, from ``open_scored``.
+        second: The run to judge.
+        tolerances: The last one whose pattern matches a metric applies; if none does, no loss is
+            allowed.
 
     Raises:
         RunError: A manifest, table or score cannot be read.
@@ -250,13 +251,13 @@ def compare_runs(
 
 
 def allowed_by(path: str, before: float, tolerances: Sequence[Tolerance]) -> float:
-    """How much worse a metric may be: the last tolerance whose pattern fits counts."""
+    """Return the allowed loss of a metric, from the last tolerance whose pattern matches."""
     fitting = (one for one in reversed(tolerances) if fnmatch.fnmatchcase(path, one.pattern))
     return next(fitting, NONE).allowed(before)
 
 
 def parts_of(run: RunFolder) -> list[DriveMetric] | None:
-    """What each drive adds to the metrics; None where the run was not scored."""
+    """Return each drive's contribution to the metrics; None if the run was not scored."""
     folder = run if _is_pooled(run.path) else RunFolder(run.file(FOLDER))
     if not folder.file(f"{BY_DRIVE}.parquet").exists():
         return None
@@ -264,16 +265,16 @@ def parts_of(run: RunFolder) -> list[DriveMetric] | None:
 
 
 def open_scored(path: Path) -> RunFolder:
-    """A finished run, or the folder that ``crosscue score -o`` wrote for several runs.
+    """Open a finished run, or the folder that ``crosscue score -o`` wrote for several runs.
 
     Raises:
-        RunError: Neither.
+        RunError: The path is neither.
     """
     return RunFolder(path) if _is_pooled(path) else open_run(path)
 
 
 def is_whole_run(run: RunFolder) -> bool:
-    """Was nothing dropped in the run, or in any of those that were scored together?"""
+    """Return whether no rows were dropped in the run, or in any of the runs scored together."""
     if not _is_pooled(run.path):
         return run.manifest().account.is_whole
     account = _tree_of(run.file(METRICS)).get("account")
@@ -330,10 +331,10 @@ def _tree_of(path: Path) -> dict[str, Any]:
 def _others(
     before: Mapping[str, MetricValue], after: Mapping[str, MetricValue]
 ) -> tuple[MetricChange, ...]:
-    """Metrics that differ and are not judged.
+    """Return the metrics that differ and are not judged.
 
-    A drive's own are named by the folder of its run; where only one side has that folder, nothing
-    changed.
+    Metrics of a single drive are named after its run folder. If only one side has that folder, they
+    are not a change.
     """
     lacking = MetricValue(math.nan)
     changes = []
@@ -372,7 +373,7 @@ def _compare_table(name: str, first: RunFolder, second: RunFolder) -> TableChang
 
 
 def _schemas(before: pa.Table, after: pa.Table) -> str:
-    """The first column that differs, as in both tables."""
+    """Return the first column that differs, as it is in both tables."""
     columns = [[f"{one.name} {one.type}" for one in table.schema] for table in (before, after)]
     for old, new in zip_longest(*columns, fillvalue="nothing"):
         if old != new:
@@ -388,7 +389,7 @@ def _compare_column(before: pa.ChunkedArray, after: pa.ChunkedArray) -> ColumnCh
     if not (pa.types.is_floating(before.type) or pa.types.is_integer(before.type)):
         rows = sum(a != b for a, b in zip(before.to_pylist(), after.to_pylist(), strict=True))
         return ColumnChange(rows, math.nan)
-    # Nulls become NaN; where both runs have none, nothing differs.
+    # Nulls become NaN; two NaN are equal.
     old, new = before.to_numpy(), after.to_numpy()
     differs = (old != new) & ~(np.isnan(old) & np.isnan(new))
     if not differs.any():
@@ -483,7 +484,7 @@ def _markdown_lines(found: Comparison) -> Iterator[str]:
 
 
 def _cell(text: str) -> str:
-    """Text that can drive neither a terminal nor a table."""
+    """Return text without terminal control characters and table separators."""
     return f"`{visible(text).replace('|', '/').replace('`', '')}`"
 
 

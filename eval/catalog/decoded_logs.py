@@ -1,4 +1,4 @@
-"""Every stream of a drive as columns on disk: one Parquet file for each topic or CAN message."""
+"""Decoding of all streams of a drive to Parquet, one file for each topic or CAN message."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROWS_HELD: Final = 8192
-"""Rows of one table held back until they are worth a row group."""
+"""Min rows of a row group; rows of a table are buffered until then."""
 RESERVED: Final = "skipped"
-"""The table of what was left out."""
+"""Name of the table of skipped and dropped rows."""
 
 
 class _BlockDecoder(Protocol):
@@ -69,7 +69,7 @@ class _BlockDecoder(Protocol):
 
 @dataclass(slots=True, eq=False)
 class _Table:
-    """One output file and the rows that wait for it."""
+    """One output file and its buffered rows."""
 
     run: RunFolder
     name: str
@@ -88,7 +88,7 @@ class _Table:
             self.write()
 
     def write(self) -> None:
-        """Write the rows that wait."""
+        """Write the buffered rows."""
         if not self.held:
             return
         columns = _labelled(columns_of(self.held), self.timeline, self.clock)
@@ -102,14 +102,14 @@ class _Table:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Decoded:
-    """A drive that was decoded; printed as the list of its tables.
+    """A decoded drive; its ``repr`` lists the tables.
 
     Attributes:
         path: The folder of the tables.
-        rows: For each file of a stream.
-        account: What became of every row.
-        timeline: Time segments.
-        details: Where and why the first rows were dropped.
+        rows: Number of rows by file of a stream.
+        account: Account of all rows.
+        timeline: Time segments of the drive.
+        details: Location and reason of the first dropped rows.
     """
 
     path: Path
@@ -119,7 +119,7 @@ class Decoded:
     details: list[str]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue decode --json`` prints."""
+        """Return the object that ``crosscue decode --json`` prints."""
         return {
             "tables": self.rows,
             "account": self.account.as_json(),
@@ -154,13 +154,13 @@ def decode_tables(
         logs: Open logs.
         vehicle: DBC files, buses and the Mobileye's mounting.
         run: Folder for the tables; cleared first.
-        selection: What part.
-        on_rows: Called with the rows read, and those that the logs declare.
+        selection: The part of the logs to decode.
+        on_rows: Called with the number of rows read, and the number that the logs declare.
 
     Raises:
         SchemaError: A DBC file cannot be read.
-        AccountError: A topic's rows do not add up.
-        EmptyResultError: Not one row in the requested part; the folder is as it was.
+        AccountError: The account of a topic does not balance.
+        EmptyResultError: The selected part contains no row; the folder is unchanged.
         OutputError: The disk is full.
     """
     ledgers = tuple(Ledger(name_of(log)) for log in logs)
@@ -239,7 +239,7 @@ def _decoded(
 
 
 def _ros_mobileye(log: Log, vehicle: Vehicle, ledger: Ledger) -> RosMobileye | None:
-    """Tables from ``mobileye_560_660_msgs``, where the log has them."""
+    """Return the decoder of ``mobileye_560_660_msgs``, or None if the log has no such messages."""
     types = {t.name: t.type_name for t in log.topics if role_of(t) is Role.MOBILEYE}
     if not types:
         return None
@@ -255,7 +255,7 @@ def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:
 
 
 def _late_topic(log: Log, name: str) -> Topic:
-    """A topic that came to light only while reading."""
+    """Return a topic that was first found while reading."""
     return next(topic for topic in log.topics if topic.name == name)
 
 
@@ -283,7 +283,7 @@ def _bus_decoders(
 
 
 def file_name(topic: str, taken: Collection[str]) -> str:
-    """A topic's name as a file name without folders, unlike those already taken."""
+    """Return a file name without folders for a topic, different from the names already taken."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "_" for c in topic)
     plain = plain.strip("_.")[:100] or "topic"
     name, number = plain, 2
@@ -295,10 +295,10 @@ def file_name(topic: str, taken: Collection[str]) -> str:
 def _labelled(
     columns: Mapping[str, NDArray[np.generic]], timeline: Timeline, clock: LogClock
 ) -> dict[str, NDArray[np.generic]]:
-    """Columns with drive time, segment and the stamps as recorded in front.
+    """Return columns preceded by drive time, segment and the recorded stamps.
 
-    A stream's own ``t_ns`` (the Mobileye's time of the image) stays; other fields of its own with
-    these names get an underscore behind.
+    A stream's own ``t_ns`` (the Mobileye's image time) is kept. Its other fields with one of these
+    names get an underscore appended.
     """
     import numpy as np
 

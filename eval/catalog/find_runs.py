@@ -1,4 +1,4 @@
-"""Which runs a command line means: run folders, folders that hold some, patterns, lists."""
+"""Runs that a command line names: run folders, folders of runs, patterns and lists."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ LIST_BYTES: Final = 64 << 20
 
 
 def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
-    """The run folders that RUN arguments mean, in the order given.
+    """Return the run folders that RUN arguments name, in the order of the arguments.
 
-    A folder with a manifest or tables is a run, whole or cut short; any other stands for the runs
-    in it, without those that were merged of others; ``@runs.txt`` names one per line; a pattern
-    that the shell left alone stands for what it matches.
+    A folder with a manifest or tables is a run, complete or interrupted. Any other folder stands
+    for the runs in it, except merged ones. ``@runs.txt`` names one run per line. A quoted pattern
+    stands for the folders that it matches.
 
     Raises:
-        RunError: A folder that neither is nor holds a run.
-        UsageError: A pattern without a match, a list that cannot be read, a run named twice, or a
-            URL.
+        RunError: A folder neither is nor holds a run.
+        UsageError: A pattern has no match, a list cannot be read, a run is named twice, or an
+            argument is a URL.
     """
     found = tuple(path for text in arguments for path in _expanded(text))
     for path, count in Counter(path.resolve() for path in found).items():
@@ -45,8 +45,8 @@ def runs_of(arguments: Sequence[str]) -> tuple[Path, ...]:
 def _expanded(text: str) -> Iterator[Path]:
     if is_remote(text):
         raise UsageError(
-            f"{text}: runs on a store; copy those that are needed to this machine (query, compare "
-            "and history read them there)"
+            f"{text}: runs on a store; copy them to this machine (only query, compare and history "
+            "read runs on a store)"
         )
     if text.startswith("@"):
         for line in _lines(Path(text[1:])):
@@ -54,7 +54,7 @@ def _expanded(text: str) -> Iterator[Path]:
     elif glob.has_magic(text) and not Path(text).exists():
         matched = [path for path in sorted(glob.glob(text)) if Path(path).is_dir()]  # noqa: PTH207
         if not matched:
-            raise UsageError(f"{text}: nothing matches; give folders of runs")
+            raise UsageError(f"{text}: nothing matches; expected folders of runs")
         for path in matched:
             yield from _expanded(path)
     else:
@@ -63,14 +63,14 @@ def _expanded(text: str) -> Iterator[Path]:
 
 def _in_folder(folder: Path) -> Iterator[Path]:
     if not folder.is_dir() or _is_run({entry.name for entry in _listed(folder)}):
-        # What is wrong with it, if anything, is reported when it is opened.
+        # A damaged run is reported when it is opened.
         yield folder
         return
     below = ((folder / one.run, one.file) for one in LocalRuns(folder).find())
     found = [run for run, file in below if not (_is_merged(run) or _is_bare(run, file))]
     if not found:
         raise UnreadableRunError(
-            f"{folder}: neither a run folder nor a folder of some; replay first"
+            f"{folder}: neither a run folder nor a folder of runs; replay first"
         )
     yield from found
 
@@ -83,12 +83,12 @@ def _listed(folder: Path) -> list[Path]:
 
 
 def _is_run(names: set[str]) -> bool:
-    """Does a folder with these files hold a run? Cut short it must be reported, not passed over."""
+    """Return whether files are those of a run; an interrupted run counts and is reported later."""
     return MANIFEST in names or is_cut_short(names)
 
 
 def _is_bare(folder: Path, file: str) -> bool:
-    """Did a run fail before it left anything but the reason? Batches and catalogs report those."""
+    """Return whether a run failed with no output but its error; batches and catalogs report it."""
     return file == FAILURE and {entry.name for entry in _listed(folder)} <= {FAILURE, LOCK}
 
 
@@ -103,11 +103,13 @@ def _lines(path: Path) -> list[str]:
     try:
         content = read_at_most(path, LIST_BYTES)
         if content is None:
-            raise UsageError(f"@{path}: larger than {LIST_BYTES >> 20} MiB; give a list of runs")
+            raise UsageError(
+                f"@{path}: larger than {LIST_BYTES >> 20} MiB; expected a list of runs"
+            )
         lines = content.decode("utf-8", "surrogateescape").splitlines()
     except OSError as error:
-        raise UsageError(f"@{path}: {error.strerror}; give a text file") from None
+        raise UsageError(f"@{path}: {error.strerror}; expected a text file") from None
     named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
     if not named:
-        raise UsageError(f"@{path}: names no run; give a line for each")
+        raise UsageError(f"@{path}: names no run; expected a line for each")
     return [str(path.parent / line) for line in named]

@@ -1,4 +1,4 @@
-"""Every metric over the versions, commits or tags that the runs of a catalog were made with."""
+"""History of every metric over the versions, commits or tags of a catalog's runs."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 BY: Final[Mapping[str, str]] = {"commit": "crosscue_commit", "version": "crosscue"}
-"""From what a history may go by to the column of ``runs``; any other name is a tag's."""
+"""Column of ``runs`` by the value of ``--by``; any other value is the name of a tag."""
 
 
 class Asked(Protocol):
     """A catalog of runs."""
 
     def query(self, sql: str) -> pa.Table:
-        """The rows that a query selects."""
+        """Return the rows that a query selects."""
         ...
 
 
@@ -44,10 +44,10 @@ class Point:
     """A metric under one version.
 
     Attributes:
-        value: Pooled over its drives; NaN where none has it.
-        low: Lower end of the 95 % interval, over drives; NaN below four.
-        high: Its upper end.
-        drives: How many it stands on.
+        value: Value pooled over the version's drives; NaN if no drive has the metric.
+        low: Lower end of the 95 % interval over drives; NaN below four drives.
+        high: Upper end of the interval.
+        drives: Number of drives pooled.
     """
 
     value: float
@@ -61,10 +61,10 @@ class MetricHistory:
     """A metric over all versions.
 
     Attributes:
-        path: Its name.
-        better: Its good direction.
-        points: One for each version.
-        changes: Where it changed.
+        path: Name of the metric.
+        better: Good direction of the metric.
+        points: One point for each version.
+        changes: Change points.
     """
 
     path: str
@@ -73,20 +73,20 @@ class MetricHistory:
     changes: tuple[ChangePoint, ...]
 
     def is_better(self, change: ChangePoint) -> bool:
-        """Is it better from this change point on, over the drives on both sides?"""
+        """Return whether the pooled metric is better after this change point than before."""
         return (change.by > 0.0) == (self.better == "higher")
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class History:
-    """Metrics over versions; printed as ``crosscue history`` prints them.
+    """Metrics over versions; its ``repr`` is the output of ``crosscue history``.
 
     Attributes:
-        by: What the versions are: ``commit``, ``version`` or a tag's name.
-        versions: In the order in which their first run was made.
-        drives: How many drives each has scored runs of.
-        metrics: Those that were scored, with changed ones first.
-        left_out: Why runs take no part, and how many.
+        by: Kind of the versions: ``commit``, ``version`` or a tag's name.
+        versions: Versions in the order in which their first run was made.
+        drives: Number of drives with a scored run, by version.
+        metrics: Scored metrics, those that changed first.
+        left_out: Number of runs left out, by reason.
     """
 
     by: str
@@ -101,7 +101,7 @@ class History:
         return tuple(one for one in self.metrics if one.changes)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue history --json`` prints."""
+        """Return the object that ``crosscue history --json`` prints."""
         return asdict(self)
 
     def __repr__(self) -> str:
@@ -126,15 +126,15 @@ def _lines(found: History) -> Iterator[str]:
 
 
 def history_of(catalog: Asked, by: str, patterns: Sequence[str] = ()) -> History:
-    """The history of every judged metric.
+    """Return the history of every judged metric.
 
     Args:
         catalog: The runs.
         by: ``commit``, ``version``, or the name of a tag.
-        patterns: Of metrics' names; none means all.
+        patterns: Patterns of metric names; empty selects all metrics.
 
     Raises:
-        EmptyResultError: No scored run says which version it is of, or no metric fits.
+        EmptyResultError: No scored run records its version, or no metric matches.
     """
     runs = _runs(catalog, by)
     left_out = {
@@ -144,9 +144,9 @@ def history_of(catalog: Asked, by: str, patterns: Sequence[str] = ()) -> History
     usable = [one for one in runs if one["is_scored"] and one["version"] is not None]
     if not usable:
         raise EmptyResultError(
-            f"history: no scored run of {len(runs)} has a {by}; score them, or give another --by"
+            f"history: no scored run of {len(runs)} has a {by}; score them, or choose another --by"
         )
-    # The latest run of a drive under a version stands for it.
+    # The latest run of a drive represents it under a version.
     chosen = {(one["version"], one["identity"]): one["run"] for one in usable}
     left_out["replaced by a later run of the same drive"] = len(usable) - len(chosen)
     versions = list(dict.fromkeys(one["version"] for one in usable))
@@ -167,7 +167,7 @@ def history_of(catalog: Asked, by: str, patterns: Sequence[str] = ()) -> History
 
 
 def limits() -> dict[str, object]:
-    """What a change point means, in numbers."""
+    """Return the parameters that define a change point."""
     return {
         "shuffles": SHUFFLES,
         "alarms": round(100.0 * FALSE_ALARMS),
@@ -177,7 +177,7 @@ def limits() -> dict[str, object]:
 
 def _runs(catalog: Asked, by: str) -> list[dict[str, Any]]:
     column = BY.get(by, "tags['{}']".format(by.replace("'", "''")))
-    # The name is quoted, and a query can reach nothing but the catalog's tables.
+    # The name is quoted, and a query can only read the catalog's tables.
     sql = (
         f"select run, coalesce(identity, run) as identity, is_scored, {column} as version "  # noqa: S608
         "from runs order by made_at, run"
@@ -189,7 +189,7 @@ def _runs(catalog: Asked, by: str) -> list[dict[str, Any]]:
 def _parts(
     catalog: Asked, place: Mapping[str, int], patterns: Sequence[str]
 ) -> dict[str, list[tuple[int, DriveMetric]]]:
-    """By metric, each drive's part with the place of its version."""
+    """Return each drive's contribution with the index of its version, by metric."""
     found: dict[str, list[tuple[int, DriveMetric]]] = {}
     table = catalog.query(
         "select s.run, coalesce(r.identity, r.run) as log, metric, kind, total, rows "

@@ -1,4 +1,4 @@
-"""Many runs against many: two versions or settings over a fleet, paired by drive."""
+"""Comparison of two sets of runs, such as two versions over a fleet, paired by drive."""
 
 from __future__ import annotations
 
@@ -16,19 +16,25 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Scored: TypeAlias = tuple[list[DriveMetric] | None, bool]
-"""What each drive of a run adds to the metrics, None if not scored; and whether it is whole."""
+"""Each drive's contribution to the metrics (None if not scored); True if no rows were dropped."""
 
 
 class Asked(Protocol):
     """A catalog of runs."""
 
     def query(self, sql: str) -> pa.Table:
-        """The rows that a query selects."""
+        """Return the rows that a query selects."""
         ...
 
 
 class _Side(NamedTuple):
-    """Attributes: ``parts``: of each drive's metrics; ``left_out``: by run, why."""
+    """One of the two sets of runs.
+
+    Attributes:
+        parts: Contributions of its drives to the metrics.
+        left_out: Reason why a run was left out, by run.
+        is_whole: True if no rows were dropped in any run.
+    """
 
     parts: list[DriveMetric]
     left_out: dict[str, str]
@@ -36,22 +42,22 @@ class _Side(NamedTuple):
 
     @property
     def logs(self) -> set[str]:
-        """Identities of its drives."""
+        """Identities of the drives."""
         return {one.log for one in self.parts}
 
 
 def read_scored(path: Path | str) -> Scored:
-    """The score of a run folder.
+    """Read the score of a run folder.
 
     Raises:
-        RunError: It is not one, or is damaged.
+        RunError: The folder is not a run, or is damaged.
     """
     run = open_scored(Path(path))
     return parts_of(run), is_whole_run(run)
 
 
 def scores_of(catalog: Asked) -> Callable[[Path | str], Scored]:
-    """The score of a run by its name in a catalog, which may be of a store."""
+    """Return a function from a run's name in a catalog, local or on a store, to its score."""
     outcomes = catalog.query("select run, outcome from runs").to_pydict()
     is_whole = {run: outcome == "whole" for run, outcome in zip(*outcomes.values(), strict=True)}
     found: dict[str, list[DriveMetric]] = {}
@@ -70,10 +76,11 @@ def compare_many(
     """Compare the scores of two sets of runs, drive by drive.
 
     Args:
-        first: Runs that were good: their folders, or what ``read`` takes.
+        first: Reference runs: their folders, or other arguments of ``read``.
         second: Runs to judge.
-        tolerances: The last one whose pattern fits a metric counts; without any, none.
-        read: How to get the score of one.
+        tolerances: The last one whose pattern matches a metric applies; if none does, no loss is
+            allowed.
+        read: Function that reads the score of a run.
 
     Raises:
         UsageError: A drive has two runs on one side.

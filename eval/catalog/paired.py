@@ -1,17 +1,17 @@
-"""Better, worse or undecided: metrics of two runs compared drive by drive.
+"""Paired comparison of two runs' metrics over drives: better, worse or undecided.
 
-If both runs are equally good, which of a drive's two results came from which run is arbitrary.
-Swapping them at random, drive by drive, shows how far metrics then differ by chance (a permutation
-test; Good, *Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3).
+If both runs are equally good, it is arbitrary which of a drive's two results came from which run.
+Swapping them at random, drive by drive, shows how far metrics differ by chance (a permutation test;
+Good, *Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3).
 
 Many cues under many conditions are many chances for a false alarm. They are corrected by Holm's
-procedure (*Scandinavian Journal of Statistics* 6, 1979) with the swaps' own joint distribution in
+procedure (*Scandinavian Journal of Statistics* 6, 1979) with the joint distribution of the swaps in
 place of Bonferroni's bound (Westfall, Young, *Resampling-Based Multiple Testing*, 1993, algorithm
-4.1): from the metric that differs most, in units of its own spread, each is judged by the largest
-difference over those that remain. So a metric that did not change is called better or worse in at
-most 5 % of comparisons, however many there are, however they depend on each other, and whatever
-else did change. Benjamini and Hochberg's procedure decides more, but lets 5 % of its verdicts be
-false, which a gate that fails for a single one cannot use.
+4.1): starting with the metric that differs most in units of its own spread, each is judged by the
+largest difference over the remaining ones. A metric that did not change is therefore called better
+or worse in at most 5 % of comparisons, for any number of metrics, any dependence between them, and
+any change of the others. Benjamini and Hochberg's procedure decides more, but allows 5 % of its
+verdicts to be false, which is too many for a gate that fails on a single one.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from crosscue.eval.scoring.by_drive import Direction, DriveMetric, Kind, directi
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 
 FALSE_ALARMS: Final = 0.05
-"""Comparisons in which any metric that did not change gets a verdict, at most."""
+"""Max fraction of comparisons in which any unchanged metric gets a verdict."""
 MIN_DRIVES: Final = 6
-"""Of five, swapping can make a difference no rarer than 2 in 32: nothing is ever decided."""
+"""With five drives, no p value is below 2 / 32, so nothing would ever be decided."""
 POWER_QUANTILE: Final = 0.841621
-"""A difference as large as the smallest that could be seen is seen in 80 % of comparisons."""
+"""Standard normal quantile of the power: the detectable difference is found with about 80 %."""
 MAX_DRIVES: Final = 1_000_000
-"""Beyond, the number of drives that would decide is not worth printing."""
+"""Above this, the number of drives that would decide is not printed."""
 EXACT_DRIVES: Final = 12
 SWAPS: Final = 1 << EXACT_DRIVES
 SEED: Final = 0
@@ -48,21 +48,22 @@ class PairedMetric:
     """One metric over the drives that both runs have.
 
     Attributes:
-        path: As in gates.
-        before: In the first run.
-        after: In the second.
-        better: Its good direction.
-        drives: Of which at least one run has rows.
-        low: Lower end of the 95 % interval of after minus before, by drive; NaN below four drives.
-        high: Its upper end.
-        p: How often chance makes this metric, or one that differs less, differ so much.
-        could_see: The smallest difference that would be seen in 80 % of comparisons; infinite below
+        path: Path of the metric, as in gates.
+        before: Value in the first run.
+        after: Value in the second run.
+        better: Good direction of the metric.
+        drives: Number of drives with rows in at least one run.
+        low: Lower end of the 95 % interval of after minus before, over drives; NaN below four
+            drives.
+        high: Upper end of the interval.
+        p: p value, corrected for all metrics.
+        could_see: The smallest difference that 80 % of comparisons would detect; infinite below
             six drives.
-        more_drives: How many more drives, as varied as these, would decide in 80 % of comparisons
-            whether a difference as large as this one is real; 0 where it is decided or zero,
-            None where it cannot be known.
-        allowed: How much worse it may be.
-        verdict: Of the second run.
+        more_drives: Number of additional drives, as varied as these, with which 80 % of
+            comparisons would detect a difference of this size; 0 if it is decided or zero, None if
+            unknown.
+        allowed: Allowed loss.
+        verdict: Verdict on the second run.
     """
 
     path: str
@@ -80,7 +81,7 @@ class PairedMetric:
 
 
 class _Sums(NamedTuple):
-    """Shapes (G,), by drive: total and rows in the first run, then in the second."""
+    """Totals and numbers of rows by drive in the first and in the second run, shapes (G,)."""
 
     total: NDArray[np.float64]
     rows: NDArray[np.float64]
@@ -96,9 +97,9 @@ def compare_drives(
     """Compare every judged metric that both runs have, over the drives that both have.
 
     Args:
-        first: Parts of the run that was good.
-        second: Parts of the run to judge.
-        allowed_of: From path and value before to how much worse it may be.
+        first: Contributions of drives to the metrics of the reference run.
+        second: The same for the run to judge.
+        allowed_of: Function from the path and the value before to the allowed loss.
     """
     logs = sorted({one.log for one in first} & {one.log for one in second})
     kinds: dict[str, Kind] = {one.metric: one.kind for one in (*first, *second)}
@@ -123,21 +124,22 @@ def compare_drives(
 def step_down(
     statistics: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Corrected p values, and what a statistic must exceed to count among all of them.
+    """Return corrected p values and the critical value over all metrics.
 
     Args:
-        statistics: Shape (M, S), of M metrics, each in units of its own spread: as observed in the
-            first column, as chance makes them in all.
+        statistics: Shape (M, S), of M metrics under S swaps, each in units of its own spread. The
+            first column is the observation.
 
     Returns:
-        Shape (M,); and infinity where too few swaps exist for any verdict.
+        The p values, shape (M,), and the critical value; infinite if there are too few swaps for
+        any verdict.
     """
     metrics = len(statistics)
     if not metrics:
         return np.ones(0), math.inf
     order = np.argsort(-statistics[:, 0], kind="stable")
     ordered = statistics[order]
-    # Of each metric and all that differ less.
+    # Maximum over each metric and all metrics that differ less.
     largest = np.maximum.accumulate(ordered[::-1], axis=0)[::-1]
     corrected = np.empty(metrics)
     is_reached = largest >= ordered[:, :1] - ROUNDING
@@ -148,7 +150,7 @@ def step_down(
 def _sums(
     logs: Sequence[str], first: Sequence[DriveMetric], second: Sequence[DriveMetric]
 ) -> dict[str, _Sums]:
-    """By metric, what each drive adds in both runs."""
+    """Return each drive's contributions in both runs, by metric."""
     place = {log: i for i, log in enumerate(logs)}
     columns: dict[str, NDArray[np.float64]] = {}
     for side, parts in enumerate((first, second)):
@@ -160,7 +162,7 @@ def _sums(
 
 
 def _swaps(drives: int) -> NDArray[np.float64]:
-    """Shape (S, G): 1 where a drive's results are swapped; the first row swaps none."""
+    """Return swaps, shape (S, G): 1 if a drive's results are swapped; the first row swaps none."""
     if drives <= EXACT_DRIVES:
         rows = np.arange(1 << drives)[:, None]
         return (rows >> np.arange(drives) & 1).astype(np.float64)
@@ -170,7 +172,7 @@ def _swaps(drives: int) -> NDArray[np.float64]:
 
 
 def _swapped(kind: Kind, sums: _Sums, swaps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """After minus before for every way of swapping, shape (S,)."""
+    """Return after minus before for every swap, shape (S,)."""
     total = swaps @ (sums.other_total - sums.total)
     rows = swaps @ (sums.other_rows - sums.rows)
     before = _value(kind, sums.total.sum() + total, sums.rows.sum() + rows)
@@ -189,7 +191,7 @@ def _value(
 
 
 def _critical(largest: NDArray[np.float64]) -> float:
-    """What the largest difference must reach; infinite where no difference could be rare enough."""
+    """Return the critical value of the largest difference; infinite if there are too few swaps."""
     ordered = np.sort(largest)[::-1]
     rank = math.floor(FALSE_ALARMS * len(ordered) + ROUNDING)
     if rank < 1 or len(ordered) < 1 << MIN_DRIVES:
@@ -242,7 +244,7 @@ def _judged(
 
 
 def _more_drives(could_see: float, difference: float, drives: int) -> int | None:
-    """What can be seen shrinks with the root of the number of drives."""
+    """Return the additional drives needed; the detectable difference falls as 1 / sqrt(drives)."""
     if not math.isfinite(could_see):
         return None
     enough = drives * (could_see / difference) ** 2
@@ -250,7 +252,7 @@ def _more_drives(could_see: float, difference: float, drives: int) -> int | None
 
 
 def _jackknife(kind: Kind, sums: _Sums) -> tuple[float, int]:
-    """Standard deviation of the difference by leaving out each drive, and how many drives speak."""
+    """Return the jackknife standard deviation of the difference, and the number of drives used."""
     mine = (sums.rows > 0.0) | (sums.other_rows > 0.0)
     some = _Sums(*(column[mine] for column in sums))
     n = int(mine.sum())
@@ -268,12 +270,12 @@ def _jackknife(kind: Kind, sums: _Sums) -> tuple[float, int]:
 def pooled(
     kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]
 ) -> tuple[float, float, int]:
-    """A metric over drives, half its 95 % interval by leaving out each drive, and how many.
+    """Return a metric pooled over drives, half its 95 % jackknife interval, and the drives used.
 
     Args:
-        kind: Of the metric.
-        total: Shape (G,).
-        rows: Shape (G,); 0 for drives without the metric.
+        kind: Kind of the metric.
+        total: Sum by drive, shape (G,).
+        rows: Number of rows by drive, shape (G,); 0 for drives without the metric.
     """
     mine = rows > 0.0
     total, rows, n = total[mine], rows[mine], int(mine.sum())

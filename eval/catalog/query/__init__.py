@@ -1,1 +1,1 @@
-"""The runs below a folder as tables, and SQL over them."""
+"""SQL queries over the runs below a folder."""

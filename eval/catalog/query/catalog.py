@@ -1,4 +1,4 @@
-"""Every run below a folder, as tables and SQL."""
+"""Catalog of all runs below a folder or URL, queried by SQL."""
 
 from __future__ import annotations
 
@@ -33,23 +33,24 @@ _OF_CONDITION: Final = "select run from runs where (\n{}\n) order by run"
 class Catalog:
     """The runs below a folder; ``crosscue.catalog`` opens one.
 
-    It knows the runs that were there then; their own tables are read when a query names them.
+    It contains the runs that existed when it was opened. Their tables are read when a query names
+    them.
     """
 
     def __init__(self, places: Runs, index: Index) -> None:
-        """Use ``catalog`` instead."""
+        """Initialize the catalog; call ``catalog`` to open one."""
         self._places: Final = places
         self._index: Final = index
         self._unreadable: Final[dict[str, str]] = {}
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """By run, why it, or a table of it that a query needed, could not be read."""
+        """Reason why a run, or a table of it that a query needed, could not be read, by run."""
         return {**self._index.left_out, **self._unreadable}
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """That the index could not be saved; that drives have runs of different settings."""
+        """Notices: the index could not be saved, or drives have runs with different settings."""
         return tuple(text for text in (self._index.notice, self._several_settings()) if text)
 
     @property
@@ -60,16 +61,17 @@ class Catalog:
         return tuple(self._places.path(run) for run in done)
 
     def query(self, sql: str) -> pa.Table:
-        """The rows that a query selects; ``schema`` lists what can be queried.
+        """Return the rows that a query selects; ``schema`` lists the tables and columns.
 
-        Nothing is written and no other file is read, whatever the query says. A run of which a
-        table cannot be read is left out of that table, and added to ``left_out``.
+        No query can write anything or read another file. If a run's table cannot be read, the run
+        is left out of that table and added to ``left_out``.
 
         Args:
             sql: A single SELECT, in the SQL of DuckDB.
 
         Raises:
-            UsageError: It is not one, or names a table or column that does not exist.
+            UsageError: The text is not a single SELECT, or names a table or column that does not
+                exist.
         """
         words = {word.lower() for word in _WORD.findall(sql)}
         named = [name for name in self._names if name in words]
@@ -82,30 +84,30 @@ class Catalog:
             try:
                 return database.select(sql, tables, self._names)
             except database.FailedError:
-                # A file whose head is sound may be damaged further on, or gone.
+                # A file whose header is intact may be damaged further on or deleted.
                 if not sum(one.drop_damaged() for one in files.values()):
                     raise
 
     def select(self, query: str) -> tuple[Path, ...]:
-        """Folders of the runs that a query selects.
+        """Return the folders of the runs that a query selects.
 
         Args:
             query: As for ``named``.
 
         Raises:
-            UsageError: As ``named``; the runs are on a store, where they have no folder.
+            UsageError: As for ``named``, or the runs are on a store and have no local folder.
         """
         return tuple(self._places.path(run) for run in self.named(query))
 
     def named(self, query: str) -> tuple[str, ...]:
-        """Names of the runs that a query selects, as the column ``run`` has them; of a store, too.
+        """Return the names of the runs that a query selects: values of the column ``run``.
 
         Args:
-            query: A condition on the table ``runs``, such as ``vehicle = 'car'``; or a whole SELECT
-                whose column ``run`` names them, in whose order they come, each once.
+            query: A condition on the table ``runs``, such as ``vehicle = 'car'``; or a complete
+                SELECT with a column ``run``, whose order is kept and whose repeats are dropped.
 
         Raises:
-            UsageError: As ``query``, or the result has no column ``run``.
+            UsageError: As for ``query``, or the result has no column ``run``.
         """
         sql = query
         if not database.is_statement(query):
@@ -114,7 +116,7 @@ class Catalog:
         if "run" not in found.column_names:
             raise UsageError(
                 f"query: no column run in the result ({', '.join(found.column_names)}); "
-                "select run, or give a condition on runs"
+                "select run, or write a condition on runs"
             )
         named = dict.fromkeys(found["run"].to_pylist())
         there = {*self._listed("run")}
@@ -127,7 +129,7 @@ class Catalog:
         return tuple(named)
 
     def schema(self) -> pa.Table:
-        """Every table and column: table, column, type and meaning."""
+        """Return the table, name, type and meaning of every column."""
         import pyarrow as pa
 
         listed = [
@@ -142,7 +144,7 @@ class Catalog:
         return pa.table({name: list(column) for name, column in zip(head, columns, strict=True)})
 
     def _listed(self, column: str) -> list[Any]:
-        """A column of the table ``runs``."""
+        """Return a column of the table ``runs`` as a list."""
         import pyarrow.dataset as ds
 
         runs = self._index.tables["runs"]
@@ -150,7 +152,7 @@ class Catalog:
         return list(table[column].to_pylist())
 
     def _several_settings(self) -> str:
-        """One line on drives that were run with several settings; empty without any."""
+        """Return a notice about drives that were run with several settings; empty without any."""
         found = database.select(_SEVERAL, {"runs": self._index.tables["runs"]}, ["runs"])
         if not found.num_rows:
             return ""
@@ -180,7 +182,7 @@ class Catalog:
 
 
 def _views(table: str, found: parts.Parts) -> dict[str, Any]:
-    """A table by its name, and what a view of that name is made of."""
+    """Return the data set and, if the table is computed, the SQL of its view, by name."""
     if table not in VIEWS:
         return {table: found.dataset}
     base = f"{table}_of_runs"
@@ -191,17 +193,17 @@ def catalog(place: Path | str) -> Catalog:
     """Open the catalog of all runs below a folder or URL.
 
     Args:
-        place: A folder of runs, at any depth down to six; a single run; or a URL of fsspec's, such
-            as ``s3://bucket/runs``, of which only what a query needs is fetched.
+        place: A folder of runs, nested up to six deep; a single run; or a URL that fsspec supports,
+            such as ``s3://bucket/runs``, from which only the needed data are fetched.
 
     Raises:
-        RunError: It is not a folder, holds no run, or cannot be listed.
+        RunError: The place is not a folder, holds no run, or cannot be listed.
     """
     if is_remote(place) and not str(place).startswith("file://"):
         places: Runs = RemoteRuns(str(place))
     else:
         folder = Path(str(place).removeprefix("file://"))
         if not folder.is_dir():
-            raise UnreadableRunError(f"{folder}: not a folder; give a folder of runs")
+            raise UnreadableRunError(f"{folder}: not a folder; expected a folder of runs")
         places = LocalRuns(folder)
     return Catalog(places, open_index(places))

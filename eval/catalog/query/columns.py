@@ -1,8 +1,8 @@
-"""Tables of a catalog: their columns, SQL types and what they mean.
+"""Tables of a catalog: columns, SQL types and meanings.
 
-``runs``, ``approaches``, ``dropped`` and ``left_out`` are kept in the catalog's index. The others
-are the runs' own Parquet files; they may have more columns than are listed here, and a table that
-is not listed at all, such as ``detections``, can be asked for by the name of its file.
+``runs``, ``approaches``, ``dropped`` and ``left_out`` are stored in the catalog's index. The others
+are the runs' own Parquet files. They may have more columns than are listed here, and a table that
+is not listed, such as ``detections``, can be queried by the name of its file.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ class Column(NamedTuple):
     """One column.
 
     Attributes:
-        kind: Its type in SQL.
-        meaning: In one phrase.
+        kind: SQL type.
+        meaning: Meaning in one phrase.
     """
 
     kind: str
     meaning: str
 
 
-_RUN: Final = {"run": Column("VARCHAR", "path of the run, from the folder of the catalog")}
+_RUN: Final = {"run": Column("VARCHAR", "path of the run, relative to the folder of the catalog")}
 _LOG_TIME: Final = {
     "segment": Column("INTEGER", "time segment of the drive, from 0"),
     "log_t_ns": Column("BIGINT", "time on the log's own clock"),
@@ -41,73 +41,73 @@ INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
         **_RUN,
         "name": Column("VARCHAR", "last part of the path"),
         "outcome": Column("VARCHAR", "whole, losses where rows were dropped, or failed"),
-        "exit_status": Column("INTEGER", "0; 3 where rows were dropped; of a failed run its own"),
-        "error": Column("VARCHAR", "why the last attempt failed; null where it did not"),
-        "stage": Column(
-            "VARCHAR", "estimate; detect where nothing has been estimated; null of failed"
+        "exit_status": Column("INTEGER", "0, 3 where rows were dropped, or that of a failed run"),
+        "error": Column("VARCHAR", "error of the last attempt; null if it did not fail"),
+        "stage": Column("VARCHAR", "estimate; detect if not yet estimated; null of a failed run"),
+        "identity": Column(
+            "VARCHAR", "hash of the drive's logs, 64 hex digits; equal for all runs of a drive"
         ),
-        "identity": Column("VARCHAR", "of the drive's logs, 64 hex digits: pairs runs of a drive"),
         "logs": Column("VARCHAR[]", "names of the drive's logs"),
         "is_simulated": Column("BOOLEAN", "whether a log is simulated"),
         "vehicle": Column("VARCHAR", "name in the vehicle file"),
         "crosscue": Column("VARCHAR", "version that made the run"),
-        "crosscue_commit": Column("VARCHAR", "its commit, where it ran from a checkout"),
+        "crosscue_commit": Column("VARCHAR", "commit of crosscue, if it ran from a checkout"),
         "models": Column(
             "STRUCT(name VARCHAR, identity VARCHAR)[]",
             "detectors; the identity is a hash of weights, settings and code",
         ),
         "settings": Column("VARCHAR", "JSON of all settings: (settings->>'$.fusion.established')"),
-        "settings_sha256": Column("VARCHAR", "of settings, models and the part of the logs"),
+        "settings_sha256": Column("VARCHAR", "hash of settings, models and selection of the logs"),
         "tags": Column("MAP(VARCHAR, VARCHAR)", "set by crosscue tag: tags['weather']"),
-        "conditions": Column("VARCHAR[]", "of the drive's approaches, from the truth"),
+        "conditions": Column("VARCHAR[]", "conditions of the drive's approaches, from the truth"),
         "start_ns": Column("BIGINT", "drive time at which the drive starts"),
         "end_ns": Column("BIGINT", "drive time at which it ends"),
         "made_at": Column("TIMESTAMP", "when the run was finished, UTC"),
-        "seconds": Column("DOUBLE", "wall time of making it"),
+        "seconds": Column("DOUBLE", "wall time of the run"),
         "travelled_m": Column("DOUBLE", "length of the track; null without estimate"),
-        "frames": Column("BIGINT", "of the camera; null without detectors"),
-        "approaches": Column("BIGINT", "that the run saw"),
-        "is_scored": Column("BOOLEAN", "whether it has a score"),
-        "rows_in": Column("BIGINT", "account over all stages: taken in"),
-        "rows_used": Column("BIGINT", "used"),
-        "rows_skipped": Column("BIGINT", "skipped, with reasons in its manifest"),
-        "rows_dropped": Column("BIGINT", "dropped, with reasons in the table dropped"),
-        "notices": Column("VARCHAR[]", "what the run noted"),
-        "tables": Column("VARCHAR[]", "names of its Parquet files"),
+        "frames": Column("BIGINT", "number of camera frames; null without detectors"),
+        "approaches": Column("BIGINT", "number of approaches that the run found"),
+        "is_scored": Column("BOOLEAN", "whether the run has a score"),
+        "rows_in": Column("BIGINT", "input rows over all stages"),
+        "rows_used": Column("BIGINT", "rows used"),
+        "rows_skipped": Column("BIGINT", "rows skipped, with reasons in the manifest"),
+        "rows_dropped": Column("BIGINT", "rows dropped, with reasons in the table dropped"),
+        "notices": Column("VARCHAR[]", "notices of the run"),
+        "tables": Column("VARCHAR[]", "names of the run's Parquet files"),
     },
     "approaches": {
         **_RUN,
-        "approach": Column("BIGINT", "number in its run; null where the run has none"),
-        "start_ns": Column("BIGINT", "first log time, as the run saw it"),
+        "approach": Column("BIGINT", "number in its run; null if the run did not find it"),
+        "start_ns": Column("BIGINT", "first log time of the run's approach"),
         "end_ns": Column("BIGINT", "last log time"),
         "detected_ns": Column("BIGINT", "log time of the detection; null without"),
-        "detected_range_m": Column("DOUBLE", "range that the run estimated then"),
-        "reference": Column("VARCHAR", "start or end of the intersection, which ranges are to"),
+        "detected_range_m": Column("DOUBLE", "range estimated at the detection"),
+        "reference": Column("VARCHAR", "reference of ranges: start or end of the intersection"),
         "probabilities": Column("MAP(VARCHAR, DOUBLE)", "last belief: probabilities['left']"),
-        "not_seen": Column("VARCHAR[]", "features that no cue reported on"),
-        "truth": Column("BIGINT", "id in the truth; null without truth, and where none is"),
-        "intersection": Column("VARCHAR", "its name in the truth"),
+        "not_seen": Column("VARCHAR[]", "features without an observation by any cue"),
+        "truth": Column("BIGINT", "id in the truth; null without truth, or if not in the truth"),
+        "intersection": Column("VARCHAR", "name of the intersection in the truth"),
         "control": Column("VARCHAR", "stop_sign, traffic_light or none"),
-        "conditions": Column("VARCHAR[]", "of the truth: 'dusk' in conditions"),
-        "present": Column("VARCHAR[]", "features that are there"),
+        "conditions": Column("VARCHAR[]", "conditions in the truth, such as 'dusk'"),
+        "present": Column("VARCHAR[]", "features that are present"),
         "detected_m": Column("DOUBLE", "true distance at which it was detected; null if never"),
         "full_m": Column("DOUBLE", "the same for all features; null if never"),
         "features_m": Column("MAP(VARCHAR, DOUBLE)", "true distance of each present feature"),
         "false_features": Column("VARCHAR[]", "absent features that were detected"),
-        "why_not_detected": Column("VARCHAR", "empty where it was"),
-        "why_not_full": Column("VARCHAR", "empty where it was"),
-        "tags": Column("MAP(VARCHAR, VARCHAR)", "of the run"),
+        "why_not_detected": Column("VARCHAR", "why it was not detected; empty if it was"),
+        "why_not_full": Column("VARCHAR", "why not all features were; empty if they were"),
+        "tags": Column("MAP(VARCHAR, VARCHAR)", "tags of the run"),
     },
     "dropped": {
         **_RUN,
         "stage": Column("VARCHAR", "reading, detecting or estimating"),
         "stream": Column("VARCHAR", "topic, camera or input"),
-        "reason": Column("VARCHAR", "why"),
-        "rows": Column("BIGINT", "how many; null where it cannot be known"),
+        "reason": Column("VARCHAR", "reason"),
+        "rows": Column("BIGINT", "number of rows; null if unknown"),
     },
     "left_out": {
         **_RUN,
-        "reason": Column("VARCHAR", "why the catalog does not hold it"),
+        "reason": Column("VARCHAR", "why the run is left out"),
     },
 }
 """Tables of the index, by name."""
@@ -120,12 +120,12 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
     },
     "scores": {
         **_RUN,
-        "log": Column("VARCHAR", "identity of the drive's logs: pairs runs of a drive"),
-        "metric": Column("VARCHAR", "its path, such as cues.stop_sign.precision"),
-        "kind": Column("VARCHAR", "mean, rms or sum: how drives are pooled"),
-        "total": Column("DOUBLE", "sum over the drive's rows, of squares for rms"),
-        "rows": Column("BIGINT", "how many"),
-        "value": Column("DOUBLE", "of this drive alone"),
+        "log": Column("VARCHAR", "identity of the drive's logs; equal for all runs of a drive"),
+        "metric": Column("VARCHAR", "path, such as cues.stop_sign.precision"),
+        "kind": Column("VARCHAR", "pooling over drives: mean, rms or sum"),
+        "total": Column("DOUBLE", "sum over the drive's rows; of squares for rms"),
+        "rows": Column("BIGINT", "number of rows"),
+        "value": Column("DOUBLE", "value of this drive alone"),
     },
     "belief": {
         **_STEP,
@@ -139,9 +139,9 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
     "range": {
         **_STEP,
         "reference": Column("VARCHAR", "start or end of the intersection"),
-        "range_m": Column("DOUBLE", "estimated"),
-        "var_m2": Column("DOUBLE", "its variance"),
-        "measured_m": Column("DOUBLE", "what was measured in this step; null without"),
+        "range_m": Column("DOUBLE", "estimated range"),
+        "var_m2": Column("DOUBLE", "variance of the estimate"),
+        "measured_m": Column("DOUBLE", "range measured in this step; null without"),
         **_LOG_TIME,
     },
     "pose": {
@@ -151,9 +151,9 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
         "y_m": Column("DOUBLE", "position"),
         "heading_rad": Column("DOUBLE", "counterclockwise from the x axis"),
         "speed_mps": Column("DOUBLE", "speed"),
-        "major_axis_m": Column("DOUBLE", "of the 2-sigma ellipse"),
-        "travelled_m": Column("DOUBLE", "since the start"),
-        "landmark": Column("VARCHAR", "that corrected this pose; null without"),
+        "major_axis_m": Column("DOUBLE", "major axis of the 2-sigma ellipse"),
+        "travelled_m": Column("DOUBLE", "distance since the start"),
+        "landmark": Column("VARCHAR", "landmark that corrected this pose; null without"),
         **_LOG_TIME,
     },
     "cue_frames": {
@@ -163,9 +163,9 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
         "count": Column("BIGINT", "how many were found in the frame"),
         "approach": Column("BIGINT", "id in the truth"),
         "distance_m": Column("DOUBLE", "true distance to the intersection"),
-        "object": Column("BIGINT", "1 where the object is there, 0 where not, null unknown"),
-        "feature": Column("BIGINT", "the same of what the cue stands for"),
-        "true_count": Column("BIGINT", "how many there are; null unknown"),
+        "object": Column("BIGINT", "1 if the object is present, 0 if not, null if unknown"),
+        "feature": Column("BIGINT", "the same for the feature that the cue indicates"),
+        "true_count": Column("BIGINT", "true number of objects; null if unknown"),
         "visible": Column("DOUBLE", "visible fraction"),
     },
     "curves": {
@@ -184,17 +184,17 @@ FILES: Final[Mapping[str, str]] = {
     "cue_frames": "score/cue_frames.parquet",
     "curves": "score/curves.parquet",
 }
-"""Where a table is in a run, if not under its own name."""
+"""Path of a table in a run, if it is not stored under its own name."""
 VIEWS: Final[Mapping[str, str]] = {
     "scores": "select run, log, metric, kind, total, rows, case kind when 'sum' then total "
     "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
     "from {table}",
 }
-"""What a table is made of, if it is not its file as it stands."""
+"""SQL of the tables that are computed from a file."""
 
 
 def arrow_schema(columns: Mapping[str, Column]) -> pa.Schema:
-    """The same columns in Arrow."""
+    """Return the columns as an Arrow schema."""
     import pyarrow as pa
 
     texts = pa.list_(pa.string())

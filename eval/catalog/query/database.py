@@ -1,9 +1,9 @@
-"""SQL over tables in memory and data sets, in a DuckDB that can touch nothing else.
+"""SQL over tables in memory and data sets, in a DuckDB that cannot access anything else.
 
-It has no file system, network, extensions, Python variables or temporary files, and its settings
-are locked before a query is read; only a single SELECT is run. (Before version 2, a locked DuckDB
-could still be made to write its log to a file.) So what a query can reach are the
-tables that were handed over, which Arrow reads.
+The database has no file system, network, extensions, Python variables or temporary files, and its
+settings are locked before a query is read. Only a single SELECT is run. (Before version 2, a
+locked DuckDB could still be made to write its log to a file.) A query can therefore only access the
+tables that were passed in, which Arrow reads.
 """
 
 from __future__ import annotations
@@ -30,28 +30,29 @@ LOCKED: Final[Mapping[str, str]] = {
     "enable_external_access": "false",
     "lock_configuration": "true",
 }
-"""Settings, in an order in which each can still be set."""
+"""Settings, in the order in which they must be set."""
 MAX_LINE: Final = 300
-"""Characters of DuckDB's messages, which quote values."""
+"""Max characters of DuckDB's messages, which may quote long values."""
 _QUOTED: Final = re.compile(r'"([^"]+)"')
 _SCHEMA: Final = "crosscue query --schema lists all"
 
 
 class FailedError(UsageError):
-    """A query that is right in itself failed on the rows that it met."""
+    """A valid query failed on the rows that it read."""
 
 
 def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Table:
-    """The result of one SELECT.
+    """Return the result of one SELECT.
 
     Args:
         sql: The query.
-        tables: By name, an Arrow table or data set, or SQL text over the others.
-        known: Names of all tables that there are, for messages.
+        tables: Arrow tables, data sets, or SQL text over the others, by name.
+        known: Names of all existing tables, for messages.
 
     Raises:
-        UsageError: No single SELECT, or one that names what does not exist; the nearest is named.
-        FailedError: It fails on a row, or a file cannot be read.
+        UsageError: The text is not a single SELECT, or uses a name that does not exist; the
+            message suggests the nearest name.
+        FailedError: The query fails on a row, or a file cannot be read.
     """
     import duckdb
 
@@ -82,17 +83,17 @@ def _columns(contents: Iterable[Any]) -> list[str]:
 
 
 def is_statement(text: str) -> bool:
-    """Is it a query of its own, and no condition on one?"""
+    """Return whether the text is a complete query and not just a condition."""
     first = text.split(maxsplit=1)
     return bool(first) and first[0].lower() in ("select", "with", "from")
 
 
 def _check(database: duckdb.DuckDBPyConnection, sql: str) -> None:
-    """Refuse all but one SELECT, and names that do not exist.
+    """Refuse everything but a single SELECT over existing names.
 
     Raises:
-        UsageError: Not a single SELECT.
-        duckdb.Error: It does not parse, or names what does not exist.
+        UsageError: The text is not a single SELECT.
+        duckdb.Error: The text does not parse, or uses a name that does not exist.
     """
     import duckdb
 
@@ -101,25 +102,25 @@ def _check(database: duckdb.DuckDBPyConnection, sql: str) -> None:
     if kinds != [duckdb.StatementType.SELECT]:
         found = ", ".join(kind.name for kind in kinds) or "nothing"
         raise UsageError(f"query: expected a single SELECT, found {found}; a catalog is read-only")
-    # Errors of what is executed come as JSON, those of a relation do not.
+    # Errors of executed statements are JSON; those of a relation are plain text.
     database.execute(f"explain {statements[0].query}")
 
 
 def _message(error: duckdb.Error, tables: list[str], columns: list[str]) -> str:
-    """One line; of a misspelt table or column, with the nearest that exists."""
+    """Return a message of one line; it suggests the nearest name for a misspelt one."""
     text = str(error)
     try:
         report = json_tree(text[text.index("{") :])
-        said = str(report["exception_message"])
+        message = str(report["exception_message"])
     except (ValueError, KeyError, TypeError):
         return f"query: {one_line(error, MAX_LINE)}; {_SCHEMA}"
-    named = _QUOTED.findall(said.split("\n")[0])
+    named = _QUOTED.findall(message.split("\n")[0])
     name = str(report.get("name") or (named[-1] if named else ""))
     if report.get("type") == "Table":
         return f"query: no table {name}; {_nearest(name, tables)}"
     if report.get("exception_type") == "Binder" and name and name not in columns:
         return f"query: no column {name}; {_nearest(name, columns)}"
-    return f"query: {one_line(ValueError(said), MAX_LINE)}; {_SCHEMA}"
+    return f"query: {one_line(ValueError(message), MAX_LINE)}; {_SCHEMA}"
 
 
 def _nearest(name: str, there: list[str]) -> str:

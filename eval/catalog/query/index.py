@@ -1,7 +1,8 @@
-"""The rows of every run, read from the runs or from the index of an earlier time.
+"""Index of a catalog: the rows of every run, read from the runs or from an earlier index.
 
-The index is one file below the folder of the catalog, or in the cache where that cannot be written.
-Each run has a stamp in it; only runs of another stamp are read, and rows of runs that are gone go.
+The index is one file below the folder of the catalog, or in the cache if that folder is read-only.
+It records a stamp for each run. Only runs whose stamp changed are read again, and rows of deleted
+runs are removed.
 """
 
 from __future__ import annotations
@@ -25,63 +26,63 @@ if TYPE_CHECKING:
     import pyarrow.fs
 
 NAME: Final = ".catalog"
-"""Of the index below the folder."""
+"""Name of the folder of the index."""
 MAX_BYTES: Final = 256 << 20
-"""Of a manifest."""
+"""Max size of a manifest."""
 ENTRIES: Final = "entries"
 HALF: Final = "no manifest.json: cut short, or still being made; replay again"
 KEPT: Final = ("runs", "approaches", "dropped")
 _MARK: Final = hashlib.sha256(repr((1, INDEXED)).encode()).hexdigest()
-"""Another list of columns makes another index."""
+"""Version of the index; it changes with the list of columns."""
 
 
 class Runs(Protocol):
-    """Where runs lie; see ``local.LocalRuns``."""
+    """Storage of runs, such as ``local.LocalRuns``."""
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name used in messages."""
         ...
 
     @property
     def home(self) -> Path | None:
-        """The folder that an index may be written to."""
+        """Folder to which an index can be written, or None."""
         ...
 
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
-        """For Arrow."""
+        """Arrow's view of the storage."""
         ...
 
     def find(self) -> Iterator[Found]:
-        """Every run folder."""
+        """Yield every run folder."""
         ...
 
     def files(self, run: str) -> list[str]:
-        """Names of a run's tables, those of its score after them, and of its tags."""
+        """Return the names of a run's tables, then of its score's tables, tags and failure log."""
         ...
 
     def read(self, run: str, file: str) -> bytes:
-        """The content of one of its files."""
+        """Return the content of one of a run's files."""
         ...
 
     def place(self, run: str, file: str) -> str:
-        """Where a file is in ``filesystem``."""
+        """Return the path of a file in ``filesystem``."""
         ...
 
     def path(self, run: str) -> Path:
-        """The folder of a run."""
+        """Return the folder of a run."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Index:
-    """What a catalog holds.
+    """Content of a catalog.
 
     Attributes:
-        tables: By name, as ``columns.INDEXED`` lists them: Arrow tables or data sets.
-        left_out: By run, why it is not in the tables.
-        notice: Why the index could not be saved; empty if it was.
+        tables: Arrow tables or data sets, by name as in ``columns.INDEXED``.
+        left_out: Reason why a run is not in the tables, by run.
+        notice: Reason why the index could not be saved; empty if it was.
     """
 
     tables: Mapping[str, Any]
@@ -91,7 +92,7 @@ class Index:
 
 @dataclass(slots=True)
 class _Earlier:
-    """What an index of an earlier time knows."""
+    """Content of an earlier index."""
 
     stamps: dict[str, tuple[int, ...]]
     left_out: dict[str, str]
@@ -99,11 +100,11 @@ class _Earlier:
 
 
 def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of: None) -> Index:
-    """The rows of all runs as they are now; the index is brought up to date.
+    """Return the current rows of all runs and update the index.
 
     Args:
-        runs: Where they are.
-        on_run: Called with how many changed runs are read, and how many have to be.
+        runs: The storage of the runs.
+        on_run: Called with the number of changed runs read so far, and the number to read.
 
     Raises:
         UnreadableRunError: A folder cannot be listed, or holds no run.
@@ -111,19 +112,19 @@ def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of:
     found = {one.run: one for one in runs.find()}
     if not found:
         raise UnreadableRunError(
-            f"{runs.name}: neither a run folder nor a folder of some; replay first"
+            f"{runs.name}: neither a run folder nor a folder of runs; replay first"
         )
-    # A run alone is read as fast as its index.
+    # Reading a single run is as fast as reading an index.
     path = None if "." in found else _path_of(runs)
     earlier = _read_index(path)
     half = {run: HALF for run, one in found.items() if one.stamp == CUT_SHORT}
-    whole = {run: one for run, one in found.items() if run not in half}
-    changed = [one for run, one in whole.items() if earlier.stamps.get(run) != one.stamp]
-    gone = earlier.stamps.keys() - whole.keys()
+    complete = {run: one for run, one in found.items() if run not in half}
+    changed = [one for run, one in complete.items() if earlier.stamps.get(run) != one.stamp]
+    gone = earlier.stamps.keys() - complete.keys()
     if earlier.tables and not changed and not gone:
         return _index(earlier.tables, {**earlier.left_out, **half}, "")
     rows: list[RunRows] = []
-    unreadable = {run: why for run, why in earlier.left_out.items() if run in whole}
+    unreadable = {run: why for run, why in earlier.left_out.items() if run in complete}
     for done, one in enumerate(changed):
         on_run(done, len(changed))
         unreadable.pop(one.run, None)
@@ -135,7 +136,7 @@ def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of:
             rows += [] if read is None else [read]
     stale = gone | {one.run for one in changed}
     tables = {name: _brought_up(earlier.tables.get(name), name, stale, rows) for name in KEPT}
-    entries = _entries(whole, unreadable)
+    entries = _entries(complete, unreadable)
     return _index(tables, {**unreadable, **half}, _save(path, {ENTRIES: entries, **tables}))
 
 
@@ -143,13 +144,13 @@ def _path_of(runs: Runs) -> Path:
     if runs.home is not None:
         return runs.home / NAME
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    whole = runs.name if is_remote(runs.name) else str(Path(runs.name).resolve())
-    key = hashlib.sha256(os.fsencode(whole)).hexdigest()[:32]
+    address = runs.name if is_remote(runs.name) else str(Path(runs.name).resolve())
+    key = hashlib.sha256(os.fsencode(address)).hexdigest()[:32]
     return Path(base, "crosscue", "catalogs", key)
 
 
 def _read_index(path: Path | None) -> _Earlier:
-    """What is in the index; nothing where it is missing, damaged or of another version."""
+    """Return the content of the index; empty if it is missing, damaged or of another version."""
     if path is None:
         return _Earlier({}, {}, {})
     try:
@@ -167,14 +168,14 @@ def _read_index(path: Path | None) -> _Earlier:
 _STAMP: Final = ("stamp_0", "stamp_1", "stamp_2", "stamp_3")
 
 
-def _entries(whole: Mapping[str, Found], unreadable: Mapping[str, str]) -> pa.Table:
+def _entries(complete: Mapping[str, Found], unreadable: Mapping[str, str]) -> pa.Table:
     import pyarrow as pa
 
-    stamps = zip(*(one.stamp for one in whole.values()), strict=True) if whole else [()] * 4
-    columns: dict[str, Any] = {"run": pa.array(whole.keys(), pa.string())}
+    stamps = zip(*(one.stamp for one in complete.values()), strict=True) if complete else [()] * 4
+    columns: dict[str, Any] = {"run": pa.array(complete.keys(), pa.string())}
     for name, values in zip(_STAMP, stamps, strict=True):
         columns[name] = pa.array(values, pa.int64())
-    columns["reason"] = pa.array([unreadable.get(run) for run in whole], pa.string())
+    columns["reason"] = pa.array([unreadable.get(run) for run in complete], pa.string())
     return pa.table(columns)
 
 
@@ -189,12 +190,12 @@ def _read_run(runs: Runs, found: Found) -> RunRows | None:
 
 def _why(error: Exception) -> str:
     if isinstance(error, FileNotFoundError):
-        return "gone while it was read; open the catalog again"
+        return "deleted while it was read; open the catalog again"
     return str(error.strerror or error) if isinstance(error, OSError) else str(error)
 
 
 def _brought_up(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -> pa.Table:
-    """A table without the rows of stale runs, and with new ones."""
+    """Return a table without the rows of stale runs and with the new rows."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -207,7 +208,7 @@ def _brought_up(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -
 
 
 def _save(path: Path | None, tables: Mapping[str, pa.Table]) -> str:
-    """Empty, or why the index was not saved."""
+    """Save the index; return the reason if it could not be saved, else an empty text."""
     try:
         if path is not None:
             write(path, _MARK, tables)

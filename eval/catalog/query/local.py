@@ -1,4 +1,4 @@
-"""Runs below a folder of this machine, and what shows that one has changed."""
+"""Runs below a local folder, and the stamps that show changes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pyarrow.fs
 
 DEPTH: Final = 6
-"""Folders that runs are below the one that is searched, at most; of a store, too."""
+"""Max depth of runs below the searched folder, local or on a store."""
 SCORED: Final = "metrics.json"
 SCORE: Final = "score"
 BESIDE: Final = (TAGS, FAILURE)
@@ -28,10 +28,10 @@ class Found(NamedTuple):
     """A run folder.
 
     Attributes:
-        run: Its path from the folder that was searched, with slashes; ``.`` for that itself.
-        stamp: Another one shows that something has changed; ``CUT_SHORT`` without a manifest.
-        made_ns: When the manifest was written, or the attempt failed, as time since 1970.
-        file: What says what became of it: the manifest, or of a failed run its log.
+        run: Path relative to the searched folder, with slashes; ``.`` for that folder itself.
+        stamp: Value that changes with the content of the run; ``CUT_SHORT`` without a manifest.
+        made_ns: Time since 1970 when the manifest was written or the attempt failed.
+        file: The file that records the outcome: the manifest, or the log of a failed run.
     """
 
     run: str
@@ -44,21 +44,21 @@ class LocalRuns:
     """The runs below a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Look at nothing yet."""
+        """Use a folder, without accessing it yet."""
         self.folder: Final = folder
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name used in messages."""
         return str(self.folder)
 
     @property
     def home(self) -> Path | None:
-        """The folder, for an index; None where that is read-only."""
+        """The folder, if an index can be written to it; None if it is read-only."""
         return self.folder if os.access(self.folder, os.W_OK) else None
 
     def find(self) -> Iterator[Found]:
-        """Every run folder, whole or cut short, or the folder alone if it is one.
+        """Yield every run folder, complete or interrupted; only the folder itself if it is a run.
 
         Raises:
             UnreadableRunError: A folder cannot be listed.
@@ -70,10 +70,10 @@ class LocalRuns:
             yield from _below(str(self.folder), "", DEPTH)
 
     def files(self, run: str) -> list[str]:
-        """Names of a run's tables, those of its score after them, of its tags and failure.
+        """Return the names of a run's tables, then of its score's tables, tags and failure log.
 
         Raises:
-            OSError: It cannot be listed.
+            OSError: The folder cannot be listed.
         """
         folder = self.folder / run
         names = sorted(os.listdir(folder))  # noqa: PTH208 (there may be 100,000)
@@ -84,24 +84,24 @@ class LocalRuns:
         return tables
 
     def read(self, run: str, file: str) -> bytes:
-        """The content of one of its files.
+        """Return the content of one of a run's files.
 
         Raises:
-            OSError: It cannot be read.
+            OSError: The file cannot be read.
         """
         return (self.folder / run / file).read_bytes()
 
     def place(self, run: str, file: str) -> str:
-        """Where a file is in ``filesystem``."""
+        """Return the path of a file in ``filesystem``."""
         return str(self.folder / run / file)
 
     def path(self, run: str) -> Path:
-        """The folder of a run."""
+        """Return the folder of a run."""
         return self.folder / run
 
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
-        """For Arrow."""
+        """Arrow's local file system."""
         import pyarrow.fs
 
         return pyarrow.fs.LocalFileSystem()
@@ -140,7 +140,7 @@ def _found(folder: str, run: str) -> Found | None:
     except OSError as error:
         raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
     made_ns = manifest.st_mtime_ns
-    # A file that was replaced shows in the time of its folder.
+    # Replacing a file changes the modification time of its folder.
     stamp = (made_ns, manifest.st_size, _time(folder), _time(f"{folder}/{SCORE}"))
     return Found(run, stamp, made_ns)
 
@@ -153,9 +153,9 @@ def _time(path: str) -> int:
 
 
 def is_cut_short(names: set[str]) -> bool:
-    """Does a folder without a manifest hold what a run writes before it?
+    """Return whether files are those of a run that has not written its manifest.
 
-    A folder of pooled scores has tables, too.
+    A folder of pooled scores has tables, too, but is not a run.
     """
     has_tables = any(name.endswith(".parquet") for name in names)
     return INPUT in names or (has_tables and SCORED not in names)

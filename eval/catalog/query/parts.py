@@ -1,7 +1,7 @@
-"""Tables that are in the runs: one data set over the Parquet files of all runs.
+"""Tables stored in the runs: one data set over the Parquet files of all runs.
 
-Arrow reads them, with page checksums verified, and only the columns and row groups that are asked
-for; the run is a column that every file has one value of, so files of other runs are not opened.
+Arrow reads only the needed columns and row groups and verifies page checksums. The run is a
+partition column with one value per file, so the files of other runs are not opened.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 WORKERS: Final = 8
 SCORE: Final = "score/"
 ONLY_RUN: Final = {"run": OWN["cues"]["run"]}
-"""Of a table without a readable file, whose columns are therefore not known."""
+"""Columns of a table without a readable file, whose own columns are unknown."""
 
 
 def file_of(table: str) -> str:
-    """Where a table is in a run."""
+    """Return the path of a table in a run."""
     return FILES.get(table, f"{table}.parquet")
 
 
 def tables_of(files: Iterable[str]) -> set[str]:
-    """Names of the tables that such files hold."""
+    """Return the names of the tables that these files contain."""
     inside = {name: table for table, name in FILES.items()}
     plain = {name.removesuffix(".parquet") for name in files if not name.startswith(SCORE)}
     return plain | {inside[name] for name in files if name in inside}
@@ -39,7 +39,7 @@ class Parts:
     """One table over many runs.
 
     Attributes:
-        left_out: By run, why its file could not be read.
+        left_out: Reason why a run's file could not be read, by run.
     """
 
     def __init__(
@@ -48,9 +48,9 @@ class Parts:
         """Read the schema of every file.
 
         Args:
-            table: Its name.
-            runs: By run, the path of its file in the file system.
-            filesystem: Where they are.
+            table: Name of the table.
+            runs: Path of each run's file in the file system, by run.
+            filesystem: File system of the runs.
         """
         import pyarrow as pa
         import pyarrow.dataset as ds
@@ -75,14 +75,14 @@ class Parts:
 
     @property
     def dataset(self) -> ds.Dataset:
-        """The rows of all runs whose file can be read."""
+        """Rows of all runs whose file can be read."""
         import pyarrow.dataset as ds
 
         fragments = list(self._fragments.values())
         return ds.FileSystemDataset(fragments, self._schema, self._form, self._filesystem)
 
     def drop_damaged(self) -> int:
-        """Read every file whole and leave out those that cannot be read; how many there were."""
+        """Read every file completely, leave out unreadable ones, and return their number."""
         import pyarrow as pa
 
         damaged = {}
@@ -121,5 +121,5 @@ def _opened(
 def _why(path: str, error: Exception) -> str:
     name = path.rpartition("/")[2]
     if isinstance(error, FileNotFoundError):
-        return f"{name}: gone; open the catalog again"
+        return f"{name}: deleted; open the catalog again"
     return f"{name}: damaged or of other types ({' '.join(str(error).split())[:200]}); replay again"

@@ -1,4 +1,4 @@
-"""The rows of one run in a catalog, from its manifest, tags and score."""
+"""Rows of one run in a catalog, read from its manifest, tags and score."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ M = TypeVar("M", bound=BaseModel)
 JUDGED: Final = "score/approaches.parquet"
 _EPOCH: Final = datetime(1970, 1, 1)
 NOT_A_RUN: Final = frozenset({"merged", "decode"})
-"""Stages of folders that hold no run of their own."""
+"""Stages of folders that are not runs of a single drive."""
 
 
 class _Head(BaseModel):
@@ -56,9 +56,9 @@ class _Detect(BaseModel):
 
 
 class _Manifest(BaseModel):
-    """The parts of a run's manifest that are columns; the settings stay as they are.
+    """The parts of a run's manifest that become columns; the settings are not validated.
 
-    Checking the settings, too, takes ten times as long, and there may be 100,000.
+    Validating the settings takes ten times as long, and there may be 100,000 runs.
     """
 
     stage: Literal["detect", "estimate"]
@@ -77,28 +77,28 @@ class _Manifest(BaseModel):
 
 @dataclass(slots=True)
 class RunRows:
-    """What one run adds to each table of the index."""
+    """Rows of one run in each table of the index."""
 
     run: Row
     approaches: list[Row] = field(default_factory=list)
     dropped: list[Row] = field(default_factory=list)
 
     def table(self, name: str) -> list[Row]:
-        """Its rows of one table."""
+        """Return the rows of one table."""
         return {"runs": [self.run], "approaches": self.approaches, "dropped": self.dropped}[name]
 
 
 def rows_of(
     found: Found, name: str, head: bytes, files: Sequence[str], read: Callable[[str], bytes]
 ) -> RunRows | None:
-    """The rows of one run; None for a folder that holds none, such as one of merged tables.
+    """Return the rows of one run; None for a folder that is not a run, such as merged tables.
 
     Args:
         found: The run.
-        name: Of its folder.
+        name: Name of its folder.
         head: Content of ``manifest.json``, or of a failed run's ``failure.log``.
-        files: Of its tables, of its score's, of its tags and failure, from its folder.
-        read: Reads one of them.
+        files: Paths of its tables, its score's tables, tags and failure log, in its folder.
+        read: Function that reads one of these files.
 
     Raises:
         ValueError: The manifest or the tags are damaged or of another version.
@@ -116,20 +116,21 @@ def rows_of(
         )
     if kind.stage in NOT_A_RUN:
         return None
-    said = _read(_Manifest, head)
-    detect = _read(_Detect, head) if said.stage == "detect" else said.detect
+    manifest = _read(_Manifest, head)
+    detect = _read(_Detect, head) if manifest.stage == "detect" else manifest.detect
     results = _results(read(JUDGED)) if JUDGED in files else []
     run = found.run
     failure = _failure(read(FAILURE)) if FAILURE in files else {}
     return RunRows(
-        _run_row(found, name, said, detect, files, tags, results) | {"error": failure.get("error")},
-        _approaches(run, said, results, tags),
-        _dropped(run, said.account),
+        _run_row(found, name, manifest, detect, files, tags, results)
+        | {"error": failure.get("error")},
+        _approaches(run, manifest, results, tags),
+        _dropped(run, manifest.account),
     )
 
 
 def _results(content: bytes) -> list[Row]:
-    """Of the approaches in the truth, as ``approaches.parquet`` of a score has them."""
+    """Return the results of the approaches in the truth, from a score's ``approaches.parquet``."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -143,50 +144,52 @@ def _results(content: bytes) -> list[Row]:
 def _run_row(
     found: Found,
     name: str,
-    said: _Manifest,
+    manifest: _Manifest,
     detect: _Detect | None,
     files: Sequence[str],
     tags: Mapping[str, str],
     results: Sequence[Row],
 ) -> Row:
-    lines = [one for _, _, one in said.account.lines()]
-    segments = said.time.segments
-    identity = identity_of_all([log.identity for log in said.logs]) if said.logs else None
+    lines = [one for _, _, one in manifest.account.lines()]
+    segments = manifest.time.segments
+    identity = identity_of_all([log.identity for log in manifest.logs]) if manifest.logs else None
     return {
         "run": found.run,
         "name": name,
-        "outcome": "whole" if said.account.is_whole else "losses",
-        "exit_status": 0 if said.account.is_whole else 3,
-        "stage": said.stage,
+        "outcome": "whole" if manifest.account.is_whole else "losses",
+        "exit_status": 0 if manifest.account.is_whole else 3,
+        "stage": manifest.stage,
         "identity": None if identity is None else identity.digest,
-        "logs": [log.name for log in said.logs],
-        "is_simulated": any(log.is_simulated for log in said.logs),
-        "vehicle": said.settings.get("name"),
-        "crosscue": said.versions.get("crosscue"),
-        "crosscue_commit": said.versions.get("crosscue_commit"),
+        "logs": [log.name for log in manifest.logs],
+        "is_simulated": any(log.is_simulated for log in manifest.logs),
+        "vehicle": manifest.settings.get("name"),
+        "crosscue": manifest.versions.get("crosscue"),
+        "crosscue_commit": manifest.versions.get("crosscue_commit"),
         "models": [
             {"name": one["name"], "identity": one["identity"]}
             for one in (() if detect is None else detect.detectors)
         ],
-        "settings": sys.intern(json.dumps(said.settings, sort_keys=True)),
+        "settings": sys.intern(json.dumps(manifest.settings, sort_keys=True)),
         "settings_sha256": settings_sha256(
-            said.settings, None if detect is None else list(detect.detectors), said.selection
+            manifest.settings,
+            None if detect is None else list(detect.detectors),
+            manifest.selection,
         ),
         "tags": list(tags.items()),
         "conditions": sorted({tag for one in results for tag in one["conditions"]}),
         "start_ns": segments[0].start_ns if segments else None,
         "end_ns": segments[-1].end_ns if segments else None,
         "made_at": _made_at(found),
-        "seconds": said.timings.seconds,
-        "travelled_m": None if said.pose is None else said.pose.travelled_m,
+        "seconds": manifest.timings.seconds,
+        "travelled_m": None if manifest.pose is None else manifest.pose.travelled_m,
         "frames": None if detect is None else detect.counts.frames,
-        "approaches": 0 if said.scene is None else len(said.scene.approaches),
+        "approaches": 0 if manifest.scene is None else len(manifest.scene.approaches),
         "is_scored": "score/by_drive.parquet" in files,
         "rows_in": sum(one.entered for one in lines),
         "rows_used": sum(one.used for one in lines),
         "rows_skipped": sum(n for one in lines for n in one.skipped.values()),
         "rows_dropped": sum(n for one in lines for n in one.dropped.values()),
-        "notices": list(said.notices),
+        "notices": list(manifest.notices),
         "tables": [file for file in files if file not in BESIDE],
     }
 
@@ -197,25 +200,25 @@ def _made_at(found: Found) -> datetime | None:
 
 
 def _failure(content: bytes) -> dict[str, str]:
-    """What the head of a ``failure.log`` says; nothing where it is not a log of ours."""
+    """Return the header fields of a ``failure.log``; empty if it is not a log of crosscue."""
     head, _, _ = content.decode("utf-8", "replace").partition("\n\n")
-    said = {line[:10].rstrip(): line[10:] for line in head.splitlines()}
-    return said if {"drive", "error"} <= said.keys() else {}
+    fields = {line[:10].rstrip(): line[10:] for line in head.splitlines()}
+    return fields if {"drive", "error"} <= fields.keys() else {}
 
 
 def _failed_row(found: Found, name: str, content: bytes, tags: Mapping[str, str]) -> Row | None:
-    """Of a run that failed, where nothing but the reason is known."""
-    said = _failure(content)
-    if not said:
+    """Return the row of a failed run, of which only the reason is known."""
+    fields = _failure(content)
+    if not fields:
         return None
-    status = said.get("status", "")
-    versions = dict(one.partition(" ")[::2] for one in said.get("versions", "").split(", "))
+    status = fields.get("status", "")
+    versions = dict(one.partition(" ")[::2] for one in fields.get("versions", "").split(", "))
     return {
         "run": found.run,
         "name": name,
         "outcome": "failed",
         "exit_status": int(status) if status.isdecimal() else None,
-        "error": said["error"],
+        "error": fields["error"],
         "crosscue": versions.get("crosscue"),
         "crosscue_commit": versions.get("crosscue_commit"),
         "tags": list(tags.items()),
@@ -238,10 +241,10 @@ def _read(model: type[M], content: bytes) -> M:
 
 
 def _approaches(
-    run: str, said: _Manifest, results: Sequence[Row], tags: Mapping[str, str]
+    run: str, manifest: _Manifest, results: Sequence[Row], tags: Mapping[str, str]
 ) -> list[Row]:
-    """Those of the run, each with its result where it was scored; then those it has none for."""
-    own = () if said.scene is None else said.scene.approaches
+    """Return the run's approaches with their results if scored, then those that it did not find."""
+    own = () if manifest.scene is None else manifest.scene.approaches
     by_number = {one["approach"]: one for one in results if one["approach"] is not None}
     shared = {"run": run, "tags": list(tags.items())}
     seen = [

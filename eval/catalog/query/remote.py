@@ -1,4 +1,4 @@
-"""Runs on an object store, found by one listing and read by ranges; protocols are fsspec's."""
+"""Runs on an object store, found by one listing and read by byte ranges through fsspec."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 TIMES: Final = ("LastModified", "last_modified", "mtime", "updated", "created")
-"""What stores call the time of an object; the first that is there is taken."""
+"""Names of an object's modification time in various stores; the first that exists is used."""
 VERSIONS: Final = ("ETag", "etag", "version_id", "generation", "md5Hash", *TIMES)
-"""What shows that an object is another one."""
+"""Fields that change when an object is replaced."""
 
 Infos = Mapping[str, Mapping[str, Any]]
 
@@ -32,13 +32,13 @@ class RemoteRuns:
     """The runs below a URL."""
 
     home: Final = None
-    """Nothing is written to a store: its index is in the cache."""
+    """Nothing is written to a store; its index is in the cache."""
 
     def __init__(self, url: str) -> None:
-        """Find the store.
+        """Open the store.
 
         Raises:
-            UnreadableRunError: There is no such protocol.
+            UnreadableRunError: The protocol is unknown.
         """
         url_to_fs = import_module("fsspec.core").url_to_fs
         self.name: Final = url
@@ -51,12 +51,12 @@ class RemoteRuns:
         self._objects: dict[str, dict[str, Mapping[str, Any]]] = {}
 
     def find(self) -> Iterator[Found]:
-        """Every run folder, whole or cut short.
+        """Yield every run folder, complete or interrupted.
 
         Raises:
-            UnreadableRunError: The store cannot be asked.
+            UnreadableRunError: The store cannot be listed.
         """
-        # What an earlier catalog listed is kept by some stores' libraries.
+        # Some stores' libraries cache the listing of an earlier catalog.
         self._system.invalidate_cache()
         listed = self._asked(lambda: self._system.find(self._root, detail=True))
         self._objects = _by_folder(self._root, listed)
@@ -81,7 +81,7 @@ class RemoteRuns:
                 yield Found(folder, CUT_SHORT, 0)
 
     def files(self, run: str) -> list[str]:
-        """Names of a run's tables, those of its score after them, of its tags and failure."""
+        """Return the names of a run's tables, then of its score's tables, tags and failure log."""
         own = [name for name in self._objects[run] if name.endswith(".parquet") or name in BESIDE]
         scored = self._objects.get(_joined(run, SCORE), {})
         return sorted(own) + [
@@ -89,24 +89,24 @@ class RemoteRuns:
         ]
 
     def read(self, run: str, file: str) -> bytes:
-        """The content of one of its files.
+        """Return the content of one of a run's files.
 
         Raises:
-            OSError: It cannot be read.
+            OSError: The file cannot be read.
         """
         try:
             return bytes(self._system.cat_file(self.place(run, file)))
         except OSError:
             raise
-        except Exception as error:  # each store's library has errors of its own
+        except Exception as error:  # each store's library has its own errors
             raise OSError(one_line(error)) from None
 
     def place(self, run: str, file: str) -> str:
-        """Where a file is in ``filesystem``."""
+        """Return the path of a file in ``filesystem``."""
         return f"{self._root}/{file}" if run == "." else f"{self._root}/{run}/{file}"
 
     def path(self, run: str) -> Path:
-        """No folder of this machine.
+        """Refuse, because a run on a store has no local folder.
 
         Raises:
             UsageError: Always.
@@ -117,7 +117,7 @@ class RemoteRuns:
 
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
-        """For Arrow: what is read of an object is what was requested, without reading ahead."""
+        """Arrow's view of the store, which reads only the requested bytes, without read-ahead."""
         import pyarrow as pa
         import pyarrow.fs
 
@@ -135,7 +135,7 @@ class RemoteRuns:
         return (_digest({head: own[head]}), size, _digest(others), _digest(scored))
 
     def _asked(self, ask: Callable[[], T]) -> T:
-        """What a store answers; each store's library has errors of its own."""
+        """Return a store's answer; translate the errors of the store's library."""
         try:
             return ask()
         except FileNotFoundError:

@@ -1,7 +1,7 @@
-"""The index of a catalog as one file: a zip of Parquet tables, replaced whole.
+"""File format of a catalog's index: a zip of Parquet tables that is replaced atomically.
 
-It only saves time: whatever is wrong with it, the runs are read again. Its members are stored, not
-compressed again, and zip's checksums show damage.
+The index is only a cache: if it is damaged, the runs are read again. Its members are stored without
+further compression, and the checksums of zip reveal damage.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ FORMAT: Final = "format"
 
 
 class Stored:
-    """An index that was read; its tables are opened when they are used."""
+    """An index in memory; its tables are opened when they are used."""
 
     def __init__(self, content: bytes, mark: str) -> None:
-        """Check the head.
+        """Check the version.
 
         Args:
-            content: Of the file.
-            mark: What this version writes.
+            content: Content of the file.
+            mark: Version that this crosscue writes.
 
         Raises:
-            ValueError: Damaged, or of another version.
+            ValueError: The file is damaged or of another version.
         """
         try:
             self._archive: Final = zipfile.ZipFile(io.BytesIO(content))
@@ -42,10 +42,10 @@ class Stored:
             raise ValueError("of another version")
 
     def table(self, name: str) -> Any:
-        """One of its tables: a data set, of which only the columns that are used get decoded.
+        """Return one of its tables as a data set, which decodes only the columns that are used.
 
         Raises:
-            ValueError: Damaged.
+            ValueError: The table is damaged.
         """
         import pyarrow as pa
         import pyarrow.dataset as ds
@@ -59,10 +59,10 @@ class Stored:
 
 
 def write(path: Path, mark: str, tables: Mapping[str, pa.Table]) -> None:
-    """Write an index, whole or not at all.
+    """Write an index atomically.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     import pyarrow.parquet as pq
 

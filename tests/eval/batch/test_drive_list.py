@@ -196,7 +196,7 @@ def test_a_copy_of_a_drive_is_not_taken_for_another(tmp_path: Path) -> None:
         ("@{}/empty.txt", "names no drive"),
         ("@{}/torn.txt", "line 2: No closing quotation"),
         ("@{}/twice.txt", "named twice"),
-        ("{}/bare", "no drive in it"),
+        ("{}/bare", "no drive found"),
     ],
 )
 def test_errors_are_one_line(tmp_path: Path, argument: str, said: str) -> None:

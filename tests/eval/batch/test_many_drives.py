@@ -164,7 +164,7 @@ def test_the_same_bytes_on_one_and_on_two_workers(tmp_path: Path) -> None:
 def test_two_jobs_of_one_name_are_refused(tmp_path: Path) -> None:
     job = made_jobs(tmp_path, ["plain"])[0]
 
-    with pytest.raises(UsageError, match="drive0: two drives of this name"):
+    with pytest.raises(UsageError, match="drive0: two drives have this name"):
         run_many([job, job], letters, TWO)
     with pytest.raises(ValueError, match="counts of 1 or more"):
         Processes(0)

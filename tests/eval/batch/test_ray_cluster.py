@@ -66,7 +66,7 @@ def test_an_address_where_nobody_listens_is_reported_at_once() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    with pytest.raises(CrosscueError, match=f"--ray {address}: nobody listens there"):
+    with pytest.raises(CrosscueError, match=f"--ray {address}: no connection"):
         joined(address).__enter__()
 
 

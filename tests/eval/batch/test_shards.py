@@ -59,7 +59,7 @@ def test_a_shard_is_read(text: str, variables: Mapping[str, str], shard: Shard) 
         ("two", {}, "expected i/n"),
         ("auto", {}, "neither SLURM_ARRAY_TASK_ID nor RANK and WORLD_SIZE is set"),
         ("auto", {"RANK": "1"}, "neither"),
-        ("auto", {"RANK": "3", "WORLD_SIZE": "3"}, "outside its own count"),
+        ("auto", {"RANK": "3", "WORLD_SIZE": "3"}, "outside its own range"),
         ("auto", {"RANK": "x", "WORLD_SIZE": "3"}, "RANK='x': expected a whole number"),
         ("auto", array(3, 1, 7, 1, 3), "expected array tasks in equal steps"),
         ("auto", array(1, 1, 7, 1, 3), "expected array tasks in equal steps"),

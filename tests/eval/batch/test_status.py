@@ -144,7 +144,7 @@ def test_drives_without_a_run_are_merged_as_failures_whatever_the_order(
 
 
 def test_where_no_batch_is_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableRunError, match="no batch of drives; give the folder"):
+    with pytest.raises(UnreadableRunError, match="no batch of drives; expected the folder"):
         drives_of_folder(tmp_path)
     with pytest.raises(crosscue.UsageError, match="each named once"):
         crosscue.batch_status(tmp_path, tmp_path)

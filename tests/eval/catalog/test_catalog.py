@@ -188,14 +188,14 @@ def test_a_damaged_table_costs_its_run_that_table_only(tmp_path: Path) -> None:
 
     assert rows == [{"run": "good"}]
     assert found.left_out.keys() == {"gone", "torn"}
-    assert "belief.parquet: gone" in found.left_out["gone"]
+    assert "belief.parquet: deleted" in found.left_out["gone"]
     assert len(found.select("true")) == 3
 
 
 def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableRunError, match="neither a run folder nor a folder of some"):
+    with pytest.raises(UnreadableRunError, match="neither a run folder nor a folder of runs"):
         crosscue.catalog(tmp_path)
-    with pytest.raises(UnreadableRunError, match="not a folder; give a folder of runs"):
+    with pytest.raises(UnreadableRunError, match="not a folder; expected a folder of runs"):
         crosscue.catalog(tmp_path / "gone")
 
 

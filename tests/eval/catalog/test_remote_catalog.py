@@ -153,7 +153,7 @@ def test_runs_on_a_store_have_no_folder(url: str) -> None:
 @pytest.mark.parametrize(
     ("place", "said"),
     [
-        ("counted://nowhere", "nothing there|neither a run folder nor a folder of some"),
+        ("counted://nowhere", "nothing there|neither a run folder nor a folder of runs"),
         ("nonsense://bucket/runs", "nonsense"),
     ],
 )

@@ -59,7 +59,7 @@ def test_patterns_and_lists(runs: Path) -> None:
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("{}/empty", "neither a run folder nor a folder of some"),
+        ("{}/empty", "neither a run folder nor a folder of runs"),
         ("{}/z*", "nothing matches"),
         ("@{}/gone", "No such file"),
         ("@{}/a/manifest.json", "neither|names no run|no run folder"),

@@ -208,7 +208,7 @@ def test_two_different_runs_of_one_name_are_refused(
     assert run(["replay", log, "--each", "-o", str(tmp_path / "b"), "-q", "--to", "2"]) == 0
 
     assert run(["merge", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(tmp_path / "c")]) == 2
-    assert "two different runs of one name" in capsys.readouterr().err
+    assert "two different runs have one name" in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
 
 
