@@ -1,1 +1,1 @@
-"""Logs opened, whatever their format, and parts and summaries of them."""
+"""Open logs of any format, select parts of them, and summarise them."""

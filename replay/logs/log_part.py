@@ -1,4 +1,4 @@
-"""Which part of open logs is wanted: topics, and a span in seconds after the first row."""
+"""Selection of a part of open logs: topics, and a time range in seconds after the first row."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ def part_of(
     end_s: float | None = None,
     topics: Iterable[str] | None = None,
 ) -> Selection:
-    """The rows of ``topics`` from ``start_s`` until before ``end_s``.
+    """Select the rows of ``topics`` from ``start_s`` to ``end_s`` (exclusive).
 
     Args:
-        logs: Of one drive; seconds count from the first row of the earliest.
+        logs: Open logs of one drive; seconds count from the first row of the earliest log.
         start_s: Seconds after the first row, or None for the beginning.
-        end_s: Seconds after the first row, no longer wanted; None for the end.
-        topics: Names, or None for all.
+        end_s: Seconds after the first row, exclusive, or None for the end.
+        topics: Names of topics, or None for all.
 
     Raises:
-        UsageError: Not a finite time, or an empty span.
+        UsageError: A time is not finite, or the time range is empty.
         MissingTopicError: No log has a topic of that name, or no log has a row.
     """
     wanted = None if topics is None else named_topics(logs, topics, "topics")
@@ -46,16 +46,16 @@ def part_of(
 def part_in_words(
     logs: Sequence[Log], start: str | None, end: str | None, topics: Iterable[str] | None
 ) -> Selection:
-    """The part that ``--from``, ``--to`` and ``--topics`` ask for.
+    """Parse the values of ``--from``, ``--to`` and ``--topics`` into a selection.
 
     Args:
-        logs: Of one drive; seconds count from the first row of the earliest.
+        logs: Open logs of one drive; seconds count from the first row of the earliest log.
         start: Seconds, ``12.5``, or absolute nanoseconds, ``17...ns``; None for the beginning.
-        end: Likewise, no longer wanted; None for the end.
-        topics: Names; None or none for all.
+        end: End of the time range, exclusive, in the same form; None for the end.
+        topics: Names of topics; None or empty for all.
 
     Raises:
-        UsageError: A time that cannot be read, or an empty span.
+        UsageError: A time cannot be parsed, or the time range is empty.
         MissingTopicError: No log has a topic of that name, or no log has a row.
     """
     wanted = named_topics(logs, topics, "--topics") if topics else None
@@ -85,10 +85,10 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
 
 
 def named_topics(logs: Sequence[Log], names: Iterable[str], flag: str) -> frozenset[str]:
-    """The names, each of which a log has.
+    """Check that each name is a topic of one of the logs, and return the names.
 
     Raises:
-        MissingTopicError: No log has one of them; the message lists those there are.
+        MissingTopicError: A topic is in no log; the message lists the available topics.
     """
     known = {topic.name for log in logs for topic in log.topics}
     wanted = frozenset(names)
@@ -100,10 +100,10 @@ def named_topics(logs: Sequence[Log], names: Iterable[str], flag: str) -> frozen
 
 
 def first_ns(logs: Sequence[Log]) -> int:
-    """Log time of the first stored row of the earliest log.
+    """Return the log time of the first stored row of the earliest log.
 
     Raises:
-        MissingTopicError: No log holds a single row.
+        MissingTopicError: No log contains a row.
     """
     starts: list[int] = []
     for log in logs:

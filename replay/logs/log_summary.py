@@ -1,6 +1,6 @@
-"""What one log holds, in one pass: topics, clocks, account, findings.
+"""Summary of a log from a single pass: topics, clocks, account and findings.
 
-``summarise`` reads; ``LogSummary`` is what ``crosscue info --json`` prints, field for field.
+``summarise`` reads the log. ``crosscue info --json`` prints the fields of ``LogSummary``.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ _NEEDS_A_LINE: Final = (Role.CAMERA, Role.CAN)
 
 @dataclass(frozen=True, slots=True)
 class CanIdCount:
-    """How often one identifier was seen on a bus.
+    """Number of frames with one identifier on a bus.
 
     Attributes:
         arbitration_id: The identifier.
-        is_extended: It has 29 bits.
-        count: Frames.
-        rate_hz: Frames a second over the bus's duration, or None where that is 0.
+        is_extended: True for a 29-bit identifier.
+        count: Number of frames.
+        rate_hz: Frames per second over the bus's duration, or None where the duration is 0.
     """
 
     arbitration_id: int
@@ -69,20 +69,20 @@ class TopicSummary:
     """One topic of a log.
 
     Attributes:
-        name: As the log spells it.
-        type_name: Its message type.
-        encoding: How its messages are coded.
-        used_as: What it would be used as without configuration, or None.
-        declared: Rows the format itself says there are, or None.
-        found: Rows met in the bytes; with ``--quick`` 0, as everything below.
-        used: Rows handed on and understood.
-        skipped: Rows found and not used, by reason.
-        dropped: Rows that were in the file and could not be read, by reason.
-        dropped_unknown: Reasons of losses whose extent cannot be known.
-        rate_hz: Mean rate on the clock that is used, or None.
-        clocks: Its clocks, or None where no row was read.
-        can_ids: For a CAN bus: its most frequent identifiers.
-        can_id_count: For a CAN bus: how many different identifiers there are.
+        name: Name as stored in the log.
+        type_name: Message type.
+        encoding: Message encoding.
+        used_as: Role of the topic without configuration, or None.
+        declared: Number of rows that the log declares, or None.
+        found: Number of rows found in the bytes; with ``--quick`` this and all below are empty.
+        used: Number of rows yielded and decoded.
+        skipped: Number of rows found and not used, by reason.
+        dropped: Number of rows that were in the file and could not be read, by reason.
+        dropped_unknown: Reasons of losses of unknown extent.
+        rate_hz: Mean rate on the clock in use, or None.
+        clocks: Clocks of the topic, or None where no row was read.
+        can_ids: Most frequent identifiers of a CAN bus.
+        can_id_count: Number of different identifiers on a CAN bus.
     """
 
     name: str
@@ -103,23 +103,23 @@ class TopicSummary:
 
 @dataclass(frozen=True, slots=True)
 class LogSummary:
-    """One log.
+    """Summary of one log.
 
     Attributes:
-        path: As the user gave it.
-        format: Short name of its format.
-        is_quick: Only what the log declares was examined; its body was not read.
-        is_whole: Nothing is known to be dropped; says nothing when quick.
-        integrity: Which checksums were verified, in words.
-        seal: Whether it is sealed, when and with which hash.
+        path: Path or URL as the user wrote it.
+        format: Short name of the format.
+        is_quick: True if only the declared contents were examined and the body was not read.
+        is_whole: True if no row is known to be dropped; without meaning if ``is_quick``.
+        integrity: A sentence on the verified checksums.
+        seal: A sentence on the seal, its date and its hash.
         start_ns: Lowest log time of all topics, or None without rows.
-        end_ns: Highest log time.
-        topics: By name.
-        unattributed_dropped: Rows dropped that no topic can be named for, by reason.
-        unattributed_unknown: The same where their number is not known.
-        findings: What is wrong or odd, a sentence each.
-        notices: What the reader has to say, a sentence each.
-        drops: The first single drops.
+        end_ns: Highest log time of all topics, or None without rows.
+        topics: Summaries of the topics, sorted by name.
+        unattributed_dropped: Number of dropped rows of unknown topics, by reason.
+        unattributed_unknown: Reasons of losses of unknown extent and unknown topics.
+        findings: Problems and peculiarities, one sentence each.
+        notices: Remarks of the reader, one sentence each.
+        drops: The first losses with their details.
     """
 
     path: str
@@ -140,12 +140,12 @@ class LogSummary:
 
 @dataclass(frozen=True, slots=True)
 class Together:
-    """Several logs taken as one drive.
+    """The common time range of several logs of one drive.
 
     Attributes:
-        start_ns: Where the time begins that all logs share, or None where none exists.
-        end_ns: Where it ends.
-        findings: What is wrong with the choice, a sentence each.
+        start_ns: Start of the time range covered by all logs, or None if it is empty.
+        end_ns: End of that time range, or None if it is empty.
+        findings: Problems of the combination, one sentence each.
     """
 
     start_ns: int | None
@@ -155,7 +155,7 @@ class Together:
 
 @dataclass(slots=True)
 class _CanIds:
-    """Counts identifiers of one bus; those past ``_CAN_IDS_COUNTED`` different ones are dropped."""
+    """Counts of one bus's identifiers, limited to ``_CAN_IDS_COUNTED`` different identifiers."""
 
     counts: Counter[int] = field(default_factory=Counter)
 
@@ -176,12 +176,12 @@ class _CanIds:
 
 
 Progress = Callable[[Iterable[Block], Callable[[], tuple[int, int]]], Iterable[Block]]
-"""Hands blocks through while showing how far the work is; the second argument returns rows read,
+"""Passes blocks through and displays progress; the second argument returns the numbers of rows read
 and rows declared."""
 
 
 def quick_summary(log: Log) -> LogSummary:
-    """What a log says of itself, and whether its end is missing; its body is not read."""
+    """Summarise what a log declares and whether its end is missing, without reading its body."""
     ledger = Ledger(name_of(log))
     for topic in log.topics:
         ledger.declare(topic.name, topic.declared)
@@ -192,7 +192,7 @@ def quick_summary(log: Log) -> LogSummary:
 def summarise(
     log: Log, progress: Progress | None = None, selection: Selection = EVERYTHING
 ) -> LogSummary:
-    """Read a log once, or a part of it, in bounded memory, and say what is in it."""
+    """Read a log, or a part of it, once and in bounded memory, and summarise it."""
     ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
     blocks: Iterable[Block] = ledger.handing_on(log.read(ledger, selection))
     if progress is not None:
@@ -206,7 +206,7 @@ def summarise(
 
 
 def together(summaries: Iterable[LogSummary]) -> Together:
-    """What several logs have in common."""
+    """Return the common time range of several logs."""
     spans = {
         s.path: (s.start_ns, s.end_ns)
         for s in summaries
@@ -221,30 +221,30 @@ def together(summaries: Iterable[LogSummary]) -> Together:
 
 
 def rows_declared(log: Log) -> int:
-    """Rows that a log says it holds."""
+    """Return the number of rows that a log declares."""
     return sum(topic.declared or 0 for topic in log.topics)
 
 
 def rows_read(ledger: Ledger) -> int:
-    """Rows found so far."""
+    """Return the number of rows found so far."""
     return sum(account.found for account in ledger.accounts.values())
 
 
 def _decoded(log: Log, blocks: Iterable[Block], ledger: Ledger) -> Iterator[Block]:
-    """Blocks with their header stamps; of what cannot be decoded, at least the log's own times."""
+    """Yield decoded blocks with header stamps; undecodable blocks keep their log times."""
     decoders: dict[str, Decoder] = {}
     for block in blocks:
         if not isinstance(block.rows, Messages):
             yield block
             continue
         if block.topic not in decoders:
-            # A cut file names its topics only while being read, so they are asked for again.
+            # Topics of a truncated file are discovered while reading, so the list is read again.
             decoders |= {t.name: _decoder_of(t) for t in log.topics if t.name not in decoders}
         yield decoders[block.topic](block, ledger)
 
 
 def _decoder_of(topic: Topic) -> Decoder:
-    """The topic's decoder, or one that skips every row and says why."""
+    """Return the topic's decoder, or one that skips every row with a reason."""
     from crosscue.replay.decode import decoder_for
     from crosscue.replay.decode.interfaces import why_not_decoded
 
@@ -330,7 +330,7 @@ def _topic_summary(
 
 
 def _of_nameless(account: TopicAccount) -> Iterator[str]:
-    """Losses that no topic can be named for."""
+    """Yield findings on losses of unknown topics."""
     if not account.is_whole:
         why = ", ".join(dict.fromkeys([*account.dropped, *account.dropped_unknown]))
         at_least = "at least " if account.dropped_unknown else ""
@@ -348,7 +348,7 @@ def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[s
             why = ", ".join(topic.skipped)
             yield f"{topic.name}: none of its {topic.found} rows can be used: {why}"
     if not is_quick and not any(topic.found for topic in topics):
-        yield "not one row in it"
+        yield "it contains no rows"
 
 
 def _choices(topics: Iterable[TopicSummary]) -> Iterator[str]:
@@ -362,15 +362,15 @@ def _choices(topics: Iterable[TopicSummary]) -> Iterator[str]:
             listed = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
             yield (
                 f"{len(names)} topics could be the {role.value} ({listed}): "
-                "the vehicle file must say which to use"
+                "select one of them in the vehicle file"
             )
 
 
 def rows_of_clocks(topics: Iterable[TopicSummary]) -> Iterator[tuple[str, ...]]:
-    """Cells of the table of clocks: topic, clock, period, gaps, longest, offset, drift.
+    """Yield rows of the table of clocks: topic, clock, period, gaps, longest, offset, drift.
 
-    Offset and drift are those of the clock that is used; where that is the log time, those of the
-    header stamp, else of the publish time.
+    Offset and drift refer to the clock in use. If that is the log time, they refer to the header
+    stamp, else to the publish time.
     """
     for topic in topics:
         report = topic.clocks
@@ -395,7 +395,7 @@ def rows_of_clocks(topics: Iterable[TopicSummary]) -> Iterator[tuple[str, ...]]:
 
 
 def span_sentence(start_ns: int | None, end_ns: int | None) -> str:
-    """From when to when, and how long."""
+    """Describe a time range by its start, its end and its duration."""
     if start_ns is None or end_ns is None:
         return "no rows"
     span = f"{(end_ns - start_ns) * 1e-9:.2f} s"

@@ -1,4 +1,4 @@
-"""One way to open any recording: by its suffix, by what is in its folder, by its URL."""
+"""Open any log by its suffix, its folder's contents, or its URL."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from crosscue.replay.formats import FORMATS, format_of, known_formats
 
 
 def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
-    """Open any recording by its suffix or, for a folder, by what is in it.
+    """Open any log by its suffix or, for a folder, by its contents.
 
-    A text with ``://`` is a URL: see ``remote``. Of a log with a seal beside
-    it, what is read is held against the seal, see ``sealed_log``.
+    A string that contains ``://`` is a URL, see ``remote``. If a seal exists next to the log, the
+    data read is verified against it, see ``sealed_log``.
 
     Raises:
-        UnknownFormatError: No format fits; the message lists those there are.
-        LogError: It cannot be opened: missing, no permission, not a file or folder, or not one
-            readable record in it.
+        UnknownFormatError: No format matches; the message lists the known formats.
+        LogError: It cannot be opened: missing, no permission, not a file or folder, or without a
+            readable record.
     """
     if isinstance(path, str) and "://" in path:
         from crosscue.replay.remote.logs import open_remote
@@ -42,7 +42,7 @@ def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
 
 
 def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:
-    """As ``open_log`` of a file or folder, without looking at its seal."""
+    """Open a file or folder as ``open_log`` does, but ignore its seal."""
     name = format_of(path)
     module, _, function = (FORMATS.get(name) or known_formats()[name]).opener.partition(":")
     opener = cast("Callable[[Path, Limits], Log]", getattr(import_module(module), function))
@@ -58,10 +58,12 @@ def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:
 
 @contextmanager
 def unless_damaged(logs: Sequence[Log]) -> Iterator[None]:
-    """Blame the log, not who names its topics, where what is missing may be in the damaged part.
+    """Report a missing topic as damage of the log if a log is damaged.
+
+    The damaged part may contain the topic, so the vehicle file or option need not be wrong.
 
     Raises:
-        LogError: Instead of a ``MissingTopicError``, when a log turns out to be damaged.
+        LogError: Instead of a ``MissingTopicError``, if a log is damaged.
     """
     try:
         yield

@@ -1,6 +1,6 @@
-"""One topic of a log over a span of time, decoded: what a plot or a notebook asks for.
+"""Decoded rows of one topic over a time range, for plots and notebooks.
 
-Only what the log's index says may hold it is read; see ``Log.read``.
+Where the log has an index, only the relevant parts are read; see ``Log.read``.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class TopicPart:
     """Rows of one topic.
 
     Attributes:
-        topic: Which.
-        blocks: Its rows in stored order, in columns where the type is known, else as messages.
-        ledger: What became of every row of the log in this pass.
+        topic: The topic.
+        blocks: Rows in stored order, as columns where the type is known, else as messages.
+        ledger: Account of this pass over the log.
     """
 
     topic: Topic
@@ -46,16 +46,16 @@ class TopicPart:
 def read_topic(
     log: Log, name: str, start_ns: int | None = None, end_ns: int | None = None
 ) -> TopicPart:
-    """The rows of one topic with ``start_ns <= log time < end_ns``; all of it is held in memory.
+    """Read the rows of one topic with ``start_ns <= log time < end_ns`` into memory.
 
     Args:
         log: An open log.
-        name: Of the topic.
-        start_ns: First log time wanted, or None for the log's beginning.
-        end_ns: First log time no longer wanted, or None for the log's end.
+        name: Name of the topic.
+        start_ns: First log time, or None for the log's beginning.
+        end_ns: End of the log times, exclusive, or None for the log's end.
 
     Raises:
-        UsageError: The log has no such topic; the message lists those there are.
+        UsageError: The log has no such topic; the message lists the available topics.
         SchemaError: The log's definition of the type is damaged.
     """
     topic = next((one for one in log.topics if one.name == name), None)
@@ -70,14 +70,14 @@ def read_topic(
 
 
 def columns_of(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
-    """The rows of one topic as flat columns of equal length: its times, then what it holds.
+    """Return the rows of one topic as flat columns of equal length: times, then fields.
 
-    A column of vectors becomes one for each component: ``gyro.0``, ``gyro.1``. A field of its own
-    called ``log_t_ns`` gets an underscore behind.
+    A column of vectors becomes one column per component: ``gyro.0``, ``gyro.1``. A field of the
+    message that is itself named ``log_t_ns`` becomes ``log_t_ns_``.
 
     Args:
-        blocks: Of ``Table`` or ``CanFrames``, at least one, all with the same columns; payloads of
-            CAN frames are left out.
+        blocks: At least one block of ``Table`` or ``CanFrames``, all with the same columns.
+            Payloads of CAN frames are omitted.
     """
     columns: dict[str, NDArray[np.generic]] = {
         "log_t_ns": np.concatenate([b.log_ns for b in blocks])

@@ -1,11 +1,11 @@
-"""Logs on object stores: a part is read by ranges, a whole is fetched into a bounded store.
+"""Logs on object stores, read in byte ranges or downloaded into a local store of limited size.
 
-Of an MCAP file or ROS 1 bag whose index leads to the requested part, only the index and that part
-are fetched (``RangedLog``). A log that is read to its end is often read twice, and some readers
-need a real file (SQLite, videos), so one download beats many ranged reads there. What was fetched
-is kept under a name made of its address and version, so a changed object is fetched again; the
-least recently used go when the store grows over its limit, never one that is open. Protocols and
-credentials are fsspec's.
+If an MCAP file or ROS 1 bag has an index that locates the requested part, only the index and that
+part are fetched (``RangedLog``). Other logs are downloaded completely: a log that is read to its
+end is often read twice, and some readers need a local file (SQLite, videos). Downloads are stored
+under a name derived from the address and version, so that a changed object is downloaded again.
+When the store exceeds its limit, the least recently used logs are removed, but never an open log.
+Protocols and credentials are those of fsspec.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ VERSION_KEYS: Final = (
     "updated",
     "created",
 )
-"""What stores call the version of an object; the first that is there is taken."""
+"""Keys under which stores report the version of an object; the first one present is used."""
 LOCK: Final = ".lock"
 SIZE: Final = ".size"
 STORE_VARIABLE: Final = "CROSSCUE_STORE"
@@ -71,7 +71,7 @@ T = TypeVar("T")
 
 
 class _System(Protocol):
-    """What is used of fsspec's file systems."""
+    """The part of fsspec's file system interface that is used here."""
 
     @property
     def protocol(self) -> str | tuple[str, ...]: ...
@@ -86,11 +86,11 @@ class _System(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Store:
-    """Where fetched logs are kept.
+    """The local store of downloaded logs.
 
     Attributes:
-        folder: One folder inside for each log.
-        max_bytes: Of all logs in it; one that alone is larger is refused.
+        folder: Folder with one subfolder per log.
+        max_bytes: Maximum total size of the logs; a single larger log is refused.
     """
 
     folder: Path
@@ -98,7 +98,7 @@ class Store:
 
 
 def default_store() -> Store:
-    """As the environment says: ``CROSSCUE_STORE`` and ``CROSSCUE_STORE_GIB``.
+    """Return the store that ``CROSSCUE_STORE`` and ``CROSSCUE_STORE_GIB`` configure.
 
     Raises:
         UsageError: The limit is not a positive number.
@@ -117,7 +117,7 @@ def default_store() -> Store:
 
 @dataclass(frozen=True, slots=True)
 class _Object:
-    """One object of a remote log: its address in the store, its name in ours, and its version."""
+    """One object of a remote log: remote address, local name, size and version."""
 
     address: str
     name: str
@@ -126,31 +126,32 @@ class _Object:
 
 
 class Fetched(Closing):
-    """A log on this machine, held against removal until closed; a context manager."""
+    """A local copy of a log, protected from removal until closed; a context manager."""
 
     def __init__(self, path: Path, hold: int | None) -> None:
-        """Take over the open and locked file ``hold``, if there is one."""
+        """Take ownership of the open and locked file ``hold``, if any."""
         self.path: Final = path
         self._hold: int | None = hold
 
     @property
     def is_in_place(self) -> bool:
-        """Is it a file of this machine, which did not have to be fetched?"""
+        """True for a file of this machine, which did not need a download."""
         return self._hold is None
 
     def close(self) -> None:
-        """Let it go; it stays in the store until its space is needed."""
+        """Release the copy; it stays in the store until its space is needed."""
         if self._hold is not None:
             os.close(self._hold)
             self._hold = None
 
 
 def fetch(url: str, store: Store | None = None) -> Fetched:
-    """A remote log's file or folder on this machine, fetched unless it is there already.
+    """Return the local copy of a remote log, downloaded unless the store already has it.
 
     Raises:
-        LogError: Not there, no permission, no such protocol, changed meanwhile, or unreachable.
-        LogTooLargeError: Larger than the whole store may be.
+        LogError: Missing, no permission, unknown protocol, changed during download, or
+            unreachable.
+        LogTooLargeError: Larger than the limit of the store.
         OutputError: The store cannot be written, or the disk is full.
     """
     system, address = _opened(url)
@@ -174,7 +175,7 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
                     _make_room(store, entry, size)
                     _download(url, system, address, objects, entry)
                 os.utime(entry)
-                # From alone to among others; another process may slip in between and remove it.
+                # From an exclusive to a shared lock; another process may remove the entry between.
                 fcntl.flock(hold, fcntl.LOCK_SH)
                 if path.exists():
                     return Fetched(path, hold)
@@ -187,10 +188,10 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
 
 
 def version_of(path: str) -> str:
-    """Size and version of a log without reading it: of a file, of all files of a folder, of a URL.
+    """Return the size and version of a file, folder or URL without reading its contents.
 
     Raises:
-        LogError: It is not there or cannot be examined.
+        LogError: It does not exist or cannot be examined.
     """
     if is_remote(path):
         system, address = _opened(path)
@@ -214,10 +215,10 @@ def version_of(path: str) -> str:
 
 
 def matches(pattern: str) -> tuple[str, ...]:
-    """URLs that a pattern such as ``s3://bucket/drives/*.mcap`` stands for, sorted.
+    """Return the URLs that match a pattern such as ``s3://bucket/drives/*.mcap``, sorted.
 
     Raises:
-        LogError: The store cannot be asked.
+        LogError: The store cannot be queried.
     """
     system, address = _opened(pattern)
     found = _guarded(pattern, lambda: sorted(map(str, system.glob(address))))
@@ -228,12 +229,12 @@ def matches(pattern: str) -> tuple[str, ...]:
 
 
 class RemoteLog(Closing):
-    """A log that was fetched; closing it lets go of the fetched file."""
+    """A downloaded log; closing it releases its local copy."""
 
     def __init__(
         self, url: str, log: Log, fetched: Fetched, why: str = "its format needs a local file"
     ) -> None:
-        """Stand for ``log``, which was fetched whole for a reason."""
+        """Wrap ``log``, which was downloaded completely for the reason ``why``."""
         self._why: Final = why
         self.url: Final = url
         self._log: Final = log
@@ -241,31 +242,31 @@ class RemoteLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is on this machine."""
+        """Path of the local copy."""
         return self._log.path
 
     @property
     def format(self) -> str:
-        """As of the log."""
+        """Format of the downloaded log."""
         return self._log.format
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """As of the log."""
+        """Topics of the downloaded log."""
         return self._log.topics
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """As of the log."""
+        """Read the rows; see ``Log.read``."""
         if not self._fetched.is_in_place:
-            ledger.notice(f"fetched whole: {self._why}")
+            ledger.notice(f"downloaded completely: {self._why}")
         return self._log.read(ledger, selection)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """As of the log."""
+        """Report missing rows; see ``KnowsItsEnd``."""
         report_missing(self._log, ledger)
 
     def close(self) -> None:
-        """Close the log, then let its file go."""
+        """Close the log and release its local copy."""
         try:
             self._log.close()
         finally:
@@ -273,7 +274,7 @@ class RemoteLog(Closing):
 
 
 class _Partial(Protocol):
-    """A log that can tell whether a part of it can be read alone."""
+    """A log that reports whether a part of it can be read without the rest."""
 
     @property
     def format(self) -> str: ...
@@ -290,16 +291,16 @@ RANGED: Final = {
     ".mcap": "crosscue.replay.readers.mcap.reader:open_ranged",
     ".bag": "crosscue.replay.readers.rosbag1.reader:open_ranged",
 }
-"""Formats of which a part can be read by ranges."""
+"""Openers of the formats that can be read in byte ranges."""
 
 
 class RangedLog(Closing):
-    """A remote log of which only what is asked for is fetched; all of it once all is asked for."""
+    """A remote log that fetches only the requested parts, or all of it when all is requested."""
 
     def __init__(
         self, url: str, log: _Partial, ranged: RangedFile, whole: Callable[[str], RemoteLog]
     ) -> None:
-        """Stand for ``log``, read by ranges, or for what ``whole`` fetches."""
+        """Wrap ``log``, which is read in byte ranges; ``whole`` downloads the complete log."""
         self.url: Final = url
         self.ranged: Final = ranged
         self._log: Final = log
@@ -308,24 +309,24 @@ class RangedLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is on this machine: all of it is fetched for this."""
-        return self._fetched("its file was asked for").path
+        """Path of a local copy; reading it downloads the complete log."""
+        return self._fetched("its local path was requested").path
 
     @property
     def format(self) -> str:
-        """As of the log."""
+        """Format of the log."""
         return self._log.format
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """As of the log."""
+        """Topics of the log."""
         return self._log.topics if self._whole is None else self._whole.topics
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """As of the log; the object must be the same at the end as when it was opened.
+        """Read the rows and verify at the end that the object has not changed since it was opened.
 
         Raises:
-            LogError: It has changed meanwhile, or cannot be reached.
+            LogError: The object has changed, or cannot be reached.
         """
         why = self._log.needs_whole(selection)
         if why or self._whole is not None:
@@ -338,16 +339,16 @@ class RangedLog(Closing):
         ledger.notice(f"{took} of {self.ranged.size} bytes were fetched")
 
     def report_missing(self, ledger: Ledger) -> None:
-        """As of the log."""
+        """Report missing rows; see ``KnowsItsEnd``."""
         if isinstance(self._log, KnowsItsEnd):
             self._log.report_missing(ledger)
 
     def first_blocks(self, ledger: Ledger) -> Iterator[Block]:
-        """What the first chunk holds, for whoever examines the beginning only."""
+        """Read only the first chunk, for callers that need only the beginning."""
         return self.read(ledger, self._log.beginning)
 
     def close(self) -> None:
-        """Release the connection, and what was fetched."""
+        """Close the connection and release the local copy."""
         try:
             self._log.close()
             self.ranged.close()
@@ -364,10 +365,16 @@ class RangedLog(Closing):
 def open_remote(
     url: str, opener: Callable[[Path], Log], limits: Limits, store: Store | None = None
 ) -> RemoteLog | RangedLog:
-    """Open a log by ranges where its format and index allow it; else fetch it, then ``opener``.
+    """Open a log in byte ranges if its format and index allow it; else download it first.
+
+    Args:
+        url: Address of the log.
+        opener: Opens the local copy.
+        limits: Maximum sizes that the reader accepts.
+        store: Local store; None for the configured one.
 
     Raises:
-        CrosscueError: As ``fetch`` and ``opener``.
+        CrosscueError: As raised by ``fetch`` and ``opener``.
     """
 
     def whole(why: str) -> RemoteLog:
@@ -384,7 +391,7 @@ def open_remote(
         return whole("its format is read from a local file")
     ranged = _ranged(url, system, address, store or default_store())
     if ranged is None:
-        return whole("its store serves no ranges")
+        return whole("its store does not support range requests")
     module, _, function = RANGED[suffix].partition(":")
     open_ranged = cast(
         "Callable[[Path, RangedFile, Limits], _Partial | None]",
@@ -397,15 +404,15 @@ def open_remote(
         raise
     if log is None:
         ranged.close()
-        return whole("it has no index that can be used")
+        return whole("it has no usable index")
     return RangedLog(url, log, ranged, whole)
 
 
 def by_ranges(url: str) -> RangedFile | None:
-    """A remote log of a format that is read by ranges; None where it has to be fetched.
+    """Open a remote log in byte ranges; return None if it must be downloaded completely.
 
     Raises:
-        LogError: As ``fetch``.
+        LogError: As raised by ``fetch``.
     """
     system, address = _opened(url)
     if _is_local(system) or PurePosixPath(address).suffix.lower() not in RANGED:
@@ -414,17 +421,17 @@ def by_ranges(url: str) -> RangedFile | None:
 
 
 class RemoteFiles:
-    """A remote log's files as its store lists them; none of them is fetched by looking at it.
+    """The files of a remote log as listed by its store; none of them is downloaded.
 
     Attributes:
-        sizes: Bytes by the file's name in the log, as it would be on this machine.
+        sizes: Sizes in bytes by the name that the file has in a local copy.
     """
 
     def __init__(self, url: str) -> None:
-        """Ask the store.
+        """Query the store for the log's files.
 
         Raises:
-            LogError: As ``fetch``.
+            LogError: As raised by ``fetch``.
         """
         self._url: Final = url
         self._store: Final = default_store()
@@ -438,22 +445,22 @@ class RemoteFiles:
 
     @property
     def is_at_hand(self) -> bool:
-        """Is it on this machine, so that ``fetch`` transfers nothing?"""
+        """True if ``fetch`` needs no download, because the log is already on this machine."""
         entry = self._store.folder / _key(self._url, self._objects)
         return not self._objects or (entry / "log").exists()
 
     def ranged(self, name: str) -> RangedFile | None:
-        """One of the files by ranges; None where the store serves none.
+        """Open one of the files in byte ranges; None if the store does not support them.
 
         Raises:
-            LogError: As ``fetch``.
+            LogError: As raised by ``fetch``.
         """
         address = next(one.address for one in self._objects if one.name == name)
         return _ranged(self._url, self._system, address, self._store)
 
 
 def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile | None:
-    """The object by ranges; None if it is not a single object of known size."""
+    """Open an object in byte ranges; None if it is not a single object of known size."""
     info = _guarded(url, lambda: system.info(address))
     if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
         return None
@@ -489,7 +496,7 @@ def _is_local(system: _System) -> bool:
 
 
 def _guarded(url: str, ask: Callable[[], T]) -> T:
-    """What a store answers; each store's library has errors of its own."""
+    """Return ``ask()`` and convert any error of a store's library to a ``LogError``."""
     try:
         return ask()
     except CrosscueError:
@@ -504,7 +511,7 @@ def _guarded(url: str, ask: Callable[[], T]) -> T:
 
 
 def _objects(system: _System, address: str) -> list[_Object]:
-    """All objects of a log: of a folder all below it, of a file those that share its stem."""
+    """List the objects of a log: all objects below a folder, or those that share a file's stem."""
     address = address.rstrip("/")
     name = PurePosixPath(address).name
     if _is_folder(system, address):
@@ -515,10 +522,10 @@ def _objects(system: _System, address: str) -> list[_Object]:
         alone = system.info(address)
         try:
             around = system.ls(address[: len(address) - len(name)] or address, detail=True)
-        except (OSError, ValueError):  # a plain web server need not list anything
+        except (OSError, ValueError):  # a plain web server may have no listing
             around = [alone | {"name": address}]
         around = [one for one in around if _belongs(PurePosixPath(str(one["name"])).name, name)]
-        # A web server's list says no sizes.
+        # A web server's listing has no sizes.
         around = [
             one if one.get("size") is not None else system.info(str(one["name"])) for one in around
         ] or [alone | {"name": address}]
@@ -528,7 +535,11 @@ def _objects(system: _System, address: str) -> list[_Object]:
 
 
 def _is_folder(system: _System, address: str) -> bool:
-    """Is it a folder? To a web server every address is both, and asking costs the whole file."""
+    """Return whether an address is a folder.
+
+    On a web server, every address is both a file and a folder, and ``isdir`` downloads the file.
+    Addresses with the suffix of a known format are therefore checked with ``info``.
+    """
     suffix = PurePosixPath(address).suffix.lower()
     if any(suffix in known.suffixes for known in known_formats().values()):
         try:
@@ -539,20 +550,20 @@ def _is_folder(system: _System, address: str) -> bool:
 
 
 def _belongs(other: str, name: str) -> bool:
-    """Is ``other`` the log itself, its time file, index, or write-ahead log?"""
+    """Return whether ``other`` is the log itself, its time file, index or write-ahead log."""
     stem = PurePosixPath(name).stem
     return other == name or other.startswith((f"{stem}.", f"{name}-"))
 
 
 def _object(name: str, info: dict[str, Any]) -> _Object:
     if any(part in ("", ".", "..") for part in name.split("/")) or "\0" in name:
-        raise LogError(f"{info['name']}: no name for a file; rename the object")
+        raise LogError(f"{info['name']}: not a valid file name; rename the object")
     version = next((str(info[key]) for key in VERSION_KEYS if info.get(key) is not None), "")
     return _Object(str(info["name"]), name, int(info["size"]), version)
 
 
 def _key(url: str, objects: Sequence[_Object]) -> str:
-    """A name for this version of a log."""
+    """Return a name derived from a log's address and version."""
     digest = hashlib.sha256(url.encode())
     for one in objects:
         digest.update(f"\0{one.name}\0{one.size}\0{one.version}".encode())
@@ -560,7 +571,7 @@ def _key(url: str, objects: Sequence[_Object]) -> str:
 
 
 def _locked(entry: Path) -> int:
-    """The entry's lock file, open and locked for us alone, however long that takes."""
+    """Wait for an exclusive lock on an entry, and return its open lock file."""
     while True:
         entry.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):
@@ -572,10 +583,10 @@ def _locked(entry: Path) -> int:
 
 
 def _make_room(store: Store, entry: Path, size: int) -> None:
-    """Reserve ``size`` for an entry, removing others, the longest unused first.
+    """Reserve ``size`` bytes for an entry; remove the least recently used entries as needed.
 
     Raises:
-        OutputError: What must stay leaves too little room.
+        OutputError: The entries in use leave too little space.
     """
     gate = os.open(store.folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
     try:
@@ -612,7 +623,7 @@ def _last_used(entry: Path) -> int:
 
 
 def _removed(entry: Path) -> bool:
-    """Remove an entry, unless somebody holds it."""
+    """Remove an entry unless it is in use; return whether it was removed."""
     try:
         hold = os.open(entry / LOCK, os.O_RDWR)
     except FileNotFoundError:
@@ -620,7 +631,7 @@ def _removed(entry: Path) -> bool:
         return not entry.exists()
     try:
         fcntl.flock(hold, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # Renamed first: another process now starts over instead of finding half of it.
+        # Renamed first, so that another process starts over instead of finding a partial entry.
         gone = entry.with_name(f".{entry.name}.{os.getpid()}")
         entry.replace(gone)
         shutil.rmtree(gone)
@@ -655,7 +666,7 @@ def _download(
 
 
 def _chunks(url: str, system: _System, one: _Object) -> Iterator[bytes]:
-    """An object's bytes, exactly as many as were announced."""
+    """Yield an object's bytes and check that their number equals the listed size."""
     source = _guarded(url, lambda: system.open(one.address, "rb"))
     left = one.size
     with source:
@@ -665,4 +676,4 @@ def _chunks(url: str, system: _System, one: _Object) -> Iterator[bytes]:
                 break
             yield chunk
     if left:
-        raise LogError(f"{url}: {one.name} is not as long as its store says; run again")
+        raise LogError(f"{url}: {one.name} is not as long as its store reports; run again")

@@ -1,11 +1,11 @@
-"""Ranges of one remote object, fetched when asked for, with a bounded read-ahead.
+"""Byte ranges of a remote object, fetched on demand with a bounded read-ahead.
 
-A reader says beforehand which ranges it is going to need (``expect``); within these, pieces of up
-to 4 MiB are fetched at once. Elsewhere a little more than asked for is fetched, more each time that
-the next read goes on where the last fetch ended. Nothing is fetched twice: a replay reads its
-window several times, so what memory does not hold goes to a temporary file with holes, as long as
-the disk takes it. A lost connection is tried again a few times. A range that comes back short, or
-an object whose size or version has changed, is an error.
+A reader announces the ranges that it is going to read (``expect``). Within these, pieces of up to
+4 MiB are fetched at once. Elsewhere a small read-ahead is added, which doubles for sequential
+reads. Nothing is fetched twice: a replay reads its window several times, so data that no longer
+fits into memory moves to a sparse temporary file, as long as the disk has space. A failed request
+is retried a few times. A short response, or an object whose size or version has changed, is an
+error.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ MAX_AHEAD: Final = 512 << 10
 KEPT: Final = 64
 KEPT_BYTES: Final = 32 << 20
 WAITS_S: Final = (0.1, 0.5, 2.0)
-"""Before each further try after a lost connection."""
+"""Waiting times before each retry of a failed request."""
 
 T = TypeVar("T")
 
 
 class Spool:
-    """Bytes by position in a temporary file, which is gone when it is closed."""
+    """A cache of byte ranges in a sparse temporary file, which is deleted when closed."""
 
     def __init__(self, folder: Path, max_bytes: int) -> None:
-        """Nothing yet; the file is made when there is something to hold.
+        """Configure an empty cache; the file is created on the first write.
 
         Args:
-            folder: Where the file lies; made if it is not there.
-            max_bytes: What is more is not held.
+            folder: Folder of the file; created if it does not exist.
+            max_bytes: Maximum number of bytes to store; further data is not stored.
         """
         self._folder: Final = folder
         self._left = max_bytes
@@ -50,7 +50,7 @@ class Spool:
         self._ends: list[int] = []
 
     def put(self, at: int, content: memoryview) -> None:
-        """Hold bytes for later; on a full disk or above the limit they are let go."""
+        """Store bytes; they are discarded if the disk is full or the limit is exceeded."""
         end = at + len(content)
         if self.end_at(at) >= end or len(content) > self._left:
             return
@@ -65,24 +65,24 @@ class Spool:
             self._left = 0
             return
         self._left -= len(content)
-        # All spans that touch the new one become one with it.
+        # Merge all spans that touch the new one.
         first, last = bisect_left(self._ends, at), bisect_right(self._begins, end)
         begin = min([at, *self._begins[first:last]])
         end = max([end, *self._ends[first:last]])
         self._begins[first:last], self._ends[first:last] = [begin], [end]
 
     def end_at(self, at: int) -> int:
-        """Up to where it holds all bytes from ``at`` on; ``at`` if it does not hold that one."""
+        """Return the end of the stored span that contains ``at``, else ``at``."""
         place = bisect_right(self._begins, at) - 1
         return max(at, self._ends[place]) if place >= 0 else at
 
     def next_at(self, at: int) -> int:
-        """Where the next span begins that it holds after ``at``; ``at`` if none exists."""
+        """Return the start of the next stored span after ``at``; ``at`` if none exists."""
         place = bisect_right(self._begins, at)
         return self._begins[place] if place < len(self._begins) else at
 
     def read(self, at: int, size: int) -> bytes:
-        """Bytes that it holds; fewer or none if the disk fails, and they are fetched again."""
+        """Return stored bytes; empty if the disk fails, so that they are fetched again."""
         if self._file is None:
             return b""
         try:
@@ -91,7 +91,7 @@ class Spool:
             return b""
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Delete the file."""
         self._begins, self._ends = [], []
         if self._file is not None:
             self._file.close()
@@ -99,12 +99,12 @@ class Spool:
 
 
 class RangedFile:
-    """A remote object by position; safe from any thread.
+    """Random access to a remote object; thread-safe.
 
     Attributes:
-        url: As the user gave it.
-        size: Bytes, as the store says.
-        transferred: Bytes fetched so far.
+        url: URL as the user wrote it.
+        size: Size in bytes, as reported by the store.
+        transferred: Number of bytes fetched so far.
     """
 
     def __init__(
@@ -115,14 +115,14 @@ class RangedFile:
         changed: Callable[[], bool],
         spool: Spool,
     ) -> None:
-        """Take over an object.
+        """Wrap a remote object.
 
         Args:
-            url: As the user gave it.
-            size: Bytes, as the store says.
-            opened: Opens it; the file's reads must fetch exactly what they are asked for.
-            changed: Asks the store whether size or version are no longer what they were.
-            spool: Holds what memory does not; closed with it.
+            url: URL as the user wrote it.
+            size: Size in bytes, as reported by the store.
+            opened: Opens the object; the file's reads must fetch exactly the requested bytes.
+            changed: Queries the store and returns whether the size or version has changed.
+            spool: Cache for data that no longer fits into memory; closed with this object.
         """
         self.url: Final = url
         self.size: Final = size
@@ -138,12 +138,12 @@ class RangedFile:
         self._ahead = AHEAD
 
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """These ranges, sorted, are going to be read."""
+        """Announce the sorted ranges that are going to be read."""
         with self._lock:
             self._expected = list(ranges)
 
     def at_least(self, at: int, size: int) -> memoryview:
-        """What is at hand from ``at`` on: at least ``size`` bytes, less only at the end.
+        """Return the available bytes from ``at`` on: at least ``size``, fewer only at the end.
 
         Raises:
             LogError: The object has changed, or cannot be reached.
@@ -158,16 +158,16 @@ class RangedFile:
             return self._fetched(at, end)
 
     def verify(self) -> None:
-        """Compare size and version with what they were when it was opened.
+        """Verify that the size and version have not changed since the object was opened.
 
         Raises:
-            LogError: They differ, or the store cannot be asked.
+            LogError: They differ, or the store cannot be queried.
         """
         if self._tried(self._changed, "its version"):
             raise LogError(f"{self.url}: changed while it was read; run again when it is written")
 
     def close(self) -> None:
-        """Release the connection."""
+        """Close the connection and delete cached data."""
         with self._lock:
             self._kept.clear()
             self._spool.close()
@@ -176,11 +176,11 @@ class RangedFile:
                 self._file = None
 
     def _fetched(self, at: int, end: int) -> memoryview:
-        """The bytes from ``at`` on, to ``end`` at least; what is at hand is not fetched again."""
+        """Return the bytes from ``at`` to ``end`` or beyond, and fetch those not yet available."""
         parts: list[memoryview] = []
         place = at
         while place < end:
-            part = self._at_hand(place, end) or self._new(place, end)
+            part = self._cached(place, end) or self._new(place, end)
             parts.append(part)
             place += len(part)
         whole = parts[0] if len(parts) == 1 else memoryview(b"".join(parts))
@@ -191,8 +191,8 @@ class RangedFile:
             self._spool.put(*self._kept.popleft())
         return whole
 
-    def _at_hand(self, at: int, end: int) -> memoryview | None:
-        """What memory or the temporary file has from ``at`` on; None if not that byte."""
+    def _cached(self, at: int, end: int) -> memoryview | None:
+        """Return bytes from ``at`` on from memory or the temporary file; None if not cached."""
         for begin, kept in self._kept:
             if begin <= at < begin + len(kept):
                 return kept[at - begin : end - begin]
@@ -200,7 +200,7 @@ class RangedFile:
         return memoryview(self._spool.read(at, stop - at)) if stop > at else None
 
     def _new(self, begin: int, end: int) -> memoryview:
-        """Bytes that are not at hand, fetched, up to those that are."""
+        """Fetch bytes from ``begin`` up to the next cached byte."""
         stop = max(end, min(begin + self._reach(begin, end), self.size))
         held = [at for at, _ in self._kept] + [self._spool.next_at(begin)]
         stop = min([stop, *(at for at in held if at > begin)])
@@ -209,7 +209,7 @@ class RangedFile:
         return memoryview(found)
 
     def _reach(self, begin: int, end: int) -> int:
-        """How many bytes from ``begin`` on to fetch, if more than up to ``end``."""
+        """Return the number of bytes to fetch from ``begin`` on, including the read-ahead."""
         place = bisect_right(self._expected, (begin, self.size + 1)) - 1
         if place >= 0 and begin < self._expected[place][1]:
             return min(self._expected[place][1] - begin, PIECE)
@@ -223,18 +223,18 @@ class RangedFile:
         found = self._file.read(stop - begin)
         self.transferred += len(found)
         if len(found) != stop - begin:
-            raise OSError(f"{len(found)} of {stop - begin} bytes came")
+            raise OSError(f"{len(found)} of {stop - begin} bytes received")
         return bytes(found)
 
     def _tried(self, ask: Callable[[], T], what: str) -> T:
-        """What ``ask`` returns, after a few retries; each store's library has its own errors."""
+        """Return ``ask()``, with a few retries on any error of a store's library."""
         for wait_s in (*WAITS_S, None):
             try:
                 return ask()
             except CrosscueError:
                 raise
             except FileNotFoundError:
-                raise LogError(f"{self.url}: gone while it was read; check the store") from None
+                raise LogError(f"{self.url}: deleted while it was read; check the store") from None
             except Exception as error:
                 self._file = None
                 if wait_s is None:

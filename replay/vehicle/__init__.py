@@ -1,1 +1,1 @@
-"""The vehicle file: sections, roles, validation, draft."""
+"""The vehicle file: its sections, roles of topics, validation and drafting."""

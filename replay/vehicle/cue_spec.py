@@ -1,4 +1,4 @@
-"""One row of the table of cues, as crosscue's own and a plug-in's are written."""
+"""The type of a row in the table of cues, for built-in cues and plug-ins."""
 
 from __future__ import annotations
 
@@ -19,32 +19,35 @@ FEATURE_COLOURS: Final[dict[str, Colour]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CueSpec:
-    """One cue: what it observes, what it implies, and how reliable it was when published.
+    """One cue: its input, the features that it implies, and its published precision.
 
     Attributes:
-        name: Value in ``cues.parquet``, ``truth.json`` and the vehicle file.
-        group: Row of Table 5; cues of one group are reported and left out together.
-        title: That row's heading in reports.
-        observed_by: Input that yields it; without that input the cue is not evaluated.
-        rule: ``module:function`` that counts it, called with the input, the settings, this row.
+        name: Name in ``cues.parquet``, ``truth.json`` and the vehicle file.
+        group: Row of Table 5; cues of one group are reported and disabled together.
+        title: Heading of that row in reports.
+        observed_by: Input of the cue; without this input the cue is not evaluated.
+        rule: ``module:function`` that counts the cue, called with the input, the settings and this
+            row.
         precision: Published precision, the default message strength.
-        precision_is_lower_bound: The source says "at least".
+        precision_is_lower_bound: True if the source specifies "at least".
         supports: Features whose presence it implies.
         excludes: Features whose absence it implies.
-        scored_as: The source's definition: is the object there, or does the feature exist?
-        can_start: May send before an intersection is established.
-        per_detection: One message per detection instead of one per frame.
-        absence_counts: Near the intersection its absence is evidence against ``supports``.
-        needs_masks: Boxes alone cannot show it.
-        label: Detector label that it counts, if it is fixed.
+        scored_as: The source's definition of a correct cue: the object is present, or the feature
+            exists.
+        can_start: True if it sends messages before an intersection is established.
+        per_detection: True for one message per detection instead of one per frame.
+        absence_counts: True if its absence near the intersection is evidence against ``supports``.
+        needs_masks: True if it cannot be evaluated from boxes alone.
+        label: Detector label that it counts, if the label is fixed.
         settings: Prefix of its labels and score under ``[cues]`` of the vehicle file, if any.
-        colour: In recordings: red, green, blue.
-        seen_frames: Where persistence counts, it must be positive in this many ...
-        of_frames: ... of this many most recent frames in which it was searched for.
-        within_m: Where persistence counts, it says nothing about an intersection further away: the
-            source's runs begin 100 m before theirs, so no cue was validated beyond.
-        fade_m: Way over which its errors resemble each other, if it is about a standing thing.
-        fade_s: Time likewise, for what moves by itself; then it replaces ``fade_m``.
+        colour: Colour in recordings: red, green, blue.
+        seen_frames: For the persistent belief, the required number of positive frames among the
+            last ``of_frames``.
+        of_frames: For the persistent belief, the number of most recent frames considered.
+        within_m: For the persistent belief, the maximum distance of the intersection. The source's
+            runs begin 100 m before the intersections, so no cue was validated beyond that.
+        fade_m: Distance over which its errors are correlated, for stationary objects.
+        fade_s: Time over which its errors are correlated, for moving objects; replaces ``fade_m``.
     """
 
     name: str
@@ -72,5 +75,5 @@ class CueSpec:
 
     @property
     def claim(self) -> tuple[str, bool]:
-        """The feature it speaks about, and whether it says that the feature exists."""
+        """The implied feature, and True if the cue implies that it is present."""
         return (self.excludes[0], False) if self.excludes else (self.supports[0], True)

@@ -1,7 +1,7 @@
-"""The one table of cues: what each observes, implies, and how it is judged and drawn (Table 5).
+"""The table of cues: input, implied features, scoring and colour of each cue (Table 5).
 
-Detectors, belief, truth, scores, reports and recordings iterate over ``CUES``. A new cue is a row
-here and its ``rule``; the simulator also keeps a function for each.
+Detectors, belief, truth, scores, reports and recordings iterate over ``CUES``. A new cue takes one
+row in this table and a function for its ``rule``. The simulator also has a function for each cue.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ def _road(side: str, *, can_start: bool) -> CueSpec:
 
 
 SIGN_FRAMES: Final = 2
-"""Sign search is tuned to precision and accepts a low recall (eq. 17), so two frames in five."""
+"""Frames, of five, in which a sign must be found: sign search is tuned for precision at a low
+recall (eq. 17)."""
 MOVES_FADE_S: Final = 2.0
-"""About as long as a crossing car is in view; the next one is another car."""
+"""Typical time for which a crossing car is visible; a later detection is another car."""
 
 
 def _cars(
@@ -72,9 +73,11 @@ def _crossing(side: str) -> CueSpec:
 
 
 PAST_PRECISION: Final = 0.94
-"""Of cars on eight simulated drives with perfect boxes (``benchmarks/tracked_cars.py``): the lower
-end of the 95 % interval of 184 right of 189, when the rule was made. Today 189 of 190 are
-right; the lower end would be 0.97, but frames of one car resemble each other."""
+"""Precision on eight simulated drives with perfect boxes (``benchmarks/tracked_cars.py``).
+
+It is the lower end of the 95 % interval for 184 correct of 189 cars, measured when the rule was
+introduced. Now 189 of 190 cars are correct. The lower end would be 0.97, but frames of one car are
+correlated."""
 
 
 def _cars_past(way: str) -> CueSpec:
@@ -143,7 +146,7 @@ DO_NOT_ENTER: Final = CueSpec(
 )
 
 SAME_SIGN: Final = {"do not enter": ("do not enter", "no entry")}
-"""The American and the international sign, which say the same."""
+"""Labels of the American and the international sign, which are equivalent."""
 
 BUILTIN_CUES: Final[dict[str, CueSpec]] = {
     spec.name: spec
@@ -166,14 +169,14 @@ BUILTIN_CUES: Final[dict[str, CueSpec]] = {
         DO_NOT_ENTER,
     )
 }
-"""Our own, by name, in the order of tables; signs by the precision to which they are tuned."""
+"""Built-in cues by name, in the order of tables; the precision of signs is their tuning target."""
 
 CUES: Final[dict[str, CueSpec]] = BUILTIN_CUES | dict(loaded("cue", CueSpec, BUILTIN_CUES))
-"""Every cue by name, in the order of tables and reports: our own, then those of plug-ins."""
+"""Every cue by name, in the order of tables and reports: built-in cues, then those of plug-ins."""
 
 
 def groups() -> dict[str, tuple[CueSpec, ...]]:
-    """The rows of Table 5, each with the cues that it stands for."""
+    """Return the rows of Table 5 with the cues that each row covers."""
     found: dict[str, tuple[CueSpec, ...]] = {}
     for spec in CUES.values():
         found[spec.group] = (*found.get(spec.group, ()), spec)

@@ -1,12 +1,12 @@
-"""The vehicle file's sections on intersection range and belief; rules in ``crosscue.fusion``.
+"""The vehicle file's sections on intersection range and belief, for ``crosscue.fusion``.
 
-The graph of cues and features is a table here, so that who reads the source's figure otherwise, or
-has a cue or feature of one's own, changes a line of the vehicle file:
+The graph of cues and features is a table in the vehicle file. Users who interpret the source's
+figure differently, or who add a cue or a feature, change a line of the file:
 
     [fusion.cues]
-    stop_sign = { precision = 0.99 }                          # the rest as below
-    zebra = { precision = 0.8, supports = ["intersection"] }  # a new one
-    lanes_past = { use = false }                              # left out
+    stop_sign = { precision = 0.99 }                          # other keys keep their defaults
+    zebra = { precision = 0.8, supports = ["intersection"] }  # a new cue
+    lanes_past = { use = false }                              # a disabled cue
 """
 
 from __future__ import annotations
@@ -26,52 +26,51 @@ Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 NOT_FEATURES: Final = ("t_ns", "approach", "established", "not_believed")
-"""Columns of ``belief.parquet`` that no feature may be called."""
+"""Columns of ``belief.parquet``, which cannot be names of features."""
 
 
 class RangeFilter(Section):
     """The 1-D filter of the distance to an intersection (eq. 8 to 12)."""
 
     gate_nis: Positive | None = 16.0
-    """Measurements whose normalised innovation squared is larger are refused and counted."""
+    """Measurements with a larger normalised innovation squared are rejected and counted."""
     max_m: Positive = 150.0
-    """A sign measured further away than this is refused and counted."""
+    """Maximum range of a measurement; larger ones are rejected and counted."""
     begin_after: Annotated[int, Field(ge=1)] = 2
-    """So many measurements that agree begin a range; the source has 1. On simulated layouts that
-    are not scored, lights that are not there are often seen once, those that are there again and
-    again."""
+    """Number of consistent measurements that start a range; the source uses 1. On simulated layouts
+    that are not scored, false lights are often detected once, and true lights repeatedly."""
     begin_within_m: Positive = 5.0
-    """A first observation that none has confirmed within this way is forgotten."""
+    """Distance travelled after which an unconfirmed first measurement is discarded."""
     restart_after: Annotated[int, Field(ge=1)] = 5
-    """So many refused measurements in a row that agree among themselves replace the belief."""
+    """Number of consecutive rejected measurements that, if consistent, restart the filter."""
     sd_fraction: NotNegative = 0.05
-    """This fraction of a sign's range is added to its curve's s.d. in squares (source: 0)."""
+    """Fraction of the range whose square is added to the variance of a range curve (source: 0)."""
     fade_m: NotNegative = 1.0
-    """A sign's errors resemble each other over this way, so that an observation soon after another
-    counts for less. With 0 every frame is a new look, as in the source; on simulated drives the
-    variance
-    is then five times too small, with these two about right."""
+    """Distance over which the errors of a sign's measurements are correlated, so that measurements
+    in quick succession count less. With 0, frames are independent, as in the source. On simulated
+    drives, the variance is then five times too small; with the defaults of this setting and
+    ``sd_fraction`` it is about right."""
     take_up_m: NotNegative = 10.0
-    """A range from motion is taken up over this way: it is an estimate from the same observations
-    as before and some more, no new measurement. Corrections below it never make the range grow.
-    With 0 it is taken up at once."""
+    """Distance over which the filter adopts a range from motion. Such a range is estimated mostly
+    from earlier observations and is not an independent measurement. Corrections smaller than this
+    never increase the range. With 0, the range is adopted at once."""
     unseen_mps: Positive = 15.0
-    """Where odometry is missing, the s.d. grows by this each second; the mean stays."""
+    """Growth of the standard deviation per second where odometry is missing; the mean is kept."""
     max_sd_m: Positive = 20.0
-    """A belief less sure than this is dropped."""
+    """Maximum standard deviation; an estimate above it is discarded."""
 
 
 class FeatureEntry(Section):
-    """One thing to know about an intersection."""
+    """A feature of an intersection."""
 
     prior: Probability = 0.5
     establishes: bool = False
-    """An intersection counts as present once this is probable."""
+    """If true, a high probability of this feature establishes that an intersection is present."""
     use: bool = True
 
 
 class Fade(Section):
-    """Over what a cue's looks become independent: a way, or a time for what moves by itself."""
+    """Correlation length of a cue's errors: a distance, or a time for moving objects."""
 
     way_m: Positive | None = None
     time_s: Positive | None = None
@@ -84,29 +83,29 @@ class Fade(Section):
 
 
 class CueEntry(Section):
-    """One cue: its reliability, and the features that it is about."""
+    """A cue: its precision, and the features that it implies."""
 
     precision: Probability
-    """Fraction of its detections that are right; what it sends along its edges (Table 5)."""
+    """Fraction of correct detections; the strength of its messages (Table 5)."""
     supports: tuple[Name, ...] = ()
-    """Features that it shows to be there: direct edges."""
+    """Features whose presence it implies: direct edges."""
     excludes: tuple[Name, ...] = ()
-    """Features that it shows not to be there: exclusive edges."""
+    """Features whose absence it implies: exclusive edges."""
     speaks_first: bool = False
-    """Sends before presence is established."""
+    """If true, it sends messages before presence is established."""
     counted: bool = False
-    """Sends one message for each detection, not one for each frame."""
+    """If true, it sends one message per detection instead of one per frame."""
     dissents: bool = False
-    """Near the intersection its absence speaks against what it supports."""
+    """If true, its absence near the intersection is evidence against the supported features."""
     seen_frames: Annotated[int, Field(ge=1)] = 3
-    """With ``kind = "persistent"``, a cue counts once it was positive in this many ..."""
+    """With ``kind = "persistent"``: required number of positive frames among ``of_frames``."""
     of_frames: Annotated[int, Field(ge=1, le=1000)] = 5
-    """... of this many most recent frames in which it was searched for."""
+    """With ``kind = "persistent"``: number of most recent frames that evaluated the cue."""
     within_m: Positive = 100.0
-    """With ``kind = "persistent"`` it says nothing about an intersection known to be farther
-    away, since it was never validated there. An unknown range limits nothing."""
+    """With ``kind = "persistent"``: maximum range of the intersection, because the cue was not
+    validated beyond. It does not apply where the range is unknown."""
     fade: Fade = Fade(way_m=10.0)
-    """With ``kind = "persistent"``: over what its errors become independent."""
+    """With ``kind = "persistent"``: correlation length of its errors."""
     use: bool = True
 
     @model_validator(mode="after")
@@ -127,7 +126,7 @@ FEATURES: Final[Mapping[str, FeatureEntry]] = {
 
 
 def usual_cues() -> dict[str, CueEntry]:
-    """Every cue of the table as the source has it (Table 5 and our reading of Fig. 27)."""
+    """Return the default entries of all cues, after Table 5 and our interpretation of Fig. 27."""
     return {
         name: CueEntry(
             precision=cue.precision,
@@ -146,23 +145,23 @@ def usual_cues() -> dict[str, CueEntry]:
 
 
 class Rates(Section):
-    """How often a cue is positive where a feature is there, and where it is not."""
+    """Rates of positive frames of a cue, where a feature is present and where it is absent."""
 
     cue: Name
     feature: Name
     near: bool
-    """Within ``dissent_within_m`` of the intersection, or not known to be."""
+    """True for the rates within ``dissent_within_m`` of the intersection, False for the others."""
     if_there: Probability
     if_not: Probability
 
 
 class Calibrated(Section):
-    """What ``crosscue fit messages`` has learned; see ``crosscue.fusion.calibrated``."""
+    """Parameters learned by ``crosscue fit messages``; see ``crosscue.fusion.calibrated``."""
 
     fades: dict[Name, Fade] = Field(default_factory=dict)
-    """By cue."""
+    """Correlation length of the errors, by cue."""
     exponents: dict[Name, NotNegative] = Field(default_factory=dict)
-    """By feature: all messages' log odds times this, since cues repeat one another."""
+    """Factor on the log odds of all messages, by feature, because cues are correlated."""
     rates: tuple[Rates, ...] = ()
 
 
@@ -170,38 +169,37 @@ class Fusion(Section):
     """Belief over the features of an intersection (eq. 18)."""
 
     kind: Literal["source", "calibrated", "persistent", "temporal"] | None = None
-    """``source`` multiplies every message in (eq. 18); ``calibrated`` takes learned ratios,
-    discounted; ``persistent`` believes the published messages only of what is seen in several
-    frames, near enough, and discounts frames that resemble each other; ``temporal`` filters a
-    learned hidden Markov model along the drive. Left out: ``source`` in a simulated car's file,
-    ``persistent`` in every other."""
+    """``source`` multiplies all messages (eq. 18). ``calibrated`` uses learned likelihood ratios,
+    discounted for correlation. ``persistent`` uses the published messages of cues that are positive
+    in several frames and near enough, and discounts correlated frames. ``temporal`` filters a
+    learned hidden Markov model along the drive. Default: ``source`` in a simulated vehicle's file,
+    else ``persistent``."""
     established: Probability = 0.9
-    """Presence is established once a feature that establishes it is more probable than this."""
+    """Probability of a feature above which it establishes the presence of an intersection."""
     withdrawn: Probability = 0.5
-    """With ``kind = "temporal"`` it is withdrawn once none of them is more probable than this."""
+    """With ``kind = "temporal"``: presence is withdrawn if no such feature is more probable."""
     dissent: Probability = 0.49
-    """What a cue that dissents sends near the intersection when it is not detected."""
+    """Message strength of a cue with ``dissents`` that is not detected near the intersection."""
     dissent_within_m: NotNegative = 20.0
     dissent_every_m: NotNegative = 0.1
-    """Min distance travelled between two such messages: a car that stands sees nothing new."""
+    """Minimum distance between two such messages: a stationary vehicle gains no new evidence."""
     reference: Literal["start", "end"] = "start"
-    """Which range applies to dissent and to cues past the intersection, where both are known."""
+    """Range used for dissent and for cues past the intersection, where both are known."""
     length_m: NotNegative = 15.0
-    """From the start of an intersection to its end, where only the start is known."""
+    """Assumed length of an intersection, where only its start is known."""
     closes_behind_m: NotNegative = 2.0
-    """An approach ends once the intersection is this far behind the rear axle."""
+    """Distance of the intersection behind the rear axle at which an approach ends."""
     stale_after_m: Positive = 60.0
-    """Or once the car has gone this far without any evidence."""
+    """Distance travelled without evidence after which an approach ends."""
     stale_unranged_m: Positive = 30.0
-    """The same where no sign has reported a range."""
+    """The same distance where no sign has a range."""
     longest_m: Positive = 100.0
-    """Evidence from further before an intersection is not about it; the source's runs are as long.
-    Without a range an approach ends after this distance."""
+    """Maximum length of an approach, as in the source's runs. Evidence from farther before an
+    intersection is not attributed to it. Without a range, an approach ends after this distance."""
     turned_rad: Positive = 0.8
-    """Without a range ahead, an approach ends once the car has turned this much within about 25
-    m."""
+    """Turn within about 25 m that ends an approach without a range ahead."""
     rest_m: NotNegative = 10.0
-    """Over this distance after an intersection, only a sign with a range opens an approach."""
+    """Distance after an intersection over which only a sign with a range starts an approach."""
     features: Annotated[dict[Name, FeatureEntry], Field(validate_default=True)] = Field(
         default_factory=dict
     )
@@ -249,7 +247,7 @@ class Fusion(Section):
             if not edges:
                 raise _refused(f"{name}: neither supports nor excludes a feature; name one")
             if len(set(edges)) < len(edges):
-                raise _refused(f"{name}: a feature stands twice in its edges; keep one")
+                raise _refused(f"{name}: a feature occurs twice in its edges; keep one")
             for feature in edges:
                 if feature not in features:
                     raise _refused(
@@ -274,10 +272,10 @@ class Fusion(Section):
         for one in learned.rates:
             edges = cues[one.cue].supports + cues[one.cue].excludes if one.cue in cues else ()
             if one.feature not in edges:
-                raise _refused(f"rates: {one.cue} and {one.feature} are not joined; add the edge")
+                raise _refused(f"rates: no edge from {one.cue} to {one.feature}; add it")
             key = (one.cue, one.feature, one.near)
             if key in seen:
-                raise _refused(f"rates: {one.cue} and {one.feature} stand twice; keep one")
+                raise _refused(f"rates: {one.cue} and {one.feature} occur twice; keep one")
             seen.add(key)
         return learned
 
@@ -320,7 +318,7 @@ class Fusion(Section):
 
 
 def _merged(usual: Mapping[str, Section], given: object) -> object:
-    """The usual entries with the given ones' keys over them, as unchecked tables."""
+    """Merge the default entries with the user's keys, as unvalidated tables."""
     if not isinstance(given, Mapping):
         return given
     merged: dict[object, Any] = {name: entry.model_dump() for name, entry in usual.items()}

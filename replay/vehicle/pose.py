@@ -1,4 +1,4 @@
-"""The vehicle file's sections that the pose comes from: odometry, GNSS and where a drive begins."""
+"""The vehicle file's sections for the pose: odometry, GNSS and the start of a drive."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ DEGREE: Final = math.pi / 180.0
 
 
 class OdometryFitted(Section):
-    """Where fitted odometry comes from; ``crosscue fit odometry`` writes it, nothing else reads it.
+    """Record of a fit of the odometry, written by ``crosscue fit odometry`` for information only.
 
-    Root mean squares are of the position by odometry alone, from the start of the fitted span.
+    RMS errors are those of the position from odometry alone, from the start of the fitted span.
     """
 
     log: str
     """Name of the log."""
     reference: str
-    """What the positions came from."""
+    """Source of the reference positions."""
     start_ns: int
-    """The fitted span, on the log's clock; half open."""
+    """Start of the fitted span on the log's clock; the end is exclusive."""
     end_ns: int
     positions: int
     outliers: int
-    """Of those, further off than one good position in a thousand is."""
+    """Number of positions with a larger error than one correct position in a thousand."""
     position_sd_m: NotNegative
-    """Of the positions, by the residuals."""
+    """Standard deviation of the reference positions, estimated from the residuals."""
     rms_m: NotNegative
-    """Over the fitted span."""
+    """RMS error over the fitted span."""
     held_out_rms_m: NotNegative
-    """Over the rest of the log, which was not fitted."""
+    """RMS error over the rest of the log, which was not fitted."""
     held_out_before_rms_m: NotNegative
-    """The same with the values that were there before."""
+    """RMS error over the rest of the log with the values before the fit."""
     sd: dict[str, NotNegative] = Field(default_factory=dict)
-    """Of each fitted value."""
+    """Standard deviation of each fitted value."""
     not_observable: tuple[str, ...] = ()
-    """What the span did not show; left as it was."""
+    """Parameters that the span does not determine; they keep their values."""
 
 
 class Odometry(Section):
-    """Wheels, gyro and steering; the terms are those of ``crosscue.localization.odometry``.
+    """Wheels, gyro and steering, as defined in ``crosscue.localization.odometry``.
 
-    ``crosscue fit odometry`` writes it.
+    ``crosscue fit odometry`` writes this section.
     """
 
     track_width_m: Positive = 1.55
@@ -56,28 +56,29 @@ class Odometry(Section):
     use_front_wheels: bool = False
     wheel_step_mps: NotNegative = 0.0028
     slip_per_sqrt_m: NotNegative = 0.3
-    """The default covers a wheel radius that is off by 1 %, as on an uncalibrated car: 10 m per
-    km."""
+    """Growth of the distance error. The default covers a wheel radius error of 1 %, as on an
+    uncalibrated vehicle: 10 m per km."""
     scale_sd: NotNegative = 0.01
-    """The same as what it is, a fraction of every distance: over the 20 m by which a range comes
-    from motion, ``slip_per_sqrt_m`` would be seven times too much."""
+    """The same error as a fraction of the distance, for ranges from motion. Over their baseline of
+    about 20 m, ``slip_per_sqrt_m`` would overestimate it by a factor of seven."""
     heading_from: Literal["auto", "yaw_rate", "steering", "wheels"] = "auto"
-    """Which signal turns the pose; ``auto`` takes the first of these three that the log has."""
+    """Source of the heading change; ``auto`` selects the first of the other three in the log."""
     yaw_rate_scale: Positive = 1.0
     gyro_bias_radps: Finite = 0.0
     gyro_noise_rad_per_sqrt_s: NotNegative = 0.005
-    """The default covers a bias of 0.0006 rad/s that was not removed: 2 degrees in a minute."""
+    """Growth of the heading error. The default covers a residual bias of 0.0006 rad/s: 2 degrees in
+    a minute."""
     steering_ratio: Positive = 15.0
     steering_offset_rad: Finite = 0.0
     steering_noise_rad_sqrt_m: NotNegative = 0.01
     wheel_turn_rad_per_sqrt_m: NotNegative = 0.03
-    """The default covers tyres that differ by 0.3 %: 0.2 rad in 100 m, where wheels turn the
-    pose."""
+    """Growth of the heading error with ``heading_from = "wheels"``. The default covers tyres that
+    differ by 0.3 %: 0.2 rad in 100 m."""
     turn_per_turn: NotNegative = 0.0
     turn_rad_per_sqrt_rad: NotNegative = 0.0
-    """S.d. of the heading after one radian of turning."""
+    """Standard deviation of the heading after a turn of one radian."""
     turn_delay_s: Finite = 0.0
-    """How long after the wheel speeds' the stamps of yaw rate or steering come."""
+    """Delay of the time stamps of yaw rate or steering relative to those of the wheel speeds."""
     max_gap_s: Positive = 0.5
     accel_var_m2ps3: NotNegative = 1.0
     fitted: OdometryFitted | None = None
@@ -87,25 +88,26 @@ class Gnss(Section):
     """A GNSS receiver and its antenna."""
 
     use: GnssUse = "start"
-    """``start``: its first seconds say where the drive begins and which way the car faces, unless
-    ``start.heading_rad`` does. ``truth``: it is kept for ``crosscue truth from-gnss`` alone.
-    ``fuse``: as ``start``, and positions are weighed into the pose, which the published method
-    never does; GNSS is then no independent truth. ``off``: nothing."""
+    """``start``: the first seconds determine the start position and, unless ``start.heading_rad``
+    is set, the heading. ``truth``: GNSS is used only by ``crosscue truth from-gnss``. ``fuse``: as
+    ``start``, and positions also update the pose. The published method never does this, and GNSS
+    is then no independent truth. ``off``: GNSS is ignored."""
     x_m: Finite = 0.0
-    """The antenna, ahead of the rear axle."""
+    """Distance of the antenna ahead of the rear axle."""
     y_m: Finite = 0.0
     position_sd_m: Positive = 3.0
-    """S.d. of east and of north, where the receiver states none."""
+    """Standard deviation of east and north, where the receiver reports none."""
     course_sd_rad: Positive = 3.0 * DEGREE
-    """S.d. of the course over ground, from ``min_speed_mps`` on."""
+    """Standard deviation of the course over ground at ``min_speed_mps`` or more."""
     min_speed_mps: Positive = 3.0
-    """Below, the course is noise."""
+    """Minimum speed at which the course over ground is used; below, it is noise."""
     delay_s: Finite = 0.0
-    """How long after they were true positions and courses are stamped."""
+    """Delay of the time stamps of positions and courses."""
     interval_s: NotNegative = 1.0
-    """With ``fuse``, time between two positions that count: a receiver's errors last."""
+    """With ``fuse``: minimum time between two updates, because a receiver's errors persist."""
     gate_nis: Positive = 13.8
-    """With ``fuse``, refuse a position farther off, as one good position in a thousand is."""
+    """With ``fuse``: positions with a larger normalised innovation squared are rejected (one
+    correct position in a thousand exceeds the default)."""
 
 
 class Start(Section):
@@ -115,9 +117,9 @@ class Start(Section):
     y_m: Finite = 0.0
     position_sd_m: Positive = 1.0
     heading_rad: Finite | None = None
-    """Left out: taken from the first compass readings."""
+    """Heading; by default estimated from the first compass readings."""
     heading_sd_rad: Positive = 5.0 * DEGREE
     map_origin: tuple[Finite, Finite, Finite] | None = None
-    """Latitude and longitude in degrees and altitude in metres of the map's zero, where known."""
+    """Latitude and longitude in degrees and altitude in metres of the map's origin, if known."""
     source: str = ""
-    """Where this pose comes from; a run that found it in the log records it here."""
+    """Source of this pose; a run that finds it in the log records it here."""

@@ -1,4 +1,4 @@
-"""What each topic would be used as, by its type: the table of the contract."""
+"""Roles of topics by their message types."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from crosscue.replay.decode.ros.type_names import ros2_spelling
 
 
 class Role(Enum):
-    """What a stream is to the run."""
+    """The role of a stream in a run."""
 
     CAMERA = "camera"
     CAMERA_INFO = "camera calibration"
@@ -46,7 +46,7 @@ BY_TYPE: Final[Mapping[str, Role]] = {
     "nav_msgs/msg/Odometry": Role.ODOMETRY,
     "geometry_msgs/msg/PoseStamped": Role.POSE,
 }
-"""Type names in ROS 2 spelling; ``ros2_spelling`` brings ROS 1 names here."""
+"""Roles by type name in ROS 2 spelling; ``ros2_spelling`` converts ROS 1 names."""
 
 OF_TABLES: Final[Mapping[str, Role | None]] = {
     "crosscue/Table": None,
@@ -56,11 +56,11 @@ OF_TABLES: Final[Mapping[str, Role | None]] = {
         if role in (Role.IMU, Role.MAGNETOMETER, Role.GNSS, Role.ODOMETRY, Role.POSE, Role.WHEELS)
     },
 }
-"""Types whose rows are plain columns: ``convert`` may change them, and the role stays."""
+"""Types whose rows are plain columns: ``convert`` may change the type, but not the role."""
 
 
 def role_of(topic: Topic) -> Role | None:
-    """What ``topic`` would be used as without configuration, or None."""
+    """Return the role of ``topic`` without configuration, or None."""
     if topic.converted_from in OF_TABLES:
         return OF_TABLES[topic.converted_from]
     name = ros2_spelling(topic.type_name)

@@ -1,4 +1,4 @@
-"""What the sections of a vehicle file are made of."""
+"""Base class of the sections of a vehicle file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Section(BaseModel):
-    """What all sections share: unknown keys are refused, nothing changes after reading."""
+    """Base class of all sections: immutable, with unknown keys refused."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
@@ -20,7 +20,7 @@ class Section(BaseModel):
 
 
 def tuples(value: Any) -> Any:
-    """TOML values with tuples for lists, which strict models expect."""
+    """Convert the lists in TOML values to tuples, which strict models expect."""
     if isinstance(value, dict):
         return {key: tuples(item) for key, item in value.items()}
     return tuple(tuples(item) for item in value) if isinstance(value, list) else value

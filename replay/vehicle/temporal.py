@@ -1,4 +1,4 @@
-"""The vehicle file's section on the belief over time; its model is ``crosscue.fusion.temporal``."""
+"""The vehicle file's section on the belief over time, for ``crosscue.fusion.temporal``."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ ByDistance = Annotated[tuple[Probability, ...], Field(min_length=1)]
 
 
 class CueChain(Section):
-    """How a cue behaves where some features are there and others are not.
+    """Transition probabilities of a cue, given the presence and absence of features.
 
-    Probabilities are listed by distance, nearest first, in the bins of ``Temporal.edges_m``; there
-    is a single one where no intersection is ahead.
+    Probabilities are listed by distance, nearest first, in the bins of ``Temporal.edges_m``. Where
+    no intersection is ahead, each list has a single entry.
     """
 
     cue: Name
@@ -28,11 +28,11 @@ class CueChain(Section):
     missing: tuple[Name, ...] = ()
     """Features that are absent."""
     first: ByDistance
-    """Probability of a positive where it was not searched for in the step before."""
+    """Probability of a positive if the cue was not evaluated in the previous step."""
     stays: ByDistance
-    """Probability of a positive after a positive step."""
+    """Probability of a positive after a positive."""
     appears: ByDistance
-    """Probability of a positive after a negative step."""
+    """Probability of a positive after a negative."""
 
     @model_validator(mode="after")
     def _line_up(self) -> Self:
@@ -44,38 +44,38 @@ class CueChain(Section):
 
 
 class Temporal(Section):
-    """What ``crosscue fit temporal`` has learned."""
+    """Parameters learned by ``crosscue fit temporal``."""
 
     ahead: Probability
-    """Probability that an intersection is within reach where a drive begins."""
+    """Probability that an intersection is within the visibility range where a drive begins."""
     ways: dict[str, Probability]
-    """From the ways that an intersection offers, joined by ``+`` (``none`` for a dead end), to how
-    often it does: ``{ "left+right" = 0.2, ... }``; other combinations count as impossible."""
+    """Prior probabilities of the combinations of roads at an intersection, joined by ``+``
+    (``none`` for a dead end): ``{ "left+right" = 0.2, ... }``. Other combinations have probability
+    zero."""
     edges_m: Annotated[tuple[float, ...], Field(min_length=2)]
-    """Edges of the bins of distance, rising; the last is the visibility range."""
+    """Edges of the distance bins, ascending; the last one is the visibility range."""
     chains: tuple[CueChain, ...]
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     """Exponent of all cues' likelihoods, since cues are correlated even given the state."""
     lapse: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.0
-    """Probability that a place is unlike all others; cues say nothing there, and the prior
-    holds."""
+    """Probability of an atypical place, where cues are uninformative and the prior applies."""
     stray: Probability = 0.05
-    """Probability that a sign's range has nothing to do with the intersection."""
+    """Probability that a sign's range is unrelated to the intersection."""
     step_m: Positive = 1.5
-    """A cue is evaluated again after this distance ..."""
+    """Distance after which a cue is evaluated again, unless ``step_s`` has passed earlier."""
     step_s: Positive = 0.5
-    """... or this time."""
+    """Time after which a cue is evaluated again."""
     spacing_m: Positive = 150.0
     """Mean distance between intersections."""
     cell_m: Positive = 2.0
-    """Width of the cells of distance."""
+    """Width of the cells of the distance grid."""
     behind_m: NotNegative = 4.0
-    """An intersection is passed once it is this far behind."""
+    """Distance behind the vehicle at which an intersection is passed."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if any(a >= b for a, b in pairwise(self.edges_m)):
-            raise PydanticCustomError("temporal", "edges_m: expected rising distances")
+            raise PydanticCustomError("temporal", "edges_m: expected ascending distances")
         bins = len(self.edges_m) - 1
         for one in self.chains:
             wanted = bins if one.there or one.missing else 1

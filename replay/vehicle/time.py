@@ -1,4 +1,4 @@
-"""The vehicle file's ``[time]``: where a drive is split, and what a car can do meanwhile."""
+"""The vehicle file's ``[time]``: splitting of drives, and limits on motion across a gap."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from .section import NotNegative, Positive, Section
 
 
 class Time(Section):
-    """When a drive falls into time segments, and how estimators cross the gap between two."""
+    """Division of a drive into time segments, and treatment of the gaps between them."""
 
     max_silence_s: Positive = 1.0
-    """Wheel speeds silent for longer than this begin a new segment."""
+    """A longer gap in the wheel speeds starts a new segment."""
     restart_after_s: NotNegative = 5.0
-    """After a longer gap, or a clock set back, the range filter and the belief start over."""
+    """After a longer gap, or after a clock is set back, the range filter and the belief restart."""
     unknown_gap_s: Positive = 1.0
-    """Taken for the gap where a clock was set back: its true length cannot be known."""
+    """Assumed gap where a clock was set back, because its true length is unknown."""
     max_accel_mps2: NotNegative = 4.0
-    """How fast the car may have changed its speed during a gap."""
+    """Maximum acceleration of the vehicle during a gap."""
     max_turn_rate_radps: NotNegative = 0.5
-    """How fast it may have turned."""
+    """Maximum turn rate of the vehicle during a gap."""
     max_speed_mps: Positive = 60.0
-    """And how fast it may have gone."""
+    """Maximum speed of the vehicle during a gap."""

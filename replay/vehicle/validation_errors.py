@@ -1,4 +1,4 @@
-"""What is wrong with a settings file, in one line, from the errors of its model."""
+"""One-line messages for validation errors of a settings file."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 GIVEN_CHARACTERS: Final = 80
-"""So much of a wrong value is shown."""
+"""Maximum number of characters of an invalid value in a message."""
 
 
 def explain(error: ValidationError, text: str | None, where: str, root: type[BaseModel]) -> str:
-    """One line for a file that does not fit its model: place, what, what to do.
+    """Describe a validation error in one line: place, problem, remedy.
 
     Args:
-        error: Of its validation.
-        text: The file's, when it is TOML: its line is reported.
+        error: The validation error.
+        text: Text of the file if it is TOML, to report the line.
         where: Name of the file.
-        root: The model.
+        root: Model of the file.
     """
     first, *others = error.errors(include_url=False)
     keys = [str(part) for part in first["loc"]]
@@ -49,10 +49,10 @@ def _suggestion(keys: list[str], root: type[BaseModel]) -> str:
     is_table = False
     for key in keys[:-1]:
         if key.isdigit():
-            # The place of one entry in a list of sections; the section itself is known already.
+            # An index in a list of sections; the section itself is already known.
             continue
         if is_table:
-            # The name of one entry in a table of sections; the section itself is known already.
+            # A name in a table of sections; the section itself is already known.
             is_table = False
         elif section is not None:
             section, is_table = _section_of(section, key)
@@ -60,11 +60,11 @@ def _suggestion(keys: list[str], root: type[BaseModel]) -> str:
     close = difflib.get_close_matches(keys[-1], known, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]}?"
-    return f"there are: {', '.join(known)}" if known else "take it out"
+    return f"there are: {', '.join(known)}" if known else "remove it"
 
 
 def _section_of(section: type[BaseModel], key: str) -> tuple[type[BaseModel] | None, bool]:
-    """The section below ``key``, and whether it stands there under names of the user's."""
+    """Return the section below ``key``, and whether its entries have user-defined names."""
     field = section.model_fields.get(key)
     if field is None:
         return None, False
@@ -79,7 +79,7 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _line_of(keys: list[str], text: str) -> int:
-    """Line of the deepest of ``keys`` that the text spells out; 1 where none is."""
+    """Return the line of the deepest of ``keys`` that occurs in the text; 1 if none does."""
     names = [key for key in keys if not key.isdigit()]
     places = {key: int(at) for key, at in pairwise(keys) if at.isdigit()}
     seen: Counter[str] = Counter()

@@ -1,10 +1,11 @@
-"""The vehicle file: which stream plays which role, how sensors are mounted, how noisy they are.
+"""The vehicle file: roles of topics, mounting and noise of sensors, and settings of estimators.
 
-TOML, versioned, checked with pydantic. Unknown keys, wrong units and missing roles are refused with
-the line in the file and a suggestion. Units stand last in every name (SI); frames are ISO 8855 /
-REP-103: x forward, y left, heading counter-clockwise. Every default is written to the manifest.
+The file is TOML with a version, and is validated with pydantic. For unknown keys, wrong units and
+missing roles, the error names the line in the file and a suggestion. The unit (SI) is the last part
+of every name. Frames follow ISO 8855 / REP-103: x forward, y left, heading counter-clockwise. Every
+default is written to the manifest.
 
-The table of cues, which the file is checked against, is exported with it.
+This module also exports the table of cues that the file is checked against.
 """
 
 from __future__ import annotations
@@ -40,136 +41,137 @@ Matrix = tuple[Vector, Vector, Vector]
 Proportion = Annotated[float, Field(ge=0.0, le=1.0)]
 Polygon = Annotated[tuple[tuple[Proportion, Proportion], ...], Field(min_length=3)]
 Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
-"""``MESSAGE.SIGNAL`` as the DBC file spells them."""
+"""``MESSAGE.SIGNAL``, spelled as in the DBC file."""
 
 
 class Topics(Section):
-    """Which topic plays which role; a role left out goes to the only topic of a fitting type."""
+    """Topics by role; an omitted role is filled by the only topic of a matching type."""
 
     camera: str | None = None
     imu: str | None = None
     magnetometer: str | None = None
     heading: str | None = None
-    """Topic with a column ``heading_rad``, or an inertial unit whose orientation is trusted."""
+    """Topic with a column ``heading_rad``, or an inertial unit with a reliable orientation."""
     gnss: str | None = None
     odometry: str | None = None
 
 
 class WheelSpeeds(Section):
-    """Signals with the speed of each wheel; the rear two alone are enough."""
+    """Signals with the speed of each wheel; the two rear wheels are sufficient."""
 
     bus: str | None = None
-    """Topic of the bus that carries them; left out, ``can.bus``."""
+    """Topic of the bus that carries them; by default ``can.bus``."""
     front_left: Signal | None = None
     front_right: Signal | None = None
     rear_left: Signal
     rear_right: Signal
     unit: Literal["km/h", "m/s", "mph", "rad/s"] | None = None
-    """Overrides the unit of the DBC file, or states it where the file is silent."""
+    """Unit of the signals; overrides the unit of the DBC file, which may be missing there."""
     wheel_radius_m: Positive | None = None
     """Rolling radius, for signals in rad/s."""
 
 
 class AngleSignal(Section):
-    """One signal with an angle or an angular rate, counter-clockwise positive."""
+    """A signal with an angle or an angular rate, positive counter-clockwise."""
 
     bus: str | None = None
-    """Topic of the bus that carries it; left out, ``can.bus``."""
+    """Topic of the bus that carries it; by default ``can.bus``."""
     signal: Signal
     unit: Literal["deg", "rad", "deg/s", "rad/s"] | None = None
     sign: Literal[1, -1] = 1
 
 
 class Can(Section):
-    """The bus with the car's own signals and how to decode it."""
+    """The CAN bus with the vehicle's signals, and the databases that decode it."""
 
     bus: str | None = None
-    """Topic of the bus; may be left out where the log has only one. A section may name another."""
+    """Topic of the bus; optional if the log has only one. Sections may override it."""
     dbc: tuple[str, ...] = ()
-    """Files, relative to the vehicle file's folder."""
+    """Paths of the database files, relative to the vehicle file's folder."""
     wheel_speeds: WheelSpeeds | None = None
     yaw_rate: AngleSignal | None = None
     steering: AngleSignal | None = None
 
 
 class Mobileye(Section):
-    """The Mobileye's bus, protocol and mounting."""
+    """Bus, protocol and mounting of the Mobileye."""
 
     bus: str | None = None
-    """Topic of its bus; left out, no Mobileye is read from CAN."""
+    """Topic of its bus; if omitted, no Mobileye is read from CAN."""
     revision: Literal["auto", "classic", "2.32"] = "auto"
     family: Literal["auto", "extended", "tsr"] = "auto"
-    """Which of the two meanings message 0x700 has."""
+    """Protocol family, which decides the meaning of message 0x700."""
     slots: Literal[10, 13] = 13
     x_m: Finite | None = None
-    """Reference point ahead of the rear axle; must be measured, so it has no default."""
+    """Distance of its reference point ahead of the rear axle; must be measured, so no default."""
     y_m: Finite = 0.0
     yaw_rad: Finite = 0.0
 
 
 class Compass(Section):
-    """From a magnetometer's reading to a heading; ``crosscue fit compass`` writes this section."""
+    """Conversion of magnetometer readings to a heading; written by ``crosscue fit compass``."""
 
     use: bool = True
     mounting_rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    """Turns the sensor's axes into forward, left, up."""
+    """Rotation from the sensor's axes to forward, left, up."""
     mounting_yaw_rad: Finite = 0.0
     hard_iron_t: Vector = (0.0, 0.0, 0.0)
     soft_iron: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     declination_rad: Finite = 0.0
-    """East positive."""
+    """Magnetic declination, positive to the east."""
     heading_sd_rad: Positive = 15.0 * DEGREE
     interval_m: NotNegative = 1.0
-    """A reading counts once the car has gone this far since the last that counted."""
+    """Minimum distance travelled between two readings that are used."""
     interval_s: NotNegative = 2.0
-    """And this long: twice the time over which the compass's error persists."""
+    """Minimum time between two readings that are used: twice the correlation time of the error."""
     gate_nis: Positive | None = 10.8
-    """Refuse readings whose normalised innovation squared is larger."""
+    """Readings with a larger normalised innovation squared are rejected."""
 
 
 class Camera(Section):
-    """Pinhole camera and where it sits."""
+    """Pinhole camera model and mounting."""
 
     x_m: Finite = 0.0
-    """Ahead of the rear axle."""
+    """Distance ahead of the rear axle."""
     y_m: Finite = 0.0
     z_m: Finite = 1.2
     focal_px: Positive | None = None
     center_px: tuple[Finite, Finite] | None = None
     roll_rad: Finite = 0.0
-    """How far it is turned about its axis: its right side down is positive."""
+    """Rotation about the optical axis, positive with the right side down."""
     pitch_rad: Finite = 0.0
-    """How far its axis points below the horizon."""
+    """Angle of the optical axis below the horizon."""
     yaw_rad: Finite = 0.0
-    """How far its axis points to the left; ``crosscue fit odometry`` finds it where the truth is
-    the camera's track."""
+    """Angle of the optical axis to the left; ``crosscue fit odometry`` estimates it where the truth
+    is the camera's track."""
     pitch_sd_rad: NotNegative = 0.01
-    """How far that is off in a frame: a car pitches by some half a degree as it brakes."""
+    """Standard deviation of the pitch in a frame: a vehicle pitches by about half a degree when it
+    brakes."""
     depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
-    """How many bits of a 16-bit picture are in use; 12 for many cameras."""
+    """Number of bits used in 16-bit images; 12 for many cameras."""
 
 
 class Regions(Section):
-    """Where to look for road (eq. 13): in the picture, as published, or on the ground."""
+    """Regions in which road is searched (eq. 13): in the image, as published, or on the ground."""
 
     kind: Literal["picture", "ground"] | None = None
-    """``picture``: the polygons below. ``ground``: rectangles on the road, anchored to the believed
-    intersection; needs ``camera.focal_px``, ``z_m`` and a range. Left out: ``ground``, but
-    ``picture`` in a simulated car's file and where a polygon is given."""
+    """``picture``: the polygons below. ``ground``: rectangles on the road, anchored to the
+    estimated intersection; needs ``camera.focal_px``, ``z_m`` and a range. Default: ``ground``, but
+    ``picture`` in a simulated vehicle's file and where a polygon is specified."""
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
-    """Polygons of (x, y) in fractions of the picture's width and height."""
+    """Polygon of (x, y) in fractions of the image's width and height; likewise the other two."""
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
     right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
     aside_m: tuple[Positive, Positive] = (12.0, 20.0)
-    """On the ground: lateral span in which side roads are searched, beyond three lanes beside the
-    ego lane and no farther than a camera sees nearby."""
+    """On the ground: lateral range in which side roads are searched. It starts beyond three lanes
+    next to the ego lane and ends where a camera no longer sees the ground nearby."""
     beyond_m: tuple[Positive, Positive] = (6.0, 26.0)
-    """On the ground: span beyond the intersection's end in which the road ahead is searched."""
+    """On the ground: range beyond the intersection's end in which the road ahead is searched."""
     half_width_m: Positive = 2.0
-    """Half the width of that region, centered on the ego vehicle's path."""
+    """Half the width of the region ahead, which is centered on the ego vehicle's path."""
     min_rows: Positive = 6.0
-    """A region that spans fewer rows of the segmentation is not seen: where a road ends, the
-    embedded network's mask runs on for up to five."""
+    """Minimum number of rows of the segmentation that a visible region spans. Where a road ends,
+    the embedded network's mask extends up to five rows too far."""
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
@@ -181,39 +183,40 @@ class Regions(Section):
 
 
 class OwnCue(Section):
-    """A cue of your own: it counts detections with one of these labels and a higher score."""
+    """A user-defined cue: it counts detections with one of these labels and a higher score."""
 
     labels: Annotated[tuple[str, ...], Field(min_length=1)]
     score: Proportion = 0.5
 
 
 SIMULATED_CAR: Final = "crosscue simulated car"
-"""Name in the vehicle files that ``simulate`` writes; with it the published belief is the default.
+"""Name in the vehicle files that ``simulate`` writes; it makes the published belief the default.
 
-That a log is simulated is known from the file beside it, see ``crosscue.replay.files.made_of``."""
+Whether a log is simulated is recorded in a file next to it, see ``crosscue.replay.files.made_of``.
+"""
 
 
 class Cues(Section):
-    """When a detection is a cue."""
+    """Conditions under which a detection is a cue."""
 
     stop_sign_labels: tuple[str, ...] = ("stop sign",)
     stop_sign_score: Proportion | None = None
-    """Only higher scores count. Left out: the detector's own threshold, which ``crosscue fit
-    detector`` writes into its card, or 0.5; the source's network has the source's 0.9."""
+    """Minimum score. Default: the threshold in the detector's model card, which ``crosscue fit
+    detector`` writes, or 0.5. The source's network uses the source's 0.9."""
     traffic_light_labels: tuple[str, ...] = ("traffic light",)
     traffic_light_score: Proportion | None = None
-    """As ``stop_sign_score``."""
+    """Minimum score, with the same default as ``stop_sign_score``."""
     road_fraction: Proportion = 0.2
-    """More road than this in a region is a cue (eq. 14)."""
+    """Minimum fraction of road in a region that is a cue (eq. 14)."""
     own: dict[Name, OwnCue] = Field(default_factory=dict)
-    """By name; what each says about an intersection is declared under [fusion.cues]."""
+    """User-defined cues by name; [fusion.cues] declares the features that they support."""
 
     @field_validator("own")
     @classmethod
     def _new_names(cls, own: dict[str, OwnCue]) -> dict[str, OwnCue]:
         for name in own:
             if name in CUES:
-                raise ValueError(f"{name}: a cue of this name is there already; choose another")
+                raise ValueError(f"{name}: a cue of this name already exists; choose another")
         return own
 
 
@@ -221,46 +224,47 @@ class Cars(Section):
     """Crossing and parked cars: shape, association and motion (eq. 15, 16)."""
 
     kind: Literal["pairs", "tracks"] | None = None
-    """``pairs``: motion in the picture between two frames, as published. ``tracks``: motion on the
-    road over three frames and more, the ego vehicle's taken out; needs ``camera.focal_px`` and
-    odometry. Left out: ``pairs`` in a simulated car's file, ``tracks`` in every other."""
+    """``pairs``: motion in the image between two frames, as published. ``tracks``: motion on the
+    road over three or more frames, compensated for ego motion; needs ``camera.focal_px`` and
+    odometry. Default: ``pairs`` in a simulated vehicle's file, else ``tracks``."""
     labels: tuple[str, ...] = ("car",)
     score: Proportion | None = None
-    """As ``cues.stop_sign_score``; the source's network has the source's 0.95."""
+    """Minimum score, with the same default as ``cues.stop_sign_score``; the source's network uses
+    the source's 0.95."""
     length_per_height: Positive = 2.0
-    """Only cars seen from the side: min ratio of their length to their height."""
+    """Minimum ratio of length to height, which selects cars seen from the side."""
     area_change: Proportion = 0.03
-    """The same car in two frames: mask areas differ by less."""
+    """Maximum relative change of the mask area between two detections of the same car."""
     position_change: Proportion = 0.05
-    """And positions by less than this fraction of the picture's width."""
+    """Maximum change of position between them, as a fraction of the image width."""
     still_change: Proportion = 0.002
-    """A car that moved by less than this fraction of the width, both ways, stood."""
+    """Maximum motion of a stationary car on either axis, as a fraction of the image width."""
     slope: NotNegative = 0.25
-    """Horizontal motion: max vertical pixels per horizontal pixel."""
+    """Maximum slope of horizontal motion: vertical pixels per horizontal pixel."""
     max_gap_s: Positive = 0.5
-    """Frames further apart are not compared."""
+    """Maximum time between two frames that are compared."""
     min_frames: Annotated[int, Field(ge=3)] = 3
-    """With ``kind = "tracks"``: min number of frames with a car before it is judged."""
+    """With ``kind = "tracks"``: minimum number of frames with a car before it is classified."""
     max_frames: Annotated[int, Field(ge=3, le=100)] = 10
-    """Number of most recent frames by which it is judged."""
+    """Number of most recent frames used to classify a car."""
     parked_frames: Annotated[int, Field(ge=3, le=100)] = 15
-    """The same for a parked one: it takes longer to be sure that a car stands."""
+    """Number of most recent frames used to classify a parked car, which takes longer."""
     within_m: Positive = 100.0
-    """Cars farther away, by their height, are not judged; nearer ones are judged where their motion
-    is certain."""
+    """Maximum distance, derived from a car's height, of the cars that are classified."""
     crossing_mps: Positive = 2.0
-    """A car that crosses moves sideways by more; a parked one surely moves by less. One past the
-    intersection comes or goes by more."""
+    """Minimum lateral speed of a crossing car, and maximum speed of a parked car. Also the minimum
+    longitudinal speed of an oncoming or outgoing car past the intersection."""
     past_within_m: Positive = 120.0
-    """Oncoming and outgoing cars past the intersection: max distance ahead, by their height."""
+    """Maximum distance, derived from their height, of oncoming and outgoing cars past the
+    intersection."""
     past_aside_m: Positive = 12.0
-    """Max distance of these cars to either side of the ego path: three lanes beside its own."""
+    """Maximum lateral distance of these cars from the ego path, about three lanes."""
     past_frames: Annotated[int, Field(ge=3, le=100)] = 30
-    """Number of most recent frames by which these cars are judged."""
+    """Number of most recent frames used to classify these cars."""
 
 
 class RangeCurve(Section):
-    """From an object's height in pixels to its range; ``crosscue fit ranges`` writes it."""
+    """Range curve over an object's height in pixels; written by ``crosscue fit ranges``."""
 
     family: Literal["pinhole", "pinhole-offset", "power"] = "pinhole"
     parameters: tuple[Finite, ...]
@@ -268,56 +272,57 @@ class RangeCurve(Section):
 
 
 class Ranges(Section):
-    """Where ranges to an intersection come from, and a curve for each kind of object."""
+    """Source of the ranges to an intersection, with a curve for each kind of object."""
 
     kind: Literal["curve", "motion"] | None = None
-    """``curve``: the curves below, and no range without one. ``motion``: range and true height
-    together, from how an object grows as the car moves; needs ``camera.focal_px``. Left out: a
-    curve where one is given, else motion where ``camera.focal_px`` is."""
+    """``curve``: the curves below; objects without a curve have no range. ``motion``: joint
+    estimate of range and true height from an object's growth in the image as the vehicle moves;
+    needs ``camera.focal_px``. Default: ``curve`` where one is specified, else ``motion`` where
+    ``camera.focal_px`` is."""
     stop_sign: RangeCurve | None = None
     traffic_light: RangeCurve | None = None
     light_setback_m: Finite = 3.0
-    """With ``motion``: distance from the intersection's end to the lights that face the ego vehicle
-    from the far corners, and from lights seen from behind to its start; a fitted curve includes
-    it."""
+    """With ``motion``: distance from the intersection's end to the lights at the far corners, which
+    face the ego vehicle, and from lights seen from behind to the intersection's start. A fitted
+    curve includes it."""
     light_setback_sd_m: NotNegative = 2.0
-    """Standard deviation of that distance from one intersection to another."""
+    """Standard deviation of that distance between intersections."""
 
 
 class DetectorSection(Section):
-    """A detector under a name of your choice."""
+    """A detector with a user-defined name."""
 
     kind: str = "model"
-    """A detector's name, or ``module:factory``."""
+    """Name of the detector, or ``module:factory``."""
     card: str | None = None
-    """Model card, relative to the vehicle file's folder."""
+    """Path of the model card, relative to the vehicle file's folder."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """For its factory, checked by it."""
+    """Settings for the detector's factory, which validates them."""
 
 
 class Landmarks(Section):
-    """Camera pictures against a landmark database; ``crosscue fit landmarks`` writes min_score."""
+    """Matching of images with landmarks; ``crosscue fit landmarks`` writes ``min_score``."""
 
     matcher: str = "orb"
-    """``orb``, ``orb-essential``, or your own ``module:factory``."""
+    """``orb``, ``orb-essential``, or a user-defined ``module:factory``."""
     min_score: NotNegative = 20.0
     """Matches with a lower score are ignored."""
     sigmas: Annotated[float, Field(gt=0.0, le=4.0)] = 2.0
-    """Compare with landmarks inside this many standard deviations of the position."""
+    """Size of the search region around the position, in standard deviations."""
     max_candidates: Annotated[int, Field(ge=1)] = 50
     gate_nis: Positive | None = 13.8
-    """Refuse matches whose normalised innovation squared is larger (as for one correct match in a
-    thousand)."""
+    """Matches with a larger normalised innovation squared are rejected (one correct match in a
+    thousand exceeds the default)."""
     interval_m: NotNegative = 1.0
-    """Compare again once the car has travelled this far ..."""
+    """Minimum distance travelled between two comparisons."""
     interval_s: NotNegative = 0.1
-    """... and this much time has passed."""
+    """Minimum time between two comparisons."""
     revisit_m: NotNegative = 100.0
-    """A landmark is used again once the car has travelled this far, since its error repeats."""
+    """Minimum distance travelled between two uses of a landmark, because its error repeats."""
 
 
 class Vehicle(Section):
-    """A whole vehicle file."""
+    """A complete vehicle file."""
 
     version: Literal[1]
     name: str = "unnamed"
@@ -340,7 +345,7 @@ class Vehicle(Section):
     fusion: Annotated[Fusion, Field(validate_default=True)] = Fusion()
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     lost_above_m: Positive = 100.0
-    """The pose counts as lost while the 2-sigma ellipse's full major axis exceeds this."""
+    """Maximum full major axis of the 2-sigma ellipse; above it, the pose is reported as lost."""
 
     @field_validator("regions")
     @classmethod
@@ -374,7 +379,7 @@ class Vehicle(Section):
         return ranges
 
     def labels_of(self, cue: CueSpec) -> tuple[str, ...]:
-        """Labels of the things that a cue is made of; none for road and Mobileye."""
+        """Return the detector labels that a cue counts; empty for road and Mobileye cues."""
         if cue.observed_by == "car pairs":
             return self.cars.labels
         if cue.settings is not None:
@@ -383,9 +388,9 @@ class Vehicle(Section):
         return () if cue.label is None else SAME_SIGN.get(cue.label, (cue.label,))
 
     def threshold_of(self, cue: CueSpec) -> tuple[str | None, float | None]:
-        """Where a cue's min score is set in the file, and the score if one is set there.
+        """Return the key of a cue's minimum score in the file, and the score if it is set.
 
-        Without a place every score counts; without a score the detector's threshold holds.
+        Without a key, every score counts. Without a score, the detector's threshold applies.
         """
         if cue.settings is None:
             return None, None
@@ -394,20 +399,20 @@ class Vehicle(Section):
         return f"[cues] {name}", score
 
     def cue_labels(self) -> dict[str, tuple[str, ...]]:
-        """From every cue, a user's own among them, to its labels; none for road."""
+        """Return the labels of every cue, including user-defined cues; empty for road."""
         own = {name: one.labels for name, one in self.cues.own.items()}
         return {name: self.labels_of(cue) for name, cue in CUES.items()} | own
 
     @property
     def counts_any_label(self) -> bool:
-        """Whether a cue of objects names no label, as a plug-in's may: its rule reads any."""
+        """Return whether the rule of any object cue reads all labels, as a plug-in's may."""
         return any(
             cue.observed_by == "objects" and not self.labels_of(cue) for cue in CUES.values()
         )
 
 
 def _is_simulated(info: ValidationInfo) -> bool:
-    """Is it the file of a simulated car, whose defaults are as published?"""
+    """Return whether the file belongs to a simulated vehicle, which uses published defaults."""
     return bool(info.data.get("name") == SIMULATED_CAR)
 
 
@@ -415,7 +420,8 @@ def load(path: Path) -> Vehicle:
     """Read and check a vehicle file.
 
     Raises:
-        VehicleError: Not there, not TOML, or a key or value that does not fit; with the line.
+        VehicleError: The file is missing, not TOML, or has an invalid key or value; the message
+            names the line.
     """
     try:
         content = read_at_most(path, MAX_BYTES)
@@ -439,17 +445,17 @@ def load(path: Path) -> Vehicle:
 
 
 def vehicle_given(given: Vehicle | Path | str | None) -> Vehicle:
-    """Settings as they are, or of a file; the defaults for None."""
+    """Return the settings, loaded from a file if a path is passed; the defaults for None."""
     if given is None:
         return Vehicle(version=1)
     return given if isinstance(given, Vehicle) else load(Path(given))
 
 
 def parse(text: str, where: str) -> Vehicle:
-    """Check the text of a vehicle file; ``where`` names it in errors.
+    """Parse and validate the text of a vehicle file; ``where`` names it in errors.
 
     Raises:
-        VehicleError: As in ``load``.
+        VehicleError: As for ``load``.
     """
     try:
         tree = toml_tree(text)

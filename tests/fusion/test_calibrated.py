@@ -251,14 +251,14 @@ def test_without_approaches_that_lack_a_feature_nothing_is_learned_of_it() -> No
         (
             "calibrated.rates = [{ cue = 'road_left', feature = 'right', near = true, "
             "if_there = 0.5, if_not = 0.5 }]",
-            "road_left and right are not joined",
+            "no edge from road_left to right",
         ),
         (
             "calibrated.rates = ["
             + "{ cue = 'road_left', feature = 'left', near = true, if_there = 0.5, if_not = 0.4 },"
             * 2
             + "]",
-            "road_left and left stand twice",
+            "road_left and left occur twice",
         ),
     ],
 )

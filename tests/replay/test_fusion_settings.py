@@ -70,7 +70,7 @@ def test_edges_to_a_feature_that_is_not_used_are_gone() -> None:
         ("[fusion.cues]\nstripes = { precision = 0.8 }", "neither supports nor excludes"),
         (
             "[fusion.cues]\nroad_left = { excludes = ['left'] }",
-            "road_left: a feature stands twice",
+            "road_left: a feature occurs twice",
         ),
         ("[fusion.cues]\nroad_left = { precision = 1.0 }", "precision: .*less than 1"),
         ("[fusion.cues]\nroad_left = { precission = 0.5 }", "precission: no such key"),

@@ -126,7 +126,7 @@ def test_all_of_a_remote_log_is_fetched_once_and_kept(tmp_path: Path, web: Serve
     assert found == again
     assert len(found["/speed"]) == 400
     assert web.sent < 1.5 * path.stat().st_size
-    assert any("fetched whole: all of it was asked for" in said for said in ledger.notices)
+    assert any("downloaded completely: all of it was requested" in said for said in ledger.notices)
 
 
 def test_a_format_that_needs_a_file_is_fetched_whole(tmp_path: Path, web: Served) -> None:
@@ -138,7 +138,7 @@ def test_a_format_that_needs_a_file_is_fetched_whole(tmp_path: Path, web: Served
         rows = sum(map(len, log.read(ledger, Selection(end_ns=1_500 * MS))))
 
     assert rows == 1
-    assert any("fetched whole" in said for said in ledger.notices)
+    assert any("downloaded completely" in said for said in ledger.notices)
 
 
 def test_a_log_that_changes_while_it_is_read_is_refused(tmp_path: Path, web: Served) -> None:

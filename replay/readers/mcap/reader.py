@@ -109,7 +109,7 @@ class McapLog(Closing):
         """Why reading this part takes all bytes of the file; empty if the index leads to it."""
         segment = self._segments[0]
         if selection == EVERYTHING:
-            return "all of it was asked for"
+            return "all of it was requested"
         if len(self._segments) > 1 or not segment.has_end:
             return "it has no summary that can be used"
         found = find_window(segment, segment.declarations(self._book), selection)

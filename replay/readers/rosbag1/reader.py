@@ -118,7 +118,7 @@ class BagLog(Closing):
     def needs_whole(self, selection: Selection) -> str:
         """Why reading this part takes all bytes of the file; empty if the index leads to it."""
         if selection == EVERYTHING:
-            return "all of it was asked for"
+            return "all of it was requested"
         found = find_bag_window(
             self._contents, self._first, self._index_at, self._chunk_count, selection
         )

@@ -181,7 +181,7 @@ def test_two_cameras_or_buses_ask_for_a_line_in_the_vehicle_file() -> None:
     log = made()
     two = replace(log, topics=(*log.topics, columns("can1", "crosscue/CanFrames")))
 
-    assert "2 topics could be the CAN bus (can0, can1): the vehicle file must say which to use" in (
+    assert "2 topics could be the CAN bus (can0, can1): select one of them in the vehicle file" in (
         summarise(two).findings
     )
 
@@ -224,7 +224,7 @@ def test_logs_shown_together_report_their_common_time_or_that_there_is_none() ->
 def test_an_empty_log_is_no_error_and_says_that_it_is_empty() -> None:
     text = shown(MadeLog((), (columns("/imu"),)))
 
-    assert "- not one row in it" in text
+    assert "- it contains no rows" in text
     assert "no rows" in text
 
 

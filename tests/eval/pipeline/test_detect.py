@@ -212,7 +212,7 @@ def test_intrinsics_of_another_size_are_refused_and_doubtful_ones_are_named(
     vehicle.write_text("version = 1\n[camera]\nfocal_px = 600.0\ncenter_px = [32.0, 24.0]\n")
     assert run([*command, "--overwrite"]) == 0
     (notice,) = open_run(out).drive_manifest().notices
-    assert "camera.focal_px = 600: a picture 64 pixels wide would show 6 deg" in notice
+    assert "camera.focal_px = 600: an image 64 pixels wide would show 6 deg" in notice
 
 
 @pytest.mark.parametrize(
