@@ -1,1 +1,1 @@
-"""Clocks of a log: their order, offsets and findings."""
+"""Analyze the clocks of a log: order, offsets, drift and faults."""

@@ -1,4 +1,4 @@
-"""Which of a row's three times is meant, and the rows' times on it."""
+"""The three times of a row, and the times of rows on one of these clocks."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from crosscue.replay.columns import Block, Int64s
 
 LATEST_NS: Final = 1 << 62
-"""Stamps from the year 2116 on are nonsense; below it, differences fit into 64 bits."""
+"""Upper bound on valid stamps, in the year 2116; below it, differences fit into 64 bits."""
 
 
 class Clock(Enum):
-    """Which of a row's times."""
+    """One of a row's times."""
 
     LOG = "log time"
     PUBLISH = "publish time"
@@ -22,9 +22,9 @@ class Clock(Enum):
 
 
 def times_of(block: Block, clock: Clock) -> Int64s:
-    """The times of a block's rows on ``clock``, shape (N,).
+    """Return the times of a block's rows on ``clock``, shape (N,).
 
-    A row without that stamp (absent, 0 or absurd) gets its log time, so times stay comparable.
+    A row without a valid stamp (absent, 0 or absurd) has its log time, so times stay comparable.
     """
     column = {Clock.PUBLISH: block.publish_ns, Clock.HEADER: block.header_ns}.get(clock)
     if column is None:

@@ -1,4 +1,4 @@
-"""What is wrong with a log's clocks, in plain words."""
+"""Describe faults of a log's clocks in plain English."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ DRIFT_WORTH_TELLING_PPM: Final = 50.0
 DRIFT_ERRORS_WORTH_TELLING: Final = 5.0
 DUPLICATES_WORTH_TELLING: Final = 0.01
 ROWS_FOR_OFFSET: Final = 3
-"""A message or two sent long before the recorder started are latched, not off."""
+"""Min number of rows for a report of a clock's offset. One or two messages sent long before the
+recorder started are latched messages, not a wrong clock."""
 APART_NS: Final = SECOND_NS
-"""Topics whose times lie this far from each other share no clock."""
+"""Distance between the times of two topics beyond which they share no clock."""
 
 _FIRST_UTC_NS: Final = 946_684_800 * SECOND_NS
-"""The year 2000; stamps below it do not count from 1970."""
+"""Start of the year 2000; lower stamps do not count from 1970."""
 _GPS_EPOCH_S: Final = 315_964_800
 _KNOWN_OFFSETS_S: Final[Mapping[int, str]] = {
     18: "GPS time counted from 1970, without leap seconds",
@@ -31,7 +32,7 @@ _KNOWN_OFFSETS_S: Final[Mapping[int, str]] = {
 
 
 def findings(reports: Mapping[str, ClockReport]) -> tuple[str, ...]:
-    """One sentence for everything worth a person's attention, topic by topic.
+    """Return one sentence for each fault, topic by topic.
 
     Times are seconds after the log's first row.
     """
@@ -47,10 +48,10 @@ def findings(reports: Mapping[str, ClockReport]) -> tuple[str, ...]:
 
 
 def apart(spans: Mapping[str, tuple[int, int]]) -> tuple[str, ...]:
-    """Sentences on names whose span of times comes nowhere near any other's.
+    """Return sentences about names whose time span is far from all others.
 
     Args:
-        spans: From a name to its first and last time.
+        spans: First and last time by name.
     """
     alone = [
         name
@@ -67,18 +68,18 @@ def apart(spans: Mapping[str, tuple[int, int]]) -> tuple[str, ...]:
         listed = "; ".join(f"{name} {span_text(*spans[name])}" for name in sorted(spans))
         return (f"no two share a clock, or they were recorded one after the other: {listed}",)
     return tuple(
-        f"{name}: shares no time with any other: {span_text(*spans[name])}"
+        f"{name}: overlaps in time with no other: {span_text(*spans[name])}"
         for name in sorted(alone)
     )
 
 
 def span_text(first_ns: int, last_ns: int) -> str:
-    """A span of absolute times: dates where they count from 1970, else seconds."""
+    """Format a span of absolute times, as dates where they count from 1970, else in seconds."""
     return f"{instant_text(first_ns)} to {instant_text(last_ns)}"
 
 
 def instant_text(t_ns: int) -> str:
-    """An absolute time: a UTC date-time where it counts from 1970, else seconds from zero."""
+    """Format an absolute time, as a UTC date-time where it counts from 1970, else in seconds."""
     if t_ns < _FIRST_UTC_NS:
         return f"{t_ns / SECOND_NS:.3f} s"
     whole_s, rest_ns = divmod(t_ns, SECOND_NS)
@@ -87,7 +88,7 @@ def instant_text(t_ns: int) -> str:
 
 
 def duration_text(ns: float) -> str:
-    """A duration with three digits and the unit that suits it."""
+    """Format a duration with three digits and a suitable unit."""
     size = abs(ns)
     for unit, scale_ns in (("s", 1e9), ("ms", 1e6), ("us", 1e3)):
         if size >= scale_ns * 0.9995:
@@ -123,7 +124,7 @@ def _of_order(stamps: StampReport, clock: Clock, start_ns: int) -> Iterator[str]
             f"{_rows(stamps.late_rows)} in {_times(stamps.late_stretches, 'stretch', 'es')} out of "
             f"order on {clock.value}, by up to {duration_text(stamps.worst_late_ns)}"
         )
-    # A recorder that stores a burst at one instant is usual; a sensor that repeats itself is not.
+    # A recorder often stores a burst at one instant, but a sensor should not repeat a stamp.
     worth = DUPLICATES_WORTH_TELLING * stamps.rows if clock is Clock.LOG else 0
     if stamps.duplicates > worth and stamps.is_steady and not stamps.is_constant:
         yield f"{_rows(stamps.duplicates)} with the {clock.value} of the row before"

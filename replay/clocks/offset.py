@@ -1,14 +1,15 @@
-"""One clock of a topic against the log clock: offset, drift, jumps.
+"""Estimate offset, drift and jumps of a topic's clock relative to the log clock.
 
-A row's delay is its log time less its stamp: transport and waiting, which vary and are never
-negative, on top of what the two clocks differ by. So the *lower envelope* of the delays shows the
-clocks alone. Its line is fitted with Theil and Sen's median of slopes (P. K. Sen, 1968) through the
-smallest delays of up to 128 stretches of equal size, which a few stalled stretches cannot bend.
+The delay of a row is its log time minus its stamp. It is the sum of the difference between the two
+clocks and of transport and waiting, which vary and are never negative. The *lower envelope* of the
+delays therefore shows the clocks alone. Its line is fitted with the Theil-Sen median of slopes
+(P. K. Sen, 1968) through the smallest delays of up to 128 intervals of equal size. A few stalled
+intervals do not affect the median.
 
 A *jump* is a step of that envelope: the smallest delays of the two seconds before and after a row
-differ by more than 10 ms and six times the usual waiting, and the step is sharp (half of it shows
-within four rows on either side), so neither a slow drift nor a stalled recorder whose queue empties
-within two seconds is called one. Offset and drift are those of the longest stretch without jump.
+differ by more than 10 ms and six times the usual waiting, and half of the step occurs within four
+rows on either side. A slow drift is therefore not a jump, and neither is a stalled recorder whose
+queue empties within two seconds. Offset and drift are those of the longest interval without a jump.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ JUMP_WINDOW_NS: Final = 2_000_000_000
 _JUMP_OVER_WAIT: Final = 6
 _SHARP_ROWS: Final = 4
 _ROWS_BESIDE: Final = 16
-"""Rows that must be on either side of a jump; fewer cannot distinguish it from a ramp."""
+"""Rows required on either side of a jump; with fewer, a ramp looks the same."""
 _SHORTEST_SIDE_NS: Final = 100_000_000
 _WINDOW_ROWS: Final = (_ROWS_BESIDE, 8192)
 _ENVELOPE_BINS: Final = 1024
@@ -41,16 +42,16 @@ _FIT_SPAN_NS: Final = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class ClockLine:
-    """How a clock runs beside the log clock.
+    """Offset and drift of a clock relative to the log clock.
 
     Attributes:
-        rows: Rows of the stretch that was fitted.
+        rows: Number of rows of the fitted interval.
         start_log_ns: Log time of its first row.
         end_log_ns: Log time of its last row.
-        offset_ns: Stamp less log time at its first row, waiting taken out.
-        drift_ppm: How much faster the clock runs than the log clock, or None where the stretch is
-            too short to say.
-        drift_error_ppm: One standard error of the drift, enlarged where the clock's line bends.
+        offset_ns: Stamp minus log time at its first row, without waiting.
+        drift_ppm: Excess rate of the clock over the log clock, or None if the interval is too
+            short.
+        drift_error_ppm: One standard error of the drift, enlarged if the clock's line bends.
     """
 
     rows: int
@@ -62,7 +63,7 @@ class ClockLine:
 
 
 class OffsetWatch:
-    """Takes log times and stamps in stored order and fits one clock to the other."""
+    """Fit of one clock to the log clock, from log times and stamps in stored order."""
 
     def __init__(self) -> None:
         self.jumps = 0
@@ -76,7 +77,7 @@ class OffsetWatch:
         self._longest: ClockLine | None = None
 
     def add(self, log_ns: Int64s, stamps_ns: Int64s) -> None:
-        """Take in the next rows: shape (N,) each, both within 0 and 2 ** 62."""
+        """Add the next rows: shape (N,) each, both between 0 and 2 ** 62."""
         self._log = np.concatenate([self._log, log_ns])
         self._delay = np.concatenate([self._delay, log_ns - stamps_ns])
         if not self._window and len(self._log) >= _WINDOW_ROWS[0]:
@@ -85,17 +86,17 @@ class OffsetWatch:
             self._decide(len(self._log) - self._window)
 
     def finish(self) -> None:
-        """Decide the last rows; none may follow."""
+        """Process the last rows; no rows may follow."""
         self._window = self._window or _WINDOW_ROWS[0]
         self._decide(len(self._log))
         self._close_envelope()
 
     def line(self) -> ClockLine | None:
-        """The line of the longest stretch without jump, or None without rows."""
+        """Return the line of the longest interval without a jump, or None if there are no rows."""
         return self._longest
 
     def _decide(self, n: int) -> None:
-        """Judge rows up to ``n``; of those before, keep what the next ones look back on."""
+        """Process rows up to ``n``, and keep the earlier rows that the next ones refer to."""
         start = self._decided
         for row, by_ns in self._jump_rows(start, n):
             self._grow_envelope(start, row)
@@ -110,7 +111,7 @@ class OffsetWatch:
         self._decided = n - drop
 
     def _jump_rows(self, start: int, n: int) -> list[tuple[int, int]]:
-        """Rows from ``start`` to ``n`` at which the delay jumps, and by how much."""
+        """Return the rows from ``start`` to ``n`` at which the delay jumps, with the step."""
         delay, width = self._delay, self._window
         if len(delay) < 2 * _ROWS_BESIDE:
             return []
@@ -128,7 +129,7 @@ class OffsetWatch:
     def _one_per_run(
         self, rows: NDArray[np.intp], by: Int64s, start: int, n: int
     ) -> list[tuple[int, int]]:
-        """A rise shows at its row and just after, a fall just before and at its row."""
+        """Reduce each run of rows to one: a rise begins at its row, a fall ends at its row."""
         jumps: list[tuple[int, int]] = []
         previous = start - self._rows_since_jump
         for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []:
@@ -140,7 +141,7 @@ class OffsetWatch:
         return jumps
 
     def _lasts(self, row: int) -> bool:
-        """Do the rows on both sides span some time, or is it a queue emptied at once?"""
+        """Return whether the rows on both sides span some time, unlike a queue emptied at once."""
         first, last = max(row - self._window, 0), min(row + self._window, len(self._log)) - 1
         before_ns, after_ns = (
             self._log[row - 1] - self._log[first],
@@ -163,7 +164,7 @@ class OffsetWatch:
 
 
 class _Envelope:
-    """The smallest delay in each of up to ``_ENVELOPE_BINS`` stretches of time, ever wider."""
+    """The smallest delay in each of up to ``_ENVELOPE_BINS`` intervals, which widen over time."""
 
     def __init__(self, start_ns: int, base_ns: int) -> None:
         self._start_ns, self._base_ns = start_ns, base_ns
@@ -174,7 +175,7 @@ class _Envelope:
         self._at: Int64s = np.zeros(_ENVELOPE_BINS, dtype=np.int64)
 
     def add(self, log_ns: Int64s, delay_ns: Int64s) -> None:
-        """Take in rows, shape (N,) each."""
+        """Add rows, shape (N,) each."""
         since = np.maximum(log_ns - self._start_ns, 0)
         self._end_ns = max(self._end_ns, self._start_ns + int(since.max()))
         while int(since.max()) >= self._width_ns * _ENVELOPE_BINS:
@@ -189,7 +190,7 @@ class _Envelope:
         self._at[used[lower]] = since[smallest][lower]
 
     def _halve(self) -> None:
-        """Join neighbours, so that twice the time fits."""
+        """Merge neighbouring intervals, so that twice the time fits."""
         half = _ENVELOPE_BINS // 2
         pairs = self._delay.reshape(half, 2)
         pick = np.argmin(pairs, axis=1)[:, None]
@@ -202,7 +203,7 @@ class _Envelope:
         self._width_ns *= 2
 
     def line(self) -> ClockLine:
-        """The envelope's line; its drift is None where too little time has passed."""
+        """Return the envelope's line; its drift is None if the time span is too short."""
         used = np.flatnonzero(self._rows)
         total = int(self._rows.sum())
         per_group = max(_ROWS_PER_GROUP, -(-total // _FIT_GROUPS))
@@ -227,10 +228,10 @@ class _Envelope:
 
 
 def theil_sen(x: Floats, y: Floats) -> tuple[float, float, float]:
-    """Median of slopes, its standard error, and the line's value at ``x = 0``.
+    """Return the median of slopes, its standard error, and the line's value at ``x = 0``.
 
-    The error takes the residuals' scatter from their median absolute deviation and treats them as
-    independent.
+    The error estimates the residuals' scatter from their median absolute deviation and assumes that
+    they are independent.
     """
     i, j = np.triu_indices(len(x), k=1)
     run = x[j] - x[i]
@@ -243,9 +244,10 @@ def theil_sen(x: Floats, y: Floats) -> tuple[float, float, float]:
 
 
 def _bend(x: Floats, y: Floats) -> float:
-    """What the slopes of the two halves say against one line, as a standard error of its slope.
+    """Return the standard error of a slope that the difference of the two halves' slopes implies.
 
-    Half as many points over half the span have 2.8 times the error, and their difference 4 times.
+    With half as many points over half the span, a slope has 2.8 times the error, and the difference
+    of two such slopes has 4 times the error.
     """
     half = len(x) // 2
     if half < 3:
@@ -255,13 +257,13 @@ def _bend(x: Floats, y: Floats) -> float:
 
 
 def _backward_min(values: Int64s, width: int) -> Int64s:
-    """The smallest of the ``width`` values before each one; the first repeats itself."""
+    """Return the smallest of the ``width`` values before each one; the first value is repeated."""
     smallest = forward_min(values[::-1], width)[::-1]
     return np.concatenate([values[:1], smallest[:-1]])
 
 
 def _window_rows(log_ns: Int64s) -> int:
-    """Rows that two seconds of this topic hold, within bounds."""
+    """Return the number of rows in two seconds of this topic, within bounds."""
     span_ns = max(int(log_ns.max()) - int(log_ns.min()), 1)
     rows = JUMP_WINDOW_NS * (len(log_ns) - 1) // span_ns
     return int(np.clip(rows, *_WINDOW_ROWS))

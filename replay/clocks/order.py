@@ -1,11 +1,11 @@
-"""The order of one clock's stamps: duplicates, late rows, resets, periods.
+"""Analyze the order of one clock's stamps: duplicates, late rows, resets and periods.
 
-Rows arrive in stored order. A row is *late* when its stamp is below one seen before; a run of
-late rows is a stretch. A step back is a *reset* (the clock was set back, or started again) when the
-stamps then go on from there: no later step within ``LOOK_AHEAD`` rows leaps back by half as much.
-Late rows do leap back. Two resets within ``LOOK_AHEAD`` rows count as one.
+Rows arrive in stored order. A row is *late* if its stamp is below an earlier one; a run of late
+rows is a stretch. A backward step is a *reset* (the clock was set back or restarted) if the stamps
+continue from there. That is the case if no later step within ``LOOK_AHEAD`` rows jumps forward by
+half as much, as it does after late rows. Two resets within ``LOOK_AHEAD`` rows count as one.
 
-Periods are taken from the sorted stamps between resets, so that late rows make no gaps.
+Periods are computed from the sorted stamps between resets, so that late rows cause no gaps.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from .periods import PeriodSketch
 LOOK_AHEAD: Final = 128
 EVENTS_KEPT: Final = 32
 _ROWS_TO_BELIEVE: Final = 3
-"""A step back so close to the end cannot be told from a late row, and is called one."""
+"""Rows required after a reset. A backward step closer to the end counts as a late row, because the
+two cannot be distinguished."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """A clock that was set.
+    """A step of a clock that was set.
 
     Attributes:
-        at_log_ns: Log time of the first row after it.
-        by_ns: How far the clock moved, negative when back.
+        at_log_ns: Log time of the first row after the step.
+        by_ns: Size of the step; negative if the clock was set back.
     """
 
     at_log_ns: int
@@ -39,7 +40,7 @@ class ClockStep:
 
 
 class OrderWatch:
-    """Takes stamps in stored order, a stretch at a time, and counts what is out of order."""
+    """Incremental count of rows that are out of order, from stamps in stored order."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -64,7 +65,7 @@ class OrderWatch:
         self._emitted_ns: int | None = None
 
     def add(self, stamps_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
-        """Take in the next rows: their stamps and log times, shape (N,) each."""
+        """Add the next rows: their stamps and log times, shape (N,) each."""
         if not len(stamps_ns):
             return
         self.count += len(stamps_ns)
@@ -78,12 +79,12 @@ class OrderWatch:
         self._decide(rows, log, max(len(rows) - LOOK_AHEAD, 0))
 
     def finish(self) -> None:
-        """Decide the last rows; none may follow."""
+        """Process the last rows; no rows may follow."""
         self._decide(self._undecided, self._undecided_log, len(self._undecided))
         self._emit_periods(hold=0)
 
     def _decide(self, rows: NDArray[np.int64], log: NDArray[np.int64], n: int) -> None:
-        """Judge the first ``n`` of ``rows``, looking ahead into the rest, which are kept."""
+        """Process the first ``n`` of ``rows``, looking ahead into the rest, which are kept."""
         self._undecided, self._undecided_log = rows[n:].copy(), log[n:].copy()
         if not n:
             return
@@ -99,11 +100,11 @@ class OrderWatch:
         self._era(rows[start:n])
 
     def _reset_rows(self, steps: NDArray[np.int64], n: int) -> Iterator[int]:
-        """Rows below ``n`` at which the clock was set back."""
+        """Yield the rows below ``n`` at which the clock was set back."""
         back = np.flatnonzero(steps[:n] < 0)
         if len(back):
             leap = forward_max(np.append(steps[1:], 0), LOOK_AHEAD)[back]
-            # Halving the step back, not doubling the leap, cannot overflow.
+            # The backward step is halved because doubling the forward step could overflow.
             back = back[(leap < -(steps[back] // 2)) & (back + _ROWS_TO_BELIEVE < len(steps))]
         previous = -self._rows_since_reset
         for row in back.tolist():
@@ -122,7 +123,7 @@ class OrderWatch:
         self._in_stretch = False
 
     def _era(self, stamps: NDArray[np.int64]) -> None:
-        """Rows between two resets, or a part of them."""
+        """Process rows between two resets, or a part of them."""
         if not len(stamps):
             return
         if self._high_ns is None:
@@ -144,7 +145,7 @@ class OrderWatch:
         self._emit_periods(hold=LOOK_AHEAD)
 
     def _emit_periods(self, hold: int) -> None:
-        """Steps of the sorted stamps, save the last ``hold``, among which late rows may fall."""
+        """Add the steps of the sorted stamps, except the last ``hold``, which may yet change."""
         ready = self._sorted[: max(len(self._sorted) - hold, 0)]
         self._sorted = self._sorted[len(ready) :].copy()
         if self._emitted_ns is not None:
@@ -156,10 +157,10 @@ class OrderWatch:
 
 
 def forward_max(values: NDArray[np.int64], width: int) -> NDArray[np.int64]:
-    """The largest of each value and the ``width - 1`` after it, in linear time.
+    """Return the maximum of each value and the ``width - 1`` after it, in linear time.
 
-    Running maxima from both ends of stretches ``width`` long meet in every window (M. van Herk,
-    "A fast algorithm for local minimum and maximum filters", 1992).
+    Every window combines two running maxima, from either end of intervals of length ``width``
+    (M. van Herk, "A fast algorithm for local minimum and maximum filters", 1992).
     """
     n = len(values)
     padding = np.full(-n % width + width, np.iinfo(np.int64).min, dtype=np.int64)
@@ -171,6 +172,6 @@ def forward_max(values: NDArray[np.int64], width: int) -> NDArray[np.int64]:
 
 
 def forward_min(values: NDArray[np.int64], width: int) -> NDArray[np.int64]:
-    """The smallest of each value and the ``width - 1`` after it."""
-    # The complement turns order around without overflow.
+    """Return the minimum of each value and the ``width - 1`` after it."""
+    # The complement reverses the order without overflow.
     return ~forward_max(~values, width)

@@ -1,4 +1,4 @@
-"""Periods of a stream in bounded memory: quantiles from a histogram, the longest ones exactly."""
+"""Periods of a stream in bounded memory: quantiles from a histogram, and the exact longest ones."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ LONGEST_KEPT: Final = 1024
 
 
 class PeriodSketch:
-    """Counts steps of a clock in bins a fiftieth wide, and keeps the longest with their times.
+    """Histogram of a clock's steps that also keeps the longest steps with their times.
 
-    A quantile is the mean of the steps in its bin: exact to the width of a bin (2.2 %), and far
-    better for a steady stream, whose steps share a bin.
+    A quantile is the mean of the steps in its bin. It is exact to the width of a bin (2.2 %), and
+    much better for a steady stream, whose steps are all in one bin.
     """
 
     def __init__(self) -> None:
@@ -28,11 +28,11 @@ class PeriodSketch:
         self._floor_ns = -1
 
     def add(self, steps_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> None:
-        """Take in steps.
+        """Add steps.
 
         Args:
             steps_ns: Shape (N,), not negative.
-            at_ns: Shape (N,): the stamp where each step begins.
+            at_ns: Shape (N,): the stamp at which each step begins.
         """
         if not len(steps_ns):
             return
@@ -43,7 +43,7 @@ class PeriodSketch:
         self._keep_longest(steps_ns, at_ns)
 
     def quantile_ns(self, fraction: float) -> int | None:
-        """The step below which ``fraction`` of the steps lie, or None without any."""
+        """Return a quantile of the steps, or None if there are no steps."""
         if not self.count:
             return None
         rank = int(fraction * (self.count - 1))
@@ -51,10 +51,10 @@ class PeriodSketch:
         return round(float(self._sums[bin_]) / int(self._counts[bin_]))
 
     def count_over(self, limit_ns: int) -> int:
-        """How many steps exceed ``limit_ns``.
+        """Return the number of steps that exceed ``limit_ns``.
 
-        Exact as long as no more than ``LONGEST_KEPT`` do; beyond it, steps in the limit's own bin
-        are left out.
+        The number is exact up to ``LONGEST_KEPT`` steps; beyond that, steps in the bin of the limit
+        are not counted.
         """
         kept = int(np.count_nonzero(self._long_ns > limit_ns))
         if len(self._long_ns) == self.count or limit_ns >= self._floor_ns:
@@ -63,7 +63,7 @@ class PeriodSketch:
         return max(kept, int(self._counts[limit_bin + 1 :].sum()))
 
     def longest(self) -> tuple[int, int] | None:
-        """The longest step and the stamp where it begins, the earliest if there are several."""
+        """Return the longest step and the stamp at which it begins; the earliest of equal steps."""
         if not len(self._long_ns):
             return None
         longest = int(self._long_ns.max())
@@ -83,6 +83,6 @@ class PeriodSketch:
 
 
 def _bin_of(steps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Bin 0 holds steps of 0; bin k holds those from 2 ** ((k - 1) / BINS_PER_OCTAVE) ns on."""
+    """Return bins: bin 0 holds steps of 0, bin k those from 2 ** ((k - 1) / BINS_PER_OCTAVE) ns."""
     octaves = np.log2(np.maximum(steps_ns, 1).astype(np.float64))
     return np.where(steps_ns == 0, 0, 1 + (octaves * BINS_PER_OCTAVE).astype(np.intp))

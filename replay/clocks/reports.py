@@ -1,19 +1,19 @@
-"""The three clocks of every topic, and which one to use.
+"""Report on the three clocks of every topic, and choose one of them.
 
-A recording may give up to three times for a row: the *log time* (when the recorder stored it), the
-*publish time* (when the sender sent it) and the *header stamp* (the sensor's own). ``ClockWatch``
-is fed blocks as they are read, in bounded memory, and makes a ``ClockReport`` for every topic.
+A recording may store up to three times for a row: the *log time* (when the recorder stored it), the
+*publish time* (when the sender sent it) and the *header stamp* (of the sensor). ``ClockWatch``
+accepts blocks as they are read, in bounded memory, and creates a ``ClockReport`` for every topic.
 
-The rule, in ``choose`` and nowhere else. The header stamp is used when it agrees with the log
-clock, else the publish time when it does, else the log time. A clock agrees when
+``choose`` implements the rule. The header stamp is used if it agrees with the log clock, else the
+publish time if it agrees, else the log time. A clock agrees if
 
 * at least 99 % of the rows carry it, and it moves;
 * it was never set back, never jumps, and at most 1 % of its rows are late;
 * it is within one second of the log clock, and drifts less than 1000 ppm from it.
 
-A publish time that always equals the log time says nothing and is passed over.
+A publish time that always equals the log time carries no information and is ignored.
 
-All times are int64 nanoseconds; a difference is taken before anything becomes a float.
+All times are int64 nanoseconds; differences are computed before any conversion to float.
 """
 
 from __future__ import annotations
@@ -48,30 +48,30 @@ class StampReport:
 
     Attributes:
         rows: Rows with a usable stamp.
-        unset: Rows whose stamp is 0, which for publish times and header stamps means none.
-        absurd: Rows whose stamp is negative or past the year 2115.
+        unset: Rows whose stamp is 0, which means unset for publish times and header stamps.
+        absurd: Rows whose stamp is negative or after the year 2115.
         first_ns: Stamp of the first row, in stored order; None without rows, as all below.
         last_ns: Stamp of the last row.
         min_ns: The lowest stamp.
         max_ns: The highest stamp.
-        is_constant: More than one row, and all carry the same stamp.
-        duplicates: Rows with the stamp of the row before.
-        resets: How often the clock was set back.
-        reset_steps: The first of these.
-        late_rows: Rows stamped below an earlier row, resets aside.
-        late_stretches: Runs of such rows.
-        worst_late_ns: How far the latest of them is below.
+        is_constant: True if there are several rows and all have the same stamp.
+        duplicates: Rows with the stamp of the previous row.
+        resets: Number of times that the clock was set back.
+        reset_steps: The first resets.
+        late_rows: Rows with a stamp below that of an earlier row, without resets.
+        late_stretches: Runs of late rows.
+        worst_late_ns: Largest delay of a late row.
         median_period_ns: Median step between sorted stamps.
-        is_steady: Nine of ten steps are below 2.5 median periods: not a stream of bursts.
-        gap_over_ns: What counts as a gap: over 5 median periods, or, where the topic is not steady,
-            over 5 times its 99th percentile; None with fewer than 8 periods.
-        gaps: Steps longer than that.
+        is_steady: True if nine of ten steps are below 2.5 median periods, unlike bursts.
+        gap_over_ns: Min length of a gap: 5 median periods, or, if the topic is not steady, 5 times
+            its 99th percentile; None with fewer than 8 periods.
+        gaps: Number of steps longer than ``gap_over_ns``.
         longest_step_ns: The longest step.
-        longest_step_at_ns: The stamp where it begins.
-        line: Offset and drift against the log clock; None for the log clock itself.
-        jumps: How often its offset stepped, resets included.
-        jump_steps: The first of these.
-        equals_log: Every stamp equals its row's log time.
+        longest_step_at_ns: The stamp at which the longest step begins.
+        line: Offset and drift relative to the log clock; None for the log clock itself.
+        jumps: Number of jumps of its offset, including resets.
+        jump_steps: The first jumps.
+        equals_log: True if every stamp equals its row's log time.
     """
 
     rows: int
@@ -106,12 +106,12 @@ class ClockReport:
 
     Attributes:
         topic: Name of the topic.
-        count: Rows seen.
+        count: Number of rows.
         used: The clock to use.
-        why: Why that one, in plain words.
+        why: Reason for the choice, in plain English.
         log: The log time.
-        publish: The publish time, or None where the format has none.
-        header: The header stamp, or None where the rows carry none.
+        publish: The publish time, or None if the format has none.
+        header: The header stamp, or None if the rows have none.
     """
 
     topic: str
@@ -124,46 +124,46 @@ class ClockReport:
 
     @property
     def of_used(self) -> StampReport:
-        """The report on the clock that is used."""
+        """Report on the clock that is used."""
         by_clock = {Clock.LOG: self.log, Clock.PUBLISH: self.publish, Clock.HEADER: self.header}
         return by_clock[self.used] or self.log
 
     @property
     def duration_ns(self) -> int:
-        """From the lowest to the highest time on the clock that is used."""
+        """Time from the lowest to the highest stamp of the clock that is used."""
         stamps = self.of_used
         return (stamps.max_ns or 0) - (stamps.min_ns or 0)
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean rate over the duration, or None where it cannot be said."""
+        """Mean rate over the duration, or None if it is undefined."""
         rows, span_ns = self.of_used.rows, self.duration_ns
         return (rows - 1) / (span_ns * 1e-9) if rows > 1 and span_ns > 0 else None
 
 
 class ClockWatch:
-    """Follows the clocks of every topic of one log, block by block."""
+    """Incremental analysis of the clocks of every topic of one log."""
 
     def __init__(self) -> None:
         self._topics: dict[str, _TopicWatch] = {}
 
     def see(self, block: Block) -> None:
-        """Take in a block; blocks of a topic come in stored order."""
+        """Add a block; the blocks of a topic must be in stored order."""
         if block.topic not in self._topics:
             self._topics[block.topic] = _TopicWatch()
         self._topics[block.topic].see(block)
 
     def reports(self) -> Mapping[str, ClockReport]:
-        """What has been seen so far, by topic; more blocks may follow."""
+        """Return the reports so far, by topic; more blocks may follow."""
         return {name: copy.deepcopy(t).finish(name) for name, t in self._topics.items()}
 
 
 def choose(
     count: int, log: StampReport, publish: StampReport | None, header: StampReport | None
 ) -> tuple[Clock, str]:
-    """The clock to use for a topic of ``count`` rows, and why, in plain words.
+    """Return the clock to use for a topic of ``count`` rows, and the reason in plain English.
 
-    This is the rule of the module's text. ``log`` is what remains when no other clock agrees.
+    The rule is described at the head of this module. ``log`` is used if no other clock agrees.
     """
     against: list[str] = []
     for clock, stamps in ((Clock.HEADER, header), (Clock.PUBLISH, publish)):
@@ -179,7 +179,7 @@ def choose(
 
 
 def _disagreement(count: int, stamps: StampReport) -> str | None:
-    """Why a clock cannot stand in for the log clock, or None."""
+    """Return the reason why a clock cannot replace the log clock, or None."""
     line = stamps.line
     if not stamps.rows or line is None:
         return "is never set"
@@ -202,7 +202,7 @@ def _disagreement(count: int, stamps: StampReport) -> str | None:
 
 @dataclass(slots=True)
 class _StampWatch:
-    """One clock of one topic, as it is being read."""
+    """Incremental analysis of one clock of one topic."""
 
     is_log: bool = False
     order: OrderWatch = field(default_factory=OrderWatch)
@@ -212,7 +212,7 @@ class _StampWatch:
     equals_log: bool = True
 
     def add(self, log_ns: Int64s, stamps_ns: Int64s) -> None:
-        """Take in rows, shape (N,) each."""
+        """Add rows, shape (N,) each."""
         usable = (stamps_ns >= 0) & (stamps_ns < LATEST_NS)
         self.absurd += len(stamps_ns) - int(np.count_nonzero(usable))
         if not self.is_log:
@@ -228,7 +228,7 @@ class _StampWatch:
             self.offset.add(log_ns[both], stamps_ns[both])
 
     def finish(self) -> StampReport:
-        """The report; no rows may follow."""
+        """Return the report; no rows may follow."""
         order, offset = self.order, self.offset
         order.finish()
         if not self.is_log:
@@ -264,7 +264,7 @@ class _StampWatch:
 
 
 class _TopicWatch:
-    """The clocks of one topic; small blocks are gathered before they are examined."""
+    """Incremental analysis of one topic's clocks, which collects small blocks first."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -273,7 +273,7 @@ class _TopicWatch:
         self._waiting_rows = 0
 
     def see(self, block: Block) -> None:
-        """Take in a block's times; its rows are not kept."""
+        """Add a block's times; its rows are not kept."""
         columns = {
             Clock.LOG: block.log_ns,
             Clock.PUBLISH: block.publish_ns,
@@ -286,7 +286,7 @@ class _TopicWatch:
             self._take_in()
 
     def finish(self, topic: str) -> ClockReport:
-        """The report; no block may follow."""
+        """Return the report; no block may follow."""
         self._take_in()
         reports = {clock: watch.finish() for clock, watch in self._stamps.items()}
         log = reports[Clock.LOG]
@@ -307,11 +307,11 @@ class _TopicWatch:
 
 
 def _gap_limit(order: OrderWatch) -> tuple[int | None, bool]:
-    """What counts as a gap, and whether the stream is steady."""
+    """Return the min length of a gap, and whether the stream is steady."""
     median_ns = order.periods.quantile_ns(0.5)
     if median_ns is None or order.periods.count < _PERIODS_FOR_GAPS:
         return None, True
-    # Where most rows come in bursts at one instant the median says nothing.
+    # The median is meaningless if most rows arrive in bursts at one instant.
     is_steady = 0 < (order.periods.quantile_ns(0.9) or 0) <= _STEADY_RATIO * median_ns
     usual_ns = median_ns if is_steady else order.periods.quantile_ns(0.99)
     return (GAP_PERIODS * usual_ns if usual_ns else None), is_steady

@@ -1,7 +1,8 @@
-"""Messages to columns: one decoder per way of coding, one table from message type to columns.
+"""Decode messages into columns, with one decoder per message encoding.
 
 ``decoder_for(topic)`` returns a function from a block of ``Messages`` to a block of ``CanFrames``,
-``Table`` or ``Images`` with ``header_ns``; what cannot be decoded is skipped in the ledger.
+``Table`` or ``Images`` with ``header_ns``. Messages that cannot be decoded are counted in the
+ledger.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ __all__ = ["Decoder", "decoder_for"]
 
 
 class Decoder(Protocol):
-    """From a block as read to a block of columns of the rows that could be decoded."""
+    """Function from a block as read to a block of columns of the decoded rows."""
 
     def __call__(self, block: Block, ledger: Ledger, /) -> Block:
-        """Decode; blocks that are columns already come back as they are.
+        """Decode a block; blocks that are columns already are returned unchanged.
 
         Messages that do not fit are skipped in ``ledger`` with reason, count and time.
         """
@@ -35,16 +36,17 @@ BY_ENCODING: Final[Mapping[str, str]] = {
     "protobuf": "crosscue.replay.decode.protobuf:protobuf_decoder",
     "json": "crosscue.replay.decode.json_text:json_decoder",
 }
-"""From message encoding to ``module:function`` from topic to decoder or None."""
+"""Factories by message encoding, as ``module:function``. Each maps a topic to a decoder or None."""
 
 
 def decoder_for(topic: Topic) -> Decoder | None:
-    """The decoder of ``topic``, or None if nobody here knows its encoding or type.
+    """Return the decoder of ``topic``, or None if its encoding or type is unsupported.
 
-    Service events have none; ``interfaces.why_not_decoded`` says why a topic has none.
+    Service events have none; ``interfaces.why_not_decoded`` returns the reason.
 
     Raises:
-        SchemaError: The log defines the type, but the definition is damaged, too large, or lies.
+        SchemaError: The log defines the type, but the definition is damaged, too large, or
+            contradicts the type's name.
     """
     maker = BY_ENCODING.get(topic.encoding)
     if is_service_event(topic) or (is_feedback(topic) and not topic.schema.strip()):

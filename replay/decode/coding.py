@@ -1,4 +1,4 @@
-"""Which coding an encoded picture has: its first bytes say it, its label only where they do not."""
+"""Determine the coding of a picture from its first bytes, or from its label if they are unclear."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Final
 from crosscue.replay.columns import ImageCoding
 
 MAGIC_BYTES: Final = 12
-"""As many first bytes as ``coding_of`` examines."""
+"""Number of first bytes that ``coding_of`` examines."""
 
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
-"""Of files that are read as images."""
+"""Suffixes of files that are read as images."""
 JPEG: Final = b"\xff\xd8"
 _LABELS: Final[tuple[tuple[str, ImageCoding], ...]] = (
     ("jpeg", "jpeg"),
@@ -26,15 +26,15 @@ STREAMS: Final[dict[str, ImageCoding]] = {
     "hevc": "h265",
     "av1": "av1",
 }
-"""Labels of ``CompressedVideo`` that we know."""
+"""Codings by supported label of ``CompressedVideo``."""
 
 
 def coding_of(first: bytes, label: str) -> ImageCoding | None:
-    """The coding of a picture, or None where neither its bytes nor its label say one we know.
+    """Return the coding of a picture, or None if neither its bytes nor its label identify it.
 
     Args:
         first: The picture's first ``MAGIC_BYTES`` bytes, or fewer.
-        label: The message's ``format`` (``jpeg``, ``rgb8; jpeg compressed bgr8``).
+        label: The message's ``format``, for example ``jpeg`` or ``rgb8; jpeg compressed bgr8``.
     """
     if first.startswith(JPEG):
         return "jpeg"

@@ -1,4 +1,4 @@
-"""Foxglove's message types, whatever they are coded in: one line a type."""
+"""Table of Foxglove's message types, independent of their encoding."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 
 class Picture(Enum):
-    """How a picture's coding is known."""
+    """Kind of picture message, which determines how the coding is found."""
 
     COMPRESSED = "compressed"
     VIDEO = "video"
@@ -25,11 +25,11 @@ PICTURES: Final[Mapping[str, Picture]] = {
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a standard column comes from.
+    """Source field of a standard column.
 
     Attributes:
         path: Dotted path of the field.
-        count: Length of the array; 0 for a number; -1 for a list filled up with NaN.
+        count: Length of the array; 0 for a number; -1 for a list padded with NaN.
     """
 
     path: str

@@ -1,9 +1,8 @@
-"""Topics that belong to a service or an action: which of them hold data, and why others do not.
+"""Topics of services and actions, and the reasons why some of them are not decoded.
 
 ROS 2 records the calls of a service on ``SERVICE/_service_event``, as ``package/srv/NAME_Event``,
 and the progress of an action on ``ACTION/_action/feedback``, as
-``package/action/NAME_FeedbackMessage``.
-Recorders seldom store a definition that these types can be read with.
+``package/action/NAME_FeedbackMessage``. Recorders seldom store complete definitions of these types.
 """
 
 from __future__ import annotations
@@ -18,22 +17,22 @@ _FEEDBACK: Final = "_FeedbackMessage"
 
 
 def is_service_event(topic: Topic) -> bool:
-    """Does ``topic`` hold the calls of a service?"""
+    """Return whether ``topic`` holds the calls of a service."""
     is_named_so = "/srv/" in topic.type_name or topic.name.endswith("/_service_event")
     return is_named_so and topic.type_name.endswith("_Event")
 
 
 def is_feedback(topic: Topic) -> bool:
-    """Does ``topic`` hold the feedback of an action?"""
+    """Return whether ``topic`` holds the feedback of an action."""
     return "/action/" in topic.type_name and topic.type_name.endswith(_FEEDBACK)
 
 
 def why_not_decoded(topic: Topic, otherwise: str) -> str:
-    """The reason for which rows of a topic that has no decoder are skipped.
+    """Return the reason for skipping the rows of a topic that has no decoder.
 
     Args:
         topic: The topic.
-        otherwise: The reason if it belongs to no service and to no action.
+        otherwise: The reason for a topic that belongs to neither a service nor an action.
     """
     if is_service_event(topic):
         return SERVICE_EVENT

@@ -1,6 +1,6 @@
-"""Decoder for JSON messages: numbers under dotted names, Foxglove's types in standard columns.
+"""Decode JSON messages: numbers with dotted names, and Foxglove's types as standard columns.
 
-JSON that names a key twice, or holds NaN or Infinity (which JSON does not have), is refused.
+JSON with duplicate keys, or with NaN or Infinity (which JSON does not define), is refused.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _BAD: Final = (ValueError, KeyError, TypeError, RecursionError, OverflowError)
 
 
 def json_decoder(topic: Topic) -> Callable[[Block, Ledger], Block]:
-    """The decoder of a JSON topic; a schema, where there is one, must be a JSON object.
+    """Return the decoder of a JSON topic; its schema, if any, must be a JSON object.
 
     Raises:
-        SchemaError: The schema is too large, or no JSON object.
+        SchemaError: The schema is too large, or is not a JSON object.
     """
     if len(topic.schema) > DEFAULT_LIMITS.schema_bytes:
         raise SchemaError(
@@ -73,12 +73,12 @@ def _refuse(word: str) -> float:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
-        raise ValueError("a key stands twice in one object")
+        raise ValueError("an object has a duplicate key")
     return found
 
 
 def _nanoseconds(value: Any) -> int | None:
-    """``{"sec": ..., "nsec": ...}`` as nanoseconds, or None if it is not that."""
+    """Convert ``{"sec": ..., "nsec": ...}`` to nanoseconds; None if it is something else."""
     if not isinstance(value, dict) or value.keys() != {"sec", "nsec"}:
         return None
     seconds, rest = value["sec"], value["nsec"]
@@ -160,7 +160,7 @@ def _at(value: Any, source: Source) -> Any:
 
 
 def _column(values: list[Any]) -> NDArray[np.generic]:
-    """Whole numbers stay whole; a key that some messages lack is NaN there."""
+    """Build a column; integers stay integers, and missing keys become NaN."""
     if any(isinstance(value, list) for value in values):
         width = max(len(value) for value in values)
         return np.array([v + [np.nan] * (width - len(v)) for v in values], np.float64)

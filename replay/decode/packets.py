@@ -1,7 +1,7 @@
-"""Packets of a video stream to pictures: H.264, H.265 and AV1, through FFmpeg (PyAV).
+"""Decode packets of a video stream (H.264, H.265, AV1) into pictures with FFmpeg (PyAV).
 
-A packet's row carries the time of the picture that it becomes, so pictures come out with their own
-times, in the order in which they are shown, however the stream was coded.
+The row of a packet has the time of its picture. Pictures are therefore yielded with their own times
+in display order, whatever the order of coding.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
     from av import VideoFrame
 
 CODECS: Final = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
-"""From a coding of ``Images`` to FFmpeg's decoder."""
+"""FFmpeg's decoders by coding of ``Images``."""
 MAX_PIXELS: Final = 64_000_000
 AT_ONCE: Final = 8
-"""Pictures in a block: at 1280 by 720 these are 22 MB."""
+"""Number of pictures in a block; at 1280 by 720 these are 22 MB."""
 NOT_DECODED: Final = "video packet not decoded"
 NO_PICTURE: Final = "video packet that became no picture"
 
 
 def is_stream(images: Images) -> bool:
-    """Are these packets, of which none is a picture by itself?"""
+    """Return whether these are packets of a video stream, not complete pictures."""
     return any(coding in CODECS for coding in images.coding)
 
 
 class PacketDecoder:
-    """One topic's packets to raw pictures (``bgr8``); call ``flush`` once at the end."""
+    """Decoder of one topic's packets into raw pictures (``bgr8``); call ``flush`` at the end."""
 
     def __init__(self, topic: str, ledger: Ledger) -> None:
-        """Prepare.
+        """Prepare the decoder.
 
         Args:
-            topic: Of the packets.
-            ledger: Records packets from which no picture could be decoded.
+            topic: Topic of the packets.
+            ledger: Records packets that yield no picture.
         """
         self._topic = topic
         self._ledger = ledger
@@ -48,7 +48,7 @@ class PacketDecoder:
         self._taken = self._shown = 0
 
     def __call__(self, block: Block) -> Iterator[Block]:
-        """Pictures that these packets complete; those of later ones may still be awaited.
+        """Yield the pictures completed by these packets; some may only follow later packets.
 
         Raises:
             LogError: PyAV is not installed.
@@ -71,7 +71,7 @@ class PacketDecoder:
             yield from self._full()
 
     def flush(self) -> Iterator[Block]:
-        """The last pictures; packets that never became one are reported."""
+        """Yield the last pictures, and report packets that yielded none."""
         if self._context is None:
             return
         import av
@@ -84,7 +84,7 @@ class PacketDecoder:
             yield self._block()
         lacking = self._taken - self._shown
         if lacking > 0:
-            # A stream that does not begin at a key frame loses those before the first.
+            # A stream that does not begin at a key frame loses the packets before the first one.
             self._ledger.skip(self._topic, NO_PICTURE, lacking)
         self._context = None
 
@@ -112,10 +112,10 @@ class PacketDecoder:
 
 
 def import_av(where: str) -> None:
-    """Refuse with a remedy where PyAV is not installed.
+    """Check that PyAV is installed.
 
     Raises:
-        LogError: It is not.
+        LogError: It is not installed; the message states the remedy.
     """
     if find_spec("av") is None:
         raise LogError(f"{where}: decoding video needs PyAV; install it with: pip install av")

@@ -1,4 +1,4 @@
-"""Pictures found one by one in protobuf or JSON messages, made into columns."""
+"""Combine single pictures from protobuf or JSON messages into columns."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class PictureRow:
     Attributes:
         stamp_ns: The sensor's own time, or None.
         start: First byte in the buffer.
-        stop: One past the last.
-        magic: Its first bytes.
-        label: ``format`` or, of a raw picture, ``encoding``.
-        width_px: Of a raw picture.
-        height_px: Of a raw picture.
-        step_bytes: Of a raw picture.
+        stop: One past the last byte.
+        magic: First bytes of the picture.
+        label: ``format``, or ``encoding`` of a raw picture.
+        width_px: Width of a raw picture.
+        height_px: Height of a raw picture.
+        step_bytes: Bytes per row of a raw picture.
     """
 
     stamp_ns: int | None
@@ -49,14 +49,14 @@ def images_of(
     rows: list[PictureRow | str],
     ledger: Ledger,
 ) -> Block:
-    """A block of the pictures among ``rows``; the others, and texts saying why, are refused.
+    """Return a block of the pictures among ``rows``, and refuse the other rows.
 
     Args:
-        block: As read; for its times.
-        buffer: What ``start`` and ``stop`` count in.
-        picture: Which kind they are.
-        rows: One for each row of the block; a text for a message that did not fit.
-        ledger: Takes what is skipped or dropped.
+        block: The block as read, for its times.
+        buffer: Buffer that ``start`` and ``stop`` refer to.
+        picture: Kind of the pictures.
+        rows: One element for each row of the block; a reason for a message that does not fit.
+        ledger: Records skipped and dropped rows.
     """
     kept: list[int] = []
     good: list[PictureRow] = []
@@ -88,7 +88,7 @@ def images_of(
 
 
 def _judge(row: PictureRow | str, picture: Picture) -> tuple[ImageCoding | None, str, str]:
-    """The picture's coding, or None with reason and detail."""
+    """Return the picture's coding, or None with reason and detail."""
     if isinstance(row, str):
         return None, MISFIT, row
     if row.start == row.stop:

@@ -1,7 +1,7 @@
-"""Decoder for protobuf messages, whose schema is a serialised FileDescriptorSet.
+"""Decode protobuf messages, whose schema is a serialized FileDescriptorSet.
 
-Pictures, the heavy ones, are found as ranges of the log by walking the outermost fields. All other
-messages come rarely and are parsed one by one by the protobuf package.
+Pictures are large and are located as ranges of the log by parsing only the outermost fields. All
+other messages are rare and are parsed one by one with the protobuf package.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ _DTYPES: Final[dict[int, str]] = {
 
 
 def protobuf_decoder(topic: Topic) -> Callable[[Block, Ledger], Block] | None:
-    """The decoder of a protobuf topic; None if the log does not define its type.
+    """Return the decoder of a protobuf topic; None if the log does not define its type.
 
     Raises:
-        SchemaError: The descriptor is damaged, too large, or lacks what its type's name promises.
+        SchemaError: The descriptor is damaged, too large, or contradicts its type's name.
     """
     if not topic.schema:
         return None
@@ -99,13 +99,13 @@ def _files(schema: bytes) -> list[Any]:
 
 
 def _add(pool: descriptor_pool.DescriptorPool, files: dict[str, Any]) -> None:
-    """Add files after those that they import; a set that goes round or lacks one is refused."""
+    """Add files after their imports; a set with a cycle or a missing import is refused."""
     added: set[str] = set()
     waiting = dict(files)
     while waiting:
         ready = [name for name, each in waiting.items() if added.issuperset(each.dependency)]
         if not ready:
-            raise ValueError(f"file {min(waiting)!r} imports one that is not there")
+            raise ValueError(f"file {min(waiting)!r} imports a missing file")
         for name in ready:
             pool.AddSerializedFile(waiting.pop(name).SerializeToString())
             added.add(name)
@@ -116,10 +116,10 @@ class _Leaf:
     """One column of a table.
 
     Attributes:
-        column: Its name.
+        column: Name of the column.
         steps: Field names from the root.
         dtype: NumPy code; ``time``; or empty for the length of a repeated field.
-        count: As in ``Source``.
+        count: Length of the array, as in ``Source``.
     """
 
     column: str
@@ -173,7 +173,7 @@ def _walk_type(
 
 
 def _check_time(descriptor: Descriptor) -> None:
-    """Refuse a descriptor that calls something else a time."""
+    """Refuse a descriptor of a time whose fields are not those of a time."""
     wanted = (("seconds", 1, FieldDescriptor.TYPE_INT64), ("nanos", 2, FieldDescriptor.TYPE_INT32))
     for name, number, kind in wanted:
         each = descriptor.fields_by_name.get(name)
@@ -246,7 +246,7 @@ def _column(leaf: _Leaf, values: list[Any]) -> NDArray[np.generic]:
 
 @dataclass(frozen=True, slots=True)
 class _PictureDecoder:
-    """Field numbers of a picture message."""
+    """Decoder of picture messages, with their field numbers."""
 
     picture: Picture
     numbers: dict[int, str]
@@ -331,10 +331,10 @@ def _picture_decoder(name: str, descriptor: Descriptor) -> _PictureDecoder:
 
 
 def outer_fields(payload: memoryview) -> Iterator[tuple[int, int, int, int | None]]:
-    """Outermost fields of a protobuf message: number, first byte, end, value of a plain one.
+    """Yield the outermost fields of a protobuf message: number, first byte, end, scalar value.
 
     Raises:
-        ValueError: A field passes the end, or is of a kind that does not exist.
+        ValueError: A field extends past the end, or has an invalid wire type.
     """
     at, size = 0, len(payload)
     while at < size:
@@ -354,7 +354,7 @@ def outer_fields(payload: memoryview) -> Iterator[tuple[int, int, int, int | Non
         else:
             raise ValueError(f"field {number} has the wire type {wire}")
         if at > size:
-            raise ValueError(f"field {number} passes the end")
+            raise ValueError(f"field {number} extends past the end")
         yield number, begin, at, plain
 
 
@@ -362,7 +362,7 @@ def _varint(payload: memoryview, at: int) -> tuple[int, int]:
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(payload):
-            raise ValueError("a number passes the end")
+            raise ValueError("a number extends past the end")
         byte = payload[at]
         at += 1
         value |= (byte & 0x7F) << shift

@@ -1,4 +1,4 @@
-"""What becomes of messages that give no row: damaged ones are dropped, foreign ones skipped."""
+"""Account for messages that yield no row: damaged ones are dropped, unsupported ones skipped."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ LONG_LENS: Final = "over 14 lens coefficients"
 FOREIGN: Final = frozenset(
     {WRONG_CODING, EMPTY_PICTURE, IMAGE_CODING, VIDEO_CODING, BIG_ENDIAN, LONG_LENS}
 )
-"""Reasons of messages that are whole and that nothing here decodes; any other reason is damage."""
+"""Reasons for intact messages that are not supported; any other reason means damage."""
 
 
 def refuse(
     ledger: Ledger, block: Block, first: int, reason: str, why: str = "", count: int = 1
 ) -> None:
-    """Put messages that give no row into the account.
+    """Count messages that yield no row.
 
     Args:
-        ledger: The log's.
-        block: As read.
-        first: Which of its rows is the first of them, for its time.
-        reason: Short; decides between skipped and dropped.
-        why: The detail.
-        count: How many there are.
+        ledger: The log's ledger.
+        block: The block as read.
+        first: Index in the block of the first of these messages, for its time.
+        reason: Short reason, which decides between skipped and dropped.
+        why: Detail of the reason.
+        count: Number of messages.
     """
     put = ledger.skip if reason in FOREIGN else ledger.spoil
     put(block.topic, reason, count, why, int(block.log_ns[first]))

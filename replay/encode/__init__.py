@@ -1,1 +1,1 @@
-"""Blocks of any log to ROS 2 messages: the way back from ``crosscue.replay.decode``."""
+"""Encode blocks of any log as ROS 2 messages, the inverse of ``crosscue.replay.decode``."""

@@ -1,7 +1,7 @@
-"""CAN frames as ``can_msgs/msg/Frame``, and CAN FD frames as a type of our own.
+"""Encode CAN frames as ``can_msgs/msg/Frame``, and CAN FD frames as a type of crosscue.
 
-``can_msgs/msg/Frame`` holds 8 bytes and has no flag for CAN FD. Frames of CAN FD go to the topic
-``<topic>/fd`` with the type ``crosscue_msgs/msg/CanFdFrame``.
+``can_msgs/msg/Frame`` holds 8 bytes and has no flag for CAN FD. CAN FD frames are written to the
+topic ``<topic>/fd`` with the type ``crosscue_msgs/msg/CanFdFrame``.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def _fd_type() -> tuple[Ros2Type, Plan]:
 
 
 def can_messages(block: Block, frames: CanFrames, ledger: Ledger) -> list[Outgoing]:
-    """CAN frames as messages; the header's frame_id is the bus."""
+    """Return CAN frames as messages; the header's frame_id is the bus."""
     unknown = frames.length == LENGTH_UNKNOWN
     if unknown.any():
         ledger.notice(
-            f"{block.topic}: the log does not keep the frames' lengths; they are written with "
-            f"{frames.data.shape[1]} bytes, as it pads them"
+            f"{block.topic}: the log does not record the lengths of frames; they are written with "
+            f"{frames.data.shape[1]} bytes, the padded length"
         )
         length = np.where(unknown, frames.data.shape[1], frames.length).astype(np.uint8)
         frames = replace(frames, length=length)

@@ -1,4 +1,4 @@
-"""Copies many ranges of bytes from one buffer into another, whole columns of messages at a time."""
+"""Copy many ranges of bytes between buffers, complete columns of messages at a time."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FEW_LENGTHS: Final = 32
-"""Copies of as many different lengths are made length by length; of more, one by one."""
+"""Max number of different lengths for copies length by length; with more, copies are single."""
 LARGE: Final = 4096
-"""Mean bytes from which copying one by one is as fast."""
+"""Mean size in bytes from which single copies are as fast."""
 
 
 def copy_ranges(
@@ -20,7 +20,7 @@ def copy_ranges(
     source_start: NDArray[np.int64],
     length: NDArray[np.int64],
 ) -> None:
-    """Copy N ranges of bytes; ranges of one length together, where there are few lengths."""
+    """Copy N ranges of bytes; ranges of one length are copied together if there are few lengths."""
     if not len(length):
         return
     mean = int(length.sum()) // len(length)
@@ -41,7 +41,7 @@ def copy_ranges(
 
 
 def _windows(buffer: NDArray[np.uint8], width: int) -> NDArray[np.void]:
-    """Every stretch of ``width`` bytes of a buffer, as one view of it."""
+    """Return a view of a buffer with an item of ``width`` bytes at every position."""
     view: NDArray[np.void] = np.ndarray(
         (len(buffer) - width + 1,), f"V{width}", buffer.data, strides=(1,)
     )

@@ -1,6 +1,6 @@
-"""ROS 2 definitions as complete text, and what ROS 1 types are called there.
+"""Write complete ROS 2 definitions, and convert ROS 1 definitions to ROS 2.
 
-A text made here says how messages are coded; constants and comments are not part of that.
+The text specifies the encoding of messages, without constants and comments.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _TIMES: Final[Mapping[str, tuple[Field, ...]]] = {
 
 
 def text_of(type_name: str, known: Definitions) -> str:
-    """A complete ``ros2msg`` definition: the type and, after separators, all it is made of."""
+    """Return a complete ``ros2msg`` definition: the type and, after separators, its parts."""
     parts = [_body(known[type_name])]
     for name in _needed(type_name, known):
         fields = known.get(name) or _TIMES.get(name)
@@ -39,10 +39,10 @@ def text_of(type_name: str, known: Definitions) -> str:
 
 
 def completed(type_name: str, text: bytes, known: Definitions) -> bytes:
-    """A stored ``ros2msg`` text with the types added that it needs and leaves out.
+    """Complete a stored ``ros2msg`` text with the types that it uses but omits.
 
     Raises:
-        SchemaError: It needs a type that nobody here knows.
+        SchemaError: It uses an unknown type.
     """
     whole = dict(known)
     missing: list[str] = []
@@ -51,7 +51,7 @@ def completed(type_name: str, text: bytes, known: Definitions) -> bytes:
             fields = _TIMES.get(name) or (well_known(name) or {}).get(name)
             if fields is None:
                 raise SchemaError(f"{type_name}: its definition lacks the type {name}")
-            # What it is made of is examined next, since the walk goes on over ``whole``.
+            # The loop continues over ``whole``, so the parts of this type are examined next.
             whole[name] = fields
             missing.append(f"MSG: {_short(name)}\n{_body(fields)}")
     end = b"" if text.endswith(b"\n") or not missing else b"\n"
@@ -59,17 +59,17 @@ def completed(type_name: str, text: bytes, known: Definitions) -> bytes:
 
 
 def standard_text(type_name: str) -> str:
-    """``text_of`` a type that ROS 2 itself, or this toolkit, defines."""
+    """Return ``text_of`` a type that ROS 2 or crosscue defines."""
     known = well_known(type_name)
     if known is None:
-        raise SchemaError(f"{type_name}: not a type that we know")
+        raise SchemaError(f"{type_name}: unknown type")
     return text_of(type_name, known)
 
 
 def as_ros2(type_name: str, ros1: Definitions) -> Definitions:
-    """Definitions of a ROS 1 type for ROS 2: the header loses its counter.
+    """Return the ROS 2 definitions of a ROS 1 type, with headers without counter.
 
-    Where ROS 2 has a type of this name whose fields are coded alike, its field names are taken.
+    If ROS 2 has a type of this name with the same encoding, its field names are used.
     """
     known: dict[str, tuple[Field, ...]] = {}
     for name, fields in ros1.items():
@@ -84,7 +84,7 @@ def as_ros2(type_name: str, ros1: Definitions) -> Definitions:
 
 
 def differs_in_ros2(type_name: str, known: Definitions) -> bool:
-    """Has ROS 2 another type of this name, coded otherwise?"""
+    """Return whether ROS 2 has a type of this name with a different encoding."""
     modern = well_known(type_name)
     return modern is not None and not _alike(type_name, known, modern)
 
@@ -106,7 +106,7 @@ def _alike(name: str, ours: Definitions, theirs: Definitions) -> bool:
 
 
 def _needed(type_name: str, known: Definitions) -> Iterator[str]:
-    """Names of the types that a type is made of, asking ``known`` as late as it can."""
+    """Yield the names of the types that a type consists of, with lazy look-ups in ``known``."""
     seen = {type_name}
     waiting = [type_name]
     while waiting:

@@ -1,4 +1,4 @@
-"""Pictures as ROS 2 messages: compressed ones, raw ones, and packets of a video stream."""
+"""Encode pictures as ROS 2 messages: compressed and raw pictures, and packets of video streams."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNSTATED: Final = "raw picture without size"
 
 
 def image_messages(block: Block, images: Images, ledger: Ledger) -> list[Outgoing]:
-    """Pictures in the type that fits their coding; nearly every topic has but one."""
+    """Return pictures in the types of their codings; nearly every topic has only one."""
     kinds = np.array([_kind(coding) for coding in images.coding])
     out: list[Outgoing] = []
     for kind in dict.fromkeys(kinds.tolist()):
@@ -78,12 +78,12 @@ def _string(head: bytes, text: str) -> bytes:
 
 
 def _with_bytes(head: bytes, content: memoryview) -> bytes:
-    """Everything before the picture: the head and the length of what follows."""
+    """Return the bytes before the picture: the head and the length of the picture."""
     return head + bytes(-len(head) % 4) + len(content).to_bytes(4, "little")
 
 
 def _joined(parts: list[tuple[bytes, bytes]], images: Images) -> Messages:
-    """One buffer: encapsulation, head, picture and what comes after it, message by message."""
+    """Join encapsulation, head, picture and tail of all messages in one buffer."""
     sizes = (images.bytes_.stop - images.bytes_.start).tolist()
     length: list[int] = []
     for (head, tail), size in zip(parts, sizes, strict=True):

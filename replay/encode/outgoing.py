@@ -1,4 +1,4 @@
-"""What encoders give: CDR messages of one topic with the definition of their type."""
+"""Output of encoders: CDR messages of one topic with the definition of their type."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Ros2Type:
     """A ROS 2 message type.
 
     Attributes:
-        name: ROS 2 spelling.
-        schema: Its complete definition.
+        name: Name in ROS 2 spelling.
+        schema: Complete definition.
         schema_encoding: ``ros2msg`` or ``ros2idl``.
     """
 
@@ -34,10 +34,10 @@ class Ros2Type:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outgoing:
-    """Messages ready to be stored.
+    """Encoded messages ready to be stored.
 
     Attributes:
-        type: Their type.
+        type: Type of the messages.
         block: Topic, times and CDR messages.
     """
 
@@ -46,24 +46,24 @@ class Outgoing:
 
 
 class Encoder(Protocol):
-    """From a block as read to CDR messages."""
+    """Function from a block as read to CDR messages."""
 
     def __call__(self, block: Block, ledger: Ledger, /) -> list[Outgoing]:
-        """Encode; rows that cannot be are skipped in ``ledger`` with reason and time."""
+        """Encode a block; other rows are skipped in ``ledger`` with reason and time."""
         ...
 
 
 @cache
 def standard_type(name: str) -> tuple[Ros2Type, Plan]:
-    """A type that ROS 2 or this toolkit defines, with the plan of its CDR form."""
+    """Return a type that ROS 2 or crosscue defines, with the plan of its CDR form."""
     known = well_known(name)
     if known is None:
-        raise SchemaError(f"{name}: not a type that we know")
+        raise SchemaError(f"{name}: unknown type")
     return Ros2Type(name, standard_text(name).encode()), plan_of(name, known, is_cdr=True)
 
 
 def own_type(name: str, text: str) -> tuple[Ros2Type, Plan]:
-    """A type defined here: ``text`` may use standard types, whose definitions are added."""
+    """Return a type of crosscue; the definitions of standard types in ``text`` are added."""
     known: dict[str, Definitions] = {}
     own = dict(definitions_of(name, text.encode(), "ros2msg"))
     for fields in list(own.values()):
@@ -76,18 +76,18 @@ def own_type(name: str, text: str) -> tuple[Ros2Type, Plan]:
 
 
 def with_rows(block: Block, rows: Bytes) -> Block:
-    """The block with messages of one length, shape (N, bytes of one)."""
+    """Return the block with messages of one length, shape (N, bytes of one message)."""
     start = np.arange(len(rows), dtype=np.int64) * rows.shape[1]
     return replace(block, rows=Messages(rows.reshape(-1), start, start + rows.shape[1]))
 
 
 def stamps(block: Block) -> Int64s:
-    """The sensor's own time where known, else the log's."""
+    """Return the sensor's own times where known, else log times."""
     return block.log_ns if block.header_ns is None else block.header_ns
 
 
 def without_odd_times(block: Block, ledger: Ledger) -> Block:
-    """The rows whose stamp fits 32-bit seconds; the others are skipped."""
+    """Return the rows whose stamps fit 32-bit seconds; the others are skipped."""
     seconds = stamps(block) // 1_000_000_000
     odd = (seconds < -(1 << 31)) | (seconds >= 1 << 31)
     if not odd.any():

@@ -1,7 +1,7 @@
-"""ROS 1 messages as CDR: the same values in the same order, aligned, strings terminated.
+"""Transcode ROS 1 messages to CDR: the same values in order, aligned, with terminated strings.
 
-The walk over the messages (``crosscue.replay.decode.ros.walk``) notes what goes where; when the
-sizes of all messages are known, whole columns of values are copied at once.
+The parser of messages (``crosscue.replay.decode.ros.walk``) records which bytes are copied. Once
+the sizes of all messages are known, complete columns of values are copied at once.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ HEAD: Final = len(ENCAPSULATION)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Values:
-    """M values of equal width to be copied: message, place in the log, place in the new message."""
+    """M values of equal width to copy: message, position in the log, and in the new message."""
 
     rows: Rows
     source: Int64s
@@ -39,7 +39,7 @@ class _Values:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lengths:
-    """M lengths to be written."""
+    """M lengths to write."""
 
     rows: Rows
     target: Int64s
@@ -51,7 +51,7 @@ _Job: TypeAlias = _Values | _Lengths
 
 @dataclass(slots=True, eq=False)
 class _TwoCursors(Cursor):
-    """Where we are in the log, and in the new messages.
+    """Positions in the log and in the new messages.
 
     Attributes:
         out: Position in each new message's body.
@@ -60,7 +60,7 @@ class _TwoCursors(Cursor):
     out: Int64s
 
     def pick(self, which: Bools) -> _TwoCursors:
-        """A cursor of its own over some of the messages."""
+        """Return a separate cursor over some of the messages."""
         return _TwoCursors(
             self.some_rows(which),
             self.origin[which],
@@ -70,13 +70,13 @@ class _TwoCursors(Cursor):
         )
 
     def put_back(self, which: Bools, moved: Cursor) -> None:
-        """Take over where a cursor from ``pick`` has come to."""
+        """Copy the positions of a cursor from ``pick``."""
         assert isinstance(moved, _TwoCursors)
         self.at[which] = moved.at
         self.out[which] = moved.out
 
     def numbers(self) -> Rows:
-        """Number of each message in the block."""
+        """Row number of each message in the block."""
         if isinstance(self.rows, slice):
             return np.arange(len(self.at))
         return self.rows
@@ -84,19 +84,19 @@ class _TwoCursors(Cursor):
 
 @dataclass(slots=True, eq=False)
 class _Transcriber(Walker):
-    """Walks ROS 1 messages and notes the copies that make CDR messages of them."""
+    """Parser of ROS 1 messages that records the copies for the CDR messages."""
 
     jobs: list[_Job] = field(default_factory=list)
 
     def run(self, run: Run, cursor: Cursor, keep: bool) -> None:
-        """Note the values of a run."""
+        """Record the values of a run."""
         assert isinstance(cursor, _TwoCursors)
         self._values(run, cursor.numbers(), cursor.origin + cursor.at, cursor.out)
         cursor.out = cursor.out + run.cdr_size[cursor.out & 7]
         Walker.run(self, run, cursor, keep)
 
     def _values(self, run: Run, rows: Rows, source: Int64s, target: Int64s) -> None:
-        """Note copies; neighbours that stay neighbours are copied together."""
+        """Record copies; values that remain adjacent are copied together."""
         modulo = target & 7
         places = run.cdr_place[modulo[0]] if len(modulo) and (modulo == modulo[0]).all() else None
         k, last = 0, len(run.values)
@@ -118,7 +118,7 @@ class _Transcriber(Walker):
             self.jobs.append(_Values(rows, source + run.place[0, begin], target + put, width))
 
     def text(self, text: Text, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
-        """Note a string, which gets a terminator."""
+        """Record a string, and add its terminator."""
         assert isinstance(cursor, _TwoCursors)
         first, length = Walker.text(self, text, cursor, keep)
         at = (cursor.out + 3) & -4
@@ -129,7 +129,7 @@ class _Transcriber(Walker):
         return first, length
 
     def contents(self, items: Items, cursor: Cursor, count: Int64s) -> None:
-        """Note a sequence's length and items."""
+        """Record a sequence's length and items."""
         assert isinstance(cursor, _TwoCursors)
         rows = cursor.numbers()
         if items.count is None:
@@ -153,7 +153,7 @@ class _Transcriber(Walker):
     def _all_items(
         self, items: Items, rows: Rows, first: Int64s, out: Int64s, count: Int64s
     ) -> None:
-        """Note all items of all messages as if each were a message."""
+        """Record all items of all messages as if each were a message."""
         assert items.jumps is not None
         assert items.cdr_jumps is not None
         owner = np.repeat(np.arange(len(count)), count)
@@ -165,7 +165,7 @@ class _Transcriber(Walker):
             self._values(step, rows[owner], source, target)
 
     def write(self, out: Int64s) -> Messages:
-        """The new messages of those that fit, in order.
+        """Return the new messages, in order, for the messages that fit.
 
         Args:
             out: Shape (N,): bytes of each new message's body.
@@ -200,12 +200,12 @@ def _of(width: int, like: Int64s) -> Int64s:
 
 @dataclass(frozen=True, slots=True)
 class Ros1ToCdr:
-    """From blocks of ROS 1 messages of one type to CDR.
+    """Encoder from blocks of ROS 1 messages of one type to CDR.
 
     Attributes:
-        type: What they become.
-        plan: How they are walked.
-        differs: ROS 2 itself has another type of this name.
+        type: ROS 2 type of the new messages.
+        plan: Parsing plan of the ROS 1 messages.
+        differs: True if ROS 2 has a different type with this name.
     """
 
     type: Ros2Type
@@ -213,7 +213,7 @@ class Ros1ToCdr:
     differs: bool
 
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
-        """Transcribe; messages that do not fit their definition are dropped."""
+        """Transcode a block; messages that do not fit their definition are dropped."""
         assert isinstance(block.rows, Messages)
         messages = block.rows
         found = Found(messages.buffer, True, np.ones(len(messages), np.bool_))
@@ -228,8 +228,8 @@ class Ros1ToCdr:
             refuse(ledger, block, int(rows[0]), MISFIT, refused.why, len(rows))
         if self.differs:
             ledger.notice(
-                f"{block.topic}: ROS 2 has another {self.type.name} than ROS 1; the file keeps "
-                "ROS 1's fields and defines them"
+                f"{block.topic}: {self.type.name} differs between ROS 1 and ROS 2; the file keeps "
+                "the fields of ROS 1 and defines them"
             )
         if not found.ok.any():
             return []
@@ -238,7 +238,7 @@ class Ros1ToCdr:
 
 
 def ros1_to_cdr(topic: Topic) -> Ros1ToCdr | None:
-    """The encoder of a ROS 1 topic; None if the log does not define its type.
+    """Return the encoder of a ROS 1 topic; None if the log does not define its type.
 
     Raises:
         SchemaError: The definition does not parse, or lacks a type.

@@ -1,7 +1,7 @@
-"""Tables as ROS 2 messages: a standard type where the columns are its own, else one of ours.
+"""Encode tables as ROS 2 messages, of a standard type if its fields match the columns.
 
-A table that no standard type can hold becomes ``crosscue_msgs/msg/<Topic>``: a header and one field
-for each numeric column, with the column's name.
+Any other table is encoded as ``crosscue_msgs/msg/<Topic>``: a header and one field for each numeric
+column, with the column's name.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .template import filled, template_of
 
 Columns = Mapping[str, NDArray[np.generic]]
 ABSENT: Final = -1.0
-"""First element of a covariance: "there is no such estimate" (sensor_msgs/msg/Imu says so)."""
+"""First element of a covariance without an estimate, as specified by sensor_msgs/msg/Imu."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +31,11 @@ class Standard:
     """A standard type that can hold a table.
 
     Attributes:
-        type_name: The type.
-        needs: Sets of columns; a table must have at least one of these sets whole.
-        together: Sets of columns, of which a table has all or none.
-        paths: From each column that the type can hold to its field.
-        rest: Further fields, from the columns there are.
+        type_name: Name of the type.
+        needs: Sets of columns; a table must have all columns of at least one set.
+        together: Sets of columns; a table must have all or none of each set.
+        paths: Fields by column that the type can hold.
+        rest: Function that derives further fields from the columns.
     """
 
     type_name: str
@@ -45,7 +45,7 @@ class Standard:
     rest: Callable[[Columns, int], Columns] | None = None
 
     def holds(self, columns: Columns) -> bool:
-        """Can it hold exactly this table, nothing left out?"""
+        """Return whether the type can hold all columns of a table."""
         names = frozenset(columns)
         if not names <= frozenset(self.paths) or not any(need <= names for need in self.needs):
             return False
@@ -59,7 +59,7 @@ _XY: Final = frozenset({"x_m", "y_m"})
 
 
 def _imu_rest(columns: Columns, size: int) -> Columns:
-    """Say which of the three estimates there are."""
+    """Mark the estimates that are missing by their covariances."""
     rest: dict[str, NDArray[np.generic]] = {}
     for name, field in (
         ("quat_w", "orientation"),
@@ -131,7 +131,7 @@ STANDARDS: Final = (
 
 
 def table_messages(block: Block, table: Table, types: OwnTypes, ledger: Ledger) -> list[Outgoing]:
-    """Rows of a table as messages."""
+    """Return rows of a table as messages."""
     standard = next((each for each in STANDARDS if each.holds(table.columns)), None)
     if standard is not None and types.fields_of(block.topic) is None:
         return [_as_standard(block, table, standard)]
@@ -151,12 +151,12 @@ def _as_standard(block: Block, table: Table, standard: Standard) -> Outgoing:
 
 @dataclass(frozen=True, slots=True)
 class _Own:
-    """A type made for one topic.
+    """A type created for one topic.
 
     Attributes:
         type: The type.
-        plan: Its CDR form.
-        fields: From column to field, shape (without rows) and NumPy code.
+        plan: Plan of its CDR form.
+        fields: Field, shape (without rows) and NumPy code by column.
     """
 
     type: Ros2Type
@@ -171,27 +171,27 @@ _CODES: Final = {
 
 
 class OwnTypes:
-    """The types made so far: a topic keeps the one of its first block."""
+    """Types created so far; a topic keeps the type of its first block."""
 
     def __init__(self) -> None:
-        """No topic has a type yet."""
+        """Begin without types."""
         self._made: dict[str, _Own] = {}
         self._names: set[str] = set()
 
     def fields_of(self, topic: str) -> Mapping[str, tuple[str, tuple[int, ...], str]] | None:
-        """The fields of the type made for ``topic``, or None."""
+        """Return the fields of the type created for ``topic``, or None."""
         own = self._made.get(topic)
         return None if own is None else own.fields
 
     def messages(self, block: Block, table: Table, ledger: Ledger) -> Outgoing:
-        """Rows as messages of the topic's own type; what it cannot hold is reported."""
+        """Return rows as messages of the topic's own type, and report what it cannot hold."""
         own = self._made.get(block.topic)
         if own is None:
             own = self._made[block.topic] = self._make(block.topic, table)
         left_out = [name for name in table.columns if name not in own.fields]
         if left_out:
             ledger.notice(
-                f"{block.topic}: columns that are not numbers, or came late, are not written: "
+                f"{block.topic}: columns not numeric, or absent at first, are not written: "
                 f"{', '.join(left_out[:8])}"
             )
         values: dict[str, NDArray[np.generic]] = {"header.stamp": stamps(block)}
@@ -223,7 +223,7 @@ class OwnTypes:
 
 
 def _field_name(column: str) -> str:
-    """A ROS 2 field name: lower case, digits and single underscores, a letter first."""
+    """Return a ROS 2 field name: lower case, digits and single underscores, a letter first."""
     name = re.sub(r"_+", "_", re.sub(r"[^a-z0-9]", "_", column.lower())).strip("_")
     return name if name and name[0].isalpha() else f"c_{name}".strip("_")
 

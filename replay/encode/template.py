@@ -1,7 +1,7 @@
-"""CDR messages of one shape, written as rows of a byte array.
+"""Write CDR messages of one layout as rows of a byte array.
 
-Strings and sequence lengths are the same in all rows, so that every value has one place: a template
-is written once, repeated, and the columns are laid over it.
+Strings and sequence lengths are equal in all rows, so that every value has a fixed position. A
+template is written once and repeated, and the columns are then written into it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """One message without its numbers.
+    """A message without its numbers.
 
     Attributes:
-        row: Its bytes.
+        row: Bytes of the message.
         places: First byte of each value, by path.
         items: First byte of each sequence's items, by path.
     """
@@ -36,10 +36,10 @@ class Template:
 def template_of(
     plan: Plan, texts: Mapping[str, str] | None = None, counts: Mapping[str, int] | None = None
 ) -> Template:
-    """Lay one message out.
+    """Create the template of a message.
 
     Args:
-        plan: For CDR.
+        plan: Plan of the type in CDR.
         texts: Strings by path; others are empty.
         counts: Lengths of sequences of numbers by path; others are empty.
     """
@@ -73,7 +73,7 @@ class _Making:
 
     def sequence(self, step: Items, count: int) -> None:
         if step.count is not None or (count and not step.code):
-            raise ValueError(f"{step.path}: only sequences of numbers can be laid out")
+            raise ValueError(f"{step.path}: only sequences of numbers are supported")
         self._length(count)
         width = int(step.code[1]) if step.code else 1
         if count:
@@ -93,12 +93,12 @@ def filled(
     values: Mapping[str, NDArray[np.generic]],
     items: Mapping[str, NDArray[np.generic]] | None = None,
 ) -> NDArray[np.uint8]:
-    """``size`` messages with their numbers, shape (size, bytes of one).
+    """Return ``size`` messages with their numbers, shape (size, bytes of one message).
 
     Args:
-        plan: The one that the template was made for.
-        template: Their layout.
-        size: How many.
+        plan: Plan of the template.
+        template: Template of the messages.
+        size: Number of messages.
         values: Columns by path, shape (size,) or (size, k); times as int64 nanoseconds.
         items: Contents of sequences by path, shape (size, count).
     """

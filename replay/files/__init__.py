@@ -1,1 +1,1 @@
-"""Bounded reading, atomic writing, checksums."""
+"""Read files with bounds, write them atomically, and compute checksums."""

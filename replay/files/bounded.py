@@ -1,4 +1,4 @@
-"""Files read whole, but never more of them than is sensible: a device or a pipe may have no end."""
+"""Read complete files up to a max size, because a device or a pipe may be endless."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ PIECE_BYTES: Final = 1 << 20
 
 
 def read_at_most(path: Path, max_bytes: int) -> bytes | None:
-    """What a file holds, or None when that is more than ``max_bytes``.
+    """Return the content of a file, or None if it is larger than ``max_bytes``.
 
-    Its size is not believed: that of a device or a pipe is 0.
+    The reported size of the file is not trusted, because that of a device or a pipe is 0.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     pieces, room = [], max_bytes
     with path.open("rb") as file:
-        # A file with an honest size comes in one piece, which is then not copied.
+        # A file with a correct size is read in one piece, which avoids a copy.
         step = max(PIECE_BYTES, os.fstat(file.fileno()).st_size)
         while piece := file.read(min(step, room + 1)):
             room -= len(piece)

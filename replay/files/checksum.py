@@ -1,7 +1,7 @@
-"""CRC-32 (that of zip, PNG and MCAP), by the fastest way that is installed.
+"""CRC-32 of zip, PNG and MCAP, computed by the fastest installed library.
 
-``isal`` computes it about ten times as fast as most builds of zlib, which matters where every byte
-of a log is verified; without it the result is the same, later.
+``isal`` is about ten times as fast as most builds of zlib, which matters where every byte of a log
+is verified. The result is the same without it.
 """
 
 from __future__ import annotations
@@ -28,5 +28,5 @@ _crc32: Final = _fastest()
 
 
 def crc32(content: bytes | memoryview | NDArray[np.uint8], value: int = 0) -> int:
-    """CRC-32 of ``content`` that follows on bytes whose CRC-32 is ``value``."""
+    """Return the CRC-32 of ``content`` after bytes whose CRC-32 is ``value``."""
     return _crc32(content, value)

@@ -1,4 +1,4 @@
-"""What every open log has in common: leaving the ``with`` block closes it."""
+"""Base class of open logs, which are closed at the end of a ``with`` block."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Self
 
 
 class Closing(ABC):
-    """A context manager whose end is ``close``."""
+    """Context manager that calls ``close`` on exit."""
 
     @abstractmethod
     def close(self) -> None:

@@ -1,18 +1,18 @@
-"""Which log is it? Names, sizes and a hash of enough of the bytes to tell any two apart.
+"""Identity of a log: names, sizes and a hash of enough bytes to distinguish any two logs.
 
-The identity of a log is a SHA-256 over its files, sorted by name: of each its name (a folder's with
-the folder's own in front), its size, and a hash of its content. A log of up to 4 MiB is hashed
-whole. Of a larger one, each file has an equal part of 4 MiB (64 KiB at least), and what is
-longer than its part is hashed in parts: of a file with an index at its end, as MCAP files and
-ROS 1 bags have, 64 KiB from the head, 64 KiB from the tail, and the index, up to 64 MiB; of others
-a quarter of the part from the head, a quarter from the tail, the rest as 32 blocks spread
-evenly between them. So a log of 100 GB costs milliseconds, and the same log has the same identity
-wherever it is, on a disk or at a URL, and however old it looks.
+The identity of a log is a SHA-256 over its files, sorted by name: the name of each file (with the
+name of the folder, if the log is a folder), its size, and a hash of its content. A log of up to
+4 MiB is hashed completely. Of a larger log, 4 MiB are divided equally between its files, with at
+least 64 KiB each, and a longer file is hashed in parts. For a file with an index at its end (MCAP
+files and ROS 1 bags) these are 64 KiB from the head, 64 KiB from the tail, and up to 64 MiB of the
+index. For other files they are a quarter from the head, a quarter from the tail, and 32 blocks
+spread evenly between them. Identifying a log of 100 GB therefore takes milliseconds. A log has the
+same identity at any path or URL, and at any age.
 
-Files that readers consult beside a log belong to it: time files of pictures and videos, SQLite's
-journals. Hidden files and what other commands put beside a log (``vehicle.toml``, ``truth.json``,
-``.seal``) do not. Of a URL only these parts are fetched, unless they are half of the log or
-more: then the whole log, which stays in the store for whoever reads it.
+Files next to a log that readers use belong to it: time files of pictures and videos, and SQLite's
+journals. Hidden files and the files of other commands (``vehicle.toml``, ``truth.json``, ``.seal``)
+do not. Only the hashed parts of a URL are fetched. If they are half of the log or more, the
+complete log is fetched, and remains in the store for later reads.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ _BAG_INDEX: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
 
 
 def identity_of(place: Path | str) -> Identity:
-    """The identity of a log: a file, a folder or a URL; see the head of this file.
+    """Return the identity of a log: a file, a folder or a URL; see the head of this file.
 
     Raises:
-        LogError: It is not there or cannot be read.
+        LogError: It does not exist or cannot be read.
     """
     if isinstance(place, str) and is_remote(place):
         return _identity_of_url(place)
@@ -71,10 +71,10 @@ def identity_of(place: Path | str) -> Identity:
 
 
 def identity_of_log(log: Log) -> Identity:
-    """The identity of an open log; of a remote one, what it has fetched is not fetched again.
+    """Return the identity of an open log; parts of a remote log are not fetched twice.
 
     Raises:
-        LogError: It is gone or cannot be read.
+        LogError: It no longer exists or cannot be read.
     """
     return _identity_of_ranged(log.ranged) if isinstance(log, RangedLog) else identity_of(log.path)
 
@@ -92,7 +92,7 @@ def _identity_of_url(url: str) -> Identity:
 
 
 def _identity_of_parts(url: str) -> Identity | None:
-    """The identity of a remote log of any format; None where fetching all of it is as well."""
+    """Return the identity of a remote log of any format; None if all of it should be fetched."""
     remote = RemoteFiles(url)
     name = url.rstrip("/").rpartition("/")[2]
     names = sorted(_names_of(name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
@@ -115,7 +115,7 @@ def _identity_of_parts(url: str) -> Identity | None:
 
 
 def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
-    """What a remote log's files are called in its identity, and in its store."""
+    """Return the names of a remote log's files in its identity, with those in its store."""
     if name not in sizes:
         parts = {at: PurePosixPath(at).parts[1:] for at in sizes}
         return {at: at for at in sizes if parts[at] and _is_of_log(parts[at])}
@@ -124,7 +124,7 @@ def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
 
 
 def _hashed_bytes(files: int) -> int:
-    """Bytes of each file that are hashed."""
+    """Return the number of bytes of each file that are hashed."""
     return max(SHARE_BYTES // max(files, 1), MIN_BYTES)
 
 
@@ -141,10 +141,10 @@ def _report_text(name: bytes, size: int, content: bytes) -> bytes:
 
 
 def identity_of_all(found: Sequence[Identity]) -> Identity:
-    """The identity of a drive's logs together, whatever their order.
+    """Return the combined identity of a drive's logs, in any order.
 
     Args:
-        found: Of each log; at least one.
+        found: Identity of each log; at least one.
     """
     if len(found) == 1:
         return found[0]
@@ -157,7 +157,7 @@ def identity_of_all(found: Sequence[Identity]) -> Identity:
 
 
 def _files(place: Path) -> Iterator[tuple[bytes, Path]]:
-    """A log's files and those that belong to it, with their names in it, sorted."""
+    """Yield a log's files and those that belong to it, with their names, sorted."""
     found = {place.name: place} if place.is_file() else _below(place)
     for beside in _beside(place):
         found.setdefault(f"beside/{beside.name}", beside)
@@ -176,7 +176,7 @@ def _below(folder: Path) -> dict[str, Path]:
 
 
 def _is_of_log(parts: Sequence[str]) -> bool:
-    """Does a file below a log's folder belong to the log?"""
+    """Return whether a file below a log's folder belongs to the log."""
     is_ours = parts[-1] in BESIDE or PurePosixPath(parts[-1]).suffix == ".seal"
     return not is_ours and not any(part.startswith(".") for part in parts)
 
@@ -201,7 +201,7 @@ def _beside(place: Path) -> list[Path]:
 
 
 def _names_beside(name: str, is_there: Callable[[str], bool]) -> list[str]:
-    """What is beside a file and belongs to it: journals, and the time file of a video."""
+    """Return the files next to a log that belong to it: journals, and the time file of a video."""
     from .time_file_names import times_of_video
 
     times = times_of_video(name) if PurePosixPath(name).suffix.lower() in _videos() else ()
@@ -217,7 +217,7 @@ def _videos() -> tuple[str, ...]:
 
 
 class _File(Protocol):
-    """Bytes by position."""
+    """File with reads at a position."""
 
     @property
     def size(self) -> int: ...
@@ -225,7 +225,7 @@ class _File(Protocol):
 
 
 class _Local:
-    """A file of this machine."""
+    """A local file."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor: Final = descriptor
@@ -236,7 +236,7 @@ class _Local:
 
 
 class _Remote:
-    """A remote object, of which no more than is asked for is fetched."""
+    """A remote object, of which only the requested bytes are fetched."""
 
     def __init__(self, ranged: RangedFile) -> None:
         self._ranged: Final = ranged
@@ -248,7 +248,7 @@ class _Remote:
 
 
 def _hash(file: _File, max_bytes: int) -> bytes:
-    """Hash of a file's content, or of parts of it if it is longer than ``max_bytes``."""
+    """Hash a file's content, or parts of it if it is longer than ``max_bytes``."""
     digest = hashlib.sha256()
     for at, end in _parts(file, max_bytes):
         while at < end and (part := file.read(at, min(end - at, MIB))):
@@ -258,7 +258,7 @@ def _hash(file: _File, max_bytes: int) -> bytes:
 
 
 def _parts(file: _File, max_bytes: int) -> Iterator[tuple[int, int]]:
-    """Spans of the file to hash."""
+    """Yield the spans of the file to hash."""
     size = file.size
     if size <= max_bytes:
         yield 0, size
@@ -278,7 +278,7 @@ def _parts(file: _File, max_bytes: int) -> Iterator[tuple[int, int]]:
 
 
 def _index_at(file: _File) -> int | None:
-    """Where the index at a log's end begins, as the file itself says."""
+    """Return the start of the index at a log's end, as recorded in the file."""
     head, size = bytes(file.read(0, EDGE_BYTES))[:4096], file.size
     if head.startswith(_MCAP_MAGIC):
         tail = file.read(size - EDGE_BYTES, EDGE_BYTES)

@@ -1,6 +1,6 @@
-"""Width and height of an encoded picture, from its header alone: nothing is decoded.
+"""Read width and height of an encoded picture from its header, without decoding it.
 
-A megabyte of PNG can ask for gigabytes, so whoever decodes looks here first.
+A megabyte of PNG can decode to gigabytes, so the size is checked before decoding.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ _JPEG_BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 
 
 def size_in_header(content: bytes | memoryview, coding: str) -> tuple[int, int] | None:
-    """What a JPEG, PNG, WebP or BMP picture says of itself; None where it says nothing.
+    """Return width and height from the header of a JPEG, PNG, WebP or BMP picture, or None.
 
     Args:
-        content: The whole picture.
-        coding: What it is held to be; another one's header says nothing.
+        content: The complete picture.
+        coding: Coding of the picture; the header of another coding yields None.
     """
     head = bytes(content[:32])
     if coding == "png" and head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:
@@ -34,7 +34,7 @@ def size_in_header(content: bytes | memoryview, coding: str) -> tuple[int, int] 
 
 
 def _jpeg_size(content: bytes | memoryview) -> tuple[int, int] | None:
-    """Walk the segments up to the frame header (ITU T.81, B.1 and B.2.2)."""
+    """Read the segments up to the frame header (ITU T.81, B.1 and B.2.2)."""
     at = 2
     while at + 9 <= len(content) and content[at] == 0xFF:
         marker = content[at + 1]
@@ -51,7 +51,7 @@ def _jpeg_size(content: bytes | memoryview) -> tuple[int, int] | None:
 
 
 def _webp_size(head: bytes) -> tuple[int, int] | None:
-    """From the first chunk (RFC 9649, sections 2.5 to 2.7)."""
+    """Read the size from the first chunk (RFC 9649, sections 2.5 to 2.7)."""
     kind = head[12:16]
     if kind == b"VP8X":
         width = int.from_bytes(head[24:27], "little") + 1

@@ -1,4 +1,4 @@
-"""What a log is known by wherever it is; ``identity`` computes it."""
+"""Identity of a log independent of its path; ``identity`` computes it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from typing import Final
 
 SHORT: Final = 8
-"""Hex digits in a run's name."""
+"""Number of hex digits in a run's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Which log, or which logs of one drive.
+    """Identity of a log, or of the logs of one drive.
 
     Attributes:
-        name: Of the file or folder.
-        size: Bytes in all; None in runs of earlier versions.
-        digest: 64 hex digits.
+        name: Name of the file or folder.
+        size: Total size in bytes; None in runs of earlier versions.
+        digest: SHA-256 as 64 hex digits.
     """
 
     name: str
@@ -26,7 +26,7 @@ class Identity:
 
     @property
     def short(self) -> str:
-        """Enough of it for a person."""
+        """First digits of the digest, for display."""
         return self.digest[:SHORT]
 
     def __str__(self) -> str:
@@ -35,11 +35,11 @@ class Identity:
 
 
 def as_row(identity: Identity) -> dict[str, object]:
-    """For a manifest."""
+    """Convert an identity to a row of a manifest."""
     return {"name": identity.name, "size": identity.size, "digest": identity.digest}
 
 
 def of_row(row: Mapping[str, object]) -> Identity:
-    """From a manifest."""
+    """Read an identity from a row of a manifest."""
     size = row["size"]
     return Identity(str(row["name"]), size if isinstance(size, int) else None, str(row["digest"]))

@@ -1,7 +1,7 @@
-"""What a result was made of: its inputs by identity, its settings by value.
+"""Inputs and settings of a result: its inputs by identity, its settings by value.
 
-Whatever goes on with a result, or replaces it, asks here first: another input or other settings
-would mix two things or destroy one.
+Code that continues or replaces a result compares these first, because other inputs or settings
+would mix two results or destroy one.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from crosscue.replay.files.log_identity import as_row, of_row
 from .identity import identity_of, identity_of_all
 
 SIMULATED: Final = "simulated.json"
-"""What `simulate` writes beside its log: the mark of a simulated log, and what it is made of."""
+"""File that `simulate` writes next to a log: it marks the log as simulated, with its settings."""
 NOTHING: Final[Mapping[str, Any]] = {}
-"""Of a result that need not be told from others."""
+"""Inputs and settings of a result that need not be distinguished from others."""
 
 
 def made_of(inputs: Sequence[Path], settings: Mapping[str, object]) -> dict[str, Any]:
-    """For a file beside the result: equal for equal inputs and settings, wherever they are.
+    """Return a record of inputs and settings, which does not depend on the inputs' paths.
 
     Raises:
-        LogError: An input is not there or cannot be read.
+        LogError: An input does not exist or cannot be read.
     """
     identity = as_row(identity_of_all([identity_of(path) for path in inputs])) if inputs else None
     made: dict[str, Any] = json_tree(strict_json({"identity": identity, "settings": settings}))
@@ -34,16 +34,16 @@ def made_of(inputs: Sequence[Path], settings: Mapping[str, object]) -> dict[str,
 
 
 def refuse_another(place: Path, doing: str, there: object, mine: Mapping[str, Any]) -> None:
-    """Let ``doing`` go on only over what is made of the very same.
+    """Refuse to continue or replace a result of other inputs or settings.
 
     Args:
-        place: Where the result lies.
-        doing: The flag, for the error.
-        there: What ``made_of`` returned for the result; anything else is nothing that is known.
-        mine: What ``made_of`` returns now.
+        place: Path of the result.
+        doing: The command-line option, for the error.
+        there: Value of ``made_of`` for the result; any other value counts as unknown.
+        mine: Value of ``made_of`` for the current inputs and settings.
 
     Raises:
-        UsageError: Naming both.
+        UsageError: The two differ; the message names both.
     """
     if there == mine:
         return
@@ -68,7 +68,7 @@ def _name(made: Mapping[str, Any]) -> str:
 
 
 def difference(there: object, here: object, name: str = "") -> str | None:
-    """The first setting that is not the same, with both values."""
+    """Describe the first setting that differs, with both values; None if all are equal."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in sorted({*there, *here}):
             found = difference(there.get(key), here.get(key), f"{name}.{key}" if name else key)

@@ -1,4 +1,4 @@
-"""Opening Parquet files for reading."""
+"""Open Parquet files for reading."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 
 
 def opened(path: Path) -> pa.NativeFile:
-    """A file for pyarrow to read, opened by pyarrow itself.
+    """Open a file with pyarrow for pyarrow to read.
 
-    What pyarrow reads ahead through one of Python's files is Python's memory, and its threads give
-    it back whenever they come round to it: after the interpreter has gone, that aborts the process
-    ("terminate called without an active exception") although all it wrote is right.
+    When pyarrow reads ahead through a Python file, its threads release Python's memory at any time.
+    After the interpreter has exited, this aborts the process ("terminate called without an active
+    exception"), although all output is correct.
 
     Raises:
-        OSError: Not there, not a file, not readable.
+        OSError: It does not exist, is not a file or is not readable.
     """
     import pyarrow as pa
 
-    # As bytes: a name may hold what is no UTF-8.
+    # As bytes, because a name may not be UTF-8.
     return pa.OSFile(os.fsencode(path))

@@ -1,9 +1,9 @@
-"""Files on their way: written beside their final place, held by a lock, swept when abandoned.
+"""Partial files: written in the final folder, held by a lock, and removed when abandoned.
 
-Every writer of crosscue fills a file with a temporary name in the final folder and renames it when
-it is whole. While a process works on one it holds a lock (``flock``) on the file itself, which the
-kernel drops when the process dies, however that happens. Whoever writes next in that folder takes
-away what nobody holds. A process number would not do: the system reuses it for another program.
+Every writer of crosscue writes a file with a temporary name in the final folder and renames it when
+it is complete. Meanwhile its process holds a lock (``flock``) on the file, which the kernel
+releases when the process exits for any reason. The next writer in that folder removes the files
+that are not locked. A process number would not suffice, because the system reuses it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from typing import BinaryIO, Final
 
 PARTIAL: Final = ".partial"
 NAME_BYTES: Final = 200
-"""Kept of the final name, so that the temporary one is not too long for the file system."""
+"""Max bytes of the final name in the temporary name, which file systems limit in length."""
 SWEEP_S: Final = 1.0
-"""A folder is not swept again within this time: some get thousands of files from one process."""
+"""Min time between sweeps of a folder, because a process may write thousands of files."""
 WITHOUT_LOCKS: Final = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
-"""What file systems answer that cannot lock."""
+"""Errors of file systems that do not support locks."""
 SCRATCH: Final = "crosscue-scratch-"
 
 _OURS: Final = re.compile(r"\..*\.crosscue-[0-9a-f]{16}\.partial", re.DOTALL)
@@ -36,21 +36,21 @@ _swept_s: dict[Path, float] = {}
 
 
 def is_partial(name: str) -> bool:
-    """Is this the name of a file that crosscue has begun and not finished?"""
+    """Return whether this is the name of a partial file of crosscue."""
     return _OURS.fullmatch(name) is not None
 
 
 class PartialFile:
-    """One file being written; ``keep`` gives it its final name, ``drop`` takes it away.
+    """A file that is being written; ``keep`` renames it to its final name, ``drop`` removes it.
 
-    Write to ``path``, in place: another file put there under its name would not be held.
+    Write to ``path`` in place, because a file that replaces it would not be locked.
     """
 
     def __init__(self, final: Path) -> None:
-        """Sweep the folder, then begin an empty file in it.
+        """Sweep the folder, then create an empty file in it.
 
         Raises:
-            OSError: The folder is not there or cannot be written.
+            OSError: The folder does not exist or cannot be written.
         """
         self.final: Final = final
         sweep(final.parent)
@@ -59,7 +59,7 @@ class PartialFile:
             self.path = final.with_name(f".{name}.crosscue-{secrets.token_hex(8)}{PARTIAL}")
             self._hold = os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
             try:
-                # Another process may have swept it away before it was locked.
+                # Another process may have removed it before it was locked.
                 if lock(self._hold) is not False and is_still(self._hold, self.path):
                     return
             except BaseException:
@@ -68,14 +68,14 @@ class PartialFile:
             os.close(self._hold)
 
     def open(self) -> BinaryIO:
-        """The file itself, empty, to be written and closed before ``keep``."""
+        """Return the empty file, to be written and closed before ``keep``."""
         return os.fdopen(self._hold, "wb", closefd=False)
 
     def keep(self) -> None:
-        """Have its bytes on the disk and give it its final name.
+        """Flush the file to the disk and rename it to its final name.
 
         Raises:
-            OSError: The disk cannot; the file is still there under its temporary name.
+            OSError: Flushing or renaming failed; the file remains under its temporary name.
         """
         sync(self.path)
         self.path.replace(self.final)
@@ -83,7 +83,7 @@ class PartialFile:
         sync(self.final.parent)
 
     def drop(self) -> None:
-        """Take it away; the error that led here matters more than one of this."""
+        """Remove the file; errors are ignored in favour of the error that led here."""
         with suppress(OSError):
             self.path.unlink(missing_ok=True)
         self._release()
@@ -95,11 +95,11 @@ class PartialFile:
 
 
 def sweep(folder: Path, *, again: bool = False) -> None:
-    """Take away files that crosscue began in ``folder`` and that no living process holds.
+    """Remove partial files of crosscue in ``folder`` that no running process holds.
 
     Args:
-        folder: Looked into, but not below.
-        again: Also if it was swept a moment ago.
+        folder: Folder to sweep, without its subfolders.
+        again: Sweep even if the folder was swept a moment ago.
     """
     now = time.monotonic()
     if not again and now - _swept_s.get(folder, -SWEEP_S) < SWEEP_S:
@@ -113,13 +113,13 @@ def sweep(folder: Path, *, again: bool = False) -> None:
 
 
 class Scratch:
-    """A folder for temporary files, removed when closed; those of killed processes are, too."""
+    """Folder for temporary files, removed on exit; folders of killed processes are removed too."""
 
     def __init__(self) -> None:
-        """Sweep, then make one.
+        """Sweep, then create a folder.
 
         Raises:
-            OSError: There is no place for one.
+            OSError: No folder can be created.
         """
         for entry in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*"):
             if _is_abandoned(entry, stat.S_ISDIR):
@@ -132,7 +132,7 @@ class Scratch:
             os.close(self._hold)
 
     def close(self) -> None:
-        """Remove it with all that is in it."""
+        """Remove the folder and its contents."""
         shutil.rmtree(self.path, ignore_errors=True)
         with suppress(OSError):
             os.close(self._hold)
@@ -145,7 +145,7 @@ class Scratch:
 
 
 def _is_abandoned(path: Path, is_kind: Callable[[int], bool]) -> bool:
-    """Does no process hold it? False, too, where that cannot be known."""
+    """Return whether no process holds it; False if that is unknown."""
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
@@ -161,10 +161,10 @@ def _is_abandoned(path: Path, is_kind: Callable[[int], bool]) -> bool:
 
 
 def lock(handle: int) -> bool | None:
-    """Lock an open file for this process: False if another holds it, None if that is not known.
+    """Lock an open file for this process: False if another holds it, None if that is unknown.
 
     Raises:
-        OSError: Anything else went wrong.
+        OSError: Locking failed for another reason.
     """
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -178,7 +178,7 @@ def lock(handle: int) -> bool | None:
 
 
 def is_still(handle: int, path: Path) -> bool:
-    """Is the open file the one that has this name now?"""
+    """Return whether the open file is still the one at this path."""
     try:
         return os.path.samestat(os.fstat(handle), path.stat())
     except FileNotFoundError:
@@ -186,10 +186,10 @@ def is_still(handle: int, path: Path) -> bool:
 
 
 def sync(path: Path) -> None:
-    """Have a file's bytes, or the names in a folder, on the disk itself.
+    """Flush a file's bytes, or the names in a folder, to the disk.
 
     Raises:
-        OSError: Not there, or the disk cannot.
+        OSError: It does not exist, or flushing failed.
     """
     handle = os.open(path, os.O_RDONLY)
     try:

@@ -1,4 +1,4 @@
-"""Where the time file of a folder of pictures, or of a video, lies."""
+"""Find the time file of a folder of pictures or of a video."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Final
 from crosscue.replay.errors import LogFormatError
 
 NAMES: Final = ("timestamps.txt", "times.txt", "rgb.txt")
-"""Tried in this order inside a folder, before any ``.csv``."""
+"""Names tried in this order inside a folder, before any ``.csv``."""
 
 
 def find_time_file(folder: Path) -> Path | None:
-    """The time file of a folder of pictures: inside it, or beside it under its name.
+    """Find the time file of a folder of pictures: inside it, or next to it with its name.
 
     Raises:
-        LogFormatError: Several could be meant.
+        LogFormatError: There are several candidates.
     """
     for name in NAMES:
         if (folder / name).is_file():
@@ -31,12 +31,12 @@ def find_time_file(folder: Path) -> Path | None:
 
 
 def time_file_of_video(video: Path) -> Path | None:
-    """The time file beside a video."""
+    """Find the time file next to a video."""
     places = (video.with_name(name) for name in times_of_video(video.name))
     return next((place for place in places if place.is_file()), None)
 
 
 def times_of_video(name: str) -> tuple[str, ...]:
-    """``<video>.txt``, ``<video>.csv``, with or without its suffix, by precedence."""
+    """Return ``<video>.txt``, ``<video>.csv``, with or without its suffix, by precedence."""
     stems = (name, PurePosixPath(name).stem)
     return tuple(stem + suffix for stem in stems for suffix in (".txt", ".csv"))

@@ -1,7 +1,7 @@
-"""A file of a known SHA-256 from a server or from this machine, checked before it is kept.
+"""Download or copy a file with a known SHA-256, which is checked before the file is kept.
 
-A transfer that was cut goes on where it stopped: what has come so far is beside the place of the
-whole file, as ``NAME.part``.
+An interrupted transfer continues where it stopped. The incomplete file is stored as ``NAME.part``
+in the same folder.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ _PARTIAL: Final = 206
 _RANGE_REFUSED: Final = 416
 
 Progress = Callable[[str, int, int], None]
-"""Reported a file's name, the bytes that have come, and how many there are."""
+"""Called with a file's name, the number of bytes received, and their total number."""
 
 
 class KnownFile(Protocol):
-    """A file of which is known what it must be."""
+    """A file with a known name, size and hash."""
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the file."""
         ...
 
     @property
     def size_bytes(self) -> int:
-        """How long it is."""
+        """Size of the file."""
         ...
 
     @property
     def sha256(self) -> str:
-        """In hexadecimal."""
+        """SHA-256 in hexadecimal."""
         ...
 
 
 def is_there(file: KnownFile, place: Path) -> bool:
-    """Whether ``place`` holds this very file."""
+    """Return whether ``place`` holds this file."""
     return (
         place.is_file()
         and place.stat().st_size == file.size_bytes
@@ -61,42 +61,42 @@ def is_there(file: KnownFile, place: Path) -> bool:
 
 
 def take(source: Path, file: KnownFile, place: Path, owner: str) -> None:
-    """Copy a file of this machine to its place.
+    """Copy a local file to its place.
 
     Args:
-        source: The file.
-        file: What it must be.
-        place: Where it goes.
-        owner: What it belongs to, for errors: ``model yolox-nano``.
+        source: Path of the file.
+        file: Expected name, size and hash.
+        place: Path of the copy.
+        owner: Owner of the file, for errors: ``model yolox-nano``.
 
     Raises:
-        UsageError: It is not there, or another file.
+        UsageError: The file does not exist, or is a different file.
         OutputError: The place cannot be written.
     """
     try:
         found = file_sha256(source)
     except OSError as error:
-        raise UsageError(f"{source}: {error.strerror}; give {file.name} of {owner}") from None
+        raise UsageError(f"{source}: {error.strerror}; expected {file.name} of {owner}") from None
     if found != file.sha256:
-        raise UsageError(f"{source}: SHA-256 {found}, {owner} needs {file.sha256}; give that file")
+        raise UsageError(f"{source}: SHA-256 {found}; {owner} requires the file {file.sha256}")
     write_whole(place, lambda partial: shutil.copyfile(source, partial))
 
 
 def download(
     url: str, file: KnownFile, place: Path, owner: str, otherwise: str, on_progress: Progress
 ) -> None:
-    """Bring a file from a server to its place.
+    """Download a file to its place.
 
     Args:
-        url: Of the file.
-        file: What it must be.
-        place: Where it goes; ``NAME.part`` beside it until it is whole.
-        owner: What it belongs to, for errors.
-        otherwise: What else can be done, for errors: ``give it with --weights FILE``.
-        on_progress: Called after each piece.
+        url: URL of the file.
+        file: Expected name, size and hash.
+        place: Path of the file; it is ``NAME.part`` in the same folder until it is complete.
+        owner: Owner of the file, for errors.
+        otherwise: Alternative remedy, for errors: ``give it with --weights FILE``.
+        on_progress: Called after each chunk.
 
     Raises:
-        CrosscueError: It cannot be had, or is another file.
+        CrosscueError: The download failed, or it is a different file.
         OutputError: The place cannot be written.
     """
     import pooch
@@ -119,24 +119,24 @@ def download(
         )
     except ValueError:
         raise CrosscueError(
-            f"{url}: what came is not {file.name} of {owner} (another SHA-256 than "
-            f"{file.sha256}); nothing was kept; fetch it elsewhere and {otherwise}"
+            f"{url}: the download is not {file.name} of {owner} (expected SHA-256 "
+            f"{file.sha256}); it was deleted; fetch the file elsewhere and {otherwise}"
         ) from None
     except (HTTPError, URLError, TimeoutError, ConnectionError) as error:
         why = error.reason if isinstance(error, URLError) else error
         raise CrosscueError(
-            f"{url}: not fetched: {one_line(Exception(str(why)), 160)}; run it again to go on, "
-            f"fetch it elsewhere and {otherwise}"
+            f"{url}: not fetched: {one_line(Exception(str(why)), 160)}; run it again to continue, "
+            f"or fetch the file elsewhere and {otherwise}"
         ) from None
     except OSError as error:
         raise cannot_write(place, error) from None
 
 
 def _resume(url: str, partial: Path, file: KnownFile, on_bytes: Callable[[int], None]) -> None:
-    """Append what is missing to ``partial``, never more than the file is large.
+    """Append the missing bytes to ``partial``, never beyond the size of the file.
 
     Raises:
-        OSError: The transfer or the disk failed; what has come stays.
+        OSError: The transfer or the disk failed; the received bytes are kept.
     """
     have = partial.stat().st_size if partial.exists() else 0
     if have >= file.size_bytes:
@@ -160,11 +160,11 @@ def _resume(url: str, partial: Path, file: KnownFile, on_bytes: Callable[[int], 
                 have += len(piece)
                 on_bytes(have)
     if have < file.size_bytes:
-        raise ConnectionError(f"cut after {have} of {file.size_bytes} bytes")
+        raise ConnectionError(f"interrupted after {have} of {file.size_bytes} bytes")
 
 
 def _opened(url: str, start: int, size_bytes: int) -> HTTPResponse:
-    """What the server sends from byte ``start`` on."""
+    """Open the server's response from byte ``start`` on."""
     if not url.startswith(("http://", "https://")):
         raise URLError(f"expected http:// or https://, got {url[:40]!r}")
     headers = {"Range": f"bytes={start}-{size_bytes - 1}"} if start else {}

@@ -1,7 +1,7 @@
-"""JSON and TOML text as plain values, nested no deeper than any file of ours has a reason to be.
+"""Parse JSON and TOML text with a limit on nesting.
 
-The parsers recurse, and so does most of what is done with their result. One place with one limit
-turns a hostile file into one clear line, whatever command reads it.
+The parsers recurse, and so does most code that uses their results. The limit turns a hostile file
+into an error of one clear line in every command.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from typing import Any, Final
 import numpy as np
 
 MAX_DEPTH: Final = 64
-"""Objects and arrays within each other; a manifest has about ten."""
+"""Max levels of nested objects and arrays; a manifest has about ten."""
 _STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
-"""Also one that the text ends in, so that no text makes this go over it twice."""
+"""A string, also one cut off by the end of the text, so that matching takes linear time."""
 _OPEN: Final = b"[{"
 _NO_BRACKET: Final = bytes(set(range(256)) - set(b"[]{}"))
 _TOO_DEEP: Final = f"nested over {MAX_DEPTH} levels deep"
@@ -29,10 +29,10 @@ def json_tree(
     object_pairs_hook: Callable[[list[tuple[str, Any]]], Any] | None = None,
     parse_constant: Callable[[str], Any] | None = None,
 ) -> Any:
-    """What a JSON text holds; arguments are those of ``json.loads``.
+    """Parse a JSON text; the arguments are those of ``json.loads``.
 
     Raises:
-        ValueError: No JSON, or nested too deep; one line.
+        ValueError: The text is not JSON, or nested too deeply; the message is one line.
     """
     if _depth(text) > MAX_DEPTH:
         raise ValueError(_TOO_DEEP)
@@ -43,10 +43,10 @@ def json_tree(
 
 
 def toml_tree(text: str) -> dict[str, Any]:
-    """What a TOML text holds.
+    """Parse a TOML text.
 
     Raises:
-        ValueError: No TOML, or nested too deep; one line.
+        ValueError: The text is not TOML, or nested too deeply; the message is one line.
     """
     try:
         tree = tomllib.loads(text)
@@ -61,7 +61,7 @@ def toml_tree(text: str) -> dict[str, Any]:
 
 
 def strict_json(value: object) -> str:
-    """JSON text with sorted keys; NaN and infinities become null."""
+    """Return JSON text with sorted keys; NaN and infinities become null."""
     return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
 
 
@@ -81,7 +81,7 @@ def _branches(value: Any) -> list[Any]:
 
 
 def _depth(text: str | bytes) -> int:
-    """How deep the brackets outside strings nest; of what is no JSON, some number."""
+    """Return the nesting depth of the brackets outside strings; arbitrary if it is not JSON."""
     content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if content.count(b"[") + content.count(b"{") <= MAX_DEPTH:
         return 0

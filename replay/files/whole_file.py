@@ -1,7 +1,7 @@
-"""Files written whole or not at all, and their hashes.
+"""Write files atomically, and compute hashes of files.
 
-A file gets its final name only when whole: written under a temporary name in the same folder,
-flushed to the disk, renamed.
+A file is written under a temporary name in the same folder, flushed to the disk, and then renamed,
+so that a file with the final name is always complete.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from .partial_file import PartialFile
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file, then give it its final name.
+    """Call ``write`` on a temporary file, then rename it to its final name.
 
     Raises:
-        OutputError: The disk is full or the folder cannot be written; nothing half is left.
+        OutputError: The disk is full or the folder cannot be written; no partial file remains.
     """
     partial: PartialFile | None = None
     try:
@@ -41,28 +41,28 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:
-    """The error to raise when writing ``path`` failed with ``error``."""
+    """Return the error to raise when writing ``path`` failed with ``error``."""
     if error.errno == errno.ENOSPC:
         try:
             free = shutil.disk_usage(path.parent).free // (1 << 20)
         except OSError:
             free = 0
         return OutputError(f"{path}: the disk is full ({free} MiB free); make room and run again")
-    return OutputError(f"{path}: {error.strerror or error}; choose a place you may write to")
+    return OutputError(f"{path}: {error.strerror or error}; choose a writable folder")
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically."""
     write_whole(path, lambda partial: partial.write_bytes(content))
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
+    """Write a text file atomically."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def sha256_of(path: Path) -> dict[str, str]:
-    """SHA-256 of a file, or of every file below a folder, by relative name.
+    """Return the SHA-256 of a file, or of every file below a folder, by relative name.
 
     Raises:
         OSError: A file cannot be read.
@@ -74,7 +74,7 @@ def sha256_of(path: Path) -> dict[str, str]:
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of one file, in hexadecimal.
+    """Return the SHA-256 of one file, in hexadecimal.
 
     Raises:
         OSError: It cannot be read.

@@ -1,1 +1,1 @@
-"""A drive as time segments: jumps of the clock and silent odometry."""
+"""Divide a drive into time segments at set-backs of the clock and gaps of odometry."""

@@ -1,7 +1,7 @@
-"""The pass over a drive's stamps that finds its time segments.
+"""Scan a drive's stamps to find its time segments.
 
-It reads the topics that will be used, decodes none but the wheel speeds, and keeps what does not
-grow with the log: set-backs, strays, and where wheel speeds were silent.
+The scan reads the topics that will be used and decodes only the wheel speeds. Its memory does not
+grow with the log: it keeps set-backs, strays, and gaps in the wheel speeds.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from .segments import BEGINNING, Cause, Epoch, LogClock, Marks, Segment, Timelin
 from .stamp_watch import StampWatch
 
 SAME_NS: Final = 2_000_000_000
-"""Set-backs of two topics or logs that differ by no more are one and the same."""
+"""Max difference of the set-backs of two topics or logs that count as one."""
 
 WheelReader: TypeAlias = Callable[[Block], Iterable[Samples]]
-"""The wheel speeds of a block; ``wheels_only`` of ``replay.signals.extractor`` makes one."""
+"""Reader of the wheel speeds of a block, see ``wheels_only`` in ``replay.signals.extractor``."""
 
 
 @dataclass(slots=True)
 class _Run:
-    """Wheel speeds without a silence: the era of their topic, first and last time."""
+    """Wheel speeds without a gap: the era of their topic, their first and last time."""
 
     era: int
     first_ns: int
@@ -40,7 +40,7 @@ class _Run:
 
 @dataclass(slots=True)
 class _WheelRuns:
-    """Follows the wheel speeds' times."""
+    """Incremental search for gaps in the wheel speeds."""
 
     read: WheelReader
     max_silence_ns: int
@@ -51,12 +51,12 @@ class _WheelRuns:
     _strays: int = 0
 
     def add(self, block: Block) -> None:
-        """Take a block whose stamps the watch has been given."""
+        """Add a block whose stamps were added to the watch."""
         self._waiting.append((self.watch.rows - len(block), block))
         self.settle()
 
     def settle(self) -> None:
-        """Work through the blocks of whose rows all is known."""
+        """Process the blocks whose rows are all decided."""
         while self._waiting:
             first, block = self._waiting[0]
             if self.watch.decided < first + len(block):
@@ -130,12 +130,12 @@ def scan(
 
     Args:
         logs: All logs of the drive, open.
-        planned: Which topics will be used.
-        vehicle: Limits are under ``[time]``.
-        selections: What will be read of each log.
-        wheels: For each log, what reads the wheel speeds off its blocks.
-        known: An earlier timeline of these logs: its shifts are kept, so that tables of both go
-            together.
+        planned: Plan of the topics that will be used.
+        vehicle: Vehicle with the limits, under ``[time]``.
+        selections: Selection that will be read of each log.
+        wheels: For each log, the reader of wheel speeds from its blocks.
+        known: Earlier timeline of these logs. Its shifts are kept, so that the tables of both can
+            be joined.
     """
     watches = [LogWatch(number, planned, vehicle, wheels[number]) for number in range(len(logs))]
     for watch, log, selection in zip(watches, logs, selections, strict=True):
@@ -146,13 +146,13 @@ def scan(
 
 
 class LogWatch:
-    """Takes the blocks of one log in stored order: the stamps of its topics, and its wheel speeds.
+    """Incremental scan of one log's stamps and wheel speeds, from its blocks in stored order.
 
-    For who reads the log anyway; ``scan`` reads it for this alone.
+    It serves callers that read the log anyway; ``scan`` reads the log for this purpose alone.
     """
 
     def __init__(self, number: int, planned: Plan, vehicle: Vehicle, read: WheelReader) -> None:
-        """Watch the log with this number in the plan."""
+        """Prepare the scan of the log with this number in the plan."""
         wheels = planned.source_of(Signal.WHEEL_SPEEDS)
         self.topics: Final[dict[str, StampWatch]] = {}
         self._wheels: Final = wheels if wheels is not None and wheels.log == number else None
@@ -161,7 +161,7 @@ class LogWatch:
         self._following: _WheelRuns | None = None
 
     def add(self, block: Block) -> None:
-        """Look at the next block."""
+        """Add the next block."""
         if not len(block):
             return
         watch = self.topics.setdefault(block.topic, StampWatch())
@@ -173,7 +173,7 @@ class LogWatch:
         self._following.add(block)
 
     def finish(self) -> list[_Run]:
-        """Decide the last rows; runs of wheel speeds come back where the log has them."""
+        """Process the last rows, and return the runs of wheel speeds of the log, if any."""
         for watch in self.topics.values():
             watch.finish()
         if self._following is None:
@@ -185,7 +185,7 @@ class LogWatch:
 def timeline_from(
     watches: Sequence[LogWatch], planned: Plan, vehicle: Vehicle, known: Timeline | None = None
 ) -> Timeline:
-    """The time segments of logs that have been watched to their ends, in the plan's order."""
+    """Return the time segments of completely scanned logs, in the plan's order."""
     limit_ns = round(vehicle.time.max_silence_s * 1e9)
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
     runs = [run for watch in watches for run in watch.finish()]
@@ -195,7 +195,7 @@ def timeline_from(
 
 
 class _Aligned:
-    """One log's topics, their set-backs matched with those of the topic that shows most."""
+    """One log's topics, with set-backs matched to those of the topic that has the most."""
 
     def __init__(self, watches: Mapping[str, StampWatch]) -> None:
         self.watches: Final = watches
@@ -217,7 +217,7 @@ class _Aligned:
         self.last_ns: Final = [max(some, default=0) for some in highs]
 
     def _entries(self, watch: StampWatch) -> tuple[int | None, ...]:
-        """The topic's row at which each event happens to it."""
+        """Return the topic's row at each set-back of the log."""
         span_ns = sum(era.last_ns - era.first_ns for era in watch.eras)
         reach_ns = max(SAME_NS, 3 * span_ns // max(watch.rows, 1))
         entries: list[int | None] = [None] * len(self.events)
@@ -235,7 +235,7 @@ class _Aligned:
         return tuple(entries)
 
     def marks(self) -> dict[str, Marks]:
-        """For ``LogClock``; empty where rows can stay as they are."""
+        """Return the marks for ``LogClock``; empty if no rows need to change."""
         return {
             name: Marks(self.entries[name], tuple(self.last_ns[:-1]), tuple(watch.strays))
             for name, watch in self.watches.items()
@@ -243,7 +243,7 @@ class _Aligned:
         }
 
     def epoch_of(self, topic: str, era: int) -> int:
-        """The epoch in which one of a topic's eras begins."""
+        """Return the epoch in which one of a topic's eras begins."""
         if era == 0:
             return 0
         row = self.watches[topic].set_backs[era - 1].row
@@ -275,7 +275,7 @@ def _clocks(
     clocks = []
     for i, (one, of_log) in enumerate(zip(aligned, shifts, strict=True)):
         earlier = () if known is None else known.clock(i).epochs
-        # Other topics may have been examined then: the middle of a set-back lay elsewhere.
+        # The earlier timeline may come from other topics, with another middle of the set-back.
         is_known = len(earlier) == len(of_log)
         epochs = earlier if is_known else tuple(_epochs(one, of_log))
         clocks.append(LogClock(epochs, one.marks()))
@@ -283,7 +283,7 @@ def _clocks(
 
 
 def _is_same(one: _Aligned, other: _Aligned, number: int) -> bool:
-    """Were two logs' clocks set back together?"""
+    """Return whether the clocks of two logs were set back together."""
     first, second = one.events[number], other.events[number]
     steps_ns = (first.after_ns - first.before_ns) - (second.after_ns - second.before_ns)
     return abs(steps_ns) <= SAME_NS and abs(first.before_ns - second.before_ns) <= SAME_NS
@@ -337,7 +337,7 @@ def _segments(
 
 
 def _in_epochs(one: _Aligned, topic: str, runs: Sequence[_Run]) -> Iterator[tuple[int, _Run]]:
-    """Each run with its epoch, cut where a set-back does not show in the topic itself."""
+    """Yield each run with its epoch, split at set-backs that are not visible in the topic."""
     entries, reached = one.entries[topic], 0
     for run in runs:
         number = max(one.epoch_of(topic, run.era), reached)

@@ -1,13 +1,13 @@
-"""A drive as a list of time segments, on one time that never runs back.
+"""Time segments of a drive, and a drive time that never runs backwards.
 
-A segment ends where a log's clock was set back, or where the wheel speeds were silent for longer
-than the vehicle file allows. *Drive time* (``t_ns`` everywhere) is the log's own clock as long as
-that runs forward. After a set-back it is the log's clock plus a shift that puts the rows
-``unknown_gap_s`` behind all that came before, so order is kept and nothing overlaps;
-``log_t_ns`` beside it is the stamp as recorded. A clock that jumps forward cannot be told from a
-pause: its stamps stay, and the time between them is a gap.
+A segment ends where a log's clock was set back, or where the wheel speeds are missing for longer
+than the vehicle file allows. *Drive time* (``t_ns`` everywhere) is the log's own clock while it
+runs forward. After a set-back it is the log's clock plus a shift that moves the rows
+``unknown_gap_s`` after all earlier rows, so that order is kept and nothing overlaps. ``log_t_ns``
+is the stamp as recorded. A clock that jumps forward cannot be distinguished from a pause: its
+stamps are unchanged, and the time between them is a gap.
 
-``TimedLog`` yields a log's blocks in drive time, so that nobody downstream sees a clock run back.
+``TimedLog`` yields a log's blocks in drive time, so that later stages never see a set-back.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BEGINNING: Final = int(np.iinfo(np.int64).min)
 
 
 class Cause(StrEnum):
-    """Why a segment begins."""
+    """Cause of the start of a segment."""
 
     START = "start"
     SILENCE = "odometry silent"
@@ -37,19 +37,19 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch of a drive without a gap.
+    """A part of a drive without a gap.
 
     Attributes:
-        number: From 0.
-        begins_ns: Rows from this drive time on belong to it.
-        start_ns: Drive time of its first wheel speed, or where it begins if none exists.
+        number: Number from 0.
+        begins_ns: Drive time of its beginning; later rows belong to it.
+        start_ns: Drive time of its first wheel speed, or ``begins_ns`` without wheel speeds.
         end_ns: Drive time of its last wheel speed.
         log_start_ns: ``start_ns`` on the log's own clock.
         log_end_ns: ``end_ns`` on the log's own clock.
-        cause: Why it begins.
-        gap_ns: From the last wheel speed before it to its first; None where it cannot be known.
-        by_ns: How far the clock was set, negative; 0 for other causes.
-        breaks_odometry: Whether the wheel speeds are interrupted.
+        cause: Cause of its beginning.
+        gap_ns: Time from the last wheel speed before it to its first; None if unknown.
+        by_ns: Step of the clock, negative; 0 for other causes.
+        breaks_odometry: True if the wheel speeds are interrupted.
     """
 
     number: int
@@ -66,11 +66,11 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Epoch:
-    """A stretch of one log between two set-backs of its clock.
+    """A part of one log between two set-backs of its clock.
 
     Attributes:
-        begins_ns: Drive time from which on the log's rows belong to it.
-        shift_ns: Drive time less log time.
+        begins_ns: Drive time of its beginning; later rows of the log belong to it.
+        shift_ns: Drive time minus log time.
     """
 
     begins_ns: int
@@ -79,13 +79,13 @@ class Epoch:
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """Where one topic's rows change epoch, and which of them are strays.
+    """Starts of epochs among one topic's rows, and its strays.
 
     Attributes:
-        entries: For each epoch but the first, its first row of the topic; None where the topic
-            itself shows no step: its first row beyond ``ends_ns`` then.
+        entries: For each epoch but the first, its first row of the topic. None if the topic itself
+            has no step; the epoch then starts at the first row after ``ends_ns``.
         ends_ns: For each epoch but the last, its last log time.
-        strays: Half-open ranges of rows.
+        strays: Half-open ranges of stray rows.
     """
 
     entries: tuple[int | None, ...] = ()
@@ -95,20 +95,20 @@ class Marks:
 
 @dataclass(frozen=True, slots=True)
 class LogClock:
-    """One log's clock against drive time."""
+    """One log's clock relative to drive time."""
 
     epochs: tuple[Epoch, ...] = (Epoch(BEGINNING, 0),)
     topics: Mapping[str, Marks] = field(default_factory=dict)
 
     def shift_at(self, drive_ns: Int64s) -> Int64s:
-        """Drive time less log time at each drive time, shape (N,)."""
+        """Return drive time minus log time at each drive time, shape (N,)."""
         begins = np.array([epoch.begins_ns for epoch in self.epochs], np.int64)
         shifts = np.array([epoch.shift_ns for epoch in self.epochs], np.int64)
         at: Int64s = shifts[np.searchsorted(begins, drive_ns, side="right") - 1]
         return at
 
     def log_times(self, drive_ns: Int64s) -> Int64s:
-        """The stamps as recorded."""
+        """Return the stamps as recorded."""
         return drive_ns - self.shift_at(drive_ns)
 
 
@@ -118,27 +118,27 @@ WHOLE: Final = Segment(0, BEGINNING, 0, 0, 0, 0, Cause.START)
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """A drive's segments and the clock of each of its logs.
+    """Segments of a drive and the clocks of its logs.
 
     Attributes:
-        segments: In order, at least one.
-        clocks: One for each log.
+        segments: Segments in order, at least one.
+        clocks: One clock for each log.
     """
 
     segments: tuple[Segment, ...] = (WHOLE,)
     clocks: tuple[LogClock, ...] = ()
 
     def clock(self, log: int) -> LogClock:
-        """The clock of one log."""
+        """Return the clock of one log."""
         return self.clocks[log] if log < len(self.clocks) else UNSHIFTED
 
     def numbers(self, drive_ns: Int64s) -> NDArray[np.int32]:
-        """The segment of each drive time, shape (N,)."""
+        """Return the segment number at each drive time, shape (N,)."""
         begins = np.array([one.begins_ns for one in self.segments], np.int64)
         return (np.searchsorted(begins, drive_ns, side="right") - 1).astype(np.int32)
 
     def number_of_stamp(self, log_ns: int | None) -> int | None:
-        """The segment of a stamp as recorded; None where several or none could be meant."""
+        """Return the segment number of a recorded stamp; None if it is not unique."""
         if len(self.segments) == 1:
             return 0
         if log_ns is None:
@@ -148,12 +148,12 @@ class Timeline:
 
     @property
     def has_gaps(self) -> bool:
-        """Is there more than one segment?"""
+        """True if there is more than one segment."""
         return len(self.segments) > 1
 
     @property
     def was_set_back(self) -> bool:
-        """Was a clock of the drive set back?"""
+        """True if a clock of the drive was set back."""
         return any(one.cause is Cause.SET_BACK for one in self.segments)
 
 
@@ -161,7 +161,7 @@ ONE_SEGMENT: Final = Timeline()
 
 
 def shift_of(timeline: Timeline, log: int) -> Callable[[Int64s], Int64s] | None:
-    """``shift_at`` of a log's clock, or None where that was never set back."""
+    """Return ``shift_at`` of a log's clock, or None if the clock was never set back."""
     clock = timeline.clock(log)
     return clock.shift_at if len(clock.epochs) > 1 else None
 
@@ -174,10 +174,10 @@ class TimedLog:
     clock: LogClock
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The log's blocks with drive time for log time; strays are skipped in the ledger.
+        """Yield the log's blocks in drive time; strays are skipped and counted in the ledger.
 
-        ``selection`` is in the log's own time. Read with the selection that the timeline was made
-        with: rows are told apart by counting.
+        ``selection`` is in the log's own time. It must be the selection that was scanned for the
+        timeline, because rows are identified by counting.
         """
         seen: Counter[str] = Counter()
         epochs: Counter[str] = Counter()
@@ -208,13 +208,13 @@ class TimedLog:
             int(block.log_ns[is_stray][0]),
         )
         ledger.notice(
-            f"{block.topic}: rows whose time stamp lies far from those around it were skipped"
+            f"{block.topic}: rows whose time stamp is far from those around it were skipped"
         )
         return placed.take(~is_stray)
 
 
 def _epochs(log_ns: Int64s, first: int, epoch: int, marks: Marks) -> Int64s:
-    """The epoch of each row of a block whose first row is the topic's ``first``."""
+    """Return the epoch of each row of a block that starts at the topic's row ``first``."""
     found = np.full(len(log_ns), epoch, np.int64)
     at = 0
     for number in range(epoch, len(marks.entries)):
@@ -239,7 +239,7 @@ def _is_stray(first: int, rows: int, marks: Marks) -> NDArray[np.bool_]:
 
 
 def gaps_text(segments: Sequence[Segment]) -> list[str]:
-    """One sentence on the gaps of a drive; none for a drive without."""
+    """Return one sentence about the gaps of a drive; an empty list without gaps."""
     later = segments[1:]
     if not later:
         return []

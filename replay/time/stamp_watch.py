@@ -1,15 +1,15 @@
-"""Where a topic's log clock was set back, and which of its stamps are strays.
+"""Find set-backs of a topic's log clock, and its stray stamps.
 
-Rows come in stored order. A step back of ``MIN_SET_BACK_NS`` or more is one of three things:
+Rows arrive in stored order. A backward step of ``MIN_SET_BACK_NS`` or more is one of three things:
 
-* *late rows*: within ``LOOK_AHEAD`` rows the stamps leap back to where they were; nothing happened
-  to the clock, and whoever merges by time puts them in order;
-* a *stray*: at most ``MAX_STRAY_ROWS`` rows far from both neighbours, while those lie close
-  together: the rows are wrong, ahead or behind, not the clock;
-* a *set-back*: the stamps go on from there.
+* *late rows*: within ``LOOK_AHEAD`` rows the stamps return to their earlier course; the clock is
+  unaffected, and a merge by time restores the order;
+* a *stray*: at most ``MAX_STRAY_ROWS`` rows far from both neighbours, while the neighbours are
+  close together; the rows are wrong, not the clock;
+* a *set-back*: the stamps continue from there.
 
-Smaller steps back are disorder. The first rows after a set-back decide, so one within the last
-``ROWS_TO_BELIEVE`` rows of a log passes for late rows.
+Smaller backward steps are disorder. The first rows after a set-back are decisive, so a set-back
+within the last ``ROWS_TO_BELIEVE`` rows of a log is treated as late rows.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from numpy.typing import NDArray
 
 MIN_SET_BACK_NS: Final = 100_000_000
 STRAY_NS: Final = 1_000_000_000
-"""A stray lies further than this from both its neighbours."""
+"""Min distance of a stray from both its neighbours."""
 MAX_STRAY_ROWS: Final = 8
 LOOK_AHEAD: Final = 128
 ROWS_TO_BELIEVE: Final = 3
 MAX_FINDINGS: Final = 10_000
-"""Set-backs and strays kept of one topic; later ones pass for late rows."""
+"""Max number of set-backs and strays of one topic; later ones are treated as late rows."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetBack:
-    """A clock that was set back.
+    """A set-back of a clock.
 
     Attributes:
         row: The first row after it, counted from 0 in stored order.
-        before_ns: Stamp of the row before.
+        before_ns: Stamp of the previous row.
         after_ns: Stamp of the row.
     """
 
@@ -47,14 +47,14 @@ class SetBack:
 
 @dataclass(slots=True)
 class Era:
-    """Rows between two set-backs: their lowest and highest stamp, strays left out."""
+    """Rows between two set-backs: their lowest and highest stamp without strays."""
 
     first_ns: int
     last_ns: int
 
 
 class StampWatch:
-    """Takes one topic's stamps a stretch at a time; memory holds what looking ahead needs."""
+    """Incremental search of one topic's stamps, which keeps only the rows needed to look ahead."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -69,21 +69,21 @@ class StampWatch:
 
     @property
     def decided(self) -> int:
-        """Of how many rows all is known."""
+        """Number of rows that are decided."""
         return self._decided
 
     def add(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Take in the next rows, shape (N,)."""
+        """Add the next rows, shape (N,)."""
         self.rows += len(stamps_ns)
         self._held = np.concatenate([self._held, stamps_ns])
         self._decide(len(self._held) - LOOK_AHEAD)
 
     def finish(self) -> None:
-        """Decide the last rows; none may follow."""
+        """Process the last rows; no rows may follow."""
         self._decide(len(self._held))
 
     def _decide(self, n: int) -> None:
-        """Judge the first ``n`` rows held; the rest is examined only."""
+        """Decide the first ``n`` pending rows; the rest is used to look ahead."""
         if n <= 0:
             return
         rows = self._held
@@ -106,7 +106,7 @@ class StampWatch:
         self._decided += done
 
     def _accept(self, rows: NDArray[np.int64]) -> None:
-        """Rows that belong to the era at hand."""
+        """Add rows to the current era."""
         if not len(rows):
             return
         era = self.eras[-1]
@@ -117,7 +117,7 @@ class StampWatch:
         self._before_ns = int(rows[-1])
 
     def _judge(self, rows: NDArray[np.int64], jump: int) -> int:
-        """Say what the step before row ``jump`` is; where to go on."""
+        """Classify the step before row ``jump``, and return the row at which to continue."""
         before_ns = self._before_ns
         assert before_ns is not None
         is_full = len(self.strays) + len(self.set_backs) >= MAX_FINDINGS
@@ -135,7 +135,7 @@ class StampWatch:
         return jump + 1
 
     def _stray_until(self, rows: NDArray[np.int64], jump: int, before_ns: int) -> int | None:
-        """The row after a stray that begins at ``jump``, or None where none does."""
+        """Return the row after a stray that begins at ``jump``, or None if none begins there."""
         reach_ns = max(STRAY_NS, 5 * self._step_ns // 2)
         ahead = rows[jump : jump + MAX_STRAY_ROWS + 1]
         near = (ahead >= before_ns - MIN_SET_BACK_NS) & (ahead <= before_ns + reach_ns)
@@ -149,7 +149,7 @@ class StampWatch:
 
 
 def _goes_on(rows: NDArray[np.int64], jump: int, before_ns: int, step_ns: int) -> bool:
-    """Do the stamps go on from row ``jump``, without a leap back to where they were?"""
+    """Return whether the stamps continue from row ``jump``, without returning to their course."""
     ahead = rows[jump : jump + LOOK_AHEAD]
     if len(ahead) <= ROWS_TO_BELIEVE:
         return False

@@ -130,7 +130,7 @@ def test_it_comes_from_the_server_once(card: ModelCard, server: Served) -> None:
 
 def test_a_cut_transfer_goes_on_where_it_stopped(card: ModelCard, server: Served) -> None:
     server.failing = 1
-    with pytest.raises(CrosscueError, match="cut after 524288 of 1048576 bytes"):
+    with pytest.raises(CrosscueError, match="interrupted after 524288 of 1048576 bytes"):
         fetch.fetch("net")
     assert not entries.place_of(card, card.files[0]).exists()
 
@@ -152,7 +152,9 @@ def test_another_file_than_the_catalog_means_is_not_kept(
             (found,) = fetch.fetch("net")
             assert found.path.read_bytes() == CONTENT
             continue
-        with pytest.raises(CrosscueError, match=r"what came is not net\.onnx|cut after 16"):
+        with pytest.raises(
+            CrosscueError, match=r"the download is not net\.onnx|interrupted after 16"
+        ):
             fetch.fetch("net")
         assert not entries.place_of(card, card.files[0]).exists()
 
@@ -192,7 +194,7 @@ def test_from_a_file_or_its_folder(card: ModelCard, server: Served, tmp_path: Pa
     assert not server.gets
 
     file.write_bytes(CONTENT[1:])
-    with pytest.raises(UsageError, match="model net needs"):
+    with pytest.raises(UsageError, match="model net requires"):
         fetch.fetch("net", file)
     with pytest.raises(UsageError, match="No such file"):
         fetch.fetch("net", tmp_path / "gone.onnx")

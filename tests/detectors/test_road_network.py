@@ -257,4 +257,4 @@ def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run(["train", "road", "--layouts", "L1", "-o", "/proc/nowhere/o.safetensors"]) == 1
-    assert "choose a place you may write to" in capsys.readouterr().err
+    assert "choose a writable folder" in capsys.readouterr().err

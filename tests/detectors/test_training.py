@@ -420,7 +420,7 @@ def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
 
     assert run([*base, "-o", "/proc/nowhere/out.safetensors"]) == 1
     reported = capsys.readouterr()
-    assert "choose a place you may write to" in reported.err
+    assert "choose a writable folder" in reported.err
     assert "training" not in reported.out
 
 

@@ -1,1 +1,1 @@
-"""ROS 1 and ROS 2 messages: their definitions, and the walk through their bytes."""
+"""Decode ROS 1 and ROS 2 messages: their definitions, and parsing of their bytes."""

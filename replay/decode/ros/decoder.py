@@ -1,4 +1,4 @@
-"""Decoder for ROS 2 CDR and ROS 1 messages: whole blocks at a time."""
+"""Decode ROS 2 CDR and ROS 1 messages, a block at a time."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, wa
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001
 ANY_LENGTH: Final = -1
-"""The key of the layout of messages that end in bytes."""
+"""Key of the layout of messages that end in bytes."""
 OTHER_CODINGS: Final = (0x0002, 0x0003, *range(0x0006, 0x000C))
-"""Encapsulations that DDS defines and nothing here decodes; any other number is damage."""
+"""Encapsulations that DDS defines and that are not supported; any other number means damage."""
 
 
 @dataclass(frozen=True, slots=True)
 class RosDecoder:
-    """From blocks of CDR or ROS 1 messages of one type to columns.
+    """Decoder of CDR or ROS 1 messages of one type into columns.
 
     Attributes:
-        plan: How the type is walked.
-        kind: What becomes of it.
-        tail: Path of the bytes that the type ends in, if it does.
-        layouts: Layouts met, by the length of their message; None for a length that has none.
+        plan: Parsing plan of the type.
+        kind: Conversion of the type to columns.
+        tail: Path of the bytes at the end of the type, if any.
+        layouts: Known layouts by the length of their message; None for a length without a layout.
     """
 
     plan: Plan
@@ -52,7 +52,7 @@ class RosDecoder:
     layouts: dict[int, Layout | None] = field(default_factory=dict)
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
-        """Decode; messages that do not fit are skipped in ``ledger`` with reason and time."""
+        """Decode a block; messages that do not fit are counted in ``ledger``."""
         if not isinstance(block.rows, Messages):
             return block
         fields, kept = self.walked(block, block.rows, ledger)
@@ -72,9 +72,9 @@ class RosDecoder:
         )
 
     def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[Fields, Rows]:
-        """Fields of the messages that fit, and which of the block they are.
+        """Return the fields of the messages that fit, and their row numbers in the block.
 
-        The others go into ``ledger``, dropped or skipped, with reason and time.
+        The others are dropped or skipped in ``ledger``, with reason and time.
         """
         repeated = self._repeated(messages)
         if repeated is not None:
@@ -85,7 +85,7 @@ class RosDecoder:
         return fields, kept
 
     def _repeated(self, messages: Messages) -> RepeatedFields | None:
-        """The messages without a walk, if they all repeat a layout met before."""
+        """Return the messages without parsing them, if all of them repeat a known layout."""
         if not len(messages):
             return None
         layout = self.layouts.get(self._key(messages, 0))
@@ -133,7 +133,7 @@ class RosDecoder:
     def _by_order(
         self, block: Block, messages: Messages, ledger: Ledger
     ) -> Iterator[tuple[bool, Rows]]:
-        """Messages by byte order; those coded in a way that we cannot read are refused."""
+        """Yield messages by byte order, and refuse those with an unsupported encapsulation."""
         everything = np.arange(len(messages))
         if not self.plan.is_cdr:
             yield True, everything
@@ -171,10 +171,10 @@ def _refuse(ledger: Ledger, block: Block, rows: Rows, reason: str, why: str) -> 
 
 
 def ros_decoder(topic: Topic) -> RosDecoder | None:
-    """The decoder of a topic with encoding ``cdr`` or ``ros1``; None if its type is not known.
+    """Return the decoder of a topic with encoding ``cdr`` or ``ros1``; None for unknown types.
 
     Raises:
-        SchemaError: The definition does not parse, or lacks what its type's name promises.
+        SchemaError: The definition does not parse, or contradicts its type's name.
     """
     name = ros2_spelling(topic.type_name)
     known: Definitions | None

@@ -1,7 +1,7 @@
-"""Message definitions as plain values: ROS 1 and ROS 2 ``.msg`` text, ROS 2 IDL.
+"""Parse message definitions: ROS 1 and ROS 2 ``.msg`` text, and ROS 2 IDL.
 
-A definition comes from the log, so it is parsed and never run: no code is generated from it, and
-its size is bounded before anything else is done with it.
+A definition comes from the log and is not trusted. Its size is checked first, and no code is
+generated from it.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ PRIMITIVES: Final[Mapping[str, str]] = {
     "float32": "f4",
     "float64": "f8",
 }
-"""NumPy codes; ``byte`` is signed and ``char`` is not, in ROS 1 and ROS 2 alike."""
+"""NumPy codes of primitive types; ``byte`` is signed and ``char`` is not, in ROS 1 and ROS 2."""
 
 TIME: Final = "builtin_interfaces/msg/Time"
 DURATION: Final = "builtin_interfaces/msg/Duration"
 IDL_BYTES: Final = 64 << 10
-"""IDL goes through a general parser, which takes about a second for this much text."""
+"""Max size of IDL text; its general parser takes about a second for this size."""
 
 
 class Shape(Enum):
-    """How often a field holds its type."""
+    """Multiplicity of a field."""
 
     ONE = "one"
     ARRAY = "array"
@@ -52,11 +52,11 @@ class Field:
     """One field of a message.
 
     Attributes:
-        name: As the definition spells it.
+        name: Name as spelled in the definition.
         type_name: A key of ``PRIMITIVES``, ``string``, or a message name in ROS 2 spelling.
         shape: One value, an array of ``size`` values, or a sequence.
-        size: Length of an array; most items of a sequence, 0 for no bound.
-        text_bound: Most characters of a string, 0 for no bound.
+        size: Length of an array; max items of a sequence, 0 for no bound.
+        text_bound: Max characters of a string, 0 for no bound.
     """
 
     name: str
@@ -83,16 +83,17 @@ _ANNOTATION: Final = re.compile(r"(?:@\w{1,64}(?:\([^)]{0,200}\))?[ \t]*){0,16}"
 def definitions_of(
     type_name: str, schema: bytes, schema_encoding: str, limits: Limits = DEFAULT_LIMITS
 ) -> Definitions:
-    """All types that a schema defines, by name in ROS 2 spelling.
+    """Return all types that a schema defines, by name in ROS 2 spelling.
 
     Args:
-        type_name: The message type that the schema is for.
+        type_name: Message type of the schema.
         schema: Text as stored in the log.
         schema_encoding: ``ros1msg``, ``ros2msg`` or ``ros2idl``.
         limits: ``schema_bytes`` bounds the text.
 
     Raises:
-        SchemaError: The text is too large, no text, or does not parse; the message names the line.
+        SchemaError: The text is too large, not UTF-8, or does not parse; the message names the
+            line.
     """
     if len(schema) > limits.schema_bytes:
         raise SchemaError(
@@ -130,7 +131,7 @@ def _from_msg(type_name: str, text: str) -> Definitions:
 
 
 def _feedback_of_action(type_name: str, text: str) -> str:
-    """The definition of an action's feedback from that of the action, if that is what is stored."""
+    """Derive the definition of an action's feedback, if the definition of the action is stored."""
     name = type_name.removesuffix("_FeedbackMessage")
     separator = _SEPARATOR.search(text)
     action = text[: separator.start()] if separator else text
@@ -157,7 +158,7 @@ def _fields_of(owner: str, body: str) -> Iterator[Field]:
             fixed = match["size"] and not match["most"]
             shape = Shape.ARRAY if fixed else Shape.SEQUENCE
         if match["text"] and match["type"] != "string":
-            raise SchemaError(f"{owner}: only strings have a bound, not {line[:80]!r}")
+            raise SchemaError(f"{owner}: only strings may have a bound, not {line[:80]!r}")
         has_default = match["rest"] and not match["rest"].startswith("#")
         if has_default and match["type"] not in PRIMITIVES and match["type"] != "string":
             raise SchemaError(f"{owner}: cannot read the line {line[:80]!r} of its definition")
@@ -213,19 +214,19 @@ def _from_idl(type_name: str, text: str) -> Definitions:
 
 
 def _refuse_arithmetic(type_name: str, text: str) -> None:
-    """Refuse constants that calculate.
+    """Refuse constant expressions.
 
-    ROS definitions have none, while brackets take the parser seconds each, and products and shifts
-    of constants can be made as large as one likes.
+    ROS definitions contain none. The parser takes seconds for each bracket, and products and shifts
+    of constants can become arbitrarily large.
     """
     bare = _IDL_ANNOTATION.sub("", _without_comments(text))
     for sign in ("(", "*", "<<"):
         if sign in bare:
-            raise SchemaError(f"{type_name}: IDL calculates with {sign!r}, which is not supported")
+            raise SchemaError(f"{type_name}: IDL has an expression with {sign!r}; not supported")
 
 
 def _without_comments(text: str) -> str:
-    """IDL without comments and strings, in one pass."""
+    """Remove comments and strings from IDL text in one pass."""
     kept: list[str] = []
     at = 0
     for match in _IDL_SKIP.finditer(text):
@@ -241,7 +242,7 @@ def _without_comments(text: str) -> str:
 
 
 def _from_rosbags(fields: object) -> tuple[Field, ...]:
-    """Fields in rosbags' notation as our own."""
+    """Convert fields from the representation of rosbags."""
     out: list[Field] = []
     assert isinstance(fields, list)
     for name, (node, inner) in fields:
@@ -256,7 +257,7 @@ def _from_rosbags(fields: object) -> tuple[Field, ...]:
 
 @cache
 def well_known(type_name: str) -> Definitions | None:
-    """Definitions of a ROS 2 type that logs may leave out (sqlite3 bags before ROS 2 Iron)."""
+    """Return definitions of a ROS 2 type that logs may omit (sqlite3 bags before ROS 2 Iron)."""
     from rosbags.typesys.stores.ros2_humble import FIELDDEFS
 
     own = _OWN.get(type_name)
@@ -284,4 +285,4 @@ _OWN: Final[Mapping[str, str]] = {
         "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
     ),
 }
-"""Types that are not part of the ROS 2 distribution; field names and order are the wire format."""
+"""Types outside the ROS 2 distribution; field names and order define the wire format."""

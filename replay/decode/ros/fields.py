@@ -1,4 +1,4 @@
-"""The values of walked messages, gathered when asked for."""
+"""Values of parsed messages, decoded on demand."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Part:
     """Messages of one byte order.
 
     Attributes:
-        found: Where their fields lie.
-        rows: Shape (M,): the messages of the part that fit.
+        found: Positions of their fields.
+        rows: Shape (M,): indices of the messages that fit.
     """
 
     found: Found
@@ -31,50 +31,50 @@ class Fields(Protocol):
 
     @property
     def plan(self) -> Plan:
-        """How their type is walked."""
+        """Parsing plan of their type."""
         ...
 
     @property
     def buffer(self) -> NDArray[np.uint8]:
-        """All bytes, which places count in."""
+        """Bytes of all messages, which positions refer to."""
         ...
 
     def __len__(self) -> int: ...
 
     def number(self, path: str) -> NDArray[np.generic]:
-        """Values at ``path``, native byte order: shape (M,), or (M, k) for an array of k.
+        """Return values at ``path`` in native byte order: shape (M,), or (M, k) for arrays of k.
 
-        Times and durations come as int64 nanoseconds.
+        Times and durations are int64 nanoseconds.
         """
         ...
 
     def texts(self, path: str) -> tuple[str, ...]:
-        """Strings at ``path``."""
+        """Return strings at ``path``."""
         ...
 
     def items(self, path: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First byte and number of items of the sequence at ``path``, each of shape (M,)."""
+        """Return first byte and number of items of the sequence at ``path``, each of shape (M,)."""
         ...
 
     def padded(self, path: str, width: int) -> NDArray[np.float64]:
-        """Sequences of numbers as shape (M, k), k <= ``width``, filled up with NaN."""
+        """Return sequences of numbers as shape (M, k), k <= ``width``, padded with NaN."""
         ...
 
     def take(self, keep: Bools) -> Self:
-        """The messages picked."""
+        """Return the selected messages."""
         ...
 
 
 @dataclass(slots=True, eq=False)
 class WalkedFields:
-    """Columns of messages that have been walked.
+    """Columns of parsed messages.
 
     Attributes:
-        plan: Of their type.
-        buffer: All bytes.
-        parts: By byte order; nearly always one.
-        order: Brings rows of all parts, one part after the other, into the block's order.
-        seen: Numbers gathered already.
+        plan: Parsing plan of their type.
+        buffer: Bytes of all messages.
+        parts: Messages by byte order; nearly always one part.
+        order: Permutation from the concatenated rows of all parts to the block's order.
+        seen: Numbers decoded so far.
     """
 
     plan: Plan
@@ -87,9 +87,9 @@ class WalkedFields:
         return sum(len(part.rows) for part in self.parts)
 
     def number(self, path: str) -> NDArray[np.generic]:
-        """Values at ``path``, native byte order: shape (M,), or (M, k) for an array of k.
+        """Return values at ``path`` in native byte order: shape (M,), or (M, k) for arrays of k.
 
-        Times and durations come as int64 nanoseconds.
+        Times and durations are int64 nanoseconds.
         """
         if path not in self.seen:
             value, is_cdr = self.plan.values[path], self.plan.is_cdr
@@ -97,13 +97,13 @@ class WalkedFields:
         return self.seen[path]
 
     def text_ranges(self, path: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First byte and length of the string at ``path``, each of shape (M,)."""
+        """Return first byte and length of the string at ``path``, each of shape (M,)."""
         first = self._joined(lambda part: part.found.texts[path][0][part.rows])
         length = self._joined(lambda part: part.found.texts[path][1][part.rows])
         return first.astype(np.int64, copy=False), length.astype(np.int64, copy=False)
 
     def texts(self, path: str) -> tuple[str, ...]:
-        """Strings at ``path``; one object per different string in a row."""
+        """Return strings at ``path``; runs of equal strings share one object."""
         first, length = self.text_ranges(path)
         out: list[str] = []
         last, text = b"", ""
@@ -115,13 +115,13 @@ class WalkedFields:
         return tuple(out)
 
     def items(self, path: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First byte and number of items of the sequence at ``path``, each of shape (M,)."""
+        """Return first byte and number of items of the sequence at ``path``, each of shape (M,)."""
         first = self._joined(lambda part: part.found.sequences[path][0][part.rows])
         count = self._joined(lambda part: part.found.sequences[path][1][part.rows])
         return first.astype(np.int64, copy=False), count.astype(np.int64, copy=False)
 
     def padded(self, path: str, width: int) -> NDArray[np.float64]:
-        """Sequences of numbers as shape (M, k), k <= ``width``, filled up with NaN."""
+        """Return sequences of numbers as shape (M, k), k <= ``width``, padded with NaN."""
         code = self.plan.sequences[path].code
 
         def of(part: Part) -> NDArray[np.generic]:
@@ -144,7 +144,7 @@ class WalkedFields:
         return joined if self.order is None else joined[self.order]
 
     def take(self, keep: Bools) -> WalkedFields:
-        """The messages picked."""
+        """Return the selected messages."""
         if keep.all():
             return self
         if self.order is not None:
@@ -183,7 +183,7 @@ def _numbers(part: Part, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
 def _nanoseconds(
     found: Found, place: NDArray[np.int64], code: str, *, is_cdr: bool
 ) -> NDArray[np.int64]:
-    """ROS 1 seconds are unsigned, ROS 2 seconds signed; only ROS 1 durations have signed rests."""
+    """Decode times: only ROS 1 seconds are unsigned, only ROS 1 durations have signed fractions."""
     seconds = "i4" if is_cdr or code == "duration" else "u4"
     rest = "i4" if not is_cdr and code == "duration" else "u4"
     whole = gather(found.buffer, _ordered(seconds, found), 0, place).astype(np.int64)

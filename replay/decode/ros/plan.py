@@ -1,9 +1,9 @@
-"""From a message definition to the steps in which its bytes are walked.
+"""Compile a message definition into the steps that parse its bytes.
 
 Nested messages are flattened, so that a plan is a short list of three kinds of step: a *run* of
-fields whose sizes are fixed, a string, and a sequence. Inside a run the place of every field
-depends only on where the run begins modulo 8 (CDR aligns each value to its own size), so a table
-of eight rows yields all places at once.
+fields with fixed sizes, a string, and a sequence. Inside a run the offset of every field depends
+only on the start of the run modulo 8 (CDR aligns each value to its own size), so a table of eight
+rows contains all offsets.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_DEPTH: Final = 32
 MAX_STEPS: Final = 20_000
 HEADER: Final = "std_msgs/msg/Header"
 FILLER: Final = "structure_needs_at_least_one_member"
-"""The byte that stands for an empty message on the wire; it holds no value."""
+"""Name of the byte that represents an empty message on the wire; it holds no value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Value:
         path: Dotted name from the message's root.
         code: NumPy code without byte order (``f8``), ``time`` or ``duration``.
         count: Length of an array, 0 for a single value.
-        is_bool: Stored as a byte, true unless zero.
+        is_bool: True for a bool, stored as a byte that is true unless zero.
     """
 
     path: str
@@ -51,17 +51,17 @@ class Value:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """Neighbouring fields of fixed size.
+    """Adjacent fields of fixed size.
 
     Attributes:
-        values: K of them.
+        values: K values.
         widths: Bytes of each value.
-        place: Shape (8, K), int64: offset of each value from the run's begin, by begin modulo 8.
-        size: Shape (8,), int64: bytes from the run's begin to its end, by begin modulo 8.
-        cdr_widths: Bytes of each value in CDR, where an empty message has one and a ROS 1 header
-            has no counter.
-        cdr_place: As ``place``, in CDR; differs from it in plans for ROS 1.
-        cdr_size: As ``size``, in CDR.
+        place: Shape (8, K), int64: offset of each value from the run's start, by start modulo 8.
+        size: Shape (8,), int64: bytes from the run's start to its end, by start modulo 8.
+        cdr_widths: Bytes of each value in CDR, where an empty message has one byte and a ROS 1
+            header has no counter.
+        cdr_place: Like ``place``, in CDR; differs from it in plans for ROS 1.
+        cdr_size: Like ``size``, in CDR.
     """
 
     values: tuple[Value, ...]
@@ -83,17 +83,17 @@ class Text:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Items:
-    """A sequence, or an array of things that are not fixed in size or too many to name.
+    """A sequence, or an array whose items vary in size or are too many to name.
 
     Attributes:
         path: Dotted name.
         item: Steps of one item.
         count: Length of an array; None for a sequence, whose length precedes it.
-        bound: Most items, 0 for no bound.
+        bound: Max number of items, 0 for no bound.
         code: NumPy code of a sequence of numbers, else empty.
-        jumps: Shape (K, 8): bytes that 2**k items take, by begin modulo 8; None where items vary.
-        cdr_jumps: As ``jumps``, in CDR.
-        item_bytes: Least bytes of one item.
+        jumps: Shape (K, 8): bytes of 2**k items, by start modulo 8; None if items vary in size.
+        cdr_jumps: Like ``jumps``, in CDR.
+        item_bytes: Min bytes of one item.
     """
 
     path: str
@@ -111,13 +111,13 @@ Step: TypeAlias = Run | Text | Items
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """How to walk one message type.
+    """Parsing plan of one message type.
 
     Attributes:
-        type_name: For error messages.
-        is_cdr: CDR with alignment and terminated strings; else ROS 1.
-        steps: In wire order.
-        values: Every named value, by path.
+        type_name: Name for error messages.
+        is_cdr: True for CDR with alignment and terminated strings; False for ROS 1.
+        steps: Steps in wire order.
+        values: Named values by path.
         texts: Paths of strings outside sequences.
         sequences: Sequences and arrays outside other sequences, by path.
     """
@@ -133,10 +133,10 @@ class Plan:
 def plan_of(
     type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits = DEFAULT_LIMITS
 ) -> Plan:
-    """Plan the walk through ``type_name``.
+    """Compile the parsing plan of ``type_name``.
 
     Raises:
-        SchemaError: A type is missing or contains itself, or a message could never fit the limits.
+        SchemaError: A type is missing or contains itself, or every message exceeds the limits.
     """
     steps = _Planner(type_name, known, is_cdr, limits).message(type_name, "", 0)
     runs = [step for step in steps if isinstance(step, Run)]
@@ -152,7 +152,7 @@ def plan_of(
 
 @dataclass(frozen=True, slots=True)
 class _Fixed:
-    """A value that is still to be put into a run: alignment and bytes as stored, and in CDR."""
+    """A value before it is added to a run: alignment and bytes as stored, and in CDR."""
 
     value: Value
     align: int
@@ -224,7 +224,7 @@ class _Planner:
         elif "/" in each.type_name:
             yield from self._pieces(each.type_name, path, depth + 1)
         else:
-            raise SchemaError(f"{self.root}: {path} has the type {each.type_name}, not supported")
+            raise SchemaError(f"{self.root}: {path} has the unsupported type {each.type_name}")
 
     def _number(self, each: Field, path: str, count: int) -> _Piece:
         code = PRIMITIVES[each.type_name]
@@ -267,7 +267,7 @@ class _Planner:
     def _count(self) -> None:
         self.made += 1
         if self.made > MAX_STEPS:
-            raise SchemaError(f"{self.root}: its definition unfolds to over {MAX_STEPS} fields")
+            raise SchemaError(f"{self.root}: its definition expands to over {MAX_STEPS} fields")
 
 
 def _min_bytes(step: Step) -> int:
@@ -309,7 +309,7 @@ def _run(pieces: list[_Fixed]) -> Run:
 
 
 def _laid_out(pieces: list[tuple[int, int]]) -> tuple[Int64s, Int64s]:
-    """Place of each piece, (8, K), and size of all, (8,), by where the run begins modulo 8."""
+    """Return offsets of pieces, (8, K), and their total size, (8,), by start modulo 8."""
     place = np.zeros((8, len(pieces)), np.int64)
     size = np.zeros(8, np.int64)
     for begin in range(8):
@@ -323,7 +323,7 @@ def _laid_out(pieces: list[tuple[int, int]]) -> tuple[Int64s, Int64s]:
 
 
 def _jumps(sizes: list[Int64s]) -> Int64s:
-    """Bytes that 1, 2, 4, ... 2**31 items take, by begin modulo 8: powers by squaring."""
+    """Return the bytes of 1, 2, 4, ... 2**31 items, by start modulo 8, by repeated squaring."""
     one = np.zeros(8, np.int64)
     begin = np.arange(8)
     for size in sizes:
@@ -336,7 +336,7 @@ def _jumps(sizes: list[Int64s]) -> Int64s:
 
 
 def jumped(jumps: Int64s, at: Int64s, count: Int64s) -> Int64s:
-    """Where ``count`` items that begin at ``at`` end, both of shape (N,)."""
+    """Return the ends of ``count`` items that begin at ``at``, both of shape (N,)."""
     for k in range(int(count.max(initial=0)).bit_length()):
         at = at + np.where((count >> k) & 1, jumps[k][at & 7], 0)
     return at

@@ -1,9 +1,9 @@
-"""The short way for messages that repeat one layout, as nearly all of a topic do.
+"""Fast path for messages that repeat one layout, as most messages of a topic do.
 
-When all messages of a block have the length of one that was walked before, and agree with it in
-every byte that decides where things lie (lengths of strings and sequences) and in every string,
-then every field lies where it lay there, and nothing needs to be walked. Messages that end in a
-sequence of bytes (pictures) need not have one length: what is before those bytes repeats.
+The messages of a block need not be parsed if they all have the length of an earlier message, and
+agree with it in all lengths of strings and sequences and in all strings. Every field is then at the
+same position. Messages that end in a sequence of bytes (pictures) may differ in length, because the
+part before those bytes repeats.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text
 from crosscue.replay.decode.ros.walk import Bools
 
 MAX_BYTES: Final = 4096
-"""Longer messages are few, and copying them whole would cost more than walking them."""
+"""Max size of a message for this path; longer messages are few, and copying them costs more than
+parsing them."""
 PROBE: Final = 8
-"""Bytes compared at once."""
+"""Number of bytes compared at once."""
 MAX_ITEMS: Final = 64
 LAYOUTS_KEPT: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where everything is in a message, counted from its first byte.
+    """Positions of all fields in a message, counted from its first byte.
 
     Attributes:
-        raw: The message that it was taken from, or the part of it before the bytes at its end.
+        raw: The message that the layout comes from, without the bytes at its end.
         places: First byte of each value.
         texts: First byte and length of each string.
         sequences: First byte of the items, and number of items.
-        probes: Where another message must agree with ``raw``: first of ``PROBE`` bytes, which bits
-            of them count, and what these must be.
-        tail: Path of the bytes at the end, whose number follows in each message's last four bytes
-            of what ``raw`` covers; empty if messages are of one length.
+        probes: Places where another message must agree with ``raw``: first of ``PROBE`` bytes,
+            mask of the bits that count, and their values.
+        tail: Path of the bytes at the end, whose number is in the last four bytes of ``raw``;
+            empty if all messages have one length.
     """
 
     raw: bytes
@@ -51,7 +52,7 @@ class Layout:
 
 
 def tail_of(plan: Plan) -> str:
-    """Path of the sequence of bytes that a type ends in; empty if it does not."""
+    """Return the path of the sequence of bytes at the end of a type; empty if the type has no tail."""
     last = plan.steps[-1] if plan.steps else None
     if not isinstance(last, Items) or last.count is not None or last.bound:
         return ""
@@ -59,13 +60,13 @@ def tail_of(plan: Plan) -> str:
 
 
 def layout_of(plan: Plan, raw: bytes) -> Layout | None:
-    """The layout of a little-endian message that the walk has accepted.
+    """Return the layout of a little-endian message that was parsed without error.
 
-    None for a message that is tiny or long, or has many items of varying size.
+    It is None for a message that is tiny or long, or that has many items of varying size.
 
     Args:
-        plan: Of its type.
-        raw: The message; of a type with a tail, its first ``MAX_BYTES`` bytes are enough.
+        plan: Parsing plan of its type.
+        raw: The message; for a type with a tail, its first ``MAX_BYTES`` bytes suffice.
     """
     tail = tail_of(plan)
     if len(raw) < PROBE or len(raw) > MAX_BYTES:
@@ -96,7 +97,7 @@ def layout_of(plan: Plan, raw: bytes) -> Layout | None:
 
 @dataclass(slots=True)
 class _Reading:
-    """One message read field by field."""
+    """A message that is read field by field."""
 
     raw: bytes
     head: int
@@ -109,7 +110,7 @@ class _Reading:
     fixed: list[tuple[int, int]] = field(default_factory=list)
 
     def steps(self, steps: tuple[Step, ...], *, keep: bool) -> None:
-        """Take all steps; ``keep`` the places."""
+        """Execute all steps; ``keep`` records the positions."""
         for step in steps:
             if isinstance(step, Run):
                 self._run(step, keep)
@@ -126,7 +127,7 @@ class _Reading:
         self.at += int(run.size[modulo])
 
     def take_length(self) -> int:
-        """Pass a 32-bit length."""
+        """Read a 32-bit length."""
         if self.is_cdr:
             self.at = (self.at + 3) & -4
         begin = self.head + self.at
@@ -164,7 +165,7 @@ class _Reading:
 def _probes(
     raw: bytes, ranges: list[tuple[int, int]]
 ) -> Iterator[tuple[int, np.uint64, np.uint64]]:
-    """As few probes as cover all ranges, which are in order."""
+    """Yield the fewest probes that cover all ranges, which are in order."""
     left = [at for begin, end in ranges for at in range(begin, end)]
     while left:
         begin = min(left[0], len(raw) - PROBE)
@@ -180,11 +181,11 @@ def _probes(
 
 
 def repeats(layout: Layout, messages: Messages) -> Bytes | None:
-    """All messages as rows, shape (N, bytes of ``layout.raw``), if all repeat it; else None.
+    """Return messages as rows, shape (N, len(``layout.raw``)), if all repeat it; else None.
 
     Args:
-        layout: Of a message as long as these, or with a tail.
-        messages: At least one.
+        layout: Layout of a message of the same length, or with a tail.
+        messages: At least one message.
     """
     size = len(layout.raw)
     sizes = messages.stop - messages.start
@@ -205,13 +206,13 @@ def repeats(layout: Layout, messages: Messages) -> Bytes | None:
 
 
 def tail_counts(layout: Layout, rows: Bytes, messages: Messages, padding: int) -> Int64s | None:
-    """Bytes in each message's tail, shape (N,), if these fill the messages; else None.
+    """Return the bytes in each message's tail, shape (N,), if they fill the messages; else None.
 
     Args:
-        layout: With a tail.
-        rows: What ``repeats`` gave.
-        messages: The same.
-        padding: Bytes that may be left over.
+        layout: Layout with a tail.
+        rows: Rows from ``repeats``.
+        messages: The messages passed to ``repeats``.
+        padding: Max number of bytes left over.
     """
     counts = rows[:, -4:].view("<u4")[:, 0].astype(np.int64)
     left = messages.stop - messages.start - len(layout.raw) - counts
@@ -224,13 +225,13 @@ class RepeatedFields:
     """Columns of messages that repeat one layout; see ``fields.Fields``.
 
     Attributes:
-        plan: Of their type.
-        layout: Theirs.
-        rows: Shape (M, bytes of one).
-        buffer: All bytes.
+        plan: Parsing plan of their type.
+        layout: Their layout.
+        rows: Bytes of the messages, shape (M, bytes of one message).
+        buffer: Bytes of all messages.
         start: Shape (M,): first byte of each message.
-        counts: Shape (M,): bytes in each message's tail; None without one.
-        seen: Numbers gathered already.
+        counts: Shape (M,): bytes in each message's tail; None without a tail.
+        seen: Numbers decoded so far.
     """
 
     plan: Plan
@@ -245,7 +246,7 @@ class RepeatedFields:
         return len(self.rows)
 
     def number(self, path: str) -> NDArray[np.generic]:
-        """Values at ``path``: shape (M,), or (M, k) for an array of k."""
+        """Return values at ``path``: shape (M,), or (M, k) for an array of k."""
         if path not in self.seen:
             self.seen[path] = self._number(path)
         return self.seen[path]
@@ -273,31 +274,31 @@ class RepeatedFields:
         return whole * 1_000_000_000 + rest.astype(np.int64)
 
     def text_ranges(self, path: str) -> tuple[Int64s, Int64s]:
-        """First byte and length of the string at ``path``."""
+        """Return first byte and length of the string at ``path``."""
         begin, length = self.layout.texts[path]
         return self.start + begin, np.full(len(self), length, np.int64)
 
     def texts(self, path: str) -> tuple[str, ...]:
-        """Strings at ``path``, which are all the same."""
+        """Return strings at ``path``, which are all equal."""
         begin, length = self.layout.texts[path]
         return (self.layout.raw[begin : begin + length].decode("utf-8"),) * len(self)
 
     def items(self, path: str) -> tuple[Int64s, Int64s]:
-        """First byte and number of items of the sequence at ``path``."""
+        """Return first byte and number of items of the sequence at ``path``."""
         begin, count = self.layout.sequences[path]
         if path == self.layout.tail and self.counts is not None:
             return self.start + begin, self.counts
         return self.start + begin, np.full(len(self), count, np.int64)
 
     def padded(self, path: str, width: int) -> NDArray[np.float64]:
-        """Sequences of numbers as shape (M, k), k <= ``width``."""
+        """Return sequences of numbers as shape (M, k), k <= ``width``."""
         assert path != self.layout.tail, "the bytes at the end are a range, not numbers"
         begin, count = self.layout.sequences[path]
         code = "<" + self.plan.sequences[path].code
         return self._view(begin, code, count)[:, :width].astype(np.float64)
 
     def take(self, keep: Bools) -> RepeatedFields:
-        """The messages picked."""
+        """Return the selected messages."""
         if keep.all():
             return self
         counts = None if self.counts is None else self.counts[keep]

@@ -1,6 +1,6 @@
-"""What becomes of each message type of the contract: one line a type.
+"""Table of the ROS message types with standard columns, one line per type.
 
-Everything else becomes a table of all its numbers under dotted names (``pose.position.x``), with
+All other types become tables of all their numbers with dotted names (``pose.position.x``), and with
 ``<name>.length`` for every sequence.
 """
 
@@ -50,13 +50,14 @@ LENS_COEFFICIENTS: Final = 14
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """How one message type is decoded.
+    """Conversion of one message type to rows.
 
     Attributes:
-        needs: What the definition must have: ``path`` a number, ``path:9`` an array of nine,
-            ``path$`` a string, ``path[u1]`` a sequence of that NumPy code; ``|`` for or.
-        build: From the fields of usable messages to rows.
-        doubts: Which messages are not usable, and why.
+        needs: Fields that the definition must have: ``path`` for a number, ``path:9`` for an array
+            of nine, ``path$`` for a string, ``path[u1]`` for a sequence of that NumPy code; ``|``
+            means or.
+        build: Function from the fields of usable messages to rows.
+        doubts: Function that yields the messages that are not usable, and the reason.
     """
 
     needs: tuple[str, ...]
@@ -64,10 +65,10 @@ class Kind:
     doubts: Callable[[Fields], Iterator[Doubt]] | None = None
 
     def check(self, plan: Plan) -> None:
-        """Refuse a definition that lacks what its type's name promises.
+        """Check that a definition has the fields of its type.
 
         Raises:
-            SchemaError: Naming the field.
+            SchemaError: A field is missing; the message names it.
         """
         known = {f"{path}:{value.count}" for path, value in plan.values.items()}
         known |= {f"{path}$" for path in plan.texts}
@@ -84,7 +85,7 @@ class Kind:
 
 
 def _table(**sources: str) -> Kind:
-    """A table whose columns come from one field each; ``path:9`` is an array of nine."""
+    """Return the kind of a table with one field per column; ``path:9`` is an array of nine."""
 
     def build(fields: Fields) -> Table:
         return Table({name: fields.number(path.split(":")[0]) for name, path in sources.items()})
@@ -93,7 +94,7 @@ def _table(**sources: str) -> Kind:
 
 
 _CARRIED: Final = np.where(np.arange(8) < np.arange(9)[:, None], 255, 0).astype(np.uint8)
-"""By length: all bits of the bytes that a frame carries."""
+"""Mask of the bytes that a frame carries, by its length."""
 
 
 def _can_frame(fields: Fields) -> CanFrames:
@@ -123,7 +124,7 @@ def _frame_kinds(fields: Fields) -> NDArray[np.uint8]:
 
 
 def _can_doubts(fields: Fields) -> Iterator[Doubt]:
-    # As unsigned numbers, negative ones of a lying definition are too large as well.
+    # As unsigned numbers, negative numbers of a wrong definition are too large as well.
     identifier = fields.number("id").astype(np.int64).view(np.uint64)
     long = identifier > 0x7FF
     if np.count_nonzero(long):
@@ -252,7 +253,7 @@ _IMU: Final = {
 
 
 def _imu(fields: Fields) -> Table:
-    """NaN where the message says, by a covariance that begins with -1, that it has no estimate."""
+    """Build the table; values are NaN where a covariance of -1 marks a missing estimate."""
     columns: dict[str, NDArray[np.generic]] = {}
     for estimate, sources in _IMU.items():
         covariance = fields.number(f"{estimate}_covariance").astype(np.float64, copy=False)
@@ -316,7 +317,7 @@ BY_TYPE: Final[Mapping[str, Kind]] = {
 
 
 def generic(fields: Fields) -> Table:
-    """All numbers of a message under their dotted names, and the length of every sequence."""
+    """Return all numbers of messages with dotted names, and the length of every sequence."""
     columns: dict[str, NDArray[np.generic]] = {
         path: fields.number(path) for path in fields.plan.values
     }
@@ -329,29 +330,29 @@ def generic(fields: Fields) -> Table:
 
 
 OWN_TYPES: Final = "crosscue_msgs/msg/"
-"""Types made by ``crosscue convert`` for tables: their fields are the columns."""
+"""Prefix of the types that ``crosscue convert`` creates for tables, with columns as fields."""
 
 
 def own_table(fields: Fields) -> Table:
-    """The table that a type of ours was made for."""
+    """Return the table that a type of ``crosscue convert`` stores."""
     columns = dict(generic(fields).columns)
     columns.pop("header.stamp", None)
     return Table(columns or {"present": np.ones(len(fields), np.bool_)})
 
 
 def kind_of(type_name: str) -> Kind:
-    """How a type is decoded."""
+    """Return the conversion of a type."""
     if type_name in BY_TYPE:
         return BY_TYPE[type_name]
     return Kind((), own_table if type_name.startswith(OWN_TYPES) else generic)
 
 
 STAMPS: Final = ("header.stamp", "timestamp", "stamp")
-"""Where a message keeps its sensor's time, first found first taken."""
+"""Paths of the sensor's time in a message; the first one found is used."""
 
 
 def header_ns(fields: Fields) -> Int64s | None:
-    """The sensor's own time, shape (M,), or None for a type without one."""
+    """Return the sensor's own time, shape (M,), or None for a type without one."""
     values = fields.plan.values
     for path in STAMPS:
         if path in values and values[path].code == "time":

@@ -1,7 +1,7 @@
-"""Walks N messages at once: one position per message, moved step by step with NumPy.
+"""Parse N messages at once: one position per message, advanced step by step with NumPy.
 
-Every message must be consumed exactly; what passes its end, holds an implausible length, lacks a
-terminator or leaves bytes over is refused with the field at which it happened.
+Every message must be consumed exactly. A message is refused, with the name of the field, if a field
+extends past its end, has an implausible length or lacks a terminator, or if bytes are left over.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
 MAX_ITEM_STEPS: Final = 50_000
-"""Steps that nested items of varying size may take in one block, so that no log can hang us."""
+"""Max steps for nested items of varying size in one block, which bounds the time for any log."""
 CDR_PADDING: Final = 3
-"""Bytes that may follow a CDR message to fill it up to a multiple of four."""
+"""Max bytes of padding after a CDR message, to a multiple of four."""
 
 
 @dataclass(slots=True, eq=False)
 class Refused:
-    """Messages that do not fit, all for one cause.
+    """Messages that do not fit, all for one reason.
 
     Attributes:
-        rows: Which.
-        why: The field and what is wrong with it.
+        rows: Indices of the messages.
+        why: Name of the field and the fault.
     """
 
     rows: Rows
@@ -40,17 +40,17 @@ class Refused:
 
 @dataclass(slots=True, eq=False)
 class Found:
-    """Where everything is in N messages of one byte order.
+    """Positions of all fields in N messages of one byte order.
 
     Attributes:
-        buffer: All bytes.
-        little: Numbers are little endian.
-        ok: Shape (N,): the message fits; places of others mean nothing.
-        refused: Why not.
-        places: From a value's path to its run's absolute begin (N,), that begin's alignment
-            (N,), or one number where all are equal, and the value's offset by alignment (8,).
-        texts: From a string's path to its first byte (N,) and length without terminator (N,).
-        sequences: From a sequence's path to its first item (N,) and length (N,).
+        buffer: Bytes of all messages.
+        little: True if numbers are little endian.
+        ok: Shape (N,): True if the message fits; positions of the others are meaningless.
+        refused: Reasons of the others.
+        places: By path of a value: absolute start of its run (N,), alignment of that start (N,), or
+            one number if all are equal, and offset of the value by alignment (8,).
+        texts: By path of a string: its first byte (N,) and length without terminator (N,).
+        sequences: By path of a sequence: its first item (N,) and length (N,).
     """
 
     buffer: Bytes
@@ -63,9 +63,9 @@ class Found:
 
 
 def gather(buffer: Bytes, code: str, count: int, place: Int64s) -> NDArray[np.generic]:
-    """Numbers that begin at ``place``, shape (N,) or, for ``count`` > 0, (N, count).
+    """Return numbers that begin at ``place``, shape (N,) or, for ``count`` > 0, (N, count).
 
-    A view of the buffer that has an item at every byte turns this into one indexing.
+    A view of the buffer with an item at every byte reduces this to one indexing operation.
     """
     dtype = np.dtype(code)
     width = dtype.itemsize * max(count, 1)
@@ -77,7 +77,7 @@ def gather(buffer: Bytes, code: str, count: int, place: Int64s) -> NDArray[np.ge
 
 @dataclass(slots=True, eq=False)
 class Cursor:
-    """Positions of some of the messages, relative to where each one's body begins."""
+    """Positions in some of the messages, relative to the start of each message's body."""
 
     rows: Rows | slice
     origin: Int64s
@@ -85,15 +85,15 @@ class Cursor:
     stop: Int64s
 
     def pick(self, which: Bools) -> Cursor:
-        """A cursor of its own over some of the messages."""
+        """Return a separate cursor over some of the messages."""
         return Cursor(self.some_rows(which), self.origin[which], self.at[which], self.stop[which])
 
     def put_back(self, which: Bools, moved: Cursor) -> None:
-        """Take over where a cursor from ``pick`` has come to."""
+        """Copy the positions of a cursor from ``pick``."""
         self.at[which] = moved.at
 
     def some_rows(self, which: Bools) -> Rows:
-        """Numbers in the block of some of the messages."""
+        """Return the row numbers in the block of some of the messages."""
         return np.flatnonzero(which) if isinstance(self.rows, slice) else self.rows[which]
 
 
@@ -101,9 +101,9 @@ def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
     """Find every field of every message.
 
     Args:
-        plan: For the messages' type.
-        messages: For CDR with the four bytes of encapsulation, which are not examined here.
-        little: Byte order of these messages.
+        plan: Parsing plan of the messages' type.
+        messages: Messages; in CDR with the four bytes of encapsulation, which are ignored here.
+        little: True if these messages are little endian.
     """
     head = 4 if plan.is_cdr else 0
     origin = messages.start + head
@@ -115,13 +115,13 @@ def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
 
 @dataclass(slots=True, eq=False)
 class Walker:
-    """Moves cursors over messages step by step, and keeps what it finds.
+    """Parser that moves cursors over messages step by step and records positions.
 
     Attributes:
-        found: Filled as it goes.
-        is_cdr: CDR, else ROS 1.
-        damaged: Some message has been refused.
-        spent: Steps taken inside sequences of items of varying size.
+        found: Positions recorded so far.
+        is_cdr: True for CDR, False for ROS 1.
+        damaged: True if a message was refused.
+        spent: Number of steps inside sequences of items of varying size.
     """
 
     found: Found
@@ -130,7 +130,7 @@ class Walker:
     spent: int = 0
 
     def whole(self, plan: Plan, cursor: Cursor) -> None:
-        """Walk from the first field to the last and see that nothing is left over."""
+        """Parse from the first field to the last, and check that nothing is left over."""
         self.refuse(cursor, cursor.stop < 0, "no room for the encapsulation")
         self.steps(plan.steps, cursor, keep=True)
         max_left = CDR_PADDING if plan.is_cdr else 0
@@ -138,7 +138,7 @@ class Walker:
         self.refuse(cursor, left > max_left, "bytes left over after the last field")
 
     def refuse(self, cursor: Cursor, bad: Bools, why: str) -> None:
-        """Mark the messages of ``cursor`` that are ``bad``, unless they were already."""
+        """Mark the messages of ``cursor`` that are ``bad``, unless already marked."""
         if not bad.any():
             return
         ok = self.found.ok
@@ -148,11 +148,11 @@ class Walker:
             ok[fresh] = False
             self.found.refused.append(Refused(fresh, why))
         self.damaged = True
-        # A refused message stays parked at its end: nothing is read behind it.
+        # A refused message stays at its end, so that nothing is read past it.
         cursor.at[bad] = cursor.stop[bad]
 
     def steps(self, steps: Iterable[Step], cursor: Cursor, *, keep: bool) -> None:
-        """Take all steps; ``keep`` the places, which only fields outside sequences have."""
+        """Execute all steps; ``keep`` records positions, for fields outside sequences only."""
         for step in steps:
             if isinstance(step, Run):
                 self.run(step, cursor, keep)
@@ -162,21 +162,21 @@ class Walker:
                 self.items(step, cursor, keep)
 
     def run(self, run: Run, cursor: Cursor, keep: bool) -> None:
-        """Pass fields of fixed size."""
+        """Advance past fields of fixed size."""
         modulo = _same(cursor.at & 7)
         begin = cursor.origin + cursor.at
         cursor.at = cursor.at + run.size[modulo]
-        self.refuse(cursor, cursor.at > cursor.stop, f"{run.values[0].path} passes the end")
+        self.refuse(cursor, cursor.at > cursor.stop, f"{run.values[0].path} extends past the end")
         if keep:
             for k, value in enumerate(run.values):
                 self.found.places[value.path] = (begin, modulo, run.place[:, k])
 
     def _length(self, path: str, cursor: Cursor) -> Int64s:
-        """Read the 32-bit length at the cursor; 0 for messages refused."""
+        """Read the 32-bit length at the cursor; 0 for refused messages."""
         at = (cursor.at + 3) & -4 if self.is_cdr else cursor.at
         cursor.at = at + 4
         short = cursor.at > cursor.stop
-        self.refuse(cursor, short, f"{path} passes the end")
+        self.refuse(cursor, short, f"{path} extends past the end")
         place = cursor.origin + at
         code = "<u4" if self.found.little else ">u4"
         if not self.damaged:
@@ -187,11 +187,11 @@ class Walker:
         return lengths
 
     def text(self, text: Text, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
-        """Pass a string; its first byte and its length without terminator come back."""
+        """Advance past a string; return its first byte and its length without terminator."""
         length = self._length(text.path, cursor)
         first = cursor.origin + cursor.at
         cursor.at = cursor.at + length
-        self.refuse(cursor, cursor.at > cursor.stop, f"string {text.path} passes the end")
+        self.refuse(cursor, cursor.at > cursor.stop, f"string {text.path} extends past the end")
         if self.is_cdr:
             length = self._without_terminator(text, cursor, length)
         if text.bound:
@@ -216,7 +216,7 @@ class Walker:
         self.refuse(cursor, bad, f"string {text.path} is not UTF-8")
 
     def items(self, items: Items, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
-        """Pass a sequence; its first item's place and the number of items come back."""
+        """Advance past a sequence; return the position of its first item and its length."""
         count = self._count(items, cursor)
         width = int(items.code[1]) if items.code and self.is_cdr else 1
         # An empty sequence is not followed by its items' alignment.
@@ -232,7 +232,9 @@ class Walker:
             count = self._length(items.path, cursor)
             room = cursor.stop - cursor.at
             min_bytes = max(items.item_bytes, 1)
-            self.refuse(cursor, count * min_bytes > room, f"sequence {items.path} passes the end")
+            self.refuse(
+                cursor, count * min_bytes > room, f"sequence {items.path} extends past the end"
+            )
             if items.bound:
                 over = count > items.bound
                 self.refuse(cursor, over, f"sequence {items.path} is over its bound")
@@ -241,7 +243,7 @@ class Walker:
         return np.where(self.found.ok[cursor.rows], count, 0) if self.damaged else count
 
     def contents(self, items: Items, cursor: Cursor, count: Int64s) -> None:
-        """Pass the items: all at once where their sizes are known, else one by one."""
+        """Advance past the items: all at once if their sizes are known, else one by one."""
         if items.jumps is None:
             self._each(items, cursor, count)
             return
@@ -249,10 +251,10 @@ class Walker:
             cursor.at = cursor.at + count * int(items.code[1])
         else:
             cursor.at = jumped(items.jumps, cursor.at, count)
-        self.refuse(cursor, cursor.at > cursor.stop, f"sequence {items.path} passes the end")
+        self.refuse(cursor, cursor.at > cursor.stop, f"sequence {items.path} extends past the end")
 
     def _each(self, items: Items, cursor: Cursor, count: Int64s) -> None:
-        """Pass items of varying size one by one, all messages that still have one at a time."""
+        """Advance past items of varying size one by one, for all messages in parallel."""
         for i in range(int(count.max(initial=0))):
             active = count > i
             if self.damaged:
@@ -269,14 +271,14 @@ class Walker:
 
 
 def _same(column: Int64s) -> Int64s | int:
-    """The one number that a column repeats, or the column: most logs repeat one layout."""
+    """Return the number if a column is constant, as in most logs, else the column."""
     if len(column) and (column == column[0]).all():
         return int(column[0])
     return column
 
 
 def are_utf8(buffer: Bytes, first: Int64s, length: Int64s) -> Bools:
-    """Is each range of ``buffer`` UTF-8 text? Ranges of one length are examined together."""
+    """Check that ranges of ``buffer`` are UTF-8 text; ranges of one length are checked together."""
     fine = np.ones(len(first), np.bool_)
     for rows, width in by_length(length):
         if width == 0:
@@ -296,7 +298,7 @@ def _is_utf8(text: bytes) -> bool:
 
 
 def by_length(length: Int64s) -> Iterable[tuple[Rows, int]]:
-    """Rows grouped by their length; nothing is sorted when all are equal, as they mostly are."""
+    """Yield rows grouped by length; nothing is sorted in the usual case of equal lengths."""
     if not len(length):
         return
     low, high = int(length.min()), int(length.max())

@@ -231,7 +231,7 @@ def test_a_message_that_lies_about_a_length_is_dropped_with_field_and_time() -> 
     assert len(decoded) == 2
     assert ledger.topic("/s").dropped == {MISFIT: 1}
     assert ledger.details[0].t_ns == 1_000_000
-    assert "string data passes the end" in ledger.details[0].detail
+    assert "string data extends past the end" in ledger.details[0].detail
 
 
 @pytest.mark.parametrize("head", [b"\x00\x06", b"\x00\x07", b"\x00\x03", b"\x01\x00", b"\xff\xff"])
@@ -489,7 +489,7 @@ def test_columns_pass_as_they_are() -> None:
         ("A[1000] a\n" + "=" * 80 + "\nMSG: made_msgs/A\nuint8[1000000] x\n", "alone takes"),
         ("wstring w\n", "lacks the type|not supported"),
         ("uint8[0] x\n", "array x of length 0"),
-        ("int32 x\n" * 30_000, "unfolds to over"),
+        ("int32 x\n" * 30_000, "expands to over"),
         ("x" * (2 << 20), "over the limit"),
         ("@a(" * 100_000 + "\n", "cannot read the line"),
         ("string<=x y\n", "cannot read the line"),
@@ -513,7 +513,7 @@ def test_definitions_that_unfold_without_end_are_refused_at_once() -> None:
     ]
     text = ("=" * 80 + "\n").join(["L0 a\n", *levels, "MSG: made_msgs/L9\nint8 x\n"])
 
-    with pytest.raises(SchemaError, match="unfolds to over"):
+    with pytest.raises(SchemaError, match="expands to over"):
         decoder_for(Topic("/t", "made_msgs/msg/Root", "cdr", text.encode(), "ros2msg"))
 
 

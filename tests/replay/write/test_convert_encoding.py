@@ -217,7 +217,7 @@ def test_frames_of_unknown_length_are_written_as_padded_and_it_is_said() -> None
 
     assert isinstance(back.rows, CanFrames)
     assert back.rows.length.tolist() == [8] * 5
-    assert "does not keep the frames' lengths" in ledger.notices[0]
+    assert "does not record the lengths of frames" in ledger.notices[0]
 
 
 def images(codings: tuple[str, ...], raw: bool = False) -> Images:
