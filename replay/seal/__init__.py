@@ -1,1 +1,1 @@
-"""Block checksums beside logs whose format has none."""
+"""Seals: block checksums for logs whose format has none."""

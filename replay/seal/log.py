@@ -1,9 +1,9 @@
-"""A log with a seal beside it: what is read of it is held against the seal.
+"""Read a log that has a seal, and check the bytes that are read against the seal.
 
-A block of a seal is one MiB; which of its rows a changed byte belongs to cannot be known. The rows
+A block of a seal is one MiB, and the row of a changed byte is unknown. The rows of a damaged block
 are therefore delivered, the block is reported as damaged (file, first byte, one past the last), and
-the log is not whole. Withholding them would turn one wrong byte into the loss of thousands of right
-rows.
+the log is incomplete. Withholding the rows would turn one wrong byte into the loss of thousands of
+correct rows.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ _SPANS_SHOWN: Final = 3
 
 @runtime_checkable
 class Touching(Protocol):
-    """A log that says which bytes of its files it has read; of others, all are checked."""
+    """Log that records which bytes of its files it reads; other logs are checked completely."""
 
     @property
     def touched(self) -> Touched:
-        """What was read since it was opened."""
+        """Record of the blocks that were read."""
         ...
 
 
 def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -> Log:
-    """Open a log, and hold it against its seal, or that of a folder it is in, if there is one.
+    """Open a log, and check it against its seal or the seal of a folder that contains it, if any.
 
     Args:
         path: The log.
-        opened: Opens it without looking at a seal.
-        is_part: It is read as a part of a folder, whose seal covers all of it.
+        opened: Function that opens the log without a seal.
+        is_part: The log is read as a part of a folder, whose own seal covers it.
 
     Raises:
-        LogError: The seal is damaged, or the log cannot be opened: then its seal says where it is
-            damaged.
-        OSError: As ``opened``.
+        LogError: The seal is damaged, or the log cannot be opened; the message then reports the
+            damage that the seal shows.
+        OSError: Like ``opened``.
     """
     found = seal_over(path)
     if found is None or (is_part and found[0] != seal_path(path)):
@@ -72,10 +72,10 @@ def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -
 
 
 class SealedLog(Closing):
-    """Stands for a log; see ``crosscue.replay.base.Log`` and the module's text."""
+    """Log that checks its seal; see ``crosscue.replay.base.Log`` and the head of this module."""
 
     def __init__(self, log: Log, seal: Seal, folders: Path | None = None) -> None:
-        """Stand for ``log``; ``folders`` is the seal file if it is that of a folder around it."""
+        """Wrap ``log``; ``folders`` is the seal file if it belongs to a folder around the log."""
         self.seal: Final = seal
         self.folders: Final = folders
         self._log: Final = log
@@ -84,21 +84,21 @@ class SealedLog(Closing):
 
     @property
     def path(self) -> Path:
-        """As of the log."""
+        """Path of the log."""
         return self._log.path
 
     @property
     def format(self) -> str:
-        """As of the log."""
+        """Format of the log."""
         return self._log.format
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """As of the log."""
+        """Topics of the log."""
         return self._log.topics
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The log's blocks; where it says what it reads, that is checked before each of them."""
+        """Yield the log's blocks; a log that records its reads is checked before each block."""
         check = Check(self.path, self.seal)
         for sentence in check.oddities:
             ledger.drop("", CHANGED, None, sentence)
@@ -109,13 +109,13 @@ class SealedLog(Closing):
             else:
                 yield from self._checked(self._touched, check, ledger, selection)
                 if selection == EVERYTHING:
-                    # What no reader needs, such as indexes, belongs to the log, too.
+                    # Parts that no reader needs, such as indexes, belong to the log as well.
                     _exhaust(check.everything())
         finally:
             _report(check, ledger)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """As of the log; also files that are missing, new or of another size."""
+        """Report missing parts of the log, and files that are missing, new or of another size."""
         for sentence in Check(self.path, self.seal).oddities:
             ledger.drop("", CHANGED, None, sentence)
         report_missing(self._log, ledger)
@@ -147,7 +147,7 @@ def _exhaust(steps: Iterator[int]) -> None:
 
 
 def _report(check: Check, ledger: Ledger) -> None:
-    """Put what differs into the account, and say how much was checked."""
+    """Report differences in the ledger, and how much was checked."""
     seal = check.seal
     spans = list(check.damaged())
     for span in spans:
@@ -162,7 +162,7 @@ def _report(check: Check, ledger: Ledger) -> None:
 
 
 def sealed_sentence(log: Log) -> str:
-    """Whether a log is sealed, when and how."""
+    """Describe when and how a log was sealed; empty for a log without a seal."""
     if not isinstance(log, SealedLog):
         return "not sealed"
     seal = log.seal

@@ -1,11 +1,11 @@
-"""Seals: a hash of each MiB of a log, kept beside it as ``LOG.seal``.
+"""Seals: a hash of each MiB of a log, stored next to it as ``LOG.seal``.
 
-Many formats have no checksum: a flipped payload byte in a .db3, a candump log or a video cannot be
-seen. A seal shows it to within one MiB. The hash is XXH3 with 128 bits, which guards against
-accidents (a failing disk, a broken copy), not against somebody who may write the seal as well.
+Many formats have no checksum, so that a flipped payload byte in a .db3, a candump log or a video
+cannot be detected. A seal locates it to within one MiB. The hash is XXH3 with 128 bits. It protects
+against accidents (a failing disk, a broken copy), not against an attacker who can write the seal.
 
-A log that is a folder is sealed with all of its files, except hidden ones and seals. A file is
-sealed with the files that its reader opens beside it: SQLite's journals, a video's times.
+The seal of a folder covers all of its files, except hidden files and seals. The seal of a file also
+covers the files that its reader opens next to it: SQLite's journals, or a video's time file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ HASH: Final = "xxh3_128"
 BLOCK_BYTES: Final = MIB
 DIGEST_BYTES: Final = 16
 MAX_SEAL_BYTES: Final = 256 * MIB
-"""Of a seal file; enough for 8 TB of log."""
+"""Max size of a seal file, which suffices for a log of 8 TB."""
 THE_LOG: Final = "."
 """Name in the seal of a log that is one file, so that both can be renamed together."""
 _NAMES_SHOWN: Final = 3
@@ -37,12 +37,12 @@ _NAMES_SHOWN: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class SealedFile:
-    """One file as it was sealed.
+    """One file at the time of sealing.
 
     Attributes:
-        name: Relative to the log's folder, with slashes; ``THE_LOG`` for a log of one file.
-        size: In bytes.
-        digests: ``DIGEST_BYTES`` for each block, one after the other.
+        name: Name relative to the log's folder, with slashes; ``THE_LOG`` for a log of one file.
+        size: Size in bytes.
+        digests: Concatenated hashes of all blocks, with ``DIGEST_BYTES`` each.
     """
 
     name: str
@@ -51,21 +51,21 @@ class SealedFile:
 
     @property
     def blocks(self) -> int:
-        """How many blocks it has."""
+        """Number of blocks."""
         return _blocks_in(self.size)
 
     def digest(self, block: int) -> bytes:
-        """The hash of one block."""
+        """Return the hash of one block."""
         return self.digests[block * DIGEST_BYTES : (block + 1) * DIGEST_BYTES]
 
 
 @dataclass(frozen=True, slots=True)
 class Seal:
-    """All files of a log as they were sealed.
+    """All files of a log at the time of sealing.
 
     Attributes:
-        sealed_at: UTC, ISO 8601.
-        files: By name.
+        sealed_at: Time of sealing in UTC, ISO 8601.
+        files: Files by name.
     """
 
     sealed_at: str
@@ -73,7 +73,7 @@ class Seal:
 
     @property
     def blocks(self) -> int:
-        """How many blocks all files have together."""
+        """Total number of blocks of all files."""
         return sum(file.blocks for file in self.files.values())
 
 
@@ -82,9 +82,9 @@ class Span:
     """Bytes of a file that differ from the seal.
 
     Attributes:
-        name: As in the seal.
+        name: Name as in the seal.
         start: First byte of the first block that differs.
-        stop: One past the last byte of the last one.
+        stop: One past the last byte of the last block that differs.
     """
 
     name: str
@@ -93,13 +93,13 @@ class Span:
 
 
 def seal_path(log: Path) -> Path:
-    """Where the seal of a log lies, or would lie."""
-    # "." has no name, and links must stay.
+    """Return the path of a log's seal, which need not exist."""
+    # "." has no name, and symbolic links must not be resolved.
     return Path(os.path.abspath(log) + SUFFIX)  # noqa: PTH100
 
 
 def files_of(log: Path) -> dict[str, Path]:
-    """The files of a log by their names in a seal.
+    """Return the files of a log by their names in a seal.
 
     Raises:
         OSError: A folder cannot be listed.
@@ -122,7 +122,7 @@ def _is_video(log: Path) -> bool:
 
 
 def _walked(folder: Path) -> Iterator[Path]:
-    """Regular files below a folder, links followed once."""
+    """Yield the regular files below a folder; links are followed once."""
     met: set[tuple[int, int]] = set()
     _is_new(folder, met)
     for place, folders, names in os.walk(folder, followlinks=True, onerror=_fail):
@@ -148,12 +148,12 @@ def _fail(error: OSError) -> None:
 
 @dataclass(slots=True)
 class Sealing:
-    """A seal that is not finished yet; iterate over it to make it.
+    """An unfinished seal; iterate over it to compute it.
 
     Attributes:
-        log: What is sealed.
-        done: Bytes hashed so far.
-        total: Bytes to hash.
+        log: Log to seal.
+        done: Number of bytes hashed so far.
+        total: Number of bytes to hash.
     """
 
     log: Path
@@ -162,10 +162,10 @@ class Sealing:
     _made: dict[str, SealedFile] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[int]:
-        """Hash every block; yields the bytes done.
+        """Hash every block, and yield the number of bytes done.
 
         Raises:
-            LogError: A file cannot be read, or changes meanwhile.
+            LogError: A file cannot be read, or changes during hashing.
         """
         try:
             files = files_of(self.log)
@@ -182,11 +182,11 @@ class Sealing:
         except OSError as error:
             raise LogError(f"{error.filename or self.log}: {error.strerror or error}") from None
         if after != before:
-            raise LogError(f"{self.log}: changed while it was sealed; seal it when it is written")
+            raise LogError(f"{self.log}: changed while it was sealed; seal it when it is complete")
 
     @property
     def seal(self) -> Seal:
-        """The seal, once all is hashed."""
+        """Return the seal, once all bytes are hashed."""
         return Seal(datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), self._made)
 
 
@@ -200,10 +200,10 @@ def _blocks_in(size: int) -> int:
 
 
 def digests_of(path: Path, blocks: Iterable[int], size: int) -> Iterator[bytes]:
-    """The hash of some blocks of a file, taken as ``size`` bytes long.
+    """Yield the hashes of blocks of a file, for a size of ``size`` bytes.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     buffer = memoryview(bytearray(BLOCK_BYTES))
     with path.open("rb", buffering=0) as file:
@@ -216,22 +216,22 @@ def digests_of(path: Path, blocks: Iterable[int], size: int) -> Iterator[bytes]:
 
 
 def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
-    """Write a log's seal, whole or not at all; False if the same one is there.
+    """Write a log's seal atomically; return False if an equal seal exists.
 
     Raises:
-        OutputError: Another seal is there and is not to be replaced, or it cannot be written.
+        OutputError: A different seal exists and ``overwrite`` is False, or it cannot be written.
     """
     path = seal_path(log)
     if path.exists() and not overwrite:
         try:
             kept = read_seal(path)
         except LogError as error:
-            raise OutputError(f"{error}, or give --overwrite") from None
+            raise OutputError(f"{error}, or use --overwrite") from None
         if kept.files == seal.files:
             return False
         raise OutputError(
             f"{path}: the log differs from its seal of {kept.sealed_at}; see "
-            f"'crosscue seal --check {log}', and give --overwrite only if the log is right"
+            f"'crosscue seal --check {log}', and use --overwrite only if the log is correct"
         )
     from crosscue.replay.base import write_text
 
@@ -257,7 +257,7 @@ def _as_text(seal: Seal) -> str:
 
 
 def _own_check(tree: Mapping[str, Any]) -> str:
-    """Hash of a seal's own content, so that damage in it is not taken for damage in the log."""
+    """Return the hash of a seal's own content, which distinguishes its damage from the log's."""
     plain = json.dumps(tree, sort_keys=True, separators=(",", ":"))
     return str(xxhash.xxh3_128_hexdigest(plain.encode()))
 
@@ -304,12 +304,12 @@ def _unsound(path: Path, what: str) -> LogError:
 
 
 def _file_of(entry: Mapping[str, Any]) -> SealedFile:
-    """One entry.
+    """Read the entry of a file.
 
     Raises:
-        ValueError: A name that leads out of the log, or hashes that do not fit the size.
+        ValueError: The name leads out of the log, or the hashes do not match the size.
         KeyError: A field is missing.
-        TypeError: A field of another type.
+        TypeError: A field has another type.
     """
     name, size = entry["name"], entry["size"]
     if not isinstance(name, str) or not isinstance(size, int):
@@ -330,12 +330,12 @@ def _file_of(entry: Mapping[str, Any]) -> SealedFile:
 
 
 def seal_over(log: Path) -> tuple[Path, Seal] | None:
-    """Where the seal of a log lies and what it says: its own, or of a folder that it is in.
+    """Return path and content of a log's seal, or of the seal of a folder that contains the log.
 
     Raises:
         LogError: The seal is damaged.
     """
-    # Asked of every log that is opened: names are joined as text, which is ten times as quick.
+    # Called for every log that is opened; joining names as text is ten times as fast.
     place = os.path.abspath(log)  # noqa: PTH100
     if os.path.exists(place + SUFFIX):  # noqa: PTH110
         own = Path(place + SUFFIX)
@@ -351,7 +351,7 @@ def seal_over(log: Path) -> tuple[Path, Seal] | None:
 
 
 def _part_of(seal: Seal, log: Path, name: str) -> Seal | None:
-    """What a folder's seal says of one log in it; None if nothing."""
+    """Return the part of a folder's seal for one log in it, or None if it has no such part."""
     if log.is_dir():
         inside = name + "/"
         files = [
@@ -374,11 +374,11 @@ def _part_of(seal: Seal, log: Path, name: str) -> Seal | None:
 
 
 class Check:
-    """Holds the files of a log against its seal, each block at most once.
+    """Check of a log's files against its seal, each block at most once.
 
     Attributes:
-        checked: Blocks examined.
-        oddities: Files that are missing, new, or of another size; a sentence each.
+        checked: Number of blocks checked.
+        oddities: Sentences about files that are missing, new, or of another size.
     """
 
     def __init__(self, log: Path, seal: Seal) -> None:
@@ -414,20 +414,20 @@ class Check:
             yield f"size changed: {_few(changed)}"
 
     def called(self, name: str) -> str:
-        """A file's name for a person."""
+        """Return a file's name for display."""
         return self._name if name == THE_LOG else name
 
     def named(self, path: Path) -> str | None:
-        """The name in the seal of one of the log's files, or None if it is not one of them."""
+        """Return the name in the seal of one of the log's files, or None for other files."""
         return self._names.get(path)
 
     def everything(self) -> Iterator[int]:
-        """Check all that is left; yields the blocks checked so far."""
+        """Check all remaining blocks, and yield the number of blocks checked so far."""
         for name, file in self.seal.files.items():
             yield from self.blocks(name, range(file.blocks))
 
     def blocks(self, name: str, blocks: Iterable[int]) -> Iterator[int]:
-        """Check some blocks of a file; those beyond its end or checked before are left out."""
+        """Check blocks of a file, except those beyond its end or checked before."""
         file = self.seal.files.get(name)
         if file is None or name not in self._sizes:
             return
@@ -440,7 +440,7 @@ class Check:
                 self._note(name, block, digest == file.digest(block))
                 yield self.checked
         except OSError:
-            # What the disk cannot read is as good as changed; the reader says what the disk says.
+            # An unreadable block counts as changed; the reader reports the disk's error.
             for block in wanted:
                 if block not in seen:
                     self._note(name, block, False)
@@ -452,7 +452,7 @@ class Check:
             self._bad.setdefault(name, set()).add(block)
 
     def damaged(self) -> Iterator[Span]:
-        """Where blocks differ, neighbours as one span."""
+        """Yield the spans that differ, with adjacent blocks as one span."""
         for name, bad in sorted(self._bad.items()):
             size = max(self.seal.files[name].size, 0)
             blocks = sorted(bad)

@@ -1,4 +1,4 @@
-"""Which parts of its files a log has read, in blocks, so that a seal can be held against them."""
+"""Record the blocks of files that a log has read, so that they can be checked against a seal."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 BLOCK_BITS: Final = 20
-"""Blocks of 1 MiB, as in seals."""
+"""Size of blocks as a power of two: 1 MiB, as in seals."""
 
 Blocks: TypeAlias = dict[Path, set[int]]
-"""Numbers of blocks, by file."""
+"""Block numbers by file."""
 
 
 class Touched:
-    """Collects the blocks read while opening, and those read while somebody listens."""
+    """Record of the blocks read while a log is opened, and while listeners are active."""
 
     def __init__(self) -> None:
-        """Begin with what opening the log reads."""
+        """Begin with the blocks read while the log is opened."""
         self._lock: Final = Lock()
         self._listeners: list[Blocks] = [{}]
         self._opening: Blocks | None = self._listeners[0]
 
     def add(self, path: Path, start: int, size: int) -> None:
-        """``size`` bytes of a file were read from byte ``start`` on; safe from any thread."""
+        """Record that ``size`` bytes of a file were read from byte ``start`` on; thread-safe."""
         if size <= 0 or not self._listeners:
             return
         blocks = range(start >> BLOCK_BITS, ((start + size - 1) >> BLOCK_BITS) + 1)
@@ -38,14 +38,14 @@ class Touched:
                 listener.setdefault(path, set()).update(blocks)
 
     def of_opening(self) -> Blocks:
-        """What opening the log has read; asked once, when it is open."""
+        """Return the blocks read while the log was opened; to be called once it is open."""
         with self._lock:
             self._listeners = [one for one in self._listeners if one is not self._opening]
         return self._opening or {}
 
     @contextmanager
     def listened(self) -> Iterator[Blocks]:
-        """Blocks read within the ``with`` block; emptied by ``taken``."""
+        """Collect the blocks read within a ``with`` block; ``taken`` empties the collection."""
         own: Blocks = {}
         with self._lock:
             self._listeners.append(own)
@@ -56,7 +56,7 @@ class Touched:
                 self._listeners = [one for one in self._listeners if one is not own]
 
     def taken(self, listener: Blocks) -> Blocks:
-        """What a listener has heard since it was last asked."""
+        """Return the blocks of a listener since the last call."""
         with self._lock:
             heard = dict(listener)
             listener.clear()
@@ -64,7 +64,7 @@ class Touched:
 
 
 class _Noted(FileIO):
-    """A file that notes which of its bytes are read."""
+    """File that records which of its bytes are read."""
 
     def __init__(self, path: Path, touched: Touched) -> None:
         super().__init__(path, "rb")
@@ -88,7 +88,7 @@ class _Noted(FileIO):
 
 
 def open_noted(path: Path, touched: Touched, buffering: int = 1 << 13) -> BufferedReader:
-    """A file opened for reading, whatever is read of it noted.
+    """Open a file for reading, and record all reads.
 
     Raises:
         OSError: It cannot be opened.

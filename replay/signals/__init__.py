@@ -1,1 +1,1 @@
-"""From a log's blocks to the few signals that estimators take, by role."""
+"""Extract the signals that estimators use from a log's blocks, by role."""

@@ -1,4 +1,4 @@
-"""A car's own signals from the frames of one bus, as the vehicle file names them."""
+"""Read a vehicle's signals from the frames of one bus, as named in the vehicle file."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from .kinds import MOBILEYE_SIGNALS, Samples, Signal
 
 
 class CanSignals:
-    """Reads wheel speeds, yaw rate and steering of one bus, a block at a time."""
+    """Reader of wheel speeds, yaw rate and steering of one bus, a block at a time."""
 
     def __init__(
         self, bus: str, ledger: Ledger, vehicle: Vehicle, signals: Collection[Signal]
     ) -> None:
-        """Prepare.
+        """Prepare the decoder.
 
         Args:
-            bus: Its topic.
-            ledger: Records what could not be used.
-            vehicle: Names the signals.
-            signals: What this bus carries, a Mobileye's among them where it is on the same bus.
+            bus: Topic of the bus.
+            ledger: Ledger that records unusable frames.
+            vehicle: Vehicle file, which names the signals.
+            signals: Signals of this bus, including those of a Mobileye on the same bus.
 
         Raises:
-            VehicleError: A name that the database does not hold.
+            VehicleError: The database lacks a named signal.
         """
         self._can: Final = vehicle.can
         self._signals: Final = frozenset(signals)
@@ -48,7 +48,7 @@ class CanSignals:
         self._decode: Final = BusDecoder(database, bus, ledger, wanted, elsewhere=elsewhere)
 
     def __call__(self, block: Block) -> Iterator[Samples]:
-        """The samples of a block of frames."""
+        """Yield the samples of a block of frames."""
         tables = {part.topic.rsplit("/", 1)[1]: part for part in self._decode(block)}
         can = self._can
         if can.wheel_speeds is not None and Signal.WHEEL_SPEEDS in self._signals:
@@ -71,22 +71,22 @@ class CanSignals:
 
 @lru_cache(maxsize=8)
 def database_of(files: tuple[str, ...]) -> CanDatabase:
-    """Read once for the probe of the clocks and the run."""
+    """Read the database, once for both the probe of the clocks and the run."""
     return CanDatabase.load([Path(name) for name in files])
 
 
 def check_signals(
     database: CanDatabase, vehicle: Vehicle, signals: Collection[Signal]
 ) -> frozenset[tuple[str, str]]:
-    """The (message, signal) pairs that the vehicle file names, each known to the database.
+    """Return the (message, signal) pairs that the vehicle file names, checked with the database.
 
     Args:
-        database: Of all buses.
+        database: Database of all buses.
         vehicle: The vehicle file.
-        signals: Those that one bus carries; pairs of others are left out.
+        signals: Signals of one bus; pairs of other signals are omitted.
 
     Raises:
-        VehicleError: A name that the database does not hold; with the nearest one.
+        VehicleError: The database lacks a name; the message suggests the nearest one.
     """
     known = {f"{m.topic_name}.{s.name}" for m in database.messages for s in m.signals}
     pairs: set[tuple[str, str]] = set()

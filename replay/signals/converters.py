@@ -1,4 +1,4 @@
-"""Decoded columns to samples: CAN signals by name, tables by their columns, in SI units."""
+"""Convert decoded columns to samples in SI units: CAN signals by name, tables by their columns."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def column_of(
     scales: Mapping[str, float],
     key: str,
 ) -> _Column | None:
-    """The column that the vehicle file names, in SI units; None where the block has none of it.
+    """Return the column that the vehicle file names, in SI units; None if the block lacks it.
 
     Raises:
-        VehicleError: Its unit is not one of ``scales``.
+        VehicleError: Its unit is not in ``scales``.
     """
     if name is None:
         return None
@@ -60,7 +60,7 @@ def column_of(
 
 
 def wheel_samples(columns: Sequence[_Column | None]) -> Iterator[Samples]:
-    """Speeds of four wheels, front left to rear right, at the times of the rear left one."""
+    """Yield the speeds of four wheels, front left to rear right, at times of the rear left one."""
     base = columns[2]
     if base is None or not len(base.t_ns):
         return
@@ -71,7 +71,7 @@ def wheel_samples(columns: Sequence[_Column | None]) -> Iterator[Samples]:
         if column.t_ns is base.t_ns:
             speeds[:, i] = column.values
             continue
-        # Wheels in different messages: each takes the other's nearest earlier reading.
+        # Wheels in other messages use their latest earlier reading.
         at = np.searchsorted(column.t_ns, base.t_ns, side="right") - 1
         speeds[:, i] = np.where(at >= 0, column.values[np.maximum(at, 0)], np.nan)
     yield Samples(Signal.WHEEL_SPEEDS, base.t_ns, speeds)
@@ -80,7 +80,7 @@ def wheel_samples(columns: Sequence[_Column | None]) -> Iterator[Samples]:
 def angle_samples(
     tables: Mapping[str, Block], section: AngleSignal, signal: Signal, key: str
 ) -> Iterator[Samples]:
-    """An angle or its rate, counter-clockwise."""
+    """Yield samples of an angle or its rate, counter-clockwise."""
     column = column_of(tables, section.signal, section.unit, ANGLE_UNITS, key)
     if column is not None and len(column.t_ns):
         yield Samples(signal, column.t_ns, column.values * section.sign)
@@ -141,7 +141,7 @@ def _heading(block: Block, ledger: Ledger) -> Iterator[Samples]:
 
 
 def _course(block: Block, ledger: Ledger) -> Iterator[Samples]:
-    # A fix without course and speed is no fault: most receivers' messages carry neither.
+    # A fix without course and speed is not a fault, because most receivers report neither.
     if isinstance(block.rows, Table) and {"course_rad", "speed_mps"} <= set(block.rows.columns):
         columns = [np.asarray(block.rows[name], float) for name in ("course_rad", "speed_mps")]
         yield Samples(Signal.COURSE, block.log_ns, np.stack(columns, axis=1))
@@ -162,7 +162,7 @@ def _position(block: Block, ledger: Ledger) -> Iterator[Samples]:
 
 
 def _position_sd_m(table: Table) -> Floats:
-    """East and north alike; NaN where the receiver does not say."""
+    """Return the horizontal standard deviation; NaN where the receiver does not report it."""
     sd = np.full(len(table), np.nan)
     if "position_sd_m" in table.columns:
         sd = np.asarray(table["position_sd_m"], np.float64)

@@ -1,4 +1,4 @@
-"""Blocks of a log to samples of the signals planned."""
+"""Extract samples of the planned signals from the blocks of a log."""
 
 from __future__ import annotations
 
@@ -24,48 +24,48 @@ if TYPE_CHECKING:
 
 
 PROBE_NS: Final = 10_000_000_000
-"""Log time examined before a clock is chosen for each topic."""
+"""Duration at a log's start that is examined to choose a clock for each topic."""
 
 
 READERS: Final = {
     Role.CAN: "crosscue.replay.signals.can_signals:CanSignals",
     Role.MOBILEYE: "crosscue.replay.mobileye.samples:MobileyeStream",
 }
-"""What reads a bus or a device: ``module:class``, imported for a drive that has one."""
+"""Readers of buses and devices as ``module:class``, imported for a drive that has one."""
 
 CanReader: TypeAlias = Callable[[Block], Iterator[Samples]]
 
 
 class MobileyeReader(Protocol):
-    """Reads one device, a block at a time."""
+    """Reader of one device, a block at a time."""
 
     def __call__(self, block: Block, /) -> Iterator[Samples]:
-        """The samples of a block."""
+        """Yield the samples of a block."""
         ...
 
     def flush(self) -> Iterator[Samples]:
-        """What was held back until it was known to be whole; once, at the log's end."""
+        """Yield the samples held back as incomplete; to be called once, at the log's end."""
         ...
 
 
 def _no_pictures(block: Block) -> None:
-    """Let them pass."""
+    """Ignore pictures."""
 
 
 @dataclass(slots=True)
 class Extractor:
-    """Blocks of one log to samples; keeps what a bus needs from block to block.
+    """Extractor of samples from one log's blocks, with the state of buses between blocks.
 
     Attributes:
-        planned: Which topics give which signals.
+        planned: Plan of topics and signals.
         vehicle: The vehicle file.
         log: Index of the log.
-        ledger: Where skips are reported.
-        clocks: From a topic to the clock whose times its samples carry; the log's where none is.
-        watch: Sees every block, decoded.
-        on_pictures: Given every block of ``Images``, its ``log_ns`` on the clock chosen.
-        shift_at: From drive time to how far it lies from the log's own, where blocks come in drive
-            time; sensors' stamps are shifted alike.
+        ledger: Ledger that records skipped rows.
+        clocks: Clock of a topic's samples; the log clock for topics that are not listed.
+        watch: Called with every decoded block.
+        on_pictures: Called with every block of ``Images``, whose ``log_ns`` is on the chosen clock.
+        shift_at: Difference between drive time and the log's own clock at a drive time, if blocks
+            are in drive time; sensors' stamps are shifted likewise.
     """
 
     planned: Plan
@@ -82,7 +82,7 @@ class Extractor:
     _packets: dict[str, PacketDecoder] = field(default_factory=dict)
 
     def __call__(self, block: Block) -> Iterator[Samples]:
-        """The samples of one block; rows that cannot be used are skipped in the ledger."""
+        """Yield the samples of one block; unusable rows are skipped in the ledger."""
         source = next(
             (s for s in self.planned.sources if s.log == self.log and s.topic.name == block.topic),
             None,
@@ -117,16 +117,16 @@ class Extractor:
                 yield from FROM_TABLE[signal](block, self.ledger)
 
     def _shifted(self, header_ns: Int64s, log_ns: Int64s) -> Int64s:
-        """Sensors' stamps in drive time; 0, for none, where they did not follow the log's clock."""
+        """Return sensors' stamps in drive time; 0 (unset) if they differ from the log's clock."""
         assert self.shift_at is not None
         shifted = header_ns + self.shift_at(log_ns)
         follows = (header_ns > 0) & (np.abs(shifted - log_ns) <= MAX_OFFSET_NS)
         return np.where(follows, shifted, 0)
 
     def finish(self) -> Iterator[tuple[str, Samples]]:
-        """What was held back until it was known to be whole, with its topic; at the log's end.
+        """Yield the samples held back as incomplete, with their topics, at the log's end.
 
-        The last pictures of a video stream go to ``on_pictures``.
+        The last pictures of a video stream are passed to ``on_pictures``.
         """
         for packets in self._packets.values():
             for block in packets.flush():
@@ -137,7 +137,7 @@ class Extractor:
                 yield source.topic.name, samples
 
     def _show(self, block: Block, images: Images) -> None:
-        """Pictures to whoever examines them, packets of a video decoded first."""
+        """Pass pictures to ``on_pictures``, after decoding the packets of a video."""
         from crosscue.replay.decode.packets import PacketDecoder, is_stream
 
         if self.on_pictures is _no_pictures:
@@ -188,14 +188,14 @@ def _reader(role: Role) -> Callable[..., Any]:
 def probe_clocks(
     log: Log, planned: Plan, vehicle: Vehicle, number: int, selection: Selection
 ) -> dict[str, Clock]:
-    """Which clock to use for each planned topic, judged by the log's first seconds.
+    """Choose a clock for each planned topic from the log's first seconds.
 
     Args:
-        log: Open.
-        planned: Which topics give which signals.
+        log: The open log.
+        planned: Plan of topics and signals.
         vehicle: The vehicle file.
-        number: Of the log in the plan.
-        selection: What will be read of the log.
+        number: Index of the log in the plan.
+        selection: Selection that will be read of the log.
     """
     extractor = Extractor(planned, vehicle, number, Ledger(""))
     first_ns: int | None = None
@@ -213,7 +213,7 @@ def probe_clocks(
 def wheels_only(
     planned: Plan, vehicle: Vehicle, number: int, clocks: Mapping[str, Clock]
 ) -> Extractor:
-    """Extracts the wheel speeds of one log's blocks and decodes nothing else."""
+    """Return an extractor that decodes only the wheel speeds of one log's blocks."""
     can = vehicle.can.model_copy(update={"yaw_rate": None, "steering": None})
     source = planned.source_of(Signal.WHEEL_SPEEDS)
     only = () if source is None else (replace(source, signals=(Signal.WHEEL_SPEEDS,)),)
@@ -224,15 +224,15 @@ def wheels_only(
 def pictures_of(
     log: Log, number: int, topic: Topic, vehicle: Vehicle, ledger: Ledger, selection: Selection
 ) -> Iterator[tuple[Block, Images]]:
-    """A camera's pictures, a block at a time, on the clock that its first seconds show to be best.
+    """Yield a camera's pictures in blocks, on the clock chosen from the log's first seconds.
 
     Args:
-        log: Open.
-        number: Of the log in the drive.
-        topic: Of the camera.
+        log: The open log.
+        number: Index of the log in the drive.
+        topic: Topic of the camera.
         vehicle: The vehicle file.
-        ledger: Records what could not be used.
-        selection: Which part of the log to read; its topics do not count.
+        ledger: Ledger that records unusable rows.
+        selection: Part of the log to read; its topics are ignored.
     """
     planned = Plan((Source(number, topic, ()),), {})
     wanted = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)

@@ -1,4 +1,4 @@
-"""What estimators take of a log, and which of its topics give it."""
+"""Signals that estimators use, their samples, and the plan of their topics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from crosscue.replay.columns import Floats, Int64s, Topic
 
 
 class Signal(Enum):
-    """What estimators take; the value says shape and unit of the samples."""
+    """Signals that estimators use; the value describes shape and unit of the samples."""
 
     WHEEL_SPEEDS = "(N, 4) m/s: front left, front right, rear left, rear right; NaN where none"
     YAW_RATE = "(N,) rad/s, counter-clockwise"
@@ -34,9 +34,9 @@ class Samples:
     """Consecutive readings of one signal.
 
     Attributes:
-        signal: Which one.
-        t_ns: Shape (N,), int64, log clock.
-        values: Shape (N,) or (N, k); see ``Signal``.
+        signal: The signal.
+        t_ns: Times on the log clock, shape (N,), int64.
+        values: Values, shape (N,) or (N, k); see ``Signal``.
     """
 
     signal: Signal
@@ -44,7 +44,7 @@ class Samples:
     values: Floats
 
     def take(self, index: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Samples:
-        """The readings picked by ``index``."""
+        """Return the readings selected by ``index``."""
         return Samples(self.signal, self.t_ns[index], self.values[index])
 
 
@@ -59,22 +59,22 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Which topics are read for which signals, and what is missing.
+    """Plan of the topics that are read for each signal.
 
     Attributes:
-        sources: In the order of logs and topics.
-        missing: From a signal that no topic carries to the reason, in plain words.
+        sources: Sources in the order of logs and topics.
+        missing: Reasons, in plain English, by signal that no topic carries.
     """
 
     sources: tuple[Source, ...]
     missing: Mapping[Signal, str]
 
     def topics_of(self, log: int) -> frozenset[str]:
-        """Names to read from one log."""
+        """Return the names of the topics to read from one log."""
         return frozenset(source.topic.name for source in self.sources if source.log == log)
 
     def source_of(self, signal: Signal) -> Source | None:
-        """Which topic carries ``signal``."""
+        """Return the source of ``signal``, or None."""
         return next((source for source in self.sources if signal in source.signals), None)
 
 
@@ -88,7 +88,8 @@ OBSTACLE_COLUMNS: Final = (
     "valid",
     "age_frames",
 )
-"""A row with nothing but ``burst`` opens the burst of one image, which may hold no obstacle."""
+"""Columns of obstacles. A row with only ``burst`` starts the burst of an image, even without
+obstacles."""
 LANE_COLUMNS: Final = (
     "side",
     "lane_type",
@@ -99,4 +100,4 @@ LANE_COLUMNS: Final = (
     "c3_per_m2",
     "x_end_m",
 )
-"""``c0_m`` and ``x_end_m`` are NaN on a side without a marking."""
+"""Columns of lanes; ``c0_m`` and ``x_end_m`` are NaN on a side without a marking."""

@@ -1,4 +1,4 @@
-"""Decides, from topics and vehicle file, which topic carries which signal, or why none does."""
+"""Plan which topic carries which signal, from a log's topics and the vehicle file."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class _Planner:
     missing: dict[Signal, str] = field(default_factory=dict)
 
     def only(self, role: Role, named: str | None, key: str) -> tuple[int, Topic] | None:
-        """The topic named in the vehicle file, or the only one of the role.
+        """Return the topic named in the vehicle file, or the only topic of the role.
 
         Raises:
-            VehicleError: The named one is not there, or several could be meant.
+            VehicleError: The named topic does not exist, or there are several candidates.
         """
         if named is not None:
             found = [(log, topic) for log, topic in self.topics if topic.name == named]
@@ -53,7 +53,8 @@ def plan(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> Plan:
         vehicle: The vehicle file.
 
     Raises:
-        VehicleError: A named topic is not there, or several could be meant; lists them.
+        VehicleError: A named topic does not exist, or there are several candidates; the message
+            lists them.
     """
     planner = _Planner(topics, vehicle)
     _plan_can(planner)
@@ -104,7 +105,7 @@ def _plan_odometry(planner: _Planner) -> None:
     place = planner.only(Role.ODOMETRY, planner.vehicle.topics.odometry, "topics.odometry")
     if place is not None:
         planner.choose(place, Signal.WHEEL_SPEEDS)
-        # A table named for its speed has no yaw rate.
+        # A table selected for its speed has no yaw rate.
         if planner.vehicle.can.yaw_rate is None and role_of(place[1]) is Role.ODOMETRY:
             planner.choose(place, Signal.YAW_RATE)
         return
@@ -143,7 +144,7 @@ def _plan_heading(planner: _Planner) -> None:
 
 
 def _plan_mobileye(planner: _Planner) -> None:
-    """From the bus that the vehicle file names, else from messages; may be missing in a log."""
+    """Plan a Mobileye from the bus in the vehicle file, else from messages; it may be missing."""
     bus = planner.vehicle.mobileye.bus
     on_bus = [(log, topic) for log, topic in planner.topics if topic.name == bus]
     if on_bus and role_of(on_bus[0][1]) is Role.CAN:
@@ -162,15 +163,15 @@ def _plan_mobileye(planner: _Planner) -> None:
         for name in ("ObstacleStatus", "ObstacleData", "LkaLane")
     }
     if not any(places.values()):
-        lacks = "mobileye.bus is not given" if bus is None else f"no topic {bus} (mobileye.bus)"
+        lacks = "mobileye.bus is not set" if bus is None else f"no topic {bus} (mobileye.bus)"
         reason = f"{lacks}, and there are no messages of mobileye_560_660_msgs"
         planner.missing.update(dict.fromkeys(MOBILEYE_SIGNALS, reason))
         return
     if len(places["ObstacleData"]) > 1:
         names = ", ".join(topic.name for _, topic in places["ObstacleData"])
         raise VehicleError(
-            f"several topics could be the Mobileye's obstacles: {names}; give the beginning of one "
-            "device's topics as mobileye.bus in the vehicle file"
+            f"several topics could be the Mobileye's obstacles: {names}; set mobileye.bus in the "
+            "vehicle file to the prefix of one device's topics"
         )
     for name, found in places.items():
         for place in found:
@@ -179,20 +180,20 @@ def _plan_mobileye(planner: _Planner) -> None:
 
 
 def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[int, Topic] | None:
-    """The camera: the topic that the vehicle file names, or the only one; None where none exists.
+    """Return the camera that the vehicle file names, or the only one; None without a camera.
 
     Raises:
-        VehicleError: The named one is not there, or several could be meant.
+        VehicleError: The named topic does not exist, or there are several candidates.
     """
     return _Planner(topics, vehicle).only(Role.CAMERA, vehicle.topics.camera, "topics.camera")
 
 
 def pictures_only(camera: tuple[int, Topic]) -> Plan:
-    """A plan that reads nothing but the camera's pictures."""
+    """Return a plan that reads only the camera's pictures."""
     return with_pictures(Plan((), {}), camera)
 
 
 def with_pictures(planned: Plan, camera: tuple[int, Topic]) -> Plan:
-    """The same plan, with the camera's pictures read as well; see ``Extractor.on_pictures``."""
+    """Return the plan with the camera's pictures added; see ``Extractor.on_pictures``."""
     log, topic = camera
     return replace(planned, sources=(*planned.sources, Source(log, topic, ())))

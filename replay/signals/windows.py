@@ -1,8 +1,8 @@
-"""Signals of several logs, merged by time and cut into windows.
+"""Merge the signals of several logs by time, and cut them into windows.
 
-Memory is bounded by the horizon, not by the logs' length: a window closes once every source has
-passed its end, or its log has run ahead by the horizon without it. Rows that come later than that
-are skipped and reported.
+Memory is bounded by the horizon, not by the length of the logs. A window closes once every source
+has passed its end, or the source's log is ahead of it by the horizon. Later rows are skipped and
+reported.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from crosscue.replay.signals.kinds import Plan, Samples, Signal
 WIDTH_NS: Final = 1_000_000_000
 HORIZON_NS: Final = 60_000_000_000
 SLACK_NS: Final = 1_200_000_000
-"""How far rows of one topic may be out of order, or their own clock behind, without being late."""
+"""Max disorder of the rows of one topic, or lag of their own clock, before they count as late."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """All samples of ``start_ns <= t < end_ns``, each signal in order of time."""
+    """All samples with ``start_ns <= t < end_ns``, each signal in order of time."""
 
     start_ns: int
     end_ns: int
@@ -32,25 +32,25 @@ class Window:
 
 
 class Extracting(Protocol):
-    """Extracts the samples of a log's blocks, as ``replay.signals.extractor.Extractor`` does."""
+    """Extractor of samples from a log's blocks, see ``replay.signals.extractor.Extractor``."""
 
     @property
     def ledger(self) -> Ledger:
-        """Where skips are reported."""
+        """Ledger that records skipped rows."""
         ...
 
     def __call__(self, block: Block) -> Iterator[Samples]:
-        """The samples of one block."""
+        """Yield the samples of one block."""
         ...
 
     def finish(self) -> Iterator[tuple[str, Samples]]:
-        """What was held back until the log's end, by topic."""
+        """Yield the samples held back until the log's end, with their topics."""
         ...
 
 
 @dataclass(slots=True)
 class _Progress:
-    """How far one log has been read."""
+    """Reading position of one log."""
 
     log_ns: int | None = None
     topic_ns: dict[str, int] = field(default_factory=dict)
@@ -80,13 +80,13 @@ def windows(
     planned: Plan,
     width_ns: int = WIDTH_NS,
 ) -> Iterator[Window]:
-    """Read all logs side by side; give their signals a window at a time, gaps left out.
+    """Read all logs in parallel, and yield their signals in windows; empty windows are omitted.
 
     Args:
         logs: Open logs of one drive.
-        extractors: One for each log, holding its ledger.
-        selections: What to read of each log.
-        planned: Which topics give which signals.
+        extractors: One extractor for each log, with the log's ledger.
+        selections: Selection to read of each log.
+        planned: Plan of topics and signals.
         width_ns: Length of a window.
     """
     streams = [
@@ -97,7 +97,7 @@ def windows(
     progress = [_Progress() for _ in logs]
     pending = _Pending([e.ledger for e in extractors], width_ns)
     while not all(p.ended for p in progress):
-        # The log that lags behind is read on, so that none has to be held in memory.
+        # The log that lags behind is read next, so that no log has to be held in memory.
         behind = min(
             (i for i, p in enumerate(progress) if not p.ended),
             key=lambda i: (progress[i].log_ns is not None, progress[i].log_ns or 0),
@@ -118,7 +118,7 @@ def windows(
 
 
 class _Pending:
-    """Samples waiting for their window to close."""
+    """Samples of windows that are still open."""
 
     def __init__(self, ledgers: Sequence[Ledger], width_ns: int) -> None:
         self._ledgers: Final = ledgers
@@ -127,7 +127,7 @@ class _Pending:
         self._closed_ns: int | None = None
 
     def add(self, log: int, topic: str, samples: Samples) -> None:
-        """Take samples in; those before the last closed window's end are reported as late."""
+        """Add samples; those before the last closed window's end are reported as late."""
         if not len(samples.t_ns):
             return
         if self._closed_ns is not None:
@@ -145,12 +145,12 @@ class _Pending:
             self._parts.setdefault(samples.signal, []).append(samples)
 
     def next_end(self) -> int | None:
-        """End of the earliest window with samples in it."""
+        """Return the end of the earliest window with samples."""
         firsts = [int(part.t_ns.min()) for parts in self._parts.values() for part in parts]
         return (min(firsts) // self._width_ns + 1) * self._width_ns if firsts else None
 
     def close(self, end_ns: int) -> Window:
-        """The window that ends at ``end_ns``; its samples leave."""
+        """Remove and return the window that ends at ``end_ns``."""
         samples: dict[Signal, Samples] = {}
         for signal in Signal:
             inside: list[Samples] = []

@@ -1,1 +1,1 @@
-"""Writing MCAP."""
+"""Write logs as MCAP files."""

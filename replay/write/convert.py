@@ -1,4 +1,4 @@
-"""Writes blocks of any log as one MCAP file with ROS 2 types, accounting for every row."""
+"""Write the blocks of any log as one MCAP file with ROS 2 types, and account for every row."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ TOO_EARLY: Final = "time before 1970"
 
 
 class LogWriter:
-    """One log being written. Use it as a context manager.
+    """Writer of one log, to be used as a context manager.
 
-    ``add_topic`` for every topic, then ``write`` blocks in any order: they are merged by log time
-    within a window. ROS 2 messages are stored byte for byte; ROS 1 messages are transcribed;
-    everything else is written in the types that ``crosscue.replay.encode`` documents.
+    Call ``add_topic`` for every topic, then ``write`` blocks in any order: they are merged by log
+    time within a window. ROS 2 messages are stored unchanged, ROS 1 messages are transcoded, and
+    everything else is written with the types documented in ``crosscue.replay.encode``.
     """
 
     def __init__(
@@ -57,23 +57,23 @@ class LogWriter:
         compression: Compression = "zstd",
         overwrite: bool = False,
     ) -> None:
-        """Begin a file; it has its name only once the writer is closed.
+        """Create a file, which has its final name once the writer is closed.
 
         Args:
-            path: The final name.
-            ledger: Account of the log that is read; rows that cannot be written are skipped there.
-            compression: Of chunks.
-            overwrite: Replace a file that is there.
+            path: Final path of the file.
+            ledger: Ledger of the log that is read; rows that cannot be written are skipped in it.
+            compression: Compression of chunks.
+            overwrite: Replace an existing file.
 
         Raises:
             OutputError: ``path`` exists, or cannot be written.
         """
         self.written: Counter[str] = Counter()
-        """Messages by topic as they are called in the file."""
+        """Number of messages by topic name in the file."""
         self.kept: Counter[str] = Counter()
-        """Messages by topic as they are called in the log."""
+        """Number of messages by topic name in the log."""
         self.types: dict[str, str] = {}
-        """From topic in the file to its type."""
+        """Types by topic name in the file."""
         self._ledger = ledger
         self._encoders = Encoders()
         self._known: dict[str, Encoder | str] = {}
@@ -82,9 +82,9 @@ class LogWriter:
         self._mcap = McapWriter(path, compression=compression, overwrite=overwrite)
 
     def add_topic(self, topic: Topic) -> bool:
-        """Get ready for a topic; False if ROS 2 cannot hold it, and its rows will be skipped.
+        """Prepare a topic; False if ROS 2 cannot represent it, so that its rows will be skipped.
 
-        A topic without rows is not in the file.
+        A topic without rows is not written.
         """
         if topic.name in self._known:
             return not isinstance(self._known[topic.name], str)
@@ -103,7 +103,7 @@ class LogWriter:
         return not isinstance(encoder, str)
 
     def write(self, block: Block) -> int:
-        """Write a block of a topic that was added; the number of messages written comes back.
+        """Write a block of a topic that was added, and return the number of messages written.
 
         Raises:
             OutputError: The disk is full.
@@ -124,7 +124,7 @@ class LogWriter:
         return count
 
     def _without_early(self, block: Block) -> Block:
-        """MCAP times have no sign."""
+        """Return the block without times before 1970, which MCAP cannot store."""
         early = block.log_ns < 0
         if block.publish_ns is not None:
             early |= block.publish_ns < 0
@@ -154,7 +154,7 @@ class LogWriter:
         self.written[block.topic] += len(block)
 
     def close(self) -> Mapping[str, int]:
-        """Finish the file; messages by topic in it come back.
+        """Finish the file, and return the number of messages by topic.
 
         Raises:
             OutputError: The disk is full.
@@ -176,23 +176,23 @@ class LogWriter:
 
 @runtime_checkable
 class Walking(Protocol):
-    """A decoder that can tell which messages fit their definition."""
+    """Decoder that can tell which messages fit their definition."""
 
     def walked(
         self, block: Block, messages: Messages, ledger: Ledger
     ) -> tuple[object, NDArray[np.intp]]:
-        """Fields of the messages that fit, and which of the block they are."""
+        """Return the fields of the messages that fit, and their row numbers in the block."""
         ...
 
 
 @dataclass(slots=True)
 class Encoders:
-    """Encoders of the topics of one file, which share the types made for it."""
+    """Encoders of the topics of one file, which share its own types."""
 
     types: OwnTypes = field(default_factory=OwnTypes)
 
     def encoder_for(self, topic: Topic) -> Encoder | None:
-        """The encoder of ``topic``; None if its type is not known, so that ROS 2 cannot hold it.
+        """Return the encoder of ``topic``; None if its type is unknown, so ROS 2 cannot store it.
 
         Raises:
             SchemaError: Its definition is damaged.
@@ -222,9 +222,9 @@ def _cdr(topic: Topic) -> Encoder | None:
 
 @dataclass(frozen=True, slots=True)
 class _AsStored:
-    """CDR messages stay as they are, byte for byte, if they fit their definition.
+    """Encoder that keeps CDR messages unchanged if they fit their definition.
 
-    Those that do not would make other readers refuse the whole file.
+    Messages that do not fit would make other readers refuse the complete file.
     """
 
     type: Ros2Type
@@ -240,7 +240,7 @@ class _AsStored:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Decode to columns first, then write them in ROS 2's types."""
+    """Encoder that decodes to columns first, then encodes them with types of ROS 2."""
 
     decoder: Decoder
     types: OwnTypes

@@ -1,8 +1,8 @@
-"""Writes MCAP whole or not at all: chunks, message indexes, statistics, every checksum.
+"""Write MCAP files atomically, with chunks, message indexes, statistics and all checksums.
 
-The mcap package writes the file; what is ours is the order of messages and the file's name. The
-same rows give the same bytes with the same version of mcap. While it is written the file has
-another name in the same folder; the final name appears when everything is on the disk.
+The mcap package writes the file; this module orders messages and names the file. The same rows
+yield the same bytes with the same version of mcap. During writing the file has a temporary name in
+the same folder, and it is renamed once everything is on the disk.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from crosscue.replay.readers.mcap.records import CONVERTED_FROM
 
 LIBRARY: Final = "crosscue"
 CHUNK_BYTES: Final = 4 << 20
-"""Uncompressed bytes that a chunk aims at."""
+"""Target size of a chunk in uncompressed bytes."""
 WINDOW_BYTES: Final = 8 << 20
-"""Bytes of payload that wait to be merged by time."""
+"""Bytes of payload that are buffered and merged by time."""
 
 Compression: TypeAlias = Literal["zstd", "lz4", "none"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """N messages of one channel, in the order in which they are to be stored.
+    """N messages of one channel, in the order in which they are stored.
 
     Attributes:
         channel: Number of the channel.
@@ -50,7 +50,7 @@ class Stretch:
     messages: Messages
 
     def rows(self) -> Iterator[tuple[int, int, bytes, int, int]]:
-        """Channel, log time, payload, publish time and sequence number of each message."""
+        """Yield channel, log time, payload, publish time and sequence number of each message."""
         times = zip(self.log_ns.tolist(), self.publish_ns.tolist(), strict=True)
         for i, ((log_ns, publish_ns), number) in enumerate(
             zip(times, self.sequence.tolist(), strict=True)
@@ -59,9 +59,9 @@ class Stretch:
 
 
 class McapWriter:
-    """One MCAP file with profile ``ros2``. Use it as a context manager.
+    """Writer of one MCAP file with profile ``ros2``, to be used as a context manager.
 
-    Leaving normally gives the file its name; leaving with an error leaves nothing.
+    On normal exit the file has its final name; on an error nothing remains.
     """
 
     def __init__(
@@ -72,19 +72,19 @@ class McapWriter:
         overwrite: bool = False,
         chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
-        """Open a file beside ``path`` and write its header.
+        """Open a temporary file next to ``path`` and write its header.
 
         Args:
-            path: The final name.
-            compression: Of chunks.
-            overwrite: Replace a file that is there.
-            chunk_bytes: Uncompressed bytes that a chunk aims at.
+            path: Final path of the file.
+            compression: Compression of chunks.
+            overwrite: Replace an existing file.
+            chunk_bytes: Target size of a chunk in uncompressed bytes.
 
         Raises:
             OutputError: ``path`` exists, or cannot be written.
         """
         if path.is_dir():
-            raise OutputError(f"{path}: is a folder; give the name of a file")
+            raise OutputError(f"{path}: is a folder; expected the name of a file")
         if path.exists() and not overwrite:
             raise OutputError(f"{path}: exists; give another name or --overwrite")
         self.path = path
@@ -114,17 +114,17 @@ class McapWriter:
         schema_encoding: str = "ros2msg",
         converted_from: str = "",
     ) -> int:
-        """Number of the channel for CDR messages of a topic; the same call returns the same one.
+        """Return the channel number for CDR messages of a topic; equal calls return one channel.
 
         Args:
-            topic: Name.
-            type_name: ROS 2 spelling (``sensor_msgs/msg/Imu``).
+            topic: Name of the topic.
+            type_name: Name of the type in ROS 2 spelling (``sensor_msgs/msg/Imu``).
             schema: Complete definition with all dependencies.
             schema_encoding: ``ros2msg`` or ``ros2idl``.
-            converted_from: As in ``Topic``; kept in the channel's metadata.
+            converted_from: Original type as in ``Topic``; stored in the channel's metadata.
 
         Raises:
-            OutputError: More topics than an MCAP file can number.
+            OutputError: There are more topics than an MCAP file can number.
         """
         key = (topic, type_name)
         if key not in self._ids:
@@ -142,23 +142,23 @@ class McapWriter:
         return self._schema_ids[key]
 
     def write(self, stretch: Stretch) -> None:
-        """Take messages; times must not be negative.
+        """Write messages; times must not be negative.
 
         Raises:
             OutputError: The disk is full.
-            ValueError: A time before 1970.
+            ValueError: A time is before 1970.
         """
         if not len(stretch.messages):
             return
         if int(stretch.log_ns.min()) < 0 or int(stretch.publish_ns.min()) < 0:
-            raise ValueError("MCAP has no times before 1970")
+            raise ValueError("MCAP cannot store times before 1970")
         self._waiting.append(stretch)
         self._waiting_bytes += int((stretch.messages.stop - stretch.messages.start).sum())
         if self._waiting_bytes >= WINDOW_BYTES:
             self._guarded(self._flush)
 
     def _flush(self) -> None:
-        """Merge what waits by time, and hand it on message by message."""
+        """Merge the buffered messages by time, and write them."""
         waiting, self._waiting, self._waiting_bytes = self._waiting, [], 0
         rows = [stretch.rows() for stretch in waiting]
         for which in _order(waiting):
@@ -178,7 +178,7 @@ class McapWriter:
             raise cannot_write(self.path, error) from None
 
     def close(self) -> None:
-        """Finish the file and give it its name.
+        """Finish the file and rename it to its final name.
 
         Raises:
             OutputError: The disk is full.
@@ -186,8 +186,8 @@ class McapWriter:
         self._guarded(self._finish)
 
     def discard(self) -> None:
-        """Leave nothing behind."""
-        # Bytes that cannot be flushed now belong to a file that is removed anyway.
+        """Remove the file."""
+        # Bytes that cannot be flushed belong to a file that is removed anyway.
         with suppress(OSError):
             self._file.close()
         self._partial.drop()
@@ -208,10 +208,10 @@ class McapWriter:
 
 
 def _order(stretches: Sequence[Stretch]) -> list[int]:
-    """From which of ``stretches`` each next message comes, so that they are merged by log time.
+    """Return the index of the stretch of each next message when they are merged by log time.
 
-    A channel whose clock goes back keeps its order: each of its messages counts as no earlier than
-    those before it.
+    A channel whose clock runs backwards keeps its order: each of its messages counts as no earlier
+    than its predecessors.
     """
     latest: dict[int, int] = {}
     keys = [np.empty(0, np.int64)]

@@ -227,7 +227,7 @@ def test_a_seal_is_not_replaced_by_accident(
     _flip(long_log, 7)
     capsys.readouterr()
     assert run(["seal", str(long_log)]) == 1
-    assert "--overwrite only if the log is right" in capsys.readouterr().err
+    assert "--overwrite only if the log is correct" in capsys.readouterr().err
     assert seal_path(long_log).read_bytes() == before
 
     assert run(["seal", "--overwrite", str(long_log)]) == 0

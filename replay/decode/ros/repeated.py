@@ -52,7 +52,7 @@ class Layout:
 
 
 def tail_of(plan: Plan) -> str:
-    """Return the path of the sequence of bytes at the end of a type; empty if the type has no tail."""
+    """Return the path of the bytes at the end of a type; empty if it does not end in bytes."""
     last = plan.steps[-1] if plan.steps else None
     if not isinstance(last, Items) or last.count is not None or last.bound:
         return ""
