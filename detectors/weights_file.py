@@ -76,12 +76,12 @@ def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str
         header = json_tree(content[8 : _start(content)]).get("__metadata__", {})
     except (SafetensorError, ValueError) as error:
         why = one_line(error, 120)
-        raise VehicleError(f"{path}: no safetensors file ({why}); is it whole?") from None
+        raise VehicleError(f"{path}: not a safetensors file ({why}); is it complete?") from None
     description: str | None = header.get(key)
     if SUM in header and header[SUM] != _sum(description or "", content):
         raise VehicleError(
-            f"{path}: damaged: its weights are not those it was written with; copy it again, or "
-            "train it again"
+            f"{path}: damaged: its weights do not match their checksum; copy the file again, or "
+            "train again"
         )
     wanted = EMBEDDED.get(path.name)
     if wanted is not None and path == embedded(path.name):

@@ -1,1 +1,1 @@
-"""Rules from detections to scene cues."""
+"""Rules that derive scene cues from detections."""

@@ -1,7 +1,7 @@
-"""What became of everything that a cue or a range could have come from: used, or skipped and why.
+"""Account of the candidates of each cue and range: used, or skipped with a reason.
 
-A cue that stays negative reads the same whether there was nothing to see or a threshold was too
-high. So candidates are counted, and with them the highest score that was met.
+A negative cue does not show whether nothing was visible or a threshold was too high. Therefore
+candidates are counted, and the highest score is recorded.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ Unit = Literal["detections", "frames"]
 
 @dataclass(slots=True)
 class Candidates:
-    """Of one cue or range, over a run: ``seen`` = ``used`` + all ``skipped``.
+    """Candidates of one cue or range over a run: ``seen`` = ``used`` + all ``skipped``.
 
     Attributes:
-        unit: What is counted: detections with the cue's labels, or frames with road in its region.
-        setting: Where the threshold is set in the vehicle file; None where it has none.
-        threshold: Only a higher score counts; the lowest, where detectors differ.
-        seen: How many there were.
-        used: How many became the cue or the range.
-        skipped: How many did not, by reason.
-        max_score: The highest score met; None without any.
+        unit: Unit of the counts: detections with the cue's labels, or frames with road in its
+            region.
+        setting: Key of the threshold in the vehicle file; None without a threshold.
+        threshold: Score that a candidate must exceed; the lowest if detectors differ.
+        seen: Number of candidates.
+        used: Number of candidates that became the cue or the range.
+        skipped: Number of skipped candidates, by reason.
+        max_score: Highest score of a candidate; None without candidates.
     """
 
     unit: Unit
@@ -52,12 +53,12 @@ class Candidates:
     max_score: float | None = None
 
     def meet(self, thresholds: Sequence[float]) -> None:
-        """Keep the lowest threshold that a candidate was held to."""
+        """Lower the threshold to the lowest of ``thresholds``, if it is lower."""
         met = [*thresholds, *(() if self.threshold is None else (self.threshold,))]
         self.threshold = min(met, default=None)
 
     def take(self, scores: Sequence[float], skipped: Mapping[str, int]) -> None:
-        """Count candidates with these scores, of which so many were skipped."""
+        """Count candidates with these scores, and the skipped ones among them by reason."""
         self.seen += len(scores)
         self.used += len(scores) - sum(skipped.values())
         for reason, number in skipped.items():
@@ -79,7 +80,7 @@ def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]
 
 
 def unsure_of(boxes: Sequence[Detections], labels: Sequence[str], setting: float | None) -> int:
-    """How many detections with one of the labels are not sure enough for a cue."""
+    """Number of detections with one of the labels whose score is too low for a cue."""
     return sum(
         label in labels and not is_sure
         for found in boxes
@@ -90,7 +91,7 @@ def unsure_of(boxes: Sequence[Detections], labels: Sequence[str], setting: float
 def thresholds_met(
     boxes: Sequence[Detections], labels: Sequence[str], setting: float | None
 ) -> list[float]:
-    """The thresholds that detections with one of the labels are held to."""
+    """Thresholds that apply to the detections with one of the labels."""
     if setting is not None:
         return [setting]
     return [

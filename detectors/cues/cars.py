@@ -1,8 +1,9 @@
 """Crossing and parked cars from masks in two consecutive frames (eq. 15, 16).
 
-A car seen from the side is longer than twice its height. Between two frames it is the same car when
-its mask's area and its position hardly change. Then its motion says which it is: steadily to the
-side is cross traffic, none at all is a parked car, whose nose is the lower end of its mask.
+A car seen from the side is longer than twice its height. Detections in two frames are the same car
+if mask area and position hardly change. Its motion distinguishes the two cues: a car that moves
+sideways is cross traffic, and one that does not move is parked. The nose of a parked car is the
+lower end of its mask.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ class CarShapes:
     Attributes:
         t_ns: Log time.
         size_px: Width and height of the picture.
-        center_px: Shape (N, 2), float64: middle of the box.
-        area_px: Shape (N,), float64: of the mask; of the box where there is no mask.
+        center_px: Shape (N, 2), float64: centre of the box.
+        area_px: Shape (N,), float64: area of the mask, or of the box without a mask.
         nose: Shape (N,), int64: -1 for a nose at the left, 1 at the right, 0 unknown.
     """
 
@@ -44,14 +45,14 @@ class CarShapes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Cars of one frame that were found again in the next, as columns of length M.
+    """Cars that were found in two consecutive frames, as columns of length M.
 
     Attributes:
-        step_px: Shape (M, 2), float64: how their middles moved.
-        center_px: Shape (M, 2), float64: where these are in the later frame.
-        nose: Shape (M,), int64: as in ``CarShapes``, of the later frame.
-        width_px: Of the picture.
-        judged: What they do, where that is known from more than these two frames.
+        step_px: Shape (M, 2), float64: displacement of the box centres.
+        center_px: Shape (M, 2), float64: box centres in the later frame.
+        nose: Shape (M,), int64: as in ``CarShapes``, in the later frame.
+        width_px: Width of the picture.
+        judged: Counts of cars, if they were tracked over more than these two frames.
     """
 
     step_px: NDArray[np.float64]
@@ -62,22 +63,22 @@ class Pairs:
 
 
 class Tracker(Protocol):
-    """Finds the cars of one frame again in the next; another may stand in for ``pair_cars``."""
+    """Finds the cars of one frame in the next; ``pair_cars`` is the default."""
 
     def __call__(self, before: CarShapes, now: CarShapes, settings: Cars, /) -> Pairs:
-        """Pair them, each at most once."""
+        """Pair the cars, each at most once."""
         ...
 
 
 def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
-    """The cars of one frame that are seen from the side (eq. 15: length over height, score).
+    """Select the cars of one frame that are seen from the side (eq. 15: length over height, score).
 
     Args:
         found: One or more detectors' results for the frame.
         settings: Labels, score and shape.
 
     Raises:
-        ValueError: No result at all, or a mask that is not one.
+        ValueError: ``found`` is empty, or a mask is damaged.
     """
     if not found:
         raise ValueError("found: expected at least one detector's result")
@@ -96,7 +97,7 @@ def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:
         if label in settings.labels and is_sure and _is_long(box, settings)
     ]
     boxes = np.array([box for box, _ in rows], np.float64).reshape(-1, 4)
-    # Counting pixels by column gives both area and nose from one reading of the runs.
+    # Column heights yield both area and nose from a single decoding of the runs.
     areas = [
         (box[2] - box[0]) * (box[3] - box[1]) if columns is None else float(columns.sum())
         for box, columns in rows
@@ -112,9 +113,9 @@ def _is_long(box: Sequence[float], settings: Cars) -> bool:
 
 
 def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
-    """The same cars in two frames: areas and positions hardly differ; the nearest pairs first.
+    """Pair cars of two frames whose areas and positions hardly differ, nearest pairs first.
 
-    Frames of different size, out of order or too far apart have none.
+    Frames of different size, out of order or too far apart have no pairs.
     """
     gap_s = (now.t_ns - before.t_ns) * 1e-9
     width = now.size_px[0]
@@ -132,12 +133,12 @@ def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
 
 
 def no_pairs(width_px: int) -> Pairs:
-    """Of two frames without a car that is in both."""
+    """Return empty pairs, for two frames without a common car."""
     return Pairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), width_px)
 
 
 def _nearest(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of the cheapest finite entries, each row and column at most once."""
+    """Rows and columns of the smallest finite entries, each row and column at most once."""
     rows, columns = np.nonzero(np.isfinite(cost))
     order = np.argsort(cost[rows, columns], kind="stable")
     kept: list[int] = []
@@ -153,7 +154,7 @@ def _nearest(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.in
 
 
 def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:
-    """Cars that move to the left and to the right: horizontally, and not just a little (eq. 15)."""
+    """Count cars that move to the left and to the right, horizontally and by enough (eq. 15)."""
     if not len(pairs.nose):
         return NONE
     x, y = pairs.step_px[:, 0], pairs.step_px[:, 1]
@@ -163,7 +164,7 @@ def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:
 
 
 def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
-    """Cars that stand and face left, and right (eq. 16); an unknown nose says nothing."""
+    """Count standing cars that face left and right (eq. 16); cars of unknown nose do not count."""
     if not len(pairs.nose):
         return NONE
     min_step_px = settings.still_change * pairs.width_px
@@ -172,24 +173,24 @@ def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
 
 
 def count_crossing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
-    """Cars that cross towards the side that the cue supports."""
+    """Count cars that cross towards the side that the cue supports."""
     sides = cross_traffic(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.crossing
     return of_side(sides, cue)
 
 
 def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
-    """Parked cars that face the side that the cue supports."""
+    """Count parked cars that face the side that the cue supports."""
     sides = parked_cars(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.parked
     return of_side(sides, cue)
 
 
 def count_oncoming(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
-    """Cars past the intersection that come towards the ego vehicle; None where unknown."""
+    """Count oncoming cars past the intersection; None where unknown."""
     past = None if pairs.judged is None else pairs.judged.past
     return None if past is None else past.oncoming
 
 
 def count_outgoing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
-    """Cars past the intersection that go away; None where unknown."""
+    """Count outgoing cars past the intersection; None where unknown."""
     past = None if pairs.judged is None else pairs.judged.past
     return None if past is None else past.outgoing

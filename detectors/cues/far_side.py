@@ -1,8 +1,9 @@
-"""Lane lines and vehicles past the intersection, as a Mobileye reports them: straight is a road.
+"""Cues for a road straight ahead: a Mobileye's lane lines and vehicles past the intersection.
 
-Both need to know where the intersection ends; without a range there is no count, which is neutral.
-The source takes its device's parked cars for outgoing ones (Fig. 26), so a vehicle counts whether
-it moves or stands; what stands far to the side is in a parking lot or driveway and does not.
+Both cues require the position of the intersection's end; without a range there is no count, which
+is neutral. The dissertation counts its device's parked cars as outgoing ones (Fig. 26), so a
+vehicle counts whether or not it moves. A vehicle far to the side is in a parking lot or driveway
+and does not count.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ _CUBIC: Final = [_LANE[name] for name in ("c0_m", "c1", "c2_per_m", "c3_per_m2")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MobileyeState:
-    """The last whole burst and the last line of each side.
+    """Last complete burst of obstacles, and last lane line of each side.
 
     Attributes:
-        obstacles: Shape (N, 8), ``OBSTACLE_COLUMNS``; no rows where it saw none, None where it has
-            not spoken lately.
-        lanes: Shape (M, 8), ``LANE_COLUMNS``; likewise.
+        obstacles: Shape (N, 8), ``OBSTACLE_COLUMNS``; no rows if the device sees no obstacle, None
+            without a recent message.
+        lanes: Shape (M, 8), ``LANE_COLUMNS``; None without a recent message.
     """
 
     obstacles: NDArray[np.float64] | None
@@ -42,13 +43,13 @@ class MobileyeState:
 def state_at(
     obstacles: Samples | None, lanes: Samples | None, t_ns: int, past: Past
 ) -> MobileyeState:
-    """What was known at ``t_ns``: bursts that were whole by then, and not too old.
+    """Return the device's state at ``t_ns``, from bursts that are complete and recent.
 
     Args:
         obstacles: Rows of ``Signal.MOBILEYE_OBSTACLES``, in order of time.
-        lanes: Rows of ``Signal.MOBILEYE_LANES``, likewise.
+        lanes: Rows of ``Signal.MOBILEYE_LANES``, in order of time.
         t_ns: Log time.
-        past: How long a burst takes, and when it is too old.
+        past: Duration of a burst and its maximum age.
     """
     newest = t_ns - round(past.settles_s * 1e9)
     oldest = t_ns - round(past.max_age_s * 1e9)
@@ -74,7 +75,7 @@ def _last_burst(samples: Samples | None, past: Past) -> NDArray[np.float64] | No
     values = samples.values
     last = values[:, _OBSTACLE["burst"]] == values[-1, _OBSTACLE["burst"]]
     if values[-1, _OBSTACLE["burst"]] < 0:
-        # Messages without a status message: those of one image come together.
+        # Without a status message, the messages of one image are close in time.
         last = samples.t_ns > samples.t_ns[-1] - round(past.settles_s * 1e9)
     found: NDArray[np.float64] = values[last & np.isfinite(values[:, _OBSTACLE["x_m"]])]
     return found
@@ -90,16 +91,16 @@ def _last_lanes(samples: Samples | None) -> NDArray[np.float64] | None:
 
 
 def end_of(range_m: float, *, is_end: bool, past: Past) -> float:
-    """From the rear axle to the intersection's end, by the range to its end or to its start."""
+    """Distance from the rear axle to the intersection's end, from a range to its end or start."""
     return range_m if is_end else range_m + past.intersection_length_m
 
 
 class Ahead(NamedTuple):
-    """What rules of Mobileye cues take.
+    """Input of the rules of Mobileye cues.
 
     Attributes:
-        state: What the device said last.
-        end_m: From the rear axle to the intersection's end.
+        state: Last state of the device.
+        end_m: Distance from the rear axle to the intersection's end.
     """
 
     state: MobileyeState
@@ -107,16 +108,16 @@ class Ahead(NamedTuple):
 
 
 def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> dict[str, int]:
-    """How many lane lines (0 or 1) and vehicles there are past the intersection.
+    """Count lane lines (0 or 1) and vehicles past the intersection.
 
     Args:
-        state: What the device said last.
-        end_m: From the rear axle to the intersection's end; None where no range is known.
-        past: When something is past it.
+        state: Last state of the device.
+        end_m: Distance from the rear axle to the intersection's end; None where unknown.
+        past: Conditions for being past the intersection.
 
     Returns:
-        No entry for what is unknown: no range, the end already passed, or a device that has
-        not spoken lately.
+        Counts by cue. A cue is missing if its count is unknown: without a range, after the
+        intersection, or without a recent message of the device.
     """
     if end_m is None or end_m <= 0.0:
         return {}
@@ -124,13 +125,13 @@ def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> dict[s
 
 
 def count_lanes_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:
-    """1 where a lane line runs on past the intersection, else 0."""
+    """Return 1 if a lane line continues past the intersection, else 0."""
     lanes = ahead.state.lanes
     return None if lanes is None else int(lanes_past(lanes, ahead.end_m, past).any())
 
 
 def count_vehicles_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:
-    """Vehicles past the intersection."""
+    """Count vehicles past the intersection."""
     obstacles = ahead.state.obstacles
     return None if obstacles is None else int(vehicles_past(obstacles, ahead.end_m, past).sum())
 
@@ -138,10 +139,10 @@ def count_vehicles_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:
 def lanes_past(
     lanes: NDArray[np.float64], end_m: float, past: Past
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of M lines reach past the end, shape (M,): usable ones that run on ahead."""
+    """Mark the usable lane lines that continue past the intersection's end, shape (M,)."""
     reach = end_m + past.lane_reach_m
     aside = evaluate(lanes[:, _CUBIC].T, np.full(len(lanes), reach))
-    # Sides without a marking are NaN, which is on no side of anything.
+    # Sides without a marking are NaN, so every comparison with them is false.
     with np.errstate(invalid="ignore"):
         is_far: np.ndarray[tuple[int], np.dtype[np.bool_]] = (
             (lanes[:, _LANE["x_end_m"]] >= reach)
@@ -155,7 +156,7 @@ def lanes_past(
 def vehicles_past(
     obstacles: NDArray[np.float64], end_m: float, past: Past
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of N obstacles are vehicles past the end and on the road straight ahead, shape (N,)."""
+    """Mark the obstacles that are vehicles past the end, on the road straight ahead, shape (N,)."""
     is_past: np.ndarray[tuple[int], np.dtype[np.bool_]] = (
         (obstacles[:, _OBSTACLE["x_m"]] >= end_m + past.vehicle_beyond_m)
         & (np.abs(obstacles[:, _OBSTACLE["y_m"]]) <= past.vehicle_within_y_m)

@@ -1,4 +1,4 @@
-"""Cues of a frame from what detectors found in it; a pass that goes frame by frame in time."""
+"""Compute the cues of each frame from its detections, frame by frame in time order."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from .tally import CueTally
 
 @dataclass(slots=True)
 class CuePass:
-    """Computes each frame's cues; keeps the cars of earlier frames.
+    """Computes the cues of each frame; it remembers the cars of earlier frames.
 
     Attributes:
         vehicle: Regions and thresholds.
-        tracker: Pairs cars of two frames, where the vehicle file has ``cars.kind = "pairs"``.
-        tally: Counts what became of all candidates, where somebody asks.
-        not_followed: Frames in which cars could not be followed, by reason.
+        tracker: Pairs cars of two frames, if the vehicle file has ``cars.kind = "pairs"``.
+        tally: Account of all candidates; None to skip it.
+        not_followed: Number of frames in which cars could not be tracked, by reason.
     """
 
     vehicle: Vehicle
@@ -46,12 +46,12 @@ class CuePass:
     def __call__(
         self, frame: Seen, ego: Motion | None = None, place: Place | None = None
     ) -> FrameCues:
-        """The cues of the next frame.
+        """Compute the cues of the next frame.
 
         Args:
-            frame: What was found in it.
-            ego: The ego vehicle's motion since the frame before; None where unknown.
-            place: Where the intersection is believed to be, if that is known.
+            frame: Detections in the frame.
+            ego: The ego vehicle's motion since the previous frame; None where unknown.
+            place: Estimated position of the intersection; None where unknown.
         """
         counts: dict[str, int] = {}
         pairs: Pairs | None = None
@@ -87,15 +87,15 @@ class CuePass:
         return found
 
     def restart(self) -> None:
-        """Know nothing of the cars before."""
+        """Forget the cars of earlier frames."""
         self._before = self._tracks = None
 
     def followed(self) -> list[CarMotion]:
-        """The cars of the newest frame, where they are followed over frames."""
+        """Cars of the newest frame, if they are tracked over frames."""
         return [] if self._tracks is None else self._tracks.longer()
 
     def notes(self) -> Counter[str]:
-        """Frames in which crossing and parked cars could not be computed, by reason."""
+        """Number of frames without crossing and parked cars, by reason."""
         return Counter(
             {f"crossing and parked cars: {why}": n for why, n in self.not_followed.items()}
         )
@@ -118,7 +118,7 @@ class CuePass:
     def _cars(
         self, boxes: Sequence[Detections], ego: Motion | None, place: Place | None
     ) -> Pairs | None:
-        """Cars found again; None where they could not be."""
+        """Cars found in earlier frames and this one; None if they could not be tracked."""
         cars, camera = self.vehicle.cars, self.vehicle.camera
         if cars.kind != "tracks":
             return self._pairs(boxes)
@@ -141,7 +141,7 @@ class CuePass:
         )
 
     def _pairs(self, boxes: Sequence[Detections]) -> Pairs | None:
-        """Cars found again since the frame before; None in the first frame."""
+        """Cars found in the previous frame and this one; None in the first frame."""
         now = car_shapes(boxes, self.vehicle.cars)
         before, self._before = self._before, now
         return None if before is None else self.tracker(before, now, self.vehicle.cars)
@@ -152,7 +152,7 @@ NO_FOCAL_LENGTH: Final = "camera.focal_px is not given"
 
 
 def _why_not_followed(ego: Motion | None, vehicle: Vehicle) -> str | None:
-    """Why cars cannot be followed into this frame; None where they can."""
+    """Reason why cars cannot be tracked into this frame; None if they can."""
     if vehicle.camera.focal_px is None:
         return NO_FOCAL_LENGTH
     if ego is None or ego.way_m is None:

@@ -1,4 +1,4 @@
-"""Cues that are detections with a label."""
+"""Cues that count detections by label."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from crosscue.replay.vehicle.vehicle import CueSpec, Vehicle
 
 
 def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
-    """How many detections with a cue's labels score above its setting, if it has one."""
+    """Count the detections with a cue's labels and a score above its threshold."""
     setting, min_score = vehicle.threshold_of(cue)
     return count_labels(boxes, vehicle.labels_of(cue), 0.0 if setting is None else min_score)
 
 
 def count_labels(boxes: Sequence[Detections], labels: tuple[str, ...], score: float | None) -> int:
-    """How many detections with one of ``labels`` are sure enough, see ``Detections.are_sure``."""
+    """Count detections with one of ``labels`` and a high score, as in ``Detections.are_sure``."""
     return sum(
         label in labels and is_sure
         for found in boxes

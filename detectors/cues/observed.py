@@ -1,4 +1,4 @@
-"""What rules are given: detections by role, road by region, cars by side, and where it all is."""
+"""Inputs of the rules: detections by role, road by region, cars by side, and the intersection."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from crosscue.replay.vehicle.cue_spec import CueSpec
 
 
 class Place(NamedTuple):
-    """An intersection ahead, from the rear axle.
+    """Position of the intersection ahead, as distances from the rear axle.
 
     Attributes:
-        start_m: Its start.
-        end_m: Its end.
-        sd_m: Standard deviation of either.
+        start_m: Distance to its start.
+        end_m: Distance to its end.
+        sd_m: Standard deviation of either distance.
     """
 
     start_m: float
@@ -31,12 +31,12 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RoadFractions:
-    """How much of each region of interest is road (eq. 13).
+    """Fractions of road in the regions of interest, 0 to 1 (eq. 13); NaN for an unseen region.
 
     Attributes:
-        left: Fraction of the left region's pixels, 0 to 1; NaN where the region is not seen.
-        straight: Of the straight one.
-        right: Of the right one.
+        left: Fraction of the left region's pixels that are road.
+        straight: Fraction of the straight region's pixels that are road.
+        right: Fraction of the right region's pixels that are road.
     """
 
     left: float
@@ -44,7 +44,10 @@ class RoadFractions:
     right: float
 
     def positive(self, min_fraction: float) -> tuple[bool, bool, bool]:
-        """Left, straight and right road: more than ``min_fraction`` of the region (eq. 14)."""
+        """Whether road covers more than ``min_fraction`` of the left, straight and right region.
+
+        See eq. 14.
+        """
         return self.left > min_fraction, self.straight > min_fraction, self.right > min_fraction
 
 
@@ -52,7 +55,7 @@ NOT_SEEN: Final = RoadFractions(math.nan, math.nan, math.nan)
 
 
 class Sides(NamedTuple):
-    """How many say left and how many right."""
+    """Counts for the left and for the right side."""
 
     left: int
     right: int
@@ -62,23 +65,23 @@ NONE: Final = Sides(0, 0)
 
 
 class Ways(NamedTuple):
-    """How many cars come towards the ego vehicle, and how many go away."""
+    """Numbers of oncoming and outgoing cars."""
 
     oncoming: int
     outgoing: int
 
 
 class Judged(NamedTuple):
-    """What cars do, where they were followed over several frames and not only in two.
+    """Counts of cars by behaviour, from tracks over several frames.
 
     Attributes:
         crossing: Cross traffic at the intersection.
-        parked: Parked cars there.
-        crossing_elsewhere: Cross traffic that is not there.
-        parked_elsewhere: Likewise, or the place of the intersection is unknown.
-        seen: Cars that were whole and near enough.
-        followed: Those of them that were seen in frames enough.
-        past: Cars that move along the road past the intersection; None where its place is unknown.
+        parked: Parked cars at the intersection.
+        crossing_elsewhere: Cross traffic elsewhere.
+        parked_elsewhere: Parked cars elsewhere, or all if the intersection's position is unknown.
+        seen: Number of cars that were completely visible and near enough.
+        followed: Number of those that were seen in enough frames.
+        past: Cars that move along the road past the intersection; None if its position is unknown.
     """
 
     crossing: Sides
@@ -91,9 +94,9 @@ class Judged(NamedTuple):
 
 
 def nose_of(heights_px: NDArray[np.float64]) -> int:
-    """-1 where the mask's left end is lower than its right, 1 where the right is, 0 where equal.
+    """Side of a car's nose: -1 if the mask is lower at the left end, 1 at the right, 0 if equal.
 
-    An end is the outer quarter of the mask's length: single columns are too noisy.
+    An end is the outer quarter of the mask's length, because single columns are too noisy.
 
     Args:
         heights_px: Shape (width,): mask pixels in each column.
@@ -108,12 +111,12 @@ def nose_of(heights_px: NDArray[np.float64]) -> int:
 
 
 def of_side(sides: Sides, cue: CueSpec) -> int:
-    """How many say the side that the cue supports."""
+    """Count for the side that the cue supports."""
     return sides.left if cue.supports == ("left",) else sides.right
 
 
 class Role(StrEnum):
-    """What a detector looks for; where none of a role ran, its cues are not looked for."""
+    """Kind of objects that a detector finds; without a detector of a role, its cues are unknown."""
 
     OBJECTS = "objects"
     SIGNS = "signs"
@@ -122,16 +125,16 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What detectors found in one frame, by what they look for.
+    """Detectors' results for one frame, by role.
 
     Attributes:
         t_ns: Log time of the frame.
-        objects: Of detectors of objects; empty where none ran.
-        signs: Of detectors of one-way and do-not-enter signs; empty where none ran.
-        road: Road pixels, or their fractions by region where these are known already.
-        labels: What the detectors of objects and signs can report; None for anything.
-        doubles: What was left out of ``objects`` and ``signs``, since another detector found it
-            with a better score.
+        objects: Results of detectors of objects; empty if none ran.
+        signs: Results of detectors of one-way and do-not-enter signs; empty if none ran.
+        road: Road pixels, or their fractions by region if already known.
+        labels: Labels that the detectors of objects and signs can report; None for any.
+        doubles: Detections left out of ``objects`` and ``signs``, because another detector found
+            the same objects with a better score.
     """
 
     t_ns: int
@@ -143,12 +146,12 @@ class Seen:
 
     @property
     def boxes(self) -> tuple[Detections, ...]:
-        """Of all detectors of objects and signs."""
+        """Results of all detectors of objects and signs."""
         return (*self.objects, *self.signs)
 
 
 def all_labels(labels: Iterable[Sequence[str] | None]) -> frozenset[str] | None:
-    """What several detectors can report together; None for anything, if one does not say."""
+    """Union of the labels that detectors can report; None for any, if one declares none."""
     known: set[str] = set()
     for one in labels:
         if one is None:
@@ -158,7 +161,7 @@ def all_labels(labels: Iterable[Sequence[str] | None]) -> frozenset[str] | None:
 
 
 def role_of(found: Found, is_for_signs: bool) -> Role:
-    """The role that a result plays."""
+    """Role of a detector's result."""
     if isinstance(found, RoadMask):
         return Role.ROAD
     return Role.SIGNS if is_for_signs else Role.OBJECTS
@@ -170,13 +173,13 @@ def seen(
     is_for_signs: Sequence[bool],
     labels: frozenset[str] | None = None,
 ) -> Seen:
-    """One frame's results, sorted by role.
+    """Sort one frame's results by role.
 
     Args:
         t_ns: Log time of the frame.
         found: One result for each detector.
-        is_for_signs: Whether that detector looks for one-way and do-not-enter signs.
-        labels: What all detectors can report together.
+        is_for_signs: For each detector, True if it finds one-way and do-not-enter signs.
+        labels: Labels that the detectors can report; None for any.
     """
     boxes: dict[bool, list[Detections]] = {True: [], False: []}
     road: RoadMask | None = None
@@ -190,12 +193,12 @@ def seen(
 
 @dataclass(frozen=True, slots=True)
 class FrameCues:
-    """What one frame says.
+    """Cues of one frame.
 
     Attributes:
-        counts: From each cue that was looked for, a user's own among them, to how many there were;
-            0 means searched for and not found.
-        road: Fractions of road, where a detector segments.
+        counts: Count of each evaluated cue, including the user's own; 0 means searched for and not
+            found.
+        road: Fractions of road, if a detector segments the road.
     """
 
     counts: Mapping[str, int]

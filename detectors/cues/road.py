@@ -1,4 +1,4 @@
-"""How much of the left, straight and right region of a picture is road (eq. 13, 14)."""
+"""Fractions of road in the left, straight and right region of a picture (eq. 13, 14)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ from .observed import RoadFractions
 
 
 def is_road(fractions: RoadFractions, vehicle: Vehicle, cue: CueSpec) -> int | None:
-    """1 where more than the vehicle file's fraction of the cue's region is road (eq. 14).
-
-    None where the region is not seen.
-    """
+    """Return 1 if enough of the cue's region is road, else 0 (eq. 14); None if it is not seen."""
     side = ("left", "straight", "right").index(cue.supports[0])
     if math.isnan((fractions.left, fractions.straight, fractions.right)[side]):
         return None
@@ -27,7 +24,7 @@ def is_road(fractions: RoadFractions, vehicle: Vehicle, cue: CueSpec) -> int | N
 
 @lru_cache(maxsize=64)
 def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The pixels whose centres are in a polygon, shape (h, w), by the even-odd rule."""
+    """Mark the pixels whose centres are in a polygon, shape (h, w), by the even-odd rule."""
     height, width = shape
     y, x = np.mgrid[0:height, 0:width]
     x, y = (x + 0.5) / width, (y + 0.5) / height
@@ -41,10 +38,10 @@ def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def road_fractions(road: RoadMask, regions: Regions) -> RoadFractions:
-    """Road pixels over all pixels of each region (eq. 13); regions are scaled with the mask.
+    """Compute the fraction of road in each region (eq. 13); regions are scaled to the mask.
 
     Raises:
-        ValueError: The mask is not one.
+        ValueError: The mask is damaged.
     """
     width, height = road.mask_size_px
     is_road = road.pixels()

@@ -1,19 +1,19 @@
-"""Road to the left, ahead and to the right of an intersection, looked for where that is in metres.
+"""Fractions of road to the left, ahead and to the right of an intersection, in ground regions.
 
-The source's regions are fixed in the picture (eq. 13), so a wide road of the ego vehicle's own, or
-its own lanes far ahead, lie in the region for "right". Here a region is a rectangle on the ground,
-anchored to the intersection as believed: aside the middle half between its start and its end,
-further off than the ego vehicle's own road is wide; straight, the lane beyond its end. It
-is projected with the camera's mounting and intrinsics; the ground is level.
+The dissertation's regions are fixed in the picture (eq. 13). A wide ego road, or its lanes far
+ahead, then overlap the region for "right". Here a region is a rectangle on level ground, placed
+relative to the estimated intersection. The side regions cover the middle half between its start and
+end, beyond the width of the ego road. The straight region is the lane beyond its end. The
+rectangles are projected with the camera's mounting and intrinsics.
 
-A region is **not seen**, which says nothing for or against a road,
+A region is **not seen**, which is evidence neither for nor against a road, in these cases:
 
-* where no range is known, or the region is at or behind the camera;
-* where its place on the ground is unsure by more than the margin to the intersection's ends: the
-  range's standard deviation and what the camera's pitch does to a distance ``D``,
-  ``D**2 * pitch_sd_rad / z_m``;
-* where it spans fewer than ``min_rows`` rows of the segmentation, or three quarters of it lie
-  outside the picture.
+* No range is known, or the region is at or behind the camera.
+* The uncertainty of its position exceeds the margin to the intersection's ends. It consists of the
+  range's standard deviation and the effect of the camera's pitch at distance ``D``,
+  ``D**2 * pitch_sd_rad / z_m``.
+* It spans fewer than ``min_rows`` rows of the segmentation, or three quarters of it are outside the
+  picture.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from crosscue.replay.vehicle.vehicle import Camera, Regions
 from .observed import NOT_SEEN, Place, RoadFractions
 
 MARGIN: Final = 0.25
-"""Of the intersection's depth, left out at either end."""
+"""Fraction of the intersection's depth that is left out at either end."""
 MIN_IN_PICTURE: Final = 0.25
 NEAREST_M: Final = 1.0
-"""Ahead of the camera; what is nearer is not projected."""
+"""Distance ahead of the camera below which nothing is projected."""
 
 Rectangle: TypeAlias = tuple[float, float, float, float]
-"""Nearest and furthest ahead of the rear axle, rightmost and leftmost to its left, metres."""
+"""Minimum and maximum distance ahead of the rear axle, then to its left, in metres."""
 
 
 def ground_fractions(
     road: RoadMask, camera: Camera, regions: Regions, place: Place | None
 ) -> RoadFractions:
-    """Fractions of road in regions on the ground; NaN where one is not seen.
+    """Compute fractions of road in regions on the ground; NaN for a region that is not seen.
 
     Raises:
-        ValueError: The mask is not one.
+        ValueError: The mask is damaged.
     """
     if place is None or camera.focal_px is None:
         return NOT_SEEN
@@ -59,7 +59,7 @@ def ground_fractions(
 
 
 def rectangles(regions: Regions, place: Place) -> tuple[tuple[Rectangle, float], ...]:
-    """Left, straight and right, each with its margin to the intersection's ends."""
+    """Left, straight and right rectangle, each with its margin to the intersection's ends."""
     margin_m = MARGIN * (place.end_m - place.start_m)
     first, last = place.start_m + margin_m, place.end_m - margin_m
     near_m, far_m = regions.aside_m
@@ -77,7 +77,7 @@ def outlines(
 ) -> tuple[NDArray[np.float64] | None, ...]:
     """Corners of the left, straight and right region in the picture, shape (4, 2) each.
 
-    None for one at or behind the camera, or where no range is known.
+    A region is None if it is at or behind the camera, or if no range is known.
     """
     if place is None or camera.focal_px is None or camera.z_m <= 0.0:
         return None, None, None
@@ -87,7 +87,7 @@ def outlines(
 
 
 def _outline(one: Rectangle, ground: GroundPlane) -> NDArray[np.float64] | None:
-    """Corners in the picture; None where one of them is beside or behind the camera."""
+    """Corners in the picture; None if one of them is next to or behind the camera."""
     if one[0] - ground.position_m[0] < NEAREST_M:
         return None
     corners = ground.project(_corners(one))
@@ -108,7 +108,7 @@ def _fraction(
     margin_m: float,
     place_sd_m: float,
 ) -> float:
-    """Fraction of road pixels in one rectangle; NaN where it is not seen."""
+    """Fraction of road pixels in one rectangle; NaN if it is not seen."""
     away_m = one[0] - camera.x_m
     corners = _outline(one, GroundPlane.of(camera, road.size_px))
     if corners is None or camera.z_m <= 0.0:
@@ -128,7 +128,7 @@ def _fraction(
 
 
 def _inside(polygon: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """The pixels whose centres are in a convex polygon, shape (h, w)."""
+    """Mark the pixels whose centres are in a convex polygon, shape (h, w)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
     signs: list[NDArray[np.float64]] = []
     for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):

@@ -1,4 +1,4 @@
-"""Runs the rules that the table of cues names."""
+"""Evaluate the rules of the table of cues."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any, TypeAlias, cast
 from crosscue.replay.vehicle.vehicle import CUES, CueSpec, Input
 
 Rule: TypeAlias = Callable[[Any, Any, CueSpec], int | None]
-"""From an input, the settings and the cue's row to a count; None where it cannot be evaluated."""
+"""Function of input, settings and the cue's row that returns a count; None if unknown."""
 
 
 @lru_cache(maxsize=256)
 def rule_of(name: str) -> Rule:
-    """The function that ``module:function`` names."""
+    """Import the function that ``module:function`` names."""
     module, _, function = name.partition(":")
     return cast("Rule", getattr(import_module(module), function))
 
 
 def counts_of(observed_by: Input, observed: object, settings: object) -> dict[str, int]:
-    """Counts of every cue that one input yields, in the table's order.
+    """Compute the count of every cue of one kind of input, in the table's order.
 
     Args:
-        observed_by: Which input.
-        observed: The input, as its rules take it.
-        settings: The vehicle file; of a Mobileye only ``Past``.
+        observed_by: Kind of input.
+        observed: The input, in the form that its rules take.
+        settings: The vehicle file; for a Mobileye only ``Past``.
     """
     found: dict[str, int] = {}
     for cue in CUES.values():

@@ -1,10 +1,11 @@
-"""One object found by several detectors counts once.
+"""Merge detections of the same object by several detectors, so that it counts once.
 
-Two detections of different detectors in one frame are the same object if they mean the same to the
-cues and their boxes overlap by more than half (intersection over union). The one with the better
-score is kept: a calibrated score, which is a probability, before one that is not; else the higher.
-A kept detection stands for at most one of each other detector, so that two cars in a row stay two.
-Detections of the same detector are not compared.
+Two detections of different detectors in one frame are the same object if their labels are
+equivalent to the cues and their boxes overlap by more than half (intersection over union). The
+detection with the better score is kept. A calibrated score, which is a probability, is preferred to
+an uncalibrated one; otherwise the higher score is better. A kept detection replaces at most one of
+each other detector, so that two cars in a row remain two. Detections of the same detector are not
+compared.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ KEPT: Final = -1
 
 
 def meanings(vehicle: Vehicle) -> dict[str, str]:
-    """From a label to what it means: labels that one cue counts mean the same."""
+    """Map each label to a common meaning: all labels that one cue counts share one."""
     found: dict[str, str] = {}
     for labels in vehicle.cue_labels().values():
         for label in labels:
@@ -35,16 +36,16 @@ def meanings(vehicle: Vehicle) -> dict[str, str]:
 def same_objects(
     found: Sequence[Detections], meaning: Mapping[str, str], is_calibrated: Sequence[bool]
 ) -> tuple[NDArray[np.int64], ...]:
-    """Which detections are another detector's object again.
+    """Find the detections of objects that another detector found with a better score.
 
     Args:
         found: One result for each detector.
-        meaning: From a label to what it means; a label that is not in it means itself.
-        is_calibrated: Whether the scores of each detector are probabilities.
+        meaning: Meaning of each label; labels that are missing have a meaning of their own.
+        is_calibrated: For each detector, True if its scores are probabilities.
 
     Returns:
-        For each detector shape (N,): the number of the detector whose detection is kept instead,
-        or ``KEPT``.
+        For each detector an array of shape (N,): the index of the detector whose detection is kept
+        instead, or ``KEPT``.
     """
     again = tuple(np.full(len(one), KEPT, np.int64) for one in found)
     if sum(len(one) > 0 for one in found) < 2:
@@ -71,7 +72,7 @@ def _best_kept(
     k: int,
     i: int,
 ) -> tuple[int, int] | None:
-    """The kept detection that overlaps most with one, of those that may stand for it."""
+    """Find the kept detection that overlaps a detection most and can replace it."""
     label = found[k].labels[i]
     wanted = meaning.get(label, label)
     best, largest = None, MIN_IOU

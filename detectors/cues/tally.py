@@ -1,4 +1,4 @@
-"""Counts, frame by frame, what became of the candidates of every cue."""
+"""Account for the candidates of every cue, frame by frame."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from .observed import Judged, RoadFractions, of_side
 
 @dataclass(frozen=True, slots=True)
 class CueTally:
-    """Candidates of every cue that was looked for, over the frames of a run.
+    """Candidates of every evaluated cue, over the frames of a run.
 
     Attributes:
         vehicle: Labels and thresholds.
-        by_cue: Filled frame by frame; cues that no label or region belongs to are not in it.
+        by_cue: Candidates by cue, updated frame by frame; only cues with a label or a region.
     """
 
     vehicle: Vehicle
@@ -46,12 +46,12 @@ class CueTally:
     def labelled(
         self, observed_by: Input, boxes: Sequence[Detections], counts: Mapping[str, int]
     ) -> None:
-        """Of cues that are detections with a label.
+        """Account for cues that count detections by label.
 
         Args:
-            observed_by: Which cues.
-            boxes: What they were counted in.
-            counts: What came out, of all cues.
+            observed_by: Input of the cues.
+            boxes: Detections in which they were counted.
+            counts: Counts of all cues.
         """
         for cue in CUES.values():
             labels = self.vehicle.labels_of(cue) if cue.observed_by == observed_by else ()
@@ -63,7 +63,7 @@ class CueTally:
                     self.by_cue[cue.name].meet(thresholds_met(boxes, labels, threshold))
 
     def own(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
-        """Of the user's cues."""
+        """Account for the user's cues."""
         for name, cue in self.vehicle.cues.own.items():
             if name not in counts:
                 continue
@@ -75,13 +75,13 @@ class CueTally:
     def cars(
         self, boxes: Sequence[Detections], shapes: int, pairs: int, counts: Mapping[str, int]
     ) -> None:
-        """Of cues that follow cars from frame to frame.
+        """Account for cues that pair cars of consecutive frames.
 
         Args:
             boxes: All detections of the frame.
-            shapes: Cars among them that pass the rules of shape and score.
-            pairs: Cars of these that were in the frame before, too.
-            counts: What came out.
+            shapes: Number of cars that pass the rules of shape and score.
+            pairs: Number of those that were also in the previous frame.
+            counts: Counts of all cues.
         """
         scores, low = self._cars(boxes)
         for cue in CUES.values():
@@ -99,12 +99,12 @@ class CueTally:
     def followed(
         self, boxes: Sequence[Detections], judged: Judged, counts: Mapping[str, int]
     ) -> None:
-        """Of cues that follow cars over several frames.
+        """Account for cues that track cars over several frames.
 
         Args:
             boxes: All detections of the frame.
-            judged: What became of the cars among them.
-            counts: What came out, of all cues.
+            judged: Counts of the cars by behaviour.
+            counts: Counts of all cues.
         """
         scores, low = self._cars(boxes)
         for cue in CUES.values():
@@ -127,11 +127,11 @@ class CueTally:
                 )
 
     def doubles(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
-        """Of every cue, what another detector found with a better score.
+        """Account for detections of objects that another detector found with a better score.
 
         Args:
-            boxes: What was left out.
-            counts: What came out, of all cues.
+            boxes: Detections that were left out.
+            counts: Counts of all cues.
         """
         for name, labels in self.vehicle.cue_labels().items():
             scores = scores_of(boxes, labels) if name in counts else []
@@ -139,7 +139,7 @@ class CueTally:
                 self.by_cue[name].take(scores, {SAME_OBJECT: len(scores)})
 
     def road(self, fractions: RoadFractions) -> None:
-        """Of cues that look for road in a region."""
+        """Account for cues of road in a region."""
         threshold = self.vehicle.cues.road_fraction
         for cue in CUES.values():
             side = cue.supports[0] if cue.supports else ""
@@ -168,7 +168,7 @@ class CueTally:
         self._of(name, "detections", setting, None).take(scores, skipped)
 
     def _cars(self, boxes: Sequence[Detections]) -> tuple[list[float], int]:
-        """Scores of all cars, and how many are too low."""
+        """Scores of all cars, and the number of scores that are too low."""
         cars = self.vehicle.cars
         return scores_of(boxes, cars.labels), unsure_of(boxes, cars.labels, cars.score)
 
@@ -185,7 +185,7 @@ class CueTally:
 
 
 def _judged(judged: Judged, cue: CueSpec) -> tuple[int, int]:
-    """Cars that are the cue, and those that would be at another place."""
+    """Number of cars that count for the cue, and of those that are not at the intersection."""
     if cue.group == "cross_traffic":
         return of_side(judged.crossing, cue), of_side(judged.crossing_elsewhere, cue)
     return of_side(judged.parked, cue), of_side(judged.parked_elsewhere, cue)

@@ -1,5 +1,5 @@
-"""From a network's raw outputs to boxes, scores, classes and masks: one file for each layout.
+"""Decode a network's raw outputs to boxes, scores, classes and masks; one module per layout.
 
-A new layout is one file with a subclass of ``BoxOutput`` and one row of ``table.AnyOutput``. Model
-cards name it by its ``kind``; ``crosscue model init`` finds it by its ``recognise``.
+A new layout is a module with a subclass of ``BoxOutput`` and an entry of ``table.AnyOutput``. Model
+cards name it by its ``kind``; ``crosscue model init`` recognises it by its ``recognise``.
 """

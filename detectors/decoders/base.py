@@ -1,4 +1,4 @@
-"""What every decoder takes and returns."""
+"""Base class of decoders, with the types of their inputs and results."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 Array: TypeAlias = NDArray[np.generic]
 Outputs: TypeAlias = Mapping[str, Array]
-"""Raw outputs by name, for one picture: the batch axis is there and has length 1."""
+"""Raw outputs by name, for one picture; the batch axis has length 1."""
 Size: TypeAlias = tuple[int, int]
 """Width and height in pixels."""
 
 
 class Masks(Protocol):
-    """Object masks of some candidates, computed only for those that stay."""
+    """Computes object masks, only for the candidates that remain after suppression."""
 
     def __call__(self, kept: Int64s, /) -> Floats:
-        """Shape (K, h, w): probability of the object over the network's whole input, coarser."""
+        """Return shape (K, h, w): object probability over the whole input, at lower resolution."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """What a network proposes for one picture, before thresholds, as columns of length N.
+    """Candidates of a network for one picture, before thresholds, as columns of length N.
 
     Attributes:
         boxes_px: Shape (N, 4), float64: x0, y0, x1, y1 in pixels of the network's input.
         scores: Shape (N,), float64.
         classes: Shape (N,), int64: index into the card's ``classes``.
-        masks: Computes their masks; None where the network has none.
+        masks: Computes their masks; None if the network has no masks.
     """
 
     boxes_px: Floats
@@ -48,13 +48,13 @@ class Candidates:
     masks: Masks | None = None
 
     def __len__(self) -> int:
-        """How many candidates."""
+        """Number of candidates."""
         return len(self.scores)
 
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """An input or output as a model file declares it; None for a size left open."""
+    """An input or output as a model file declares it; None for a variable size."""
 
     name: str
     shape: tuple[int | str | None, ...]
@@ -63,13 +63,13 @@ class Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Interface:
-    """What a model file says of itself.
+    """Interface that a model file declares.
 
     Attributes:
-        inputs: In the file's order.
-        outputs: Likewise.
-        metadata: Text by key, as an exporter left it.
-        class_names: From the metadata, empty where it has none.
+        inputs: Inputs, in the file's order.
+        outputs: Outputs, in the file's order.
+        metadata: Text by key, as stored by the exporter.
+        class_names: Class names from the metadata; empty if missing.
     """
 
     inputs: tuple[Tensor, ...]
@@ -80,17 +80,17 @@ class Interface:
 
 @dataclass(frozen=True, slots=True)
 class Guess:
-    """A layout that a model file may have.
+    """A possible layout of a model file.
 
     Attributes:
         settings: Keys of the card's ``[output]`` and their values.
-        class_count: How many classes it then has; None where the shapes leave it open.
-        reasons: What in the file says so.
-        assumptions: What nothing in the file says.
+        class_count: Number of classes in this layout; None if the shapes do not determine it.
+        reasons: Facts in the file that support this layout.
+        assumptions: Assumptions without support in the file.
         input: Keys of the card's ``[input]`` that networks of this layout usually have.
-        network: Keys of the card's ``[network]``, for tensors alone.
-        usual_size_px: Width and height to run at, where the file leaves them open.
-        numbers_as_coco: Networks of this layout number classes as COCO does, with its gaps.
+        network: Keys of the card's ``[network]``, for files that contain only tensors.
+        usual_size_px: Width and height to run at, where the file does not declare them.
+        numbers_as_coco: True if networks of this layout use COCO's class numbers, with gaps.
     """
 
     settings: Mapping[str, object]
@@ -104,15 +104,15 @@ class Guess:
 
 
 class BoxOutput(Settings):
-    """The part of a card's ``[output]`` that every layout has."""
+    """Settings of a card's ``[output]`` that all layouts have in common."""
 
     kind: str
     classes: tuple[str, ...]
-    """Names in the order of the network's class numbers."""
+    """Class names, in the order of the network's class numbers."""
     score: Proportion = 0.3
-    """Candidates with a lower score are not reported."""
+    """Minimum score of a detection."""
     overlap: Proportion = 0.45
-    """Of two boxes of one class that overlap more (intersection over union), the better stays."""
+    """Intersection over union above which only the better of two boxes of one class is kept."""
 
     @abstractmethod
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -121,26 +121,26 @@ class BoxOutput(Settings):
         Candidates below ``score`` may be left out.
 
         Raises:
-            ValueError: The outputs do not have the shape that the card asks for.
+            ValueError: The outputs do not have the shape that the card specifies.
         """
 
     @classmethod
     @abstractmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        """What a model file would have to be for this layout; None where it cannot be."""
+        """Return the settings with which a model file has this layout; None if it cannot."""
 
 
 def kind_of(decoder: type[BoxOutput]) -> str:
-    """The name that cards give a layout."""
+    """Name of a layout in model cards."""
     (kind,) = get_args(decoder.model_fields["kind"].annotation)
     return str(kind)
 
 
 def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:
-    """One output by the card's name for it, the only one where the card names none.
+    """Select an output by name, or the only output if the card has no name.
 
     Raises:
-        ValueError: No such output, or several and no name.
+        ValueError: The output does not exist, or a name is needed to choose one.
     """
     if name is None and len(outputs) == 1:
         return next(iter(outputs.values()))
@@ -150,10 +150,10 @@ def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:
 
 
 def rows_of(output: Array, columns: int, what: str) -> Floats:
-    """An output (1, N, columns) as a table (N, columns), float64.
+    """Convert an output (1, N, columns) to a table (N, columns), float64.
 
     Raises:
-        ValueError: Another shape.
+        ValueError: The output has another shape.
     """
     if output.ndim != 3 or output.shape[0] != 1 or output.shape[2] != columns:
         raise ValueError(f"expected (1, N, {columns}) for {what}, got {output.shape}")
@@ -161,15 +161,15 @@ def rows_of(output: Array, columns: int, what: str) -> Floats:
 
 
 def from_centers(table: Floats) -> Floats:
-    """Boxes (N, 4) as center x, center y, width, height turned into corners."""
+    """Convert boxes (N, 4) from center x, center y, width, height to corners."""
     center, half = table[:, :2], table[:, 2:4] / 2.0
     return np.hstack([center - half, center + half])
 
 
 def best_class(scores: Array) -> tuple[Floats, Int64s]:
-    """Of scores (N, C), each row's highest and its class.
+    """Maximum score of each row of scores (N, C), and its class.
 
-    They keep their type until few are left: a network has a million of them.
+    Only the maxima are converted to float64, because there can be a million scores.
     """
     if not scores.shape[1]:
         raise ValueError("0 classes; a detector needs at least one")
@@ -180,24 +180,24 @@ def best_class(scores: Array) -> tuple[Floats, Int64s]:
 
 
 def sigmoid(values: Floats) -> Floats:
-    """Logistic function, without overflow."""
+    """Compute the logistic function without overflow."""
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * values)), np.float64)
 
 
 def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
-    """A declared size as a number; None where it is open or has no such axis."""
+    """Declared size of an axis; None if it is variable or the axis does not exist."""
     size = shape[axis] if -len(shape) <= axis < len(shape) else None
     return size if isinstance(size, int) else None
 
 
 PICTURE_SIZE_INPUT: Final = "orig_target_sizes"
-"""Second input of RT-DETR, D-FINE and others: width and height that boxes are scaled to."""
+"""Second input of RT-DETR, D-FINE and others: width and height to which boxes are scaled."""
 GRID_STRIDES: Final = (8, 16, 32)
-"""Of the grids of YOLO networks and of YOLOX."""
+"""Strides of the grids of YOLO networks and of YOLOX."""
 
 
 def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False) -> int:
-    """How many cells the grids of all strides have over a picture."""
+    """Total number of cells of the grids of all strides over a picture."""
     return sum(w * h for w, h in _grids(size_px, strides, round_up))
 
 
@@ -213,7 +213,7 @@ def cells(
     steps = [np.full((w * h, 1), s) for (w, h), s in zip(grids, strides, strict=True)]
     found = (np.concatenate(corners).astype(np.float64), np.concatenate(steps).astype(np.float64))
     for one in found:
-        # The same arrays serve every picture of a size.
+        # Cached arrays, shared by all pictures of a size.
         one.setflags(write=False)
     return found
 
@@ -226,10 +226,10 @@ def _grids(size_px: Size, strides: Sequence[int], round_up: bool) -> list[Size]:
 
 
 def class_numbers(values: Floats, count: int) -> Int64s:
-    """Class numbers that came as floating-point values or integers, checked.
+    """Validate class numbers and convert them to integers.
 
     Raises:
-        ValueError: One that is not an index of ``count`` classes.
+        ValueError: A number is not an index of ``count`` classes.
     """
     bad = len(values) - int(np.isfinite(values).sum())
     if bad:

@@ -1,4 +1,4 @@
-"""The DETR family: a fixed number of queries, each with a box and class scores."""
+"""Decoder of the DETR family: a fixed number of queries, each with a box and class scores."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ _IMAGENET: Final = {
     "mean": tuple(255 * mean for mean in (0.485, 0.456, 0.406)),
     "scale": tuple(1 / (255 * deviation) for deviation in (0.229, 0.224, 0.225)),
 }
-"""Red, green, blue: mean and deviation that networks trained from ImageNet's weights expect."""
+"""Input of networks trained from ImageNet's weights: mean and scale of red, green and blue."""
 ULTRALYTICS_HEAD: Final = "RTDETRDecoder"
-"""Of the RT-DETR that Ultralytics exports, in its metadata since 8.4."""
+"""Name of RT-DETR's head in the metadata of Ultralytics' exports, since 8.4."""
 
 
 class DetrOutput(BoxOutput):
@@ -43,15 +43,15 @@ class DetrOutput(BoxOutput):
 
     kind: Literal["detr"]
     boxes: str
-    """The output with the boxes; with the classes behind them, if ``logits`` is the same."""
+    """Name of the output with the boxes; the classes follow them if ``logits`` is the same."""
     logits: str
-    """The output with the classes."""
+    """Name of the output with the classes."""
     activation: Literal["sigmoid", "softmax", "none"] = "sigmoid"
-    """From logits to scores. With softmax, the class after the listed ones means "no object"."""
+    """Function from logits to scores. With softmax, the last class means "no object"."""
     is_selected: bool = False
-    """Behind each box are the score and number of its best class, instead of all logits."""
+    """True if each box is followed by score and number of its best class instead of all logits."""
     first_class: int = 0
-    """Column of the first listed class; 1 where column 0 is not used, as in COCO's numbering."""
+    """Column of the first listed class; 1 if column 0 is unused, as in COCO's numbering."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -128,7 +128,7 @@ def _in_pixels(boxes: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]
 
 
 def _of_one(output: Tensor, model: Interface, picture: dict[str, object]) -> Guess | None:
-    """Ultralytics' RT-DETR: boxes and scores side by side, few queries, scores already."""
+    """Recognise Ultralytics' RT-DETR: one output with boxes and final scores, few queries."""
     rows, columns = static(output.shape, 1), static(output.shape, 2)
     names = len(model.class_names)
     settings = {
@@ -156,6 +156,6 @@ def _of_one(output: Tensor, model: Interface, picture: dict[str, object]) -> Gue
         settings,
         names,
         (f"rows of {columns}: 4 and the {names} classes of its metadata, {rows} queries",),
-        ("boxes are center and size in fractions, scores are scores already",),
+        ("boxes are center and size in fractions, scores are final",),
         picture,
     )

@@ -1,4 +1,4 @@
-"""Networks that suppress double boxes themselves: YOLOv10, YOLO26, exports with built-in NMS."""
+"""Decoder of networks with built-in suppression: YOLOv10, YOLO26, exports with NMS."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class EndToEndOutput(BoxOutput):
 
     kind: Literal["end-to-end"]
     name: str | None = None
-    """The output with the boxes; the only one, if left out."""
+    """Name of the output with the boxes; by default the only output."""
     prototypes: str | None = None
-    """The output with prototype masks, where there are masks."""
+    """Name of the output with prototype masks, if there are masks."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:

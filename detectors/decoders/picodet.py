@@ -1,4 +1,4 @@
-"""PicoDet (GFL): for each stride class scores, and each side's distance as a distribution."""
+"""Decoder of PicoDet (GFL): class scores, and a distribution of each side's distance."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _STRIDES = (8, 16, 32, 64)
 
 
 class PicodetOutput(BoxOutput):
-    """For each stride (1, cells, classes) scores and (1, cells, 4 * bins) logits of distances."""
+    """Scores (1, cells, classes) and logits of distances (1, cells, 4 * bins) for each stride."""
 
     kind: Literal["picodet"]
     strides: tuple[int, ...] = _STRIDES
     scores: tuple[str, ...]
-    """Outputs with scores, in the order of strides."""
+    """Names of the outputs with scores, in the order of strides."""
     distances: tuple[str, ...]
-    """Outputs with distances to left, top, right and bottom, in the order of strides."""
+    """Names of the outputs with distances to left, top, right and bottom, in the same order."""
     bins: int = 8
-    """Values of one distribution: distances 0 to bins - 1 strides."""
+    """Number of values of a distribution: distances of 0 to bins - 1 strides."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -88,7 +88,7 @@ class PicodetOutput(BoxOutput):
             },
             classes,
             (f"four pairs of outputs over the cells of strides 8 to 64 at {width} x {height}",),
-            ("scores are scores already", "pixels are normalised with ImageNet's mean, in RGB"),
+            ("scores are final", "pixels are normalised with ImageNet's mean, in RGB"),
             {
                 "colour": "rgb",
                 "fit": "stretch",
@@ -99,7 +99,7 @@ class PicodetOutput(BoxOutput):
 
 
 def _expected(logits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of each distribution over its bins: shape (N, 4, bins) to (N, 4)."""
+    """Mean of each distribution: shape (N, 4, bins) to (N, 4)."""
     weights = np.exp(logits - logits.max(axis=2, keepdims=True))
     bins = np.arange(logits.shape[2], dtype=np.float64)
     return np.asarray((weights @ bins) / weights.sum(axis=2), np.float64)

@@ -1,4 +1,4 @@
-"""SSD as TensorFlow's and OpenVINO's model zoos export it, boxes already suppressed."""
+"""Decoders of SSD exports of TensorFlow's and OpenVINO's model zoos, with built-in suppression."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class TensorflowSsdOutput(BoxOutput):
                 f"{labels.shape}, {scores.shape}"
             )
         corners = boxes[0][:, [1, 0, 3, 2]] * np.tile(size_px, 2)
-        # Rows beyond the detections are filled with zeros, whose class need not exist.
+        # Rows after the detections are zeros, whose class may not exist.
         kept = scores[0] > 0.0
         numbers = class_numbers(labels[0][kept] - self.first_class, len(self.classes))
         return Candidates(corners[kept], scores[0][kept], numbers)
@@ -78,7 +78,7 @@ class DetectionOutput(BoxOutput):
 
     kind: Literal["ssd"]
     name: str | None = None
-    """Which of the outputs; the only one, if left out."""
+    """Name of the output; by default the only output."""
     first_class: int = 1
     """Number of the first listed class; 0 is the background."""
 

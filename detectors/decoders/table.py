@@ -1,4 +1,4 @@
-"""The one table of box layouts."""
+"""Table of all box layouts."""
 
 from __future__ import annotations
 
@@ -27,4 +27,4 @@ AnyBoxOutput: TypeAlias = (
 )
 
 DECODERS: Final[tuple[type[BoxOutput], ...]] = get_args(AnyBoxOutput)
-"""In the order in which ``crosscue model init`` lists candidates."""
+"""Decoders, in the order in which ``crosscue model init`` lists candidates."""

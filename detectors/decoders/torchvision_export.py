@@ -1,4 +1,4 @@
-"""torchvision's detection models exported to ONNX: boxes, labels, scores, perhaps masks."""
+"""Decoder of torchvision's detection models exported to ONNX."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .base import (
 )
 
 _USUAL_SIZE_PX: Final = (1333, 800)
-"""To which torchvision's networks scale a picture themselves; at this size nothing is left."""
+"""Size to which torchvision's networks scale a picture, so that none is scaled twice."""
 
 
 class TorchvisionOutput(BoxOutput):
@@ -36,7 +36,7 @@ class TorchvisionOutput(BoxOutput):
     labels: str = "labels"
     scores: str = "scores"
     masks: str | None = None
-    """The output with masks over the whole input, where there is one."""
+    """Name of the output with masks over the whole input, if it exists."""
     first_class: int = 1
     """Number of the first listed class; torchvision's 0 is the background."""
 
@@ -105,7 +105,7 @@ class TorchvisionOutput(BoxOutput):
 
 
 def _by_name(model: Interface) -> dict[str, Tensor] | None:
-    """The outputs by the keys of torchvision's results, where an export names them so."""
+    """Outputs by the keys of torchvision's results, if the export has these names."""
     found = {out.name: out for out in model.outputs if out.name in ("boxes", "labels", "scores")}
     if len(found) < 3:
         return None
@@ -113,7 +113,7 @@ def _by_name(model: Interface) -> dict[str, Tensor] | None:
 
 
 def _by_shape(model: Interface) -> dict[str, Tensor] | None:
-    """The same outputs under other names: an export that names none numbers them."""
+    """Outputs by the keys of torchvision's results, if their shapes determine them."""
     kinds = {
         "boxes": [o for o in model.outputs if len(o.shape) == 2 and static(o.shape, 1) == 4],
         "labels": [o for o in model.outputs if len(o.shape) == 1 and o.is_integer],
@@ -127,10 +127,10 @@ def _by_shape(model: Interface) -> dict[str, Tensor] | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _WholeMasks:
-    """Masks that come over the whole input, shape (N, 1, H, W)."""
+    """Masks over the whole input, shape (N, 1, H, W)."""
 
     masks: Array
 
     def __call__(self, kept: NDArray[np.int64], /) -> NDArray[np.float64]:
-        """Shape (len(kept), H, W)."""
+        """Return the selected masks, shape (len(kept), H, W)."""
         return np.asarray(self.masks[kept, 0], np.float64)

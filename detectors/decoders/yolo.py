@@ -1,4 +1,4 @@
-"""YOLOv5 to v11 as their projects export them: boxes in input pixels, with or without masks."""
+"""Decoders of YOLOv5 to v11 in their projects' exports: boxes in input pixels, some with masks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class YoloV5Output(BoxOutput):
 
     kind: Literal["yolov5"]
     name: str | None = None
-    """Which of the outputs; the only one, if left out."""
+    """Name of the output; by default the only output."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -59,7 +59,7 @@ class YoloV5Output(BoxOutput):
         ):
             return None
         rows, cells = static(output.shape, 1), _cells(model)
-        # Three anchors a cell; one where the boxes of YOLOX are decoded in the network.
+        # Three anchors per cell; one if the network decodes the boxes of YOLOX itself.
         if rows is not None and (rows <= columns or (cells and rows not in (cells, 3 * cells))):
             return None
         names = len(model.class_names)
@@ -89,7 +89,7 @@ class YoloV8Output(BoxOutput):
 
     kind: Literal["yolov8"]
     name: str | None = None
-    """Which of the outputs; the only one, if left out."""
+    """Name of the output; by default the only output."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -122,9 +122,9 @@ class YoloV8SegOutput(BoxOutput):
 
     kind: Literal["yolov8-seg"]
     name: str
-    """The output with the boxes."""
+    """Name of the output with the boxes."""
     prototypes: str
-    """The output with the prototype masks."""
+    """Name of the output with the prototype masks."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
@@ -162,12 +162,12 @@ class PrototypeMasks:
     prototypes: NDArray[np.float64]
 
     def __call__(self, kept: NDArray[np.int64], /) -> NDArray[np.float64]:
-        """Shape (len(kept), h, w)."""
+        """Return the selected masks, shape (len(kept), h, w)."""
         return sigmoid(np.tensordot(self.weights[kept], self.prototypes, axes=1))
 
 
 def prototype_output(model: Interface) -> tuple[str, int] | None:
-    """Name and count of the prototype masks that a file has."""
+    """Name of the output with prototype masks, and their number; None if there is none."""
     for out in model.outputs:
         count = static(out.shape, 1)
         if len(out.shape) == 4 and count == _COEFFICIENTS:
@@ -176,10 +176,10 @@ def prototype_output(model: Interface) -> tuple[str, int] | None:
 
 
 def prototypes_of(output: Array) -> NDArray[np.float64]:
-    """Prototype masks (1, K, h, w) without their batch axis.
+    """Remove the batch axis of prototype masks (1, K, h, w).
 
     Raises:
-        ValueError: Another shape.
+        ValueError: The output has another shape.
     """
     if output.ndim != 4 or output.shape[0] != 1:
         raise ValueError(f"prototypes: expected (1, K, h, w), got {output.shape}")
@@ -193,13 +193,13 @@ def _columns(output: Array, rows: int) -> NDArray[np.float64]:
 
 
 def _cells(model: Interface) -> int | None:
-    """Cells of the strides 8, 16 and 32, where the file fixes its input's size."""
+    """Number of cells of strides 8, 16 and 32; None if the input's size is variable."""
     height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
     return cell_count((width, height), GRID_STRIDES) if width and height else None
 
 
 def _transposed(model: Interface) -> tuple[str, int] | None:
-    """Name and rows of the output whose columns are the candidates."""
+    """Name and number of rows of the output whose columns are the candidates."""
     for out in model.outputs:
         rows, columns = static(out.shape, 1), static(out.shape, 2)
         if len(out.shape) == 3 and rows is not None and (columns is None or columns > rows):

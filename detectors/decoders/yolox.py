@@ -1,4 +1,4 @@
-"""YOLOX: boxes relative to the cells of grids, with objectness."""
+"""Decoder of YOLOX: boxes relative to grid cells, with objectness."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class YoloxOutput(BoxOutput):
 
     kind: Literal["yolox"]
     name: str | None = None
-    """Which of the outputs; the only one, if left out."""
+    """Name of the output; by default the only output."""
     strides: tuple[int, ...] = GRID_STRIDES
 
     @override
@@ -42,13 +42,13 @@ class YoloxOutput(BoxOutput):
                 f"expected {shape} for {len(self.classes)} classes at {size_px[0]} x {size_px[1]}, "
                 f"got {rows.shape}"
             )
-        # Most cells are empty. No class score is above 1, so objectness alone rules those out.
+        # Most cells are empty. No class score is above 1, so a low objectness excludes a cell.
         is_able = ~(np.asarray(rows[0, :, 4], np.float64) < self.score)
         able = rows[0, is_able]
         table: NDArray[np.float64] = np.asarray(able[:, :5], np.float64)
         corner, stride = (cell[is_able] for cell in cells(size_px, self.strides))
         center = (table[:, :2] + corner) * stride
-        # A width of e^20 cells is wider than any picture; more would overflow.
+        # A width of e^20 cells exceeds any picture; more would overflow.
         half = np.exp(np.minimum(table[:, 2:4], 20.0)) * stride / 2.0
         best, classes = best_class(able[:, 5:])
         return Candidates(np.hstack([center - half, center + half]), table[:, 4] * best, classes)

@@ -1,8 +1,7 @@
-"""Neural networks from bytes, behind whichever back end is installed.
+"""Load neural networks from bytes into an installed back end.
 
-ONNX runs in ONNX Runtime where that is installed, else in OpenCV; OpenVINO IR in
-OpenVINO, TFLite in LiteRT.
-Weights always come as bytes whose hash was compared, and never pull in another file.
+ONNX runs in ONNX Runtime if that is installed, otherwise in OpenCV. OpenVINO IR runs in OpenVINO,
+TFLite in LiteRT. Weights are bytes of a verified hash and never refer to another file.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from .weights import Weights
 
 Array = NDArray[np.generic]
 _EXTERNAL: Final = b"\x0a\x08location"
-"""How a protobuf spells the key of a tensor that is in another file."""
+"""Encoded protobuf key of a tensor that is stored in another file."""
 
 
 class Network(Protocol):
@@ -35,17 +34,17 @@ class Network(Protocol):
 
     @property
     def backend(self) -> str:
-        """Name and version of what runs it."""
+        """Name and version of the back end."""
         ...
 
     def __call__(self, batch: Array, /) -> Mapping[str, Array]:
-        """All outputs by name."""
+        """Return all outputs by name."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class _Function:
-    """A back end's network as a function."""
+    """A back end's network, wrapped as a function."""
 
     backend: str
     call: Callable[[Array], Mapping[str, Array]]
@@ -60,28 +59,28 @@ def load_network(
     threads: int = 1,
     size_px: tuple[int, int] | None = None,
 ) -> Network:
-    """Make weights ready to run.
+    """Load weights into a back end.
 
     Args:
-        weights: Verified.
-        backend: ``onnxruntime``, ``opencv``, ``openvino``, ``litert``; None for the best.
-        threads: How many the back end may use, where that can be set.
-        size_px: Width and height to run at instead of those that the file declares, for networks
-            that allow it.
+        weights: Verified weights.
+        backend: ``onnxruntime``, ``opencv``, ``openvino``, ``litert``; None for the preferred one.
+        threads: Maximum number of threads, where the back end supports a limit.
+        size_px: Width and height of the input instead of those that the file declares, for
+            networks that allow it.
 
     Raises:
-        VehicleError: No installed back end reads them, or they are damaged.
+        VehicleError: No installed back end reads the weights, or they are damaged.
     """
     suffix = PurePath(weights.name).suffix.lower()
     able = BACKENDS.get(suffix)
     if able is None:
         raise VehicleError(
-            f"{weights.name}: weights of a kind not known; expected {sorted(BACKENDS)}"
+            f"{weights.name}: unsupported kind of weights; expected {sorted(BACKENDS)}"
         )
     if suffix == ".onnx" and _EXTERNAL in weights.content:
         raise VehicleError(
-            f"{weights.name}: keeps tensors in other files, which no hash covers; save it whole, "
-            "torch.onnx.export with external_data=False"
+            f"{weights.name}: stores tensors in other files, which no hash covers; save it as one "
+            "file, torch.onnx.export with external_data=False"
         )
     if backend is not None and backend not in able:
         raise VehicleError(f"{weights.name}: {backend} does not run it; one of: {', '.join(able)}")
@@ -97,7 +96,7 @@ def load_network(
         raise
     except Exception as error:
         raise VehicleError(
-            f"{weights.name}: {name} cannot read it: {one_line(error, 200)}; is it whole?"
+            f"{weights.name}: {name} cannot read it: {one_line(error, 200)}; is it complete?"
         ) from None
 
 
@@ -115,7 +114,7 @@ def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Net
     def call(batch: Array) -> Mapping[str, Array]:
         feed: dict[str, Array] = {inputs[0]: batch}
         if PICTURE_SIZE_INPUT in inputs[1:]:
-            # Boxes come in pixels of the batch, as of every other layout.
+            # Boxes are in pixels of the batch, as in every other layout.
             feed[PICTURE_SIZE_INPUT] = np.array([batch.shape[:-3:-1]] * len(batch), np.int64)
         return dict(zip(names, session.run(names, feed), strict=True))
 
@@ -154,7 +153,7 @@ def _in_openvino(weights: Weights, threads: int, size_px: Size | None) -> Networ
     ov = import_openvino()
     core = ov.Core()
     core.set_property("CPU", {"INFERENCE_NUM_THREADS": threads})
-    # Speed hints may pick half precision, and results must not depend on the processor.
+    # Performance hints may select half precision, but results must not depend on the processor.
     core.set_property("CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     model = core.read_model(weights.content, weights.second)
     if size_px is not None:
@@ -198,7 +197,7 @@ BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
     ".xml": ("openvino",),
     ".tflite": ("litert",),
 }
-"""From the weights' suffix to the back ends that run them, the preferred first."""
+"""Back ends by suffix of the weights, the preferred one first."""
 _PACKAGE: Final = {
     "onnxruntime": "onnxruntime",
     "opencv": "cv2",

@@ -1,4 +1,4 @@
-"""A model card's boxes as a detector: batches, tiles, suppression, masks."""
+"""Detector of boxes from a model card: batches, tiles, suppression and masks."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .tiles import Corner, corners, is_whole
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """A picture, or a tile of one, as given to the network."""
+    """A picture or a tile, as passed to the network."""
 
     frame: int
     pixels: Bytes
     corner: Corner | None
-    """Of a tile, in decoded pixels; None for the whole picture."""
+    """Left and top of a tile in decoded pixels; None for the whole picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """What stays of one part's candidates: boxes in decoded pixels of the frame."""
+    """Candidates of one part after suppression; boxes are in decoded pixels of the frame."""
 
     boxes: Floats
     scores: Floats
@@ -41,14 +41,14 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class BoxModel:
-    """Boxes, and masks where the network has them.
+    """Detector of boxes, with masks if the network returns them.
 
     Attributes:
-        card: How to prepare pictures.
-        output: How to read results, with the lowest score that is reported.
-        network: What runs.
+        card: The model card.
+        output: Decoder of the network's output, with the minimum score of a detection.
+        network: The loaded network.
         where: The card's file, for errors.
-        identity: Of card, settings and back end.
+        identity: Text that changes with card, settings and back end.
     """
 
     card: ModelCard
@@ -59,12 +59,12 @@ class BoxModel:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What the card's classes mean."""
+        """Labels of the card's classes."""
         return tuple(map(self.card.meaning, range(len(self.output.classes))))
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the card says that scores are probabilities."""
+        """Whether the card declares its scores to be probabilities."""
         return self.card.is_calibrated
 
     @property
@@ -75,16 +75,16 @@ class BoxModel:
 
     @property
     def calibrated_labels(self) -> tuple[str, ...]:
-        """Labels that the card has a calibration for."""
+        """Labels with a calibration in the card."""
         return tuple(label for label, one in self.card.scores.items() if one.calibration)
 
     @property
     def view(self) -> View:
-        """No finer than the card's input needs; the full size for tiles."""
+        """The resolution that the card's input needs; full size for tiles."""
         return View() if self.card.tiles is not None else view_of(self.card.input)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Detect."""
+        """Return the detections in each frame."""
         parts = [part for i, frame in enumerate(frames) for part in self._parts(i, frame)]
         found: list[list[_Found]] = [[] for _ in frames]
         step = self.card.input.max_batch
@@ -112,7 +112,7 @@ class BoxModel:
         outputs = self.network(batch[0] if is_bare else batch)
         for i, (part, (_, placement)) in enumerate(zip(parts, given, strict=True)):
             try:
-                mine = outputs if len(parts) == 1 else _fraction(outputs, i, len(parts))
+                mine = outputs if len(parts) == 1 else _of_picture(outputs, i, len(parts))
                 yield self._kept(mine, part, placement, frames[part.frame])
             except ValueError as error:
                 raise VehicleError(f"{self.where}: output: {error}; correct the card") from None
@@ -190,7 +190,7 @@ class BoxModel:
         )
 
     def _calibrated(self, scores: Floats, labels: Sequence[str]) -> Floats:
-        """Scores as the card's calibrations turn them into probabilities."""
+        """Apply the card's calibrations to scores."""
         for label in self.calibrated_labels:
             mine = np.array([one == label for one in labels], np.bool_)
             by = self.card.scores[label].calibration
@@ -199,11 +199,11 @@ class BoxModel:
         return scores
 
 
-def _fraction(outputs: Mapping[str, Array], number: int, count: int) -> dict[str, Array]:
-    """One picture's part of a batch's outputs.
+def _of_picture(outputs: Mapping[str, Array], number: int, count: int) -> dict[str, Array]:
+    """Return one picture's part of a batch's outputs.
 
     Raises:
-        ValueError: The outputs are not one for each picture.
+        ValueError: An output does not have one row per picture.
     """
     for name, values in outputs.items():
         if not values.ndim or len(values) != count:
@@ -217,13 +217,13 @@ def _fraction(outputs: Mapping[str, Array], number: int, count: int) -> dict[str
 def _mask_text(
     grid: Floats, box_px: Floats, affine: Sequence[tuple[float, float]], size_px: tuple[int, int]
 ) -> bytes:
-    """An object's mask inside its box, from probabilities over the network's input.
+    """Encode an object's mask inside its box, from probabilities over the network's input.
 
     Args:
-        grid: Shape (h, w).
+        grid: Probabilities, shape (h, w).
         box_px: x0, y0, x1, y1 in the camera's pixels.
-        affine: For x and y, grid coordinate = factor * camera pixel + offset.
-        size_px: Of the camera's picture.
+        affine: Factor and offset for x and y: grid coordinate = factor * camera pixel + offset.
+        size_px: Width and height of the camera's picture.
     """
     import cv2
 
@@ -233,7 +233,7 @@ def _mask_text(
     if width <= 0 or height <= 0:
         return b""
     (fx, ox), (fy, oy) = affine
-    # Pixel centres lie half a pixel inside, in the camera's picture and in the grid.
+    # Pixel centres are half a pixel inside, in the camera's picture and in the grid.
     shift = ((low[0] + 0.5) * fx + ox - 0.5, (low[1] + 0.5) * fy + oy - 0.5)
     matrix = np.array([[fx, 0.0, shift[0]], [0.0, fy, shift[1]]])
     part = cv2.warpAffine(

@@ -1,4 +1,4 @@
-"""Where a torch network runs."""
+"""Select the device and the number of threads of a torch network."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from crosscue.replay.errors import VehicleError
 
 
 def chosen_device(asked: str, who: str) -> torch.device:
-    """The requested device; ``auto`` is CUDA, else MPS, else the CPU.
+    """Return the requested device; ``auto`` is CUDA, else MPS, else the CPU.
 
     Args:
         asked: ``auto``, ``cpu``, ``cuda`` or ``mps``.
-        who: Asks, for the error.
+        who: Name of the caller, for the error.
 
     Raises:
-        VehicleError: It is not there.
+        VehicleError: The device is not available.
     """
     there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if asked == "auto":
         asked = next((name for name, is_there in there.items() if is_there), "cpu")
     elif not there.get(asked, True):
         raise VehicleError(
-            f"{who}: device {asked}: not there or not in this torch; use auto or cpu"
+            f"{who}: device {asked}: not available to the installed torch; use auto or cpu"
         )
     return torch.device(asked)
 
 
 @contextmanager
 def threads_of(count: int, device: torch.device) -> Iterator[None]:
-    """So many threads on a CPU; more than there are cores free make it slower by far."""
+    """Limit torch to ``count`` threads on a CPU; more than the free cores are far slower."""
     before = torch.get_num_threads()
     if device.type == "cpu" and before != count:
         torch.set_num_threads(count)

@@ -1,4 +1,4 @@
-"""Networks without fully connected layers at other sizes than their file declares."""
+"""Make the input size of an ONNX network variable."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Size = tuple[int, int]
 
 
 def free_size(content: bytes) -> bytes:
-    """An ONNX file whose input takes pictures of any size.
+    """Return an ONNX file whose input accepts pictures of any size.
 
     Raises:
-        VehicleError: The package that edits such files is not installed.
+        VehicleError: The package onnx is not installed.
     """
     if find_spec("onnx") is None:
         raise VehicleError(
@@ -34,13 +34,13 @@ def free_size(content: bytes) -> bytes:
     for value in model.graph.output:
         for dimension in value.type.tensor_type.shape.dim:
             dimension.ClearField("value")
-    # Shapes between layers are only hints, and no longer true.
+    # Shapes between layers are only hints, and no longer correct.
     del model.graph.value_info[:]
     freed: bytes = model.SerializeToString()
     return freed
 
 
 def resized(shape: Sequence[int], size_px: Size) -> list[int]:
-    """An input's shape (1, 3, h, w) or (1, h, w, 3) with another width and height."""
+    """Replace width and height in an input's shape (1, 3, h, w) or (1, h, w, 3)."""
     width, height = size_px
     return [shape[0], 3, height, width] if shape[1] == 3 else [shape[0], height, width, 3]

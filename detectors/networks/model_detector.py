@@ -1,4 +1,4 @@
-"""A network described by a model card as a detector: boxes, or road.
+"""Build a detector of boxes or of road from a model card.
 
 Settings: ``card``, ``backend``, ``threads``, ``score``.
 """
@@ -27,25 +27,25 @@ from .picture_input import Placement, prepared, view_of
 from .weights import Weights
 
 VERSION: Final = 2
-"""Counts up when the same pixels, card and settings would give other numbers."""
+"""Incremented when the same pixels, card and settings yield different numbers than before."""
 
 
 class ModelSettings(Settings):
-    """How to run a card."""
+    """Settings of a detector from a model card."""
 
     card: str
     """File name of the card."""
     backend: Literal["onnxruntime", "opencv", "openvino", "litert"] | None = None
     threads: int = 1
     score: Proportion | None = None
-    """Instead of the card's."""
+    """Minimum score of a detection; the card's by default."""
 
 
 def build(**given: Any) -> Detector:
-    """The detector that a card describes.
+    """Build the detector that a card describes.
 
     Raises:
-        VehicleError: Settings, card, weights or back end do not fit one another.
+        VehicleError: Settings, card, weights or back end are invalid or do not match.
     """
     settings = settings_of(ModelSettings, given, "detector model")
     path = Path(settings.card)
@@ -77,7 +77,7 @@ def _network(card: ModelCard, weights: Weights, settings: ModelSettings, score: 
 
 
 def _tried(detector: Detector, card: ModelCard, path: Path) -> Detector:
-    """The detector, once a grey picture has gone through it."""
+    """Run the detector on a grey picture, and return it if that succeeds."""
     size = (card.input.width_px, card.input.height_px)
     grey = np.full((size[1], size[0], 3), 114, np.uint8)
     try:
@@ -95,7 +95,7 @@ def _tried(detector: Detector, card: ModelCard, path: Path) -> Detector:
 
 @dataclass(frozen=True, slots=True)
 class RoadModel:
-    """Road pixels from semantic segmentation."""
+    """Detector of road pixels by semantic segmentation."""
 
     card: ModelCard
     output: SegmentationOutput
@@ -105,16 +105,16 @@ class RoadModel:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """None: road is not an object."""
+        """Empty: road is not an object."""
         return ()
 
     @property
     def view(self) -> View:
-        """No finer than the card's input needs."""
+        """The resolution that the card's input needs."""
         return view_of(self.card.input)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Segment."""
+        """Return the road pixels of each frame."""
         found = []
         for frame in frames:
             road = self.road_mask(frame)
@@ -124,7 +124,7 @@ class RoadModel:
         return found
 
     def road_mask(self, frame: Frame) -> NDArray[np.bool_]:
-        """Road pixels over the whole picture at the network's resolution, shape (h, w), bool."""
+        """Segment a whole picture at the network's resolution, shape (h, w), bool."""
         given, placement = prepared(frame.pixels, self.card.input)
         try:
             raw = named(self.network(given), self.output.name)
@@ -142,7 +142,7 @@ class RoadModel:
 
 
 def _part(length: int, placement: Placement, axis: int, classes: Array, side_px: int) -> slice:
-    """The part of the class map that shows the picture, along x (axis 0) or y (axis 1)."""
+    """Slice of the class map that shows the picture, along x (axis 0) or y (axis 1)."""
     per_input = classes.shape[1 - axis] / side_px
     start = round(placement.offset[axis] * per_input)
     return slice(start, start + round(length * placement.scale[axis] * per_input))
@@ -154,10 +154,10 @@ def _identity(card: ModelCard, settings: ModelSettings, network: Network) -> str
 
 
 def class_map(raw: Array, classes: int) -> Array:
-    """One class number a pixel, shape (h, w), from scores (1, C, h, w) or numbers (1, h, w).
+    """Class number of each pixel, shape (h, w), from scores (1, C, h, w) or numbers (1, h, w).
 
     Raises:
-        ValueError: Another shape, or a class that is not listed.
+        ValueError: The shape is different, or a class is not listed.
     """
     if raw.ndim == 4 and raw.shape[0] == 1 and raw.shape[1] == classes:
         return np.asarray(raw[0].argmax(axis=0))

@@ -1,7 +1,7 @@
-"""The input shape that an ONNX file declares, read from its bytes alone.
+"""Read the input shape that an ONNX file declares, without the package onnx.
 
-OpenCV runs a network on sizes that it was not made for, and returns meaningless numbers. Field
-numbers are those of ONNX's public ``onnx.proto``; everything else in the file is stepped over.
+It is needed because OpenCV runs a network on unsupported sizes and returns meaningless numbers.
+Field numbers are those of ONNX's public ``onnx.proto``; all other fields are skipped.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ Field: TypeAlias = tuple[int, int | memoryview]
 _GRAPH, _INITIALIZER, _INITIALIZER_NAME, _INPUT = 7, 5, 8, 11
 _NAME, _TYPE, _TENSOR, _SHAPE, _DIMENSION, _VALUE = 1, 2, 1, 2, 1, 1
 _FIXED: Final = {1: 8, 5: 4}
-"""Bytes of the wire types with a fixed length."""
+"""Number of bytes of the wire types with a fixed length."""
 
 
 def input_shape(content: bytes) -> tuple[int | None, ...] | None:
-    """Sizes of the first input other than a weight, None for an open one; None if not reported.
+    """Shape of the first input that is not a weight; None for variable sizes and if undeclared.
 
     Raises:
         ValueError: The bytes are not protobuf.
@@ -67,9 +67,9 @@ def _fields(message: memoryview) -> Iterator[Field]:
         elif wire in _FIXED:
             size = _FIXED[wire]
         else:
-            raise ValueError(f"wire type {wire} at byte {at}: no protobuf")
+            raise ValueError(f"wire type {wire} at byte {at}: not protobuf")
         if at + size > len(message):
-            raise ValueError(f"field {number} at byte {at} is cut short")
+            raise ValueError(f"field {number} at byte {at} is truncated")
         yield number, message[at : at + size]
         at += size
 
@@ -78,7 +78,7 @@ def _varint(message: memoryview, at: int) -> tuple[int, int]:
     value = shift = 0
     while True:
         if at >= len(message) or shift > 63:
-            raise ValueError(f"number at byte {at} is cut short")
+            raise ValueError(f"number at byte {at} is truncated")
         byte = message[at]
         value |= (byte & 0x7F) << shift
         at, shift = at + 1, shift + 7

@@ -1,9 +1,9 @@
-"""OpenVINO without its telemetry.
+"""Import OpenVINO without its telemetry.
 
-Importing OpenVINO (2026.4 and before) makes a client number in the home folder and sends an event
-to Google Analytics, from a process of its own; converting a model sends more. Nobody is asked, and
-nothing short of a file in the home folder or a variable that says this is a CI machine stops it.
-Where its telemetry package cannot be imported, OpenVINO takes a stand-in that sends nothing.
+Importing OpenVINO (up to 2026.4) creates a client number in the home folder and sends an event to
+Google Analytics from a separate process; converting a model sends more. This happens without
+consent, and only a file in the home folder or an environment variable of CI machines prevents it.
+If the telemetry package cannot be imported, OpenVINO uses a stub that sends nothing.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ TELEMETRY: Final = "openvino_telemetry"
 
 
 def import_openvino() -> Any:
-    """The package ``openvino``.
+    """Import the package ``openvino``.
 
-    A telemetry package that a program has imported before stays: that is its own choice.
+    A telemetry package that the program has already imported remains in use.
 
     Raises:
-        ModuleNotFoundError: It is not installed.
+        ModuleNotFoundError: The package is not installed.
     """
-    # None in this table is how Python learns that a module cannot be imported.
+    # An entry None makes the import of the module fail.
     sys.modules.setdefault(TELEMETRY, None)  # type: ignore[arg-type]
     return import_module("openvino")

@@ -1,4 +1,4 @@
-"""From a picture to a network's input, and from its pixels back."""
+"""Convert pictures to a network's input, and boxes back to the picture."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from crosscue.detectors.decoders.base import Array, Size
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where a picture is in a network's input: input = picture * scale + offset, x and y.
+    """Position of a picture in a network's input: input = picture * scale + offset.
 
     Attributes:
-        scale: Along x and y.
-        offset: Likewise.
+        scale: Factors along x and y.
+        offset: Offsets along x and y, in input pixels.
         size_px: Width and height of the input.
     """
 
@@ -27,19 +27,19 @@ class Placement:
     size_px: Size
 
     def to_picture(self, boxes_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Boxes (N, 4) in input pixels as boxes in the picture's."""
+        """Convert boxes (N, 4) from input pixels to the picture's."""
         return np.asarray((boxes_px - np.tile(self.offset, 2)) / np.tile(self.scale, 2), np.float64)
 
 
 def view_of(want: Input) -> View:
-    """How finely pictures are decoded; in full for a network that scales them itself."""
+    """Resolution at which to decode pictures; full size for a network that scales them itself."""
     if want.decode == "full" or want.fit == "network":
         return View()
     return View(min_width_px=want.width_px)
 
 
 def place(picture: Size, want: Input) -> Placement:
-    """Where a picture of this width and height goes."""
+    """Compute the placement of a picture of this width and height."""
     width, height = picture
     whole = (want.width_px, want.height_px)
     if want.fit == "network":
@@ -60,7 +60,7 @@ def place(picture: Size, want: Input) -> Placement:
 
 
 def prepared(pixels: NDArray[np.uint8], want: Input) -> tuple[Array, Placement]:
-    """A picture (H, W, 3) as a network's input with its batch axis, and where it is there."""
+    """Convert a picture (H, W, 3) to a network's input with batch axis, and its placement."""
     height, width = pixels.shape[:2]
     placement = place((width, height), want)
     if want.fit == "network":
@@ -71,7 +71,7 @@ def prepared(pixels: NDArray[np.uint8], want: Input) -> tuple[Array, Placement]:
 
 
 def _fitted(pixels: NDArray[np.uint8], want: Input, placement: Placement) -> NDArray[np.uint8]:
-    """The picture at the size that it has in the input."""
+    """Resize a picture to its size in the input."""
     import cv2
 
     height, width = pixels.shape[:2]
@@ -85,7 +85,7 @@ def _fitted(pixels: NDArray[np.uint8], want: Input, placement: Placement) -> NDA
 
 
 def _numbers(pixels: NDArray[np.uint8], want: Input, corner: Size, size_px: Size) -> Array:
-    """Pixels in the network's order, type and scale, the pad's value around them.
+    """Convert pixels to the network's order, type and scale, and pad them.
 
     Args:
         pixels: Shape (h, w, 3), blue, green, red.
@@ -105,7 +105,7 @@ def _numbers(pixels: NDArray[np.uint8], want: Input, corner: Size, size_px: Size
             around[:] = want.pad
         inside[:] = plane
         if want.dtype == "float32":
-            # The types of NumPy's scalars keep a plane from being converted twice.
+            # Scalars of NumPy types prevent a second conversion of the plane.
             if want.mean[i]:
                 around -= np.float32(want.mean[i])
             if want.scale[i] != 1.0:
@@ -114,7 +114,7 @@ def _numbers(pixels: NDArray[np.uint8], want: Input, corner: Size, size_px: Size
 
 
 def _inside(picture: Size, want: Input) -> Size:
-    """Largest size of the picture's proportions that fits."""
+    """Largest size that fits into the input, with the picture's proportions."""
     width, height = picture
     ratio = min(want.width_px / width, want.height_px / height)
     return max(round(width * ratio), 1), max(round(height * ratio), 1)

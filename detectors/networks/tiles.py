@@ -1,4 +1,4 @@
-"""Tiles of a picture at its own resolution, for objects too small in the whole."""
+"""Divide a picture into tiles at full resolution, to detect small objects."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from crosscue.detectors.decoders.base import Size
 
 Corner = tuple[int, int]
 EDGE_PX = 2.0
-"""A box this near to a tile's inner edge is cut off there."""
+"""Distance to a tile's inner edge within which a box counts as cut off."""
 
 
 def corners(picture: Size, tile: Size, tiles: Tiles) -> list[Corner]:
-    """Left and top of each tile: rows of tiles from ``tiles.top`` to ``tiles.bottom``."""
+    """Left and top of each tile, in rows from ``tiles.top`` to ``tiles.bottom``."""
     width, height = picture
     top, bottom = round(tiles.top * height), round(tiles.bottom * height)
     lefts = _starts(0, width, tile[0], tiles.overlap, width)
@@ -23,7 +23,7 @@ def corners(picture: Size, tile: Size, tiles: Tiles) -> list[Corner]:
 
 
 def _starts(first: int, last: int, length: int, overlap: float, side: int) -> list[int]:
-    """Where tiles of a length begin, that cover first to last and stay inside 0 to side."""
+    """Starts of tiles of a length that cover first to last and stay inside 0 to side."""
     span = last - first
     if span <= length or side <= length:
         return [min(max((first + last - length) // 2, 0), max(side - length, 0))]
@@ -34,7 +34,7 @@ def _starts(first: int, last: int, length: int, overlap: float, side: int) -> li
 def is_whole(
     boxes_px: NDArray[np.float64], corner: Corner, tile: Size, picture: Size
 ) -> NDArray[np.bool_]:
-    """Which boxes (N, 4), in the picture's pixels, are not cut off by an inner edge of a tile."""
+    """Mark the boxes (N, 4), in the picture's pixels, that no inner edge of the tile cuts off."""
     low = np.array(corner, np.float64)
     high = np.minimum(low + tile, picture)
     at_low = (boxes_px[:, :2] < low + EDGE_PX) & (low > 0)

@@ -1,7 +1,7 @@
-"""torchvision's own detection networks with weights of the user's, run as torchvision runs them.
+"""Run torchvision's detection networks with a user's weights.
 
-The file holds tensors and nothing else: a ``state_dict``, read with ``weights_only=True``, or
-safetensors. The card says what to build; torchvision scales and normalises the picture.
+The weights file contains only tensors: a ``state_dict``, read with ``weights_only=True``, or
+safetensors. The card specifies the architecture; torchvision scales and normalises the picture.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from crosscue.replay.errors import VehicleError, one_line
 from .weights import Weights
 
 _COUNTER: Final = "num_batches_tracked"
-"""Of training: missing where normalisation is frozen, and without a meaning for detection."""
+"""Suffix of training counters: missing if normalisation is frozen, and unused in detection."""
 _NESTED: Final = ("model", "state_dict", "model_state_dict", "weights")
 _PREFIXES: Final = ("module.", "model.", "_orig_mod.")
 
@@ -36,9 +36,9 @@ class StateDict:
     """Weights by name.
 
     Attributes:
-        tensors: Without counters of training.
-        is_frozen: The normalisation of the network that they were saved from was frozen.
-        notes: What was taken off to find them.
+        tensors: Tensors by name, without training counters.
+        is_frozen: True if the normalisation of the saved network was frozen.
+        notes: Outer keys and prefixes that were removed from the names.
     """
 
     tensors: Mapping[str, Tensor]
@@ -47,10 +47,11 @@ class StateDict:
 
 
 def read_state_dict(content: bytes, where: str) -> StateDict:
-    """Tensors by name from a file's bytes, without running anything.
+    """Read tensors by name from a file's bytes, without running code in it.
 
     Raises:
-        VehicleError: The file holds code or objects besides tensors, no tensors, or is damaged.
+        VehicleError: The file holds code or objects other than tensors, holds no tensors, or is
+            damaged.
     """
     tree = (
         _safetensors(content, where) if where.endswith(".safetensors") else _torch(content, where)
@@ -59,7 +60,7 @@ def read_state_dict(content: bytes, where: str) -> StateDict:
     for key in _NESTED:
         if isinstance(tree, Mapping) and isinstance(tree.get(key), Mapping):
             tree = tree[key]
-            notes.append(f"its weights lie under {key!r}")
+            notes.append(f"its weights are stored under {key!r}")
             break
     if not isinstance(tree, Mapping) or not tree:
         raise VehicleError(f"{where}: {type(tree).__name__}; expected a state dict: {_SAVE}")
@@ -72,12 +73,12 @@ def read_state_dict(content: bytes, where: str) -> StateDict:
     for prefix in _PREFIXES:
         if all(name.startswith(prefix) for name in named):
             named = {name.removeprefix(prefix): value for name, value in named.items()}
-            notes.append(f"its names begin with {prefix!r}")
+            notes.append(f"its tensor names begin with {prefix!r}")
     kept = {name: value for name, value in named.items() if not name.endswith(_COUNTER)}
     return StateDict(kept, len(kept) == len(named), tuple(notes))
 
 
-_SAVE: Final = "save tensors alone: torch.save(model.state_dict(), FILE)"
+_SAVE: Final = "save tensors only: torch.save(model.state_dict(), FILE)"
 
 
 def _safetensors(content: bytes, where: str) -> Mapping[str, Tensor]:
@@ -88,7 +89,7 @@ def _safetensors(content: bytes, where: str) -> Mapping[str, Tensor]:
         found: Mapping[str, Tensor] = load(content)
     except (SafetensorError, ValueError) as error:
         why = one_line(error, 120)
-        raise VehicleError(f"{where}: no safetensors file ({why}); is it whole?") from None
+        raise VehicleError(f"{where}: not a safetensors file ({why}); is it complete?") from None
     return found
 
 
@@ -104,18 +105,18 @@ def _torch(content: bytes, where: str) -> Any:
     except Exception as error:
         if found := re.search(r"GLOBAL ([\w.]+)", str(error)):
             raise VehicleError(
-                f"{where}: holds code or objects besides tensors ({found[1]}), and reading them "
+                f"{where}: holds code or objects other than tensors ({found[1]}), and reading them "
                 f"can run a program; {_SAVE}, or export the network to ONNX"
             ) from None
         why = one_line(error, 120)
-        raise VehicleError(f"{where}: not a whole file of weights: {why}; {_SAVE}") from None
+        raise VehicleError(f"{where}: not a complete weights file: {why}; {_SAVE}") from None
 
 
 def _is_program(content: bytes) -> bool:
-    """Whether an archive is one of TorchScript.
+    """Whether the content is a TorchScript archive.
 
     Raises:
-        ValueError: It unpacks to more than a file may hold.
+        ValueError: It unpacks to more than the maximum size.
     """
     if not zipfile.is_zipfile(io.BytesIO(content)):
         return False
@@ -128,11 +129,11 @@ def _is_program(content: bytes) -> bool:
 
 
 def shapes_of(architecture: ArchitectureName, class_count: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a network's weights, without building them in memory.
+    """Names and shapes of a network's weights, without allocating them.
 
     Args:
-        architecture: Which.
-        class_count: As torchvision counts, with the background where it has one.
+        architecture: Name of the architecture.
+        class_count: Number of classes, including the background where the architecture has one.
     """
     with torch.device("meta"):
         network = _empty(architecture, class_count)
@@ -153,10 +154,10 @@ def _empty(architecture: ArchitectureName, class_count: int) -> Any:
 def load_torchvision(
     card: ModelCard, weights: Weights, score: float, threads: int
 ) -> TorchvisionNetwork:
-    """The network that a card names, with its weights.
+    """Build the network that a card names, and load its weights.
 
     Raises:
-        VehicleError: Weights and card do not fit each other, or a weight is not finite.
+        VehicleError: Weights and card do not match, or a weight is not finite.
     """
     if card.network is None:
         raise ValueError(f"{weights.name}: the card has no [network]")
@@ -177,8 +178,8 @@ def load_torchvision(
     elif size != shape.size_px:
         own = f"{shape.size_px[0]} x {shape.size_px[1]}"
         raise VehicleError(
-            f"{weights.name}: {name} takes pictures of {own}, the card says {size[0]} x {size[1]}; "
-            "correct input.width_px and height_px"
+            f"{weights.name}: {name} accepts pictures of {own}, but the card specifies {size[0]} x "
+            f"{size[1]}; correct input.width_px and height_px"
         )
     holder = network.roi_heads if hasattr(network, "roi_heads") else network
     holder.score_thresh = score
@@ -200,7 +201,7 @@ def _check_classes(
 
 
 def class_count(tensors: Mapping[str, Tensor], name: ArchitectureName) -> int | None:
-    """How many classes the head is for, as torchvision counts; None where it is not this one."""
+    """Number of classes of the head, as torchvision counts; None if the head is missing."""
     shape = ARCHITECTURES[name]
     head = tensors.get(shape.head)
     if head is None or not head.ndim or len(head) % shape.per_class or len(head) == 0:
@@ -211,7 +212,7 @@ def class_count(tensors: Mapping[str, Tensor], name: ArchitectureName) -> int | 
 def difference(
     wanted: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor]
 ) -> tuple[int, str]:
-    """In how many tensors weights differ from a network's, and the first of them in words."""
+    """Number of tensors that differ from a network's, and a description of the first."""
     missing = [name for name in wanted if name not in tensors]
     unknown = [name for name in tensors if name not in wanted]
     other = [n for n, v in tensors.items() if n in wanted and tuple(v.shape) != wanted[n]]
@@ -228,10 +229,10 @@ def difference(
 
 
 def _fill(network: Any, tensors: Mapping[str, Tensor], name: str, where: str) -> None:
-    """Put weights into a network.
+    """Load weights into a network.
 
     Raises:
-        VehicleError: They are another network's, or not finite.
+        VehicleError: The weights are another network's, or not finite.
     """
     wanted = {
         key: value for key, value in network.state_dict().items() if not key.endswith(_COUNTER)
@@ -240,21 +241,21 @@ def _fill(network: Any, tensors: Mapping[str, Tensor], name: str, where: str) ->
     if count:
         raise VehicleError(
             f"{where}: {count} tensors do not fit {name}: {first}; correct network.architecture, "
-            "or take the file that was trained as it"
+            "or use weights that were trained with it"
         )
     for key, value in tensors.items():
         if not bool(value.isfinite().all()):
             raise VehicleError(
-                f"{where}: {key}: holds values that are not finite; take weights from before "
+                f"{where}: {key}: holds values that are not finite; use weights from before "
                 "training diverged"
             )
-    # Counters of training are all that is left out.
+    # Only training counters are missing.
     network.load_state_dict(dict(tensors), strict=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorchvisionNetwork:
-    """A network of torchvision's as a back end: one picture in, boxes and perhaps masks out."""
+    """A torchvision network as a back end; it returns boxes, and masks if it has them."""
 
     network: Any
     device: torch.device
@@ -262,11 +263,11 @@ class TorchvisionNetwork:
 
     @property
     def backend(self) -> str:
-        """Version of torch, and where it runs."""
+        """Version of torch, and the device."""
         return f"torch {torch.__version__} {self.device.type}"
 
     def __call__(self, picture: Array, /) -> Mapping[str, Array]:
-        """All that torchvision finds in a picture (3, H, W), red green blue, uint8."""
+        """Return torchvision's outputs for a picture (3, H, W), red, green, blue, uint8."""
         given = torch.from_numpy(np.asarray(picture, np.uint8)).to(self.device).float() / 255.0
         with torch.inference_mode(), threads_of(self.threads, self.device):
             (found,) = self.network([given])

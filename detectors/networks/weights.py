@@ -1,4 +1,4 @@
-"""What a back end makes a network of."""
+"""Verified weights, the input of a back end."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from crosscue.detectors.settings import Settings
 
 
 class Weights(Settings):
-    """Weights as read and verified.
+    """Content of a weights file, of verified hash.
 
     Attributes:
-        name: Of the file, for errors.
-        content: Its bytes.
+        name: Name of the file, for errors.
+        content: Bytes of the file.
         second: Bytes of an OpenVINO ``.bin``, else empty.
     """
 

@@ -1,1 +1,1 @@
-"""From a detection's size to its range."""
+"""Estimation of the range of detected objects."""

@@ -1,8 +1,9 @@
-"""Range of one detection by itself: by a fitted curve, or by standard sizes and the ground.
+"""Range of a single detection: by a fitted curve, or by standard sizes and the ground.
 
-Curves are those of the vehicle file. Without any, and with ``camera.focal_px``, lights, signs and
-vehicles have the default R = f H / h of their standard size, vehicles also the ground's; the
-standard deviation holds the spread of sizes. ``ranges.kind = "curve"`` leaves the defaults out.
+Curves are set in the vehicle file. Without a curve, and with ``camera.focal_px``, the default range
+of lights, signs and vehicles is R = f H / h with their standard size; for vehicles it is combined
+with the ground's. The standard deviation includes the spread of sizes. ``ranges.kind = "curve"``
+disables the defaults.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from .standard_sizes import VEHICLES, size_of
 from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
 
 BORDER_PX: Final = 2.0
-"""A box that reaches the picture's edge is cut, so its height and edges say nothing."""
+"""Distance to the picture's edge within which a box counts as cut, so that its height is unusable.
+"""
 
 
 def detection_range(
@@ -30,13 +32,13 @@ def detection_range(
     height_px: float,
     size_px: tuple[int, int],
 ) -> OneRange | None:
-    """From the rear axle; None where there is no curve and no default.
+    """Range from the rear axle; None without a curve and a default.
 
     Args:
         vehicle: Curves, camera and labels.
-        label: Of the detection.
+        label: Label of the detection.
         box_px: x0, y0, x1, y1.
-        height_px: Rows that its mask spans, or the box's.
+        height_px: Number of rows that its mask spans, or height of the box.
         size_px: Width and height of the picture.
     """
     cues, ranges = vehicle.cues, vehicle.ranges
@@ -66,7 +68,7 @@ def _by_size(
     height_px: float,
     size_px: tuple[int, int],
 ) -> OneRange | None:
-    """Depth from the camera."""
+    """Depth from the camera, by standard size and for vehicles also by the ground."""
     cues, camera = vehicle.cues, vehicle.camera
     focal_px = camera.focal_px or 0.0
     x0, _, x1, y1 = box_px.tolist()

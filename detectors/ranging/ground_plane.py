@@ -1,9 +1,9 @@
-"""A pinhole camera, mounted at any angle, over level ground: metres to pixels and back.
+"""Projection between level ground and the picture of a pinhole camera, mounted at any angle.
 
-Axes of the car and of the camera's body are forward, left, up (ISO 8855). The body is turned from
-the car by yaw about up, then pitch about left, then roll about forward, as the vehicle file has
-them: yaw to the left, pitch down and roll to the right are positive. Points on the ground are
-stated from the rear axle, ahead and to the left.
+Axes of the car and of the camera's body are forward, left, up (ISO 8855). The body is rotated from
+the car by yaw about up, then pitch about left, then roll about forward, with the vehicle file's
+values: yaw to the left, pitch down and roll to the right are positive. Points on the ground are
+relative to the rear axle, ahead and to the left.
 """
 
 from __future__ import annotations
@@ -17,57 +17,57 @@ from numpy.typing import NDArray
 
 
 class Mounted(Protocol):
-    """What ``[camera]`` of a vehicle file says, as ``crosscue.replay.vehicle.vehicle.Camera``."""
+    """Mounting of a camera, such as ``crosscue.replay.vehicle.vehicle.Camera``."""
 
     @property
     def focal_px(self) -> float | None:
-        """Focal length."""
+        """Focal length in pixels."""
         ...
 
     @property
     def center_px(self) -> tuple[float, float] | None:
-        """Where the optical axis meets the picture."""
+        """Principal point of the picture."""
         ...
 
     @property
     def x_m(self) -> float:
-        """Ahead of the rear axle."""
+        """Distance ahead of the rear axle."""
         ...
 
     @property
     def y_m(self) -> float:
-        """To its left."""
+        """Distance to the left of the rear axle."""
         ...
 
     @property
     def z_m(self) -> float:
-        """Above the ground."""
+        """Height above the ground."""
         ...
 
     @property
     def yaw_rad(self) -> float:
-        """To the left."""
+        """Yaw, positive to the left."""
         ...
 
     @property
     def pitch_rad(self) -> float:
-        """Down."""
+        """Pitch, positive downwards."""
         ...
 
     @property
     def roll_rad(self) -> float:
-        """To the right."""
+        """Roll, positive to the right."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundPlane:
-    """Where a camera sees the ground.
+    """A camera's view of the ground.
 
     Attributes:
         focal_px: Focal length.
-        center_px: Where the optical axis meets the picture.
-        position_m: Of the camera: ahead of the rear axle, to its left, above the ground.
+        center_px: Principal point of the picture.
+        position_m: Position of the camera: ahead of the rear axle, to its left, above the ground.
         to_car: Shape (3, 3): rotation from the camera's forward, left, up to the car's.
     """
 
@@ -78,11 +78,11 @@ class GroundPlane:
 
     @classmethod
     def of(cls, camera: Mounted, size_px: tuple[int, int]) -> GroundPlane:
-        """The camera of a vehicle file, which has a focal length.
+        """Build the view of a camera with known focal length.
 
         Args:
-            camera: Its section.
-            size_px: Width and height of the picture; its middle is the center where none is stated.
+            camera: Mounting of the camera.
+            size_px: Width and height of the picture, whose centre is the default principal point.
         """
         return cls(
             camera.focal_px or math.nan,
@@ -92,7 +92,7 @@ class GroundPlane:
         )
 
     def rays(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Directions in the car's axes, shape (N, 3), of unit depth along the optical axis.
+        """Convert pixels to directions in the car's axes, shape (N, 3), of unit depth.
 
         Args:
             points_px: Shape (N, 2): x and y.
@@ -102,9 +102,9 @@ class GroundPlane:
         return np.asarray(body @ self.to_car.T, np.float64)
 
     def seen_at(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where directions in the car's axes, shape (N, 3), lie in the picture, shape (N, 2).
+        """Project directions in the car's axes, shape (N, 3), to the picture, shape (N, 2).
 
-        NaN for what is beside or behind the camera.
+        The result is NaN for directions next to or behind the camera.
         """
         forward, left, up = (directions @ self.to_car).T
         forward = np.where(forward > 0.0, forward, np.nan)
@@ -113,25 +113,25 @@ class GroundPlane:
         return np.stack([x, center_y - self.focal_px * up / forward], axis=1)
 
     def project(self, ground_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points on the ground, shape (N, 2), in the picture; NaN beside or behind the camera."""
+        """Project ground points, shape (N, 2), to the picture; NaN next to or behind the camera."""
         x_m, y_m, z_m = self.position_m
         away_m = ground_m - np.array([x_m, y_m])
         return self.seen_at(np.column_stack([away_m, np.full(len(away_m), -z_m)]))
 
     def unproject(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points of the picture, shape (N, 2), on the ground; NaN at and above the horizon."""
+        """Project pixels, shape (N, 2), to the ground; NaN at and above the horizon."""
         x_m, y_m, z_m = self.position_m
         rays = self.rays(points_px)
         below = np.where(rays[:, 2] < 0.0, -rays[:, 2], np.nan)
         return np.asarray(rays[:, :2] * (z_m / below)[:, None] + np.array([x_m, y_m]), np.float64)
 
     def ahead_px(self) -> tuple[float, float]:
-        """What does not move in the picture as the car goes straight ahead."""
+        """Focus of expansion: the pixel that is stationary while the car drives straight ahead."""
         ((x, y),) = self.seen_at(np.array([[1.0, 0.0, 0.0]])).tolist()
         return x, y
 
     def horizon_px(self, x_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Height of the horizon in the columns ``x_px``, shape (N,)."""
+        """Vertical position of the horizon in the columns ``x_px``, shape (N,)."""
         forward, left, up = self.to_car[2]
         to_left = (self.center_px[0] - x_px) / self.focal_px
         return np.asarray(
@@ -140,7 +140,7 @@ class GroundPlane:
 
 
 def turned(yaw_rad: float, pitch_rad: float, roll_rad: float) -> NDArray[np.float64]:
-    """From the axes of a camera's body to the car's, shape (3, 3)."""
+    """Rotation matrix from the axes of a camera's body to the car's, shape (3, 3)."""
     (cy, sy), (cp, sp), (cr, sr) = (
         (math.cos(angle), math.sin(angle)) for angle in (yaw_rad, pitch_rad, roll_rad)
     )

@@ -1,7 +1,8 @@
-"""From an object's height in pixels to its range: a curve fitted to pairs, and its residual.
+"""Fit a curve from an object's height in pixels to its range.
 
-A pinhole camera sees an object of fixed size at range a / height; an offset takes up a mount ahead
-of the rear axle and masks that are a little large. Which family fits is for the data to say.
+For a pinhole camera and an object of fixed size the range is a / height. An offset accounts for a
+camera ahead of the rear axle and for masks that are slightly too large. The data decide which
+family of curves fits best.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ FAMILIES: Final[tuple[Family, ...]] = ("pinhole", "pinhole-offset", "power")
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Residuals of the pairs between two ranges.
+    """Residuals of the pairs in an interval of ranges.
 
     Attributes:
-        from_m: Nearest.
-        to_m: First no longer in it.
-        pairs: How many.
-        mean_m: Of fitted less true range.
-        sd_m: Root of their mean square.
+        from_m: Start of the interval.
+        to_m: End of the interval, exclusive.
+        pairs: Number of pairs.
+        mean_m: Mean of fitted minus true range.
+        sd_m: Root mean square of fitted minus true range.
     """
 
     from_m: float
@@ -44,10 +45,10 @@ class RangeFit:
     """A fitted curve.
 
     Attributes:
-        curve: As the vehicle file keeps it.
-        pairs: How many were used.
+        curve: The curve, in the form of the vehicle file.
+        pairs: Number of pairs used.
         bins: Residuals by distance.
-        outliers: How many more were left out, being of another object or a wrong mask.
+        outliers: Number of pairs left out, which have a wrong object or mask.
     """
 
     curve: RangeCurve
@@ -57,27 +58,30 @@ class RangeFit:
 
 
 OUTLIER_SIGMAS: Final = 5.0
-"""A pair further from the curve is left out, if it is so both in metres and by range: nobody knows
-whether errors grow with the range. Scales are median absolute deviations, which a tenth of bad
-pairs hardly moves."""
+"""Number of scales from the curve beyond which a pair is an outlier.
+
+It must be beyond both in metres and relative to the range, because it is unknown whether errors
+grow with the range. Scales are median absolute deviations, which ten per cent of bad pairs hardly
+change.
+"""
 MIN_OUTLIER: Final = 0.02
-"""But never one nearer than this fraction of its range: pairs without errors have no scale."""
+"""Relative distance from the curve below which no pair is an outlier, for pairs without errors."""
 SOFT_FRACTION: Final = 0.05
-"""Of the range: residuals beyond it count less and less in the first fit."""
+"""Relative residual above which pairs have less weight in the first fit."""
 ROUNDS: Final = 10
-"""Of fitting and leaving out; two or three settle it."""
+"""Maximum number of rounds of fitting and removing outliers; two or three usually suffice."""
 
 
 def range_of(height_px: Floats, curve: RangeCurve) -> Floats:
-    """Ranges in metres for heights in pixels, shape (N,)."""
+    """Compute ranges in metres from heights in pixels, shape (N,)."""
     return _CURVES[curve.family][0](height_px, np.array(curve.parameters))
 
 
 def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float = 10.0) -> RangeFit:
     """Fit one family by least squares of the range, without outliers.
 
-    A fit that outliers sway little comes first (``soft_l1`` of residuals by range); pairs more than
-    ``OUTLIER_SIGMAS`` off it are left out and counted, and the rest is fitted.
+    The first fit is robust (``soft_l1`` of relative residuals). Pairs beyond ``OUTLIER_SIGMAS`` of
+    it are left out and counted, and the remaining pairs are fitted.
 
     Args:
         height_px: Shape (N,), positive.
@@ -86,8 +90,8 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         bin_m: Width of the bins of distance.
 
     Raises:
-        EmptyResultError: Too few pairs.
-        UsageError: A number that is not one or not positive.
+        EmptyResultError: There are too few pairs.
+        UsageError: A number is not finite or not positive, or too few pairs are on one curve.
     """
     model, start = _CURVES[family]
     bad = ~(np.isfinite(height_px) & np.isfinite(range_m) & (height_px > 0.0) & (range_m > 0.0))
@@ -135,7 +139,7 @@ def _residual_of(
 
 
 def _inliers(off: Floats) -> NDArray[np.bool_]:
-    """Which residuals are not outliers, by the scale of the typical one."""
+    """Mark the residuals that are not outliers, by the median scale."""
     away = np.abs(off - np.median(off))
     return np.asarray(away <= OUTLIER_SIGMAS * 1.4826 * np.median(away), np.bool_)
 
@@ -143,12 +147,12 @@ def _inliers(off: Floats) -> NDArray[np.bool_]:
 def residuals(
     height_px: Floats, range_m: Floats, curve: RangeCurve, bin_m: float = 10.0
 ) -> RangeFit:
-    """A curve on pairs it was not fitted to; its ``residual_sd_m`` becomes theirs.
+    """Evaluate a curve on other pairs; its ``residual_sd_m`` is replaced by theirs.
 
     Args:
         height_px: Shape (N,).
         range_m: Shape (N,), true ranges.
-        curve: Fitted elsewhere.
+        curve: The fitted curve.
         bin_m: Width of the bins of distance.
     """
     error = range_of(height_px, curve) - range_m

@@ -1,9 +1,10 @@
-"""Which way a traffic light faces, from its picture: a lit lens is seen only from the front.
+"""Detect the lit lens of a traffic light, which is visible only from the front.
 
-A housing seen from behind or from the side is dark all over, and is not a signal for this car. The
-rule is plain image processing: inside the box, the largest spot of a signal's colour, bright,
-saturated, round, and about as large as a lens should be. One frame proves little (lamps flicker,
-hoods hide them), so that a light faces the car or does not is said of a track, over many frames.
+A housing seen from behind or from the side is completely dark and is no signal for the ego vehicle.
+Classical image processing finds the largest spot inside the box that has a signal's colour, is
+bright, saturated and round, and has about the size of a lens. A single frame is unreliable, because
+lamps flicker and hoods hide them, so a track combines many frames to decide whether a light faces
+the car.
 """
 
 from __future__ import annotations
@@ -19,36 +20,36 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections, Frame
 
 VERSION: Final = 1
-"""Of the rule; results kept by an older one are not used."""
+"""Version of the rule; cached results of other versions are not used."""
 Lens = Literal["red", "yellow", "green", "dark", "unknown"]
 MIN_WIDTH_PX: Final = 6.0
 MIN_HEIGHT_PX: Final = 14.0
-"""A smaller box says nothing: a lens of a third of its height is under five pixels."""
+"""Height below which a box is too small: its lens, a third of it, is under five pixels."""
 MIN_SATURATION: Final = 90
 MIN_VALUE: Final = 120
-"""Of 255. Sunlit walls and sky are pale, housings dark."""
+"""Minimum saturation and value, of 255. Sunlit walls and sky are pale, housings are dark."""
 HUES: Final[Mapping[Lens, tuple[tuple[int, int], ...]]] = {
     "red": ((0, 10), (160, 179)),
     "yellow": ((11, 34),),
     "green": ((45, 105),),
 }
-"""In OpenCV's half degrees; signal green is a bluish one (CIE S 004), and cameras lean to cyan."""
+"""Hues in OpenCV's half degrees; signal green is bluish (CIE S 004), and more so in cameras."""
 LENS_PER_WIDTH: Final = (0.2, 1.0)
-"""Diameter of the spot by the width of the box: 0.30 m of 0.35 m bare, of 0.60 m with a
-backplate, and glare or a blurred rim beyond that."""
+"""Bounds of the spot's diameter over the box's width: 0.30 m of 0.35 m without a backplate and of
+0.60 m with one, with a margin for glare and blur."""
 MIN_ROUND: Final = 0.5
-"""Fraction of the spot's own bounding box that it fills (a disc: 0.79)."""
+"""Minimum fraction of the spot's bounding box that it fills (a disc: 0.79)."""
 MAX_LONG: Final = 2.0
-"""Longer side of the spot by the shorter."""
+"""Maximum ratio of the spot's longer to its shorter side."""
 MARGIN: Final = 0.06
-"""Of the box's width, left out on either side: what is behind the housing."""
+"""Fraction of the box's width that is left out on either side, as background."""
 
 
 def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
-    """The lit lens in one box; ``dark`` where none is lit, ``unknown`` where too small to say.
+    """Find the lit lens in one box; ``dark`` if none is lit, ``unknown`` if the box is too small.
 
     Args:
-        pixels: Shape (H, W, 3), blue, green, red; or (H, W) grey, which says nothing.
+        pixels: Shape (H, W, 3), blue, green, red; or (H, W) grey, for which the lens is unknown.
         box_px: x0, y0, x1, y1 in those pixels.
     """
     x0, y0, x1, y1 = box_px.tolist()
@@ -71,12 +72,12 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
 
 
 def with_lenses(found: Detections, frame: Frame, labels: Sequence[str]) -> Detections:
-    """The same detections, with the lenses of those that carry one of ``labels``.
+    """Add the lenses of the detections that have one of ``labels``.
 
     Args:
-        found: In one frame.
-        frame: Its pixels, perhaps smaller than the camera's.
-        labels: Of traffic lights.
+        found: Detections in one frame.
+        frame: The decoded frame, which may be smaller than the camera's picture.
+        labels: Labels of traffic lights.
     """
     if not any(label in labels for label in found.labels):
         return found
@@ -91,7 +92,7 @@ def with_lenses(found: Detections, frame: Frame, labels: Sequence[str]) -> Detec
 
 
 def _spot_px(is_lit: NDArray[np.bool_], width_px: float) -> float:
-    """Area of the largest spot that a lens may be; 0 for none."""
+    """Area of the largest spot that can be a lens; 0 without one."""
     import cv2
 
     count, _, found, _ = cv2.connectedComponentsWithStats(is_lit.astype(np.uint8))

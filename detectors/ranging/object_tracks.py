@@ -1,9 +1,10 @@
-"""Lights or signs of one kind followed through the frames, each with its own range from motion.
+"""Track lights or signs of one kind over frames, each with its own range from motion.
 
-A standing object is looked for where it must be now: as the car goes on, it moves away from the
-picture's centre and grows by the ratio of the ranges before and after; as the car turns, it shifts
-sideways. So two lights side by side stay two, and no range mixes their heights. A housing seen from
-behind or from the side is followed, too; ``Track.facing`` says so, from the lenses seen lit.
+The position of a standing object is predicted. As the car drives, the object moves away from the
+picture's centre and grows by the ratio of the ranges before and after. As the car turns, it shifts
+sideways. Two adjacent lights therefore remain two tracks, and no range mixes their heights.
+Housings seen from behind or from the side are tracked, too; ``Track.facing`` distinguishes them by
+their lit lenses.
 """
 
 from __future__ import annotations
@@ -23,44 +24,45 @@ from .range_from_motion import MotionRange, range_from_motion
 from .standard_sizes import BOX_SPREAD, SizePrior, size_of
 
 NEAR_HEIGHTS: Final = 1.0
-"""A box belongs to a track whose predicted box is nearer than so many of its heights: the car's
-pitch shifts a far object by about its own height, and lights stand further apart."""
+"""Maximum distance of a box from a track's predicted box, in heights of the box: the car's pitch
+shifts a distant object by about its own height, and lights are further apart."""
 GROWTH: Final = 1.5
-"""And if their heights differ by less than this factor."""
+"""Maximum ratio of the heights of a box and a track's predicted box."""
 SAME_IOU: Final = 0.3
-"""A box that overlaps with one already taken is the same object again, not another track."""
+"""Intersection over union above which a box is the same object as an assigned box."""
 MERGE_M: Final = 0.2
-"""Observations so close to each other count as one, with their mean height."""
+"""Distance travelled within which observations are merged to one, with their mean height."""
 MAX_OBSERVATIONS: Final = 400
-"""Of one track, the newest: 80 m and more."""
+"""Maximum number of observations of a track; the newest, over 80 m or more, are kept."""
 GONE_M: Final = 5.0
 GONE_S: Final = 1.0
-"""A track unseen for this way and this time is over."""
+"""A track ends after this time (and the distance ``GONE_M``) without an observation."""
 MIN_LIT: Final = 2
 MIN_LIT_FRACTION: Final = 0.15
-"""A light faces the car if a lens was lit in so many frames, and in this fraction of those that
-were large enough: lamps flicker, hoods hide them, and the rule of one frame misses four in ten of
-small or blurred ones."""
+"""A light faces the car if a lens was lit in ``MIN_LIT`` frames and in this fraction of the frames
+where the box was large enough. The fraction is low because lamps flicker, hoods hide them, and the
+rule for one frame misses four in ten small or blurred lenses."""
 MIN_DARK: Final = 10
 MAX_LIT_FRACTION: Final = 0.05
-"""And does not face it if it was dark in so many frames and lit in at most this fraction."""
+"""A light does not face the car if it was dark in ``MIN_DARK`` frames and lit in at most this
+fraction."""
 SAME_MAKE: Final = 0.06
-"""Lights at one crossing are mostly of one make: their heights differ by this fraction, boxes drawn
-tight or wide included, much less than the standard sizes do."""
+"""Relative spread of the heights of lights at one intersection, which are mostly of one make. It
+includes the errors of the boxes and is much less than the spread of standard sizes."""
 SAME_ASPECT: Final = 1.2
-"""If their boxes are alike, height by width, within this factor."""
+"""Maximum ratio of the aspects (height over width) of two lights of one make."""
 OTHER_MAKE: Final = 2.0
-"""And if motion does not say otherwise by more than so many standard deviations."""
-MIN_SAID: Final = 0.25
-"""Motion has said something once it is worth this fraction of what the standard sizes say."""
+"""Maximum difference of the sizes by motion of two lights of one make, in standard deviations."""
+MIN_INFORMATION: Final = 0.25
+"""Minimum information on the size by motion, as a fraction of that of the standard sizes."""
 MIN_SEEN: Final = 5
-"""A light seen less often says nothing about the others' make."""
+"""Minimum number of frames of a light for it to inform the size of others."""
 STRAIGHT_RAD: Final = 0.15
-"""Heights follow the way only while the car goes straight; after such a turn they start over."""
+"""Turn after which a track restarts, because range from motion assumes a straight path."""
 
 
 class Facing(StrEnum):
-    """Whether a light is for this car to see."""
+    """Direction of a traffic light, relative to the ego vehicle."""
 
     EGO = "ego"
     AWAY = "away"
@@ -68,13 +70,13 @@ class Facing(StrEnum):
 
 
 class Motion(NamedTuple):
-    """Of the car since the frame before.
+    """Motion of the car since the previous frame.
 
     Attributes:
-        way_m: Forwards positive; None where unknown.
-        var_m2: Its variance.
-        turned_rad: Counter-clockwise; 0 where unknown.
-        seconds: Time passed.
+        way_m: Distance travelled, forwards positive; None where unknown.
+        var_m2: Variance of ``way_m``.
+        turned_rad: Change of heading, counter-clockwise; 0 where unknown.
+        seconds: Duration.
     """
 
     way_m: float | None
@@ -89,7 +91,7 @@ class Lens:
 
     Attributes:
         focal_px: Focal length.
-        center_px: What does not move as the car goes straight ahead.
+        center_px: Pixel that is stationary while the car drives straight ahead.
     """
 
     focal_px: float
@@ -98,23 +100,23 @@ class Lens:
 
 @dataclass(slots=True)
 class Track:
-    """One object.
+    """Track of one object.
 
     Attributes:
-        number: Of the track, from 1.
-        box_px: Where it is now: as seen, or as predicted.
-        height_px: Of its box, the same way.
-        estimate: Range and height at the last observation, from this object and those alike.
-        alone: The same from this object alone.
-        size: What its shape alone says of its height.
-        seen: In how many frames.
-        is_seen: In the newest frame.
-        since_m: Way gone since the last observation.
-        unseen_m: The same without sign.
-        unseen_s: Time since then.
-        lit: In how many frames a lens was lit.
-        dark: And in how many none was, though the box was large enough.
-        way_scale_sd: Of the odometer, as a fraction of any way.
+        number: Number of the track, from 1.
+        box_px: Current box, observed or predicted.
+        height_px: Current height of the box, observed or predicted.
+        estimate: Range and height at the last observation, from this object and similar ones.
+        alone: Range and height at the last observation, from this object only.
+        size: Prior of its height, from its aspect.
+        seen: Number of frames with an observation.
+        is_seen: True if it was observed in the newest frame.
+        since_m: Distance travelled since the last observation.
+        unseen_m: Absolute distance travelled since the last observation.
+        unseen_s: Time since the last observation.
+        lit: Number of frames in which a lens was lit.
+        dark: Number of frames in which no lens was lit although the box was large enough.
+        way_scale_sd: Relative standard deviation of the odometer's scale.
     """
 
     number: int
@@ -141,56 +143,56 @@ class Track:
 
     @property
     def range_m(self) -> float:
-        """Depth from the camera now."""
+        """Current depth from the camera."""
         return self.estimate.mean_m - self.since_m
 
     @property
     def facing(self) -> Facing:
-        """From all frames so far; one that was never examined is unknown."""
-        looked = self.lit + self.dark
-        if self.lit >= MIN_LIT and self.lit >= MIN_LIT_FRACTION * looked:
+        """Direction from all frames so far; unknown without frames of sufficient size."""
+        examined = self.lit + self.dark
+        if self.lit >= MIN_LIT and self.lit >= MIN_LIT_FRACTION * examined:
             return Facing.EGO
-        is_away = self.dark >= MIN_DARK and self.lit <= MAX_LIT_FRACTION * looked
+        is_away = self.dark >= MIN_DARK and self.lit <= MAX_LIT_FRACTION * examined
         return Facing.AWAY if is_away else Facing.UNKNOWN
 
-    def look(self, lens: str) -> None:
-        """Take the lens of the newest frame's box (``lens_of``; empty where nobody looked)."""
+    def add_lens(self, lens: str) -> None:
+        """Count the lens of the newest box (by ``lens_of``; empty if it was not examined)."""
         self.lit += lens in HUES
         self.dark += lens == "dark"
 
     @property
     def var_m2(self) -> float:
-        """Its variance, the odometer's error included: a way too long is a range too far."""
+        """Variance of the range, including the odometer's error, which scales the range."""
         stretch = self.estimate.by_motion * self._stretch()
         return self.estimate.var_m2 + (stretch * self.estimate.mean_m) ** 2
 
     @property
     def aspect(self) -> float:
-        """Height by width of its boxes, the median of the newest."""
+        """Height over width, as the median of its newest boxes."""
         return float(np.median(self._aspect))
 
     def _stretch(self) -> float:
-        """S.d. of the way as a fraction of it."""
+        """Relative standard deviation of the distance travelled."""
         way_m = abs(self._way_m[-1] - self._way_m[0])
         if way_m < MERGE_M:
             return 0.0
         return math.hypot(self.way_scale_sd, math.sqrt(self._way_var_m2) / way_m)
 
     def size_by_motion(self) -> tuple[float, float] | None:
-        """How much larger it is than its standard size, as mean and variance of the logarithm.
+        """Log ratio of its size to the standard size, as mean and variance, by motion only.
 
-        None where motion has said nothing yet. The standard size, which the estimate holds, too, is
-        taken out, so that several objects may be weighed together with it once.
+        It is None while motion has too little information. The prior of the standard size is
+        removed from the estimate, so that it is applied only once when objects are combined.
         """
         found, prior = self.alone, self.size
         precision = 1.0 / found.log_height_var - 1.0 / prior.log_var
-        if precision <= MIN_SAID / prior.log_var:
+        if precision <= MIN_INFORMATION / prior.log_var:
             return None
         mean = (found.log_height - prior.log_mean) / (found.log_height_var * precision)
         return mean, 1.0 / precision + self._stretch() ** 2
 
-    def go_on(self, motion: Motion, lens: Lens) -> None:
-        """Carry it to the next frame, where it has not been looked for yet."""
+    def predict(self, motion: Motion, lens: Lens) -> None:
+        """Predict the track to the next frame."""
         way_m = motion.way_m or 0.0
         scale = self.range_m / max(self.range_m - way_m, 0.1 * self.range_m, 1e-3)
         shift_px = lens.focal_px * math.tan(max(min(motion.turned_rad, 1.0), -1.0))
@@ -209,7 +211,7 @@ class Track:
             self._forget()
 
     def observe(self, box_px: NDArray[np.float64], height_px: float, cue: str, lens: Lens) -> None:
-        """Take the box of the newest frame."""
+        """Update the track with the box of the newest frame."""
         width_px = float(box_px[2] - box_px[0])
         if width_px > 0.0:
             self._aspect.append(height_px / width_px)
@@ -230,7 +232,7 @@ class Track:
         self.is_seen, self.unseen_m, self.unseen_s = True, 0.0, 0.0
 
     def weigh(self, size: SizePrior, lens: Lens) -> None:
-        """Take into account what objects alike say of its size."""
+        """Update the estimate with a size prior from similar objects."""
         self.estimate = self._ranged(size, lens)
 
     def _ranged(self, size: SizePrior, lens: Lens) -> MotionRange:
@@ -239,17 +241,17 @@ class Track:
         )
 
     def _forget(self) -> None:
-        """What heights said so far fits no straight road; the last estimate stands until seen."""
+        """Discard earlier heights, which are not of a straight path; the estimate remains."""
         self._way_m, self._height_px, self._merged = [self._at_m], [self.height_px], 0
         self._way_var_m2 = self._turned_rad = 0.0
 
 
 class ObjectTracks:
-    """Follows all objects of one kind; memory holds those in view.
+    """Tracks all objects of one kind that are in view.
 
     Attributes:
-        tracks: In the order in which they were first seen.
-        counts: What became of boxes, by outcome.
+        tracks: Tracks, in the order of their first observation.
+        counts: Number of boxes by outcome.
     """
 
     def __init__(
@@ -272,19 +274,19 @@ class ObjectTracks:
         heights_px: NDArray[np.float64],
         lenses: Sequence[str] = (),
     ) -> Sequence[Track]:
-        """Take the next frame's boxes.
+        """Update the tracks with the boxes of the next frame.
 
         Args:
-            motion: Of the car since the frame before.
+            motion: Motion of the car since the previous frame.
             boxes_px: Shape (N, 4): x0, y0, x1, y1.
             heights_px: Shape (N,), positive.
-            lenses: N of them, or none where nobody looked.
+            lenses: N lenses, or empty if they were not examined.
 
         Returns:
-            All tracks, those unseen in this frame as predicted.
+            All tracks; those without an observation in this frame are predicted.
         """
         for track in self.tracks:
-            track.go_on(motion, self._lens)
+            track.predict(motion, self._lens)
         lenses = lenses or [""] * len(boxes_px)
         taken = self._assign(boxes_px, heights_px, lenses)
         for i in range(len(boxes_px)):
@@ -302,7 +304,7 @@ class ObjectTracks:
     def _assign(
         self, boxes_px: NDArray[np.float64], heights_px: NDArray[np.float64], lenses: Sequence[str]
     ) -> list[int]:
-        """Nearest pairs first; the boxes that were taken."""
+        """Assign boxes to tracks, nearest pairs first; return the indices of assigned boxes."""
         pairs = [
             (away, i, j)
             for j, track in enumerate(self.tracks)
@@ -314,13 +316,13 @@ class ObjectTracks:
         for _, i, j in sorted(pairs):
             if i not in boxes and j not in tracks:
                 self.tracks[j].observe(boxes_px[i], float(heights_px[i]), self._cue, self._lens)
-                self.tracks[j].look(lenses[i])
+                self.tracks[j].add_lens(lenses[i])
                 boxes.append(i)
                 tracks.add(j)
         return boxes
 
     def _share_sizes(self) -> None:
-        """Weigh each object's size with those of the others alike, each taken by itself."""
+        """Combine each object's size with the sizes by motion of similar objects."""
         said = [
             (one, by_motion)
             for one in self.tracks
@@ -346,18 +348,18 @@ class ObjectTracks:
         track = Track(number, box_px.copy(), height_px, first, first, size)
         track.way_scale_sd = self._way_scale_sd
         track.observe(box_px, height_px, self._cue, self._lens)
-        track.look(lens)
+        track.add_lens(lens)
         track.seen = 1
         self.tracks.append(track)
 
 
 def is_alike(aspect: float, other: float) -> bool:
-    """May two lights be of one make, by the shape of their boxes?"""
+    """Whether two lights can be of one make, by the aspects of their boxes."""
     return abs(math.log(aspect / other)) < math.log(SAME_ASPECT)
 
 
 def may_be_one_make(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Do two sizes by motion agree as well as lights of one make would?"""
+    """Whether two lights can be of one make, by their sizes from motion."""
     var = one[1] + other[1] + 2.0 * SAME_MAKE**2
     return (one[0] - other[0]) ** 2 < OTHER_MAKE**2 * var
 
@@ -365,8 +367,8 @@ def may_be_one_make(one: tuple[float, float], other: tuple[float, float]) -> boo
 def difference_var_m2(one: Track, other: Track) -> float:
     """Variance of the difference of two ranges.
 
-    Of lights of one make, what is common to their sizes does not count: it makes both ranges too
-    long or too short, and the higher box is the nearer light.
+    For lights of one make, the common part of their sizes is left out. Its error changes both
+    ranges alike, and the light with the higher box is the nearer one.
     """
     apart_m2 = one.var_m2 + other.var_m2
     if not is_alike(one.aspect, other.aspect):
@@ -376,14 +378,14 @@ def difference_var_m2(one: Track, other: Track) -> float:
 
 
 def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizePrior:
-    """An object's size, given how much larger than standard others of its make are.
+    """Size prior of an object, given the sizes of others of its make.
 
-    The logarithm of a size is that of the standard size, plus what is common to the make, plus the
-    object's own (``SAME_MAKE``); all are Gaussian.
+    The logarithm of a size is the sum of three Gaussians: the standard size, a part common to the
+    make, and a part of the object (``SAME_MAKE``).
 
     Args:
-        size: What its shape alone says.
-        others: Mean and variance of the logarithm by ``Track.size_by_motion``, of each.
+        size: Prior from the object's aspect.
+        others: Mean and variance of the log ratio (``Track.size_by_motion``) of each other object.
     """
     own = min(SAME_MAKE**2, 0.5 * size.log_var)
     common = size.log_var - own
@@ -402,7 +404,7 @@ def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 
 
 def _away(track: Track, box_px: NDArray[np.float64], height_px: float) -> float:
-    """Distance from the predicted box in heights; infinite if it is another's for its height."""
+    """Distance of a box from the predicted box, in heights; infinite if the heights differ."""
     if abs(math.log(height_px / track.height_px)) > math.log(GROWTH):
         return math.inf
     apart = 0.5 * (box_px[:2] + box_px[2:] - track.box_px[:2] - track.box_px[2:])

@@ -1,18 +1,19 @@
-"""Range and true height of one light or sign together, from how it grows as the car moves.
+"""Joint estimate of range and height of a light or sign, from its growth as the car moves.
 
 A pinhole camera of focal length f sees an object of height H at depth R as h = f H / R pixels. Over
-the distance s travelled towards it, 1 / h falls linearly: 1 / h = (R0 - s) / (f H). So the growth
-yields R without knowing H; what is known of H beforehand (``standard_sizes``) is only the prior. It
-is all there is while the car stands, and is outweighed as the car moves.
+the distance s travelled towards it, 1 / h decreases linearly: 1 / h = (R0 - s) / (f H). The growth
+therefore determines R without knowledge of H. The standard size (``standard_sizes``) is the prior
+of H. It is the only information while the car stands, and is outweighed as the car moves.
 
-In logarithms, ln h = ln f + ln H - ln R + error, and H is lognormal: given R, everything is
-Gaussian, so H is integrated out exactly and the posterior of R is computed on a grid. Its prior is
-flat in ln R, so that size alone errs as often to the far side as to the near. Two things keep the
-result honest:
+In logarithms, ln h = ln f + ln H - ln R + error, and H is lognormal. Given R, everything is
+Gaussian, so H is integrated out exactly, and the posterior of R is computed on a grid. The prior of
+R is flat in ln R, so that size alone errs equally often to either side. Two measures prevent
+overconfidence:
 
-* heights in successive frames err alike, so an observation soon after another is worth little
-  (``HeightErrors.resemble_m``);
-* an observation far from the others (a box over two lights, another object) counts next to nothing.
+* Errors of heights in successive frames are correlated, so an observation soon after another has
+  little weight (``HeightErrors.resemble_m``).
+* An observation far from the others (a box over two lights, or another object) has almost no
+  weight.
 
 The scale of the errors is estimated with the range, from residuals and a weak prior.
 """
@@ -32,17 +33,17 @@ Floats: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class HeightErrors:
-    """How far a box's height is off, before anything is known of this track.
+    """Prior of the errors of a box's height.
 
-    Measured about the straight line of 1 / height against the way, 70 to 160 observations each: 2.1
-    and 2.7 % at 38 and 60 px (two lights, yolox-nano, real), 3.3 to 7.4 % at 20 to 30 px (three
-    lights, embedded network, simulated).
+    They were measured about the straight line of 1 / height over the distance travelled, with 70 to
+    160 observations each: 2.1 and 2.7 % at 38 and 60 px (two lights, yolox-nano, real pictures),
+    3.3 to 7.4 % at 20 to 30 px (three lights, embedded network, simulated pictures).
 
     Attributes:
         fraction: Standard deviation as a fraction of the height.
         edges_px: Standard deviation in pixels, added in squares.
-        resemble_m: Distance travelled over which errors resemble each other.
-        worth: How many independent observations this prior of the errors' scale counts for.
+        resemble_m: Correlation length of the errors, as distance travelled.
+        worth: Weight of this prior of the errors' scale, in independent observations.
     """
 
     fraction: float = 0.04
@@ -56,12 +57,12 @@ class MotionRange:
     """Range at the last observation, and the object's height.
 
     Attributes:
-        mean_m: Expected depth along the camera's axis, from the camera.
-        var_m2: Its variance.
-        height_m: The object's height that goes with ``mean_m``.
-        by_motion: How much of the prior variance motion took away, in [0, 1].
+        mean_m: Mean depth along the camera's axis, from the camera.
+        var_m2: Variance of the depth.
+        height_m: The object's height at ``mean_m``.
+        by_motion: Fraction of the prior variance that motion removed, in [0, 1].
         log_height: Mean of the logarithm of the height.
-        log_height_var: Its variance.
+        log_height_var: Variance of the logarithm of the height.
     """
 
     mean_m: float
@@ -76,10 +77,10 @@ NEAREST_M: Final = 0.5
 FURTHEST_M: Final = 500.0
 GRID: Final = 101
 OUTLIER: Final = 2.5
-"""In standard deviations; further off an observation's weight falls with
-the square of its distance."""
+"""Number of standard deviations beyond which an observation's weight decreases with the square of
+its distance."""
 ROUNDS: Final = 8
-"""Of reweighting; weights settle in three or four."""
+"""Number of rounds of reweighting; weights converge in three or four."""
 
 
 def range_from_motion(
@@ -89,17 +90,17 @@ def range_from_motion(
     size: SizePrior,
     errors: HeightErrors = HeightErrors(),
 ) -> MotionRange:
-    """Estimate range and true height of one object from all its observations.
+    """Estimate range and height of one object from all its observations.
 
     Args:
         travelled_m: Shape (N,), N > 0, odometer readings in time order, forwards positive.
         height_px: Shape (N,), heights of its boxes.
-        focal_px: Of the camera, in the same pixels.
-        size: Prior of its height.
+        focal_px: Focal length, in the same pixels.
+        size: Prior of the object's height.
         errors: Prior of the errors of ``height_px``.
 
     Raises:
-        ValueError: No observations, shapes that differ, or a height or focal length that is not
+        ValueError: There are no observations, shapes differ, or a height or the focal length is not
             positive.
     """
     seen = _checked(travelled_m, height_px, focal_px, errors)
@@ -124,13 +125,13 @@ def range_from_motion(
 
 @dataclass(frozen=True, slots=True)
 class _Observations:
-    """All observations; shape (N,) each.
+    """All observations, as arrays of shape (N,).
 
     Attributes:
-        ahead_m: How much further away the object was than at the last observation.
-        log_angle: ln of height over focal length.
-        var: Of ``log_angle``, before residuals are seen.
-        worth: How many independent observations each one is.
+        ahead_m: Range at the observation minus range at the last observation.
+        log_angle: Logarithm of height over focal length.
+        var: Prior variance of ``log_angle``.
+        worth: Weight of each observation, in independent observations.
     """
 
     ahead_m: Floats
@@ -139,12 +140,12 @@ class _Observations:
     worth: Floats
 
     def excess(self, range_m: Floats) -> Floats:
-        """Log of the height that each shows if the last was at ``range_m``, shape (G, N)."""
+        """Log height by each observation if the last range is ``range_m``, shape (G, N)."""
         depth = np.maximum(range_m[:, None] + self.ahead_m[None, :], 1e-3)
         return np.asarray(self.log_angle[None, :] + np.log(depth), np.float64)
 
     def at_last(self) -> _Observations:
-        """The typical last observation as the only one."""
+        """A typical observation at the last range, as the only one."""
         angle = np.array([float(np.median(self.log_angle[-5:]))])
         return _Observations(np.zeros(1), angle, self.var[-1:], np.ones(1))
 
@@ -170,14 +171,15 @@ def _checked(
     if not ((height_px > 0.0).all() and 0.0 < focal_px < np.inf):
         raise ValueError("height_px, focal_px: expected positive numbers")
     step_m = np.abs(np.diff(travelled_m))
-    # Resembling the one before by exp(-step / length), each is worth tanh(step / length / 2).
+    # With a correlation of exp(-step / length) to the previous one, the weight of an observation is
+    # tanh(step / length / 2).
     worth = np.concatenate(([1.0], np.tanh(0.5 * step_m / errors.resemble_m)))
     var = errors.fraction**2 + (errors.edges_px / height_px) ** 2
     return _Observations(travelled_m[-1] - travelled_m, np.log(height_px / focal_px), var, worth)
 
 
 def _first_weights(seen: _Observations, range_m: Floats) -> Floats:
-    """From the range that the median absolute residual likes best: no outlier sways it."""
+    """Robust initial weights, from the range with the least median absolute residual."""
     excess = seen.excess(range_m)
     away = np.abs(excess - np.median(excess, axis=1, keepdims=True))
     best = away[int(np.argmin(np.median(away, axis=1) + away.mean(axis=1)))]
@@ -191,7 +193,7 @@ def _weights(seen: _Observations, residual: Floats, errors: HeightErrors) -> Flo
     scale = 1.0
     for _ in range(ROUNDS):
         trust = _trust(np.sqrt(squares / scale))
-        # Two observations' worth goes into range and size themselves.
+        # Range and size use up two degrees of freedom.
         left = max(float(seen.worth @ trust) - 2.0, 0.0)
         scale = (errors.worth + float(seen.worth @ (trust * squares))) / (errors.worth + left)
     return np.asarray(_trust(np.sqrt(squares / scale)) / (scale * seen.var), np.float64)
@@ -203,7 +205,7 @@ def _trust(sigmas: Floats) -> Floats:
 
 
 def _refined(seen: _Observations, range_m: Floats, weights: Floats, size: SizePrior) -> _Posterior:
-    """On finer grids around what the one before found, which may be narrower than its steps."""
+    """Compute the posterior on successively finer grids; it can be narrower than a grid's steps."""
     post = _posterior(seen, range_m, weights, size)
     for _ in range(2):
         near = max(int(np.searchsorted(range_m, post.mean_m)), 1)
@@ -218,7 +220,7 @@ def _refined(seen: _Observations, range_m: Floats, weights: Floats, size: SizePr
 def _posterior(
     seen: _Observations, range_m: Floats, weights: Floats, size: SizePrior
 ) -> _Posterior:
-    """Of the range, with the size integrated out; the grid may have any spacing."""
+    """Posterior of the range, with the size integrated out; the grid may have any spacing."""
     excess = seen.excess(range_m)
     off = excess - size.log_mean
     precision = float(weights.sum()) + 1.0 / size.log_var

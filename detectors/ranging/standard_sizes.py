@@ -1,8 +1,9 @@
-"""What is known of an object's height before it is seen: standard sizes, and how they spread.
+"""Priors of an object's height: standard sizes and their spread.
 
-A signal's housing follows from its lenses (United States: MUTCD and ITE; Europe: EN 12368): three
-of 0.30 m are 1.07 m bare, and 1.32 m with a backplate of 0.13 m around. A box's shape says which of
-them is likely: bare housings are three times as high as wide, those with a backplate about twice.
+The size of a signal's housing follows from its lenses (United States: MUTCD and ITE; Europe:
+EN 12368): with three lenses of 0.30 m it is 1.07 m high, or 1.32 m with a backplate of 0.13 m
+around. The box's aspect shows which of them is probable: housings without a backplate are three
+times as high as wide, those with one about twice.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class SizePrior:
-    """What is known of an object's height before it is seen: lognormal.
+    """Lognormal prior of an object's height.
 
     Attributes:
         mean_m: Expected height.
@@ -38,12 +39,12 @@ class SizePrior:
 
 
 class Housing(NamedTuple):
-    """One kind of signal, seen from ahead.
+    """One kind of signal, seen from the front.
 
     Attributes:
-        height_m: With its backplate, if it has one.
-        width_m: The same.
-        proportion: How common it is taken to be.
+        height_m: Height, including a backplate.
+        width_m: Width, including a backplate.
+        proportion: Assumed proportion of all signals.
     """
 
     height_m: float
@@ -60,33 +61,33 @@ HOUSINGS: Final[Mapping[str, Housing]] = {
     "4 lenses of 0.30 m, backplate": Housing(1.68, 0.61, 0.05),
     "2 lenses of 0.30 m": Housing(0.71, 0.35, 0.02),
 }
-"""The proportions are a judgement, no count of signals is at hand: new signals have lenses of
-0.30 m and at least three of them (MUTCD), with or without a backplate."""
+"""Kinds of signals by name. The proportions are assumed, because no count of signals is available:
+new signals have at least three lenses of 0.30 m (MUTCD), with or without a backplate."""
 ASPECT_SPREAD: Final = 0.15
-"""Of a box's height by width about its housing's, in logarithms: boxes drawn tight or wide."""
+"""Spread of a box's aspect (height over width) about its housing's, in logarithms."""
 OBLIQUE: Final = 0.10
 ANY_ASPECT: Final = 1.5
-"""Proportion of boxes whose shape says nothing (seen from the side, with hoods, or cut), spread
-over so wide a span of logarithms."""
+"""Proportion of boxes without a characteristic aspect (seen from the side, with hoods, or cut), and
+their span of log aspects."""
 BOX_SPREAD: Final = 0.05
-"""Of a box's height about its object's."""
+"""Relative spread of a box's height about its object's."""
 STOP_SIGN: Final = SizePrior(0.82, 0.13)
-"""Faces of 0.75 m and 0.90 m across the flats, seldom 0.60 m, boxes drawn tight or wide."""
+"""Stop signs are 0.75 m and 0.90 m across flats, rarely 0.60 m; errors of boxes are included."""
 VEHICLES: Final[Mapping[str, SizePrior]] = {
     "car": SizePrior(1.65, 0.15),
     "truck": SizePrior(2.50, 0.35),
     "bus": SizePrior(3.10, 0.15),
 }
-"""By label, as COCO names them. Cars of 1.45 m, and vans and SUVs of 1.7 to 1.9 m, about as many of
-each; detectors call both pick-ups of 1.9 m and lorries of 4 m trucks. Boxes drawn tight or wide are
-in the spread."""
+"""Sizes of vehicles by COCO label. Cars are 1.45 m high, vans and SUVs 1.7 to 1.9 m, in about equal
+numbers; detectors label both pick-ups of 1.9 m and lorries of 4 m as trucks. The spread includes
+the errors of boxes."""
 
 
 def light_size(aspect: float | None = None) -> SizePrior:
-    """Height of a traffic light whose box is ``aspect`` times as high as wide.
+    """Size prior of a traffic light whose box is ``aspect`` times as high as wide.
 
     Args:
-        aspect: Positive; None where unknown, as for lights that do not hang upright.
+        aspect: Positive; None where unknown, as for lights that are not upright.
     """
     heights = np.array([one.height_m for one in HOUSINGS.values()])
     weights = np.array([one.proportion for one in HOUSINGS.values()])
@@ -102,10 +103,10 @@ def light_size(aspect: float | None = None) -> SizePrior:
 
 
 def size_of(cue: str, aspect: float | None = None) -> SizePrior:
-    """Standard size of what a cue's detections are.
+    """Size prior of the objects of a cue.
 
     Args:
         cue: ``traffic_light`` or ``stop_sign``.
-        aspect: Height by width of its box.
+        aspect: Height over width of the box; None where unknown.
     """
     return light_size(aspect) if cue == "traffic_light" else STOP_SIGN

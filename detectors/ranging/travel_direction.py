@@ -1,9 +1,9 @@
-"""Which way a camera moves, in its own axes, from two pictures: the essential matrix.
+"""Estimate a camera's direction of travel from two pictures, by the essential matrix.
 
-Where a car drives straight, its camera moves along the road, so that this direction is the
-vanishing point of the road: how far the camera's axis points beside and below it. Hartley and
-Zisserman, *Multiple View Geometry*, 2nd ed., section 9.6; points are followed by Lucas and Kanade's
-method, there and back.
+While a car drives straight, its camera moves towards the road's vanishing point. The direction of
+travel therefore shows how far the camera's axis points to the side of it and below it. See Hartley
+and Zisserman, *Multiple View Geometry*, 2nd ed., section 9.6. Points are tracked by the method of
+Lucas and Kanade, forwards and backwards.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 POINTS: Final = 600
 MIN_POINTS: Final = 60
 MIN_FLOW_PX: Final = 2.0
-"""Below this the noise of following a point decides."""
+"""Minimum optical flow; below it, noise dominates."""
 THERE_AND_BACK_PX: Final = 0.5
 OFF_LINE_PX: Final = 0.7
 INLIERS: Final = 0.5
-"""The standing part of a street must be more than what moves in it."""
+"""Minimum fraction of inliers: static points must outnumber moving ones."""
 
 
 class Travel(NamedTuple):
-    """How a camera moved from one picture to the next.
+    """Motion of a camera between two pictures.
 
     Attributes:
-        left_rad: How far its axis points left of where it went.
-        below_rad: How far its axis points below where it went.
-        turned_rad: How far it turned meanwhile, to the left.
-        points: How many points agree.
+        left_rad: Angle of its axis to the left of the direction of travel.
+        below_rad: Angle of its axis below the direction of travel.
+        turned_rad: Rotation between the pictures, to the left.
+        points: Number of inliers.
     """
 
     left_rad: float
@@ -47,7 +47,7 @@ def travel_between(
     focal_px: float,
     center_px: tuple[float, float],
 ) -> Travel | None:
-    """The direction of travel, in the axes half-way between both pictures.
+    """Estimate the direction of travel, in the axes half-way between both pictures.
 
     Args:
         before: Grey picture, shape (H, W), uint8.
@@ -56,7 +56,7 @@ def travel_between(
         center_px: Optical center in them.
 
     Returns:
-        None where too few points can be followed, or they do not agree.
+        The motion, or None if too few points can be tracked or they do not agree.
     """
     found = cv2.goodFeaturesToTrack(before, POINTS, 0.01, 8)
     if found is None or len(found) < MIN_POINTS:
@@ -86,7 +86,7 @@ def travel_between(
 def _rays(
     points: NDArray[np.float32], focal_px: float, center_px: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Directions of points in a picture, shape (N, 3), the last being 1."""
+    """Directions of pixels, shape (N, 3), with last component 1."""
     flat = (points.astype(np.float64) - np.array(center_px)) / focal_px
     return np.column_stack([flat, np.ones(len(flat))])
 
@@ -98,9 +98,9 @@ def _refined(
     after: NDArray[np.float64],
     focal_px: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Turn and shift of the least distances from epipolar lines (Sampson's), robustly.
+    """Refine rotation and translation by a robust fit of Sampson's distances.
 
-    Five points, which random sampling makes do with, leave the shift off by degrees.
+    The five points of a random sample alone leave an error of degrees in the translation.
     """
     from scipy.optimize import least_squares
 
@@ -121,7 +121,7 @@ def _refined(
 def _followed(
     before: NDArray[np.uint8], after: NDArray[np.uint8], found: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points in both pictures, those that come back to where they were."""
+    """Track points to the second picture; keep those that are tracked back to their start."""
     size = (21, 21)
     there, is_there, _ = cv2.calcOpticalFlowPyrLK(before, after, found, found.copy(), winSize=size)
     back, is_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, found.copy(), winSize=size)
@@ -131,16 +131,16 @@ def _followed(
 
 
 def _travel(turn: NDArray[np.float64], shift: NDArray[np.float64], points: int) -> Travel:
-    """Points of the first camera's axes, turned and shifted, are in the second's."""
+    """Compute the motion from the rotation and translation of the first camera's axes."""
     half = np.asarray(cv2.Rodrigues(0.5 * turn)[0], np.float64)
-    # In the second camera's axes the camera came from +shift; half the turn takes that half-way.
+    # In the second camera's axes the first is at +shift; half the rotation yields the middle axes.
     ahead = -half.T @ shift
     if ahead[2] < 0.0:
         ahead = -ahead
     return Travel(
         left_rad=math.atan2(ahead[0], ahead[2]),
         below_rad=math.atan2(-ahead[1], math.hypot(ahead[0], ahead[2])),
-        # About the camera's y axis, which points down: points move right as it turns left.
+        # About the camera's y axis, which points down: points move right as the camera turns left.
         turned_rad=float(turn[1]),
         points=points,
     )

@@ -1,10 +1,11 @@
-"""Range of a vehicle from one box: where it stands on the ground, and how high vehicles are.
+"""Range of a vehicle from one box, by the ground and by its height.
 
-On level ground a point at depth R is seen below the horizon by an angle whose tangent is z / R, for
-a camera at height z. So the lower edge of a box gives a range, which the camera's pitch spoils with
-the square of the distance: 0.3 degrees are 1 m at 20 m, and 6 m at 50 m. The height of the box
-gives another, which the spread of vehicles' heights spoils by the same fraction everywhere. Their
-logarithms are weighed by their variances: near, the ground decides, and far away, the size.
+On level ground, a point at depth R is below the horizon by an angle of tangent z / R, for a camera
+at height z. The lower edge of a box therefore yields a range, whose error by the camera's pitch
+grows with the square of the distance: 0.3 degrees are 1 m at 20 m, and 6 m at 50 m. The height of
+the box yields another range, whose relative error by the spread of vehicles' heights is constant.
+The logarithms of the two are weighted by their variances: the ground dominates at short range, the
+size at long range.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from .standard_sizes import SizePrior
 
 EDGE_PX: Final = 1.0
 EDGE_FRACTION: Final = 0.03
-"""Standard deviation of a box's edge: so many pixels, and this fraction of its height, in
+"""Standard deviation of a box's edge as a fraction of the box's height, added to ``EDGE_PX`` in
 squares."""
 OVERHANG_M: Final = 0.5
-"""What is ahead of the wheels that stand on the ground, and road that is not level."""
+"""Standard deviation by the overhang ahead of the wheels and by uneven roads."""
 CAMERA_HEIGHT_SD: Final = 0.05
-"""Of the camera's height, as a fraction: load and springs."""
+"""Relative standard deviation of the camera's height, by load and suspension."""
 MIN_SIGMAS: Final = 2.0
-"""An edge less than so many standard deviations below the horizon says nothing."""
+"""Minimum distance of a box's edge below the horizon, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +34,8 @@ class GroundCamera:
 
     Attributes:
         focal_px: Focal length.
-        height_m: Above the ground.
-        pitch_sd_rad: How far its pitch is off in a frame.
+        height_m: Height above the ground.
+        pitch_sd_rad: Standard deviation of its pitch in a frame.
     """
 
     focal_px: float
@@ -43,35 +44,34 @@ class GroundCamera:
 
 
 class OneRange(NamedTuple):
-    """Depth from the camera, and its standard deviation."""
+    """Depth from the camera and its standard deviation."""
 
     mean_m: float
     sd_m: float
 
 
 def size_range(height_px: float, focal_px: float, size: SizePrior) -> OneRange:
-    """Range of an object of a standard size: R = f H / h, as unsure as H and the box.
+    """Range of an object of a standard size, R = f H / h, with the errors of H and of the box.
 
     Args:
-        height_px: Of its box, positive.
-        focal_px: Of the camera.
-        size: Of the object.
+        height_px: Height of its box, positive.
+        focal_px: Focal length.
+        size: Size prior of the object.
     """
     mean_m = focal_px * size.mean_m / height_px
     return OneRange(mean_m, mean_m * math.hypot(size.spread, _edge_px(height_px) / height_px))
 
 
 def ground_range(slope: float, height_px: float, camera: GroundCamera) -> OneRange | None:
-    """Range of what stands on the ground at a box's lower edge.
+    """Range of an object that stands on the ground at a box's lower edge.
 
     Args:
-        slope: Of the ray through the edge: so far down, as seen from the camera, for each metre
-            ahead of the car.
-        height_px: Of the box.
-        camera: Over level ground.
+        slope: Downward slope of the ray through the edge, per metre ahead of the car.
+        height_px: Height of the box.
+        camera: Camera over level ground.
 
     Returns:
-        None at or near the horizon, where the edge says nothing.
+        The range, or None at or near the horizon, where the edge has no information.
     """
     below_rad = math.atan(slope)
     angle_sd = math.hypot(camera.pitch_sd_rad, _edge_px(height_px) / camera.focal_px)
@@ -89,10 +89,10 @@ def vehicle_range(
     """Range of a vehicle by ground and size.
 
     Args:
-        slope: Of the ray through its box's lower edge, as for ``ground_range``.
-        height_px: Of its box, positive.
-        camera: Over level ground.
-        size: Of vehicles.
+        slope: Slope of the ray through its box's lower edge, as for ``ground_range``.
+        height_px: Height of its box, positive.
+        camera: Camera over level ground.
+        size: Size prior of vehicles.
     """
     by_size = size_range(height_px, camera.focal_px, size)
     by_ground = ground_range(slope, height_px, camera)

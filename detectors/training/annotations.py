@@ -1,9 +1,9 @@
-"""COCO annotations, checked at the door: what cannot be used is counted, with the reason.
+"""Read and validate COCO annotations; unusable ones are counted by reason.
 
-Masks are compressed run lengths, plain run lengths or polygons; an annotation may also have a box
-only. It is left out when its class is not among those wanted, its picture is not listed, its box
-has no area within the picture, or its mask is not one of that picture's size; a box that sticks out
-is cut off at the picture's edge.
+Masks are compressed run lengths, plain run lengths or polygons. An annotation may also have only a
+box. It is left out if its class is not selected, its picture is not listed, its box has no area
+within the picture, or its mask is not of the picture's size. A box that exceeds the picture is
+clipped.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from crosscue.detectors import rle
 from crosscue.replay.base import AnnotationError, Int64s, SchemaError, json_tree, read_at_most
 
 MAX_BYTES: Final = 2 << 30
-"""Largest file read."""
+"""Maximum size of an annotation file."""
 MAX_SIDE_PX: Final = 32768
 
 Box: TypeAlias = tuple[float, float, float, float]
 """x0, y0, x1, y1."""
 Mask: TypeAlias = bytes | tuple[tuple[float, ...], ...]
-"""Compressed runs, or polygons as (x, y) pairs one after another."""
+"""Compressed runs, or polygons as consecutive (x, y) pairs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Labelled:
-    """One object.
+    """One annotated object.
 
     Attributes:
         label: Index into the classes.
         box_px: x0, y0, x1, y1 within the picture.
-        mask: Compressed runs, or polygons as (x, y) pairs one after another; None where only the
-            box is known.
-        is_crowd: Neither to be found nor wrong when found.
+        mask: Compressed runs, or polygons as consecutive (x, y) pairs; None where only the box is
+            known.
+        is_crowd: True for a group of objects, which is ignored: it need not be found, and
+            detections of it are not wrong.
     """
 
     label: int
@@ -51,13 +52,13 @@ class Labelled:
 
 @dataclass(frozen=True, slots=True)
 class LabelledPicture:
-    """One picture.
+    """One annotated picture.
 
     Attributes:
-        path: Its file.
+        path: File of the picture.
         size_px: Width and height as annotated.
-        objects: All of the classes wanted.
-        decoys_px: Boxes of objects of other classes, which may look like them.
+        objects: All objects of the selected classes.
+        decoys_px: Boxes of objects of other classes, which may resemble the selected ones.
     """
 
     path: Path
@@ -68,13 +69,13 @@ class LabelledPicture:
 
 @dataclass(frozen=True, slots=True)
 class LabelledSet:
-    """A set to train or to measure on.
+    """A set of annotated pictures, for training or measurement.
 
     Attributes:
-        source: The file.
-        classes: In the order of ``Labelled.label``.
-        pictures: In the order of the file.
-        left_out: What was left out or repaired, by reason.
+        source: The annotation file.
+        classes: Class names, in the order of ``Labelled.label``.
+        pictures: Pictures, in the order of the file.
+        left_out: Number of annotations and pictures that were left out or repaired, by reason.
     """
 
     source: Path
@@ -84,12 +85,12 @@ class LabelledSet:
 
     @property
     def objects(self) -> int:
-        """How many there are in all pictures."""
+        """Number of objects in all pictures."""
         return sum(len(picture.objects) for picture in self.pictures)
 
     @property
     def masks(self) -> int:
-        """How many of them have a mask."""
+        """Number of objects with a mask."""
         return sum(one.mask is not None for picture in self.pictures for one in picture.objects)
 
 
@@ -98,17 +99,17 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
 
     Args:
         path: The file.
-        folder: Where its pictures lie.
-        classes: Names wanted, in the order that labels number them.
+        folder: Folder of its pictures.
+        classes: Names of the selected classes; a label is an index into them.
 
     Raises:
-        AnnotationError: No COCO file, or no such folder.
-        SchemaError: None of its pictures is there, or nothing is of the classes.
+        AnnotationError: The file is not a COCO file, or the folder does not exist.
+        SchemaError: All pictures are missing, or no annotation is of the selected classes.
     """
     tree = _tree(path)
     if not folder.is_dir():
         raise AnnotationError(
-            f"{folder}: not a folder; give the one with the images of {path.name}"
+            f"{folder}: not a folder; expected the folder with the images of {path.name}"
         )
     left_out: Counter[str] = Counter()
     names = {row["id"]: row["name"] for row in _rows(tree, "categories", path) if "id" in row}
@@ -117,7 +118,9 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
         raise SchemaError(f"{path}: no class of {', '.join(classes)}; it has: {has or 'none'}")
     pictures = _pictures(_rows(tree, "images", path), folder, left_out)
     if not pictures:
-        raise SchemaError(f"{path}: none of its pictures is in {folder}; give the folder of images")
+        raise SchemaError(
+            f"{path}: none of its pictures is in {folder}; name the folder of its images"
+        )
     numbers = {name: i for i, name in enumerate(classes)}
     objects: dict[Any, list[Labelled]] = {key: [] for key in pictures}
     decoys: dict[Any, list[Box]] = {key: [] for key in pictures}
@@ -188,7 +191,7 @@ def _labelled(
     numbers: Mapping[str, int],
     left_out: Counter[str],
 ) -> Labelled | Box | None:
-    """The object, or only its box if its class is not wanted; None where it cannot be used."""
+    """Return the object, or only its box if its class is not selected; None if it is unusable."""
     picture, category = row.get("image_id"), row.get("category_id")
     if not isinstance(picture, int | str) or picture not in pictures:
         left_out["annotations of other pictures"] += 1
@@ -257,7 +260,7 @@ def _from_lengths(lengths: Int64s, size: tuple[int, int]) -> bytes:
 
 
 def mask_of(labelled: Labelled, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    """An object's pixels in the picture, shape (height, width); its box where it has no mask."""
+    """Rasterise an object's mask, shape (height, width); its box where it has no mask."""
     import cv2
 
     if labelled.mask is None:
@@ -269,7 +272,7 @@ def mask_of(labelled: Labelled, size_px: tuple[int, int]) -> NDArray[np.bool_]:
         return rle.decode(labelled.mask, size_px)
     canvas = np.zeros((size_px[1], size_px[0]), np.uint8)
     for polygon in labelled.mask:
-        # Corners are at pixel edges in COCO, at pixel middles in OpenCV; 4 bits of fraction.
+        # Integer coordinates are pixel edges in COCO and pixel centres in OpenCV; 4 fraction bits.
         corners = np.clip(np.array(polygon).reshape(-1, 2) - 0.5, -(2.0**20), 2.0**20)
         cv2.fillPoly(canvas, [np.rint(corners * 16).astype(np.int32)], (1,), shift=4)
     return canvas.astype(np.bool_)

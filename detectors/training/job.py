@@ -1,4 +1,4 @@
-"""One training from annotations to a checkpoint: validated on the way, going on after a kill."""
+"""Train a network from annotations to a checkpoint, with validation and resumption."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ Recipe: TypeAlias = dict[str, str | int | float]
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What to train and where it goes.
+    """A training and its outputs.
 
     Attributes:
         start: ``compact``, ``resnet50``, ``resnet50-v2`` (with COCO weights), or a checkpoint.
-        plan: Of the network.
-        schedule: How long and how fast.
-        window: Of samples.
-        output: The checkpoint; its curve and state are beside it.
-        check_every: Steps between validations.
-        check_pictures: At most so many pictures in those; the last one takes all.
-        device: As the detector's setting.
-        threads: On a CPU.
-        recipe: Words for the checkpoint.
-        made_of: Annotations, pictures and settings; only the very same training is gone on with.
+        plan: Architecture and input of the network.
+        schedule: Number of steps and learning rates.
+        window: Size and augmentation of samples.
+        output: Path of the checkpoint; its curve and state are stored next to it.
+        check_every: Number of steps between validations.
+        check_pictures: Maximum number of pictures per validation; the last one uses all.
+        device: Device, as in the detector's setting.
+        threads: Number of threads on a CPU.
+        recipe: Description of the training for the checkpoint.
+        made_of: Annotations, pictures and settings; a training with other ones is not resumed.
     """
 
     start: str
@@ -68,24 +68,24 @@ class Job:
 
     @property
     def state_path(self) -> Path:
-        """What a killed training continues from."""
+        """State file, from which an interrupted training is resumed."""
         return self.output.with_suffix(".state.safetensors")
 
     @property
     def curve_path(self) -> Path:
-        """Losses and average precisions on the way."""
+        """File of losses and average precisions during training."""
         return self.output.with_suffix(".curve.json")
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One place of the curve.
+    """One point of the training curve.
 
     Attributes:
-        step: After so many.
-        loss: Mean since the last point.
-        seconds: Of training so far, validations left out.
-        ap: By name; empty where nothing was validated.
+        step: Number of steps so far.
+        loss: Mean loss since the last point.
+        seconds: Training time so far, without validations.
+        ap: Average precision by name; empty without a validation.
     """
 
     step: int
@@ -101,24 +101,24 @@ def run_job(
     *,
     resume: bool,
     overwrite: bool,
-    tell: Callable[[Point], None],
+    report: Callable[[Point], None],
 ) -> Facts:
-    """Train, validate, calibrate, write; returns what the checkpoint says of itself.
+    """Train, validate, calibrate and write a checkpoint; return its description.
 
     Raises:
-        OutputError: Something lies where the results go, or they cannot be written.
+        OutputError: An output file exists or cannot be written.
         LogError: A picture cannot be read.
-        SchemaError: The state to go on from is damaged.
-        UsageError: The state to go on from is of another training.
-        VehicleError: The network to start from does not fit.
-        CrosscueError: The losses are not numbers any more.
+        SchemaError: The state to resume is damaged.
+        UsageError: The state to resume is of another training.
+        VehicleError: The network to start from does not match the plan.
+        CrosscueError: The losses are no longer finite.
     """
     if not (resume and job.state_path.exists()):
         _check_place(job, overwrite)
     device = chosen_device(job.device, "train mask-rcnn")
     torch.set_num_threads(job.threads)
     with reproducible(device):
-        return _run(job, train, held_out, device, resume=resume, tell=tell)
+        return _run(job, train, held_out, device, resume=resume, report=report)
 
 
 def _run(
@@ -128,7 +128,7 @@ def _run(
     device: torch.device,
     *,
     resume: bool,
-    tell: Callable[[Point], None],
+    report: Callable[[Point], None],
 ) -> Facts:
     learns_masks = train.masks > 0
     training = Training(
@@ -140,7 +140,7 @@ def _run(
         points = [Point(**row) for row in said["points"]]
     sampler = Sampler(train, job.plan, job.window, job.schedule.seed)
     for point in _learned(job, training, sampler, held_out, points):
-        tell(point)
+        report(point)
     recipe: Recipe = {"objects": train.objects, "boxes_without_mask": train.objects - train.masks}
     job = replace(job, recipe={**job.recipe, **recipe})
     has_masks = learns_masks or knows_masks(job)
@@ -159,7 +159,7 @@ def _check_place(job: Job, overwrite: bool) -> None:
 
 
 def starting_network(job: Job) -> Any:
-    """A network of the plan, with the weights it starts from; heads of other classes are random."""
+    """Build a network with its initial weights; heads for different classes start at random."""
     network = build_network(job.plan)
     if job.start == COMPACT:
         return network
@@ -177,7 +177,7 @@ def starting_network(job: Job) -> Any:
 
 
 def knows_masks(job: Job) -> bool:
-    """Whether the network to start from has learnt masks of the very classes of the plan."""
+    """Whether the network to start from was trained on masks of exactly the plan's classes."""
     if job.start == COMPACT:
         return False
     facts = checkpoint_named(job.start).facts
@@ -185,7 +185,7 @@ def knows_masks(job: Job) -> bool:
 
 
 def architecture_of(start: str) -> str:
-    """Which network a name or file is."""
+    """Architecture of a named network or of a checkpoint file."""
     if start == COMPACT or start in COCO_NETWORKS:
         return start
     return checkpoint_named(start).facts.plan.architecture
@@ -238,9 +238,9 @@ def _spread(pictures: tuple[Any, ...], max_count: int) -> tuple[Any, ...]:
 def finished_facts(
     job: Job, network: Any, held_out: LabelledSet, device: torch.device, *, has_masks: bool
 ) -> Facts:
-    """What the checkpoint says: its measured average precision, and calibrated scores.
+    """Measure average precision and calibrate the scores, for the checkpoint's description.
 
-    The first half of the held-out pictures calibrates, the second half measures how well.
+    The calibration is fitted to the first half of the held-out pictures and measured on the second.
     """
     settings = MaskRcnnSettings(threads=job.threads)
     found = raw_detections(job.plan, network, held_out, settings, device)
@@ -275,5 +275,5 @@ def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float 
 
 
 def read_curve(path: Path) -> list[Point]:
-    """The points of a curve file."""
+    """Read the points of a curve file."""
     return [Point(**row) for row in json_tree(path.read_text(encoding="utf-8"))]

@@ -1,7 +1,7 @@
-"""The training loop: samples in, an averaged network out, going on after a kill as if none came.
+"""The training loop; an interrupted training resumes with the same result.
 
-AdamW with a warm-up and a cosine, and a running average of the weights, which is what is measured
-and kept (Loshchilov and Hutter 2019; Polyak and Juditsky 1992).
+It uses AdamW with a warm-up and a cosine schedule. The result is a running average of the weights
+(Loshchilov and Hutter 2019; Polyak and Juditsky 1992).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from .samples import Sample, Sampler
 STATE_KEY: Final = "crosscue_training"
 GRADIENT_LIMIT: Final = 5.0
 BAD_STEPS: Final = 20
-"""So many losses in a row that are not numbers end the training."""
+"""Number of consecutive losses that are not finite after which training stops."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """How long and how fast to learn.
+    """Number of steps, learning rates and related settings.
 
     Attributes:
-        steps: Batches altogether.
-        batch: Samples in one.
-        rate: Highest learning rate.
-        warm_up: Steps until that is reached.
-        decay: Of weights, as AdamW means it.
-        average: Fraction of the running average that a step leaves as it was, once it has settled.
-        seed: Everything random comes from it.
+        steps: Total number of batches.
+        batch: Number of samples per batch.
+        rate: Maximum learning rate.
+        warm_up: Number of steps until the maximum rate is reached.
+        decay: Weight decay of AdamW.
+        average: Decay of the running average per step, after its initial phase.
+        seed: Seed of all random numbers.
     """
 
     steps: int
@@ -62,12 +62,12 @@ class Schedule:
 
 
 class Training:
-    """A network in training; ``steps`` continues, ``save`` and ``resume`` keep and restore it all.
+    """A network in training; ``steps`` trains, ``save`` and ``resume`` store and restore its state.
 
     Attributes:
-        network: Learns.
-        averaged: Its running average, in evaluation mode.
-        done: Steps taken.
+        network: The network in training.
+        averaged: Running average of the network, in evaluation mode.
+        done: Number of steps done.
     """
 
     def __init__(
@@ -78,13 +78,13 @@ class Training:
         *,
         learns_masks: bool = True,
     ) -> None:
-        """Build twice: what learns and its average.
+        """Build the network and its average.
 
         Args:
-            make: Builds the network, with the weights to start from.
-            schedule: How long and how fast.
-            device: Where.
-            learns_masks: Otherwise the mask head is frozen: its weights stay as they are.
+            make: Builds the network with its initial weights.
+            schedule: Number of steps and learning rates.
+            device: Device of the training.
+            learns_masks: False to freeze the mask head.
         """
         torch.manual_seed(schedule.seed)
         self.schedule, self.device = schedule, device
@@ -100,16 +100,16 @@ class Training:
         )
 
     def steps(self, sampler: Sampler) -> Iterator[tuple[int, float]]:
-        """Number and loss of each step, until all are done.
+        """Train, and yield number and loss of each step.
 
         Raises:
             LogError: A picture cannot be read.
-            CrosscueError: The losses are not numbers any more.
+            CrosscueError: The losses are no longer finite.
         """
         schedule = self.schedule
         first, last = self.done * schedule.batch, schedule.steps * schedule.batch
         with ThreadPoolExecutor(1, "samples") as pool:
-            # The next batch is made while the last one is learnt from.
+            # The next batch is prepared during the current step.
             waiting = [
                 pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
             ]
@@ -124,7 +124,7 @@ class Training:
 
     def _learn(self, batch: list[Sample]) -> float:
         schedule = self.schedule
-        # Which places the losses look at is random too, and must not depend on where we resumed.
+        # The losses sample regions at random, which must not depend on where training resumed.
         torch.manual_seed(schedule.seed * 1_000_003 + self.done)
         for group in self._optimizer.param_groups:
             group["lr"] = schedule.rate_at(self.done)
@@ -171,10 +171,10 @@ class Training:
     def save(
         self, path: Path, said: Mapping[str, Any], made_of: Mapping[str, Any] = NOTHING
     ) -> None:
-        """Keep everything needed to go on, with words of the caller's.
+        """Store everything needed to resume, with entries of the caller.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
@@ -194,11 +194,11 @@ class Training:
         write_bytes(path, serialised(plain, header))
 
     def resume(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> Mapping[str, Any]:
-        """Go on where ``save`` was called; returns the words kept then.
+        """Restore the state of ``save``; return the caller's entries.
 
         Raises:
-            SchemaError: Damaged.
-            UsageError: Of a training of something else.
+            SchemaError: The file is damaged.
+            UsageError: The file is of another training.
         """
         from safetensors import SafetensorError, safe_open
 
@@ -213,7 +213,7 @@ class Training:
         refuse_another(path, "--resume", kept.get("made_of"), made_of)
         if kept.get("schedule") != asdict(self.schedule):
             raise SchemaError(
-                f"{path}: holds a training with other settings; give the same ones, or another -o"
+                f"{path}: holds a training with other settings; use the same ones, or another -o"
             )
         self._restore(tensors, path)
         self.done = int(kept["done"])
@@ -240,7 +240,7 @@ class Training:
 
 
 def _groups(network: Any, decay: float) -> list[dict[str, Any]]:
-    """Weights decay, biases and normalisations do not."""
+    """Group parameters: weights with decay, biases and normalisations without."""
     learns = [p for p in network.parameters() if p.requires_grad]
     return [
         {"params": [p for p in learns if p.ndim > 1], "weight_decay": decay},

@@ -1,10 +1,10 @@
-"""How good a Mask R-CNN is on labelled pictures: average precision, and rates at the cues' scores.
+"""Measure a Mask R-CNN on annotated pictures: average precision, and rates at the cues' scores.
 
-Average precision is of the network's own scores, rates are of calibrated ones: a calibrated score
-is the fraction of detections with such a score that are right. The calibration is fitted for each
+Average precision uses the network's own scores, rates use calibrated ones. A calibrated score is
+the fraction of detections with such a score that are correct. The calibration is fitted for each
 class on held-out pictures by logistic regression on the score's logit (Platt 1999). A detection is
-right when it overlaps an object of its class, still free, by three tenths: a cue asks whether a far
-sign is there, and a box of ten pixels is easily off by two.
+correct if it overlaps a not yet matched object of its class by 0.3. The bound is low because a cue
+depends on the presence of a distant sign, and a box of ten pixels is easily off by two.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from .platt import fit_platt
 from .scores import MIN_AREA_PX, average_precisions, detections_on
 
 MIN_SCORE: Final = 0.02
-"""Detections below it are left out of the average precision."""
+"""Score below which detections are left out of the average precision."""
 AIMS: Final = (0.5, 0.9, 0.95)
-"""Scores at which precision and recall are reported; the last two are the cues' own."""
+"""Scores at which precision and recall are reported; the last two are thresholds of cues."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What a network reaches on some pictures.
+    """Results of a network on annotated pictures.
 
     Attributes:
-        ap: As ``average_precisions`` names it, in percent.
-        rates: By class and calibrated score.
-        cpu_s: CPU seconds a picture, reading it included.
+        ap: Average precision in percent, with the names of ``average_precisions``.
+        rates: Rates by class and calibrated score.
+        cpu_s: CPU seconds per picture, including reading.
     """
 
     ap: Mapping[str, float | None]
@@ -58,7 +58,7 @@ def measure(
 
     Raises:
         LogError: A picture cannot be read.
-        CrosscueError: Not even one picture fits into memory.
+        CrosscueError: A single picture does not fit into memory.
     """
     facts = checkpoint.facts
     began = time.process_time()
@@ -78,14 +78,14 @@ def raw_detections(
     settings: MaskRcnnSettings,
     device: torch.device,
 ) -> list[Detections]:
-    """What a network finds, with its own scores from ``MIN_SCORE``.
+    """Run a network with its uncalibrated scores, from ``MIN_SCORE``.
 
     Args:
-        plan: Of the network.
+        plan: Architecture and input of the network.
         network: A torchvision ``MaskRCNN``.
         labelled: The pictures.
-        settings: The score in them is not examined.
-        device: Where.
+        settings: Settings of the detector; the minimum score in them is ignored.
+        device: Device of the network.
 
     Raises:
         LogError: A picture cannot be read.
@@ -96,18 +96,18 @@ def raw_detections(
 
 
 def rates_by_score(rows: Judged, by: Calibration) -> dict[float, Rates]:
-    """How many are found and right at each of ``AIMS``, by calibrated scores."""
+    """Rates at each of ``AIMS``, by calibrated scores."""
     scores = np.array([calibrated(score, by) for score in rows.scores.tolist()])
     return {aim: rates_at(Judged(scores, rows.is_right, rows.signs), aim) for aim in AIMS}
 
 
 OVERLAP: Final = 0.3
 MIN_ROWS: Final = 20
-"""Fewer right or wrong detections of a class than this, and its scores stay as they are."""
+"""Minimum number of correct and of wrong detections of a class for a calibration."""
 
 
 def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, Judged]:
-    """Every detection as right or wrong, by class, but those of objects that do not count."""
+    """Judge every detection as correct or wrong, by class, without those of ignored objects."""
     table: dict[str, Judged] = {}
     for label, name in enumerate(labelled.classes):
         scores: list[float] = []
@@ -154,7 +154,7 @@ def _verdicts(
 
 
 def fitted(rows: Judged) -> Calibration:
-    """The calibration of one class."""
+    """Fit the calibration of one class."""
     right = int(rows.is_right.sum())
     if min(right, len(rows.is_right) - right) < MIN_ROWS:
         return Calibration()

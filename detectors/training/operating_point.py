@@ -1,4 +1,4 @@
-"""The sign score to ask for, so that nearly all that is found is right."""
+"""Choose the minimum score of a sign for a given precision."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from crosscue.detectors.boxes import overlaps
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """What was found in labelled frames, as columns of length N, and how much there was to find.
+    """Judged detections in annotated frames, as columns of length N.
 
     Attributes:
         scores: Shape (N,), float64.
-        is_right: Shape (N,), bool: over a true sign that no better one took.
-        signs: True signs.
+        is_right: Shape (N,), bool: matched to a true sign that no better detection matched.
+        signs: Number of true signs.
     """
 
     scores: NDArray[np.float64]
@@ -27,12 +27,12 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """How good a threshold is on some frames.
+    """Counts of detections at a threshold.
 
     Attributes:
-        found: Detections at or above it.
-        right: Of these.
-        signs: True signs.
+        found: Number of detections at or above the threshold.
+        right: Number of correct ones among them.
+        signs: Number of true signs.
     """
 
     found: int
@@ -41,12 +41,12 @@ class Rates:
 
     @property
     def precision(self) -> float:
-        """Right of found; NaN where nothing was found."""
+        """Fraction of detections that are correct; NaN without detections."""
         return self.right / self.found if self.found else float("nan")
 
     @property
     def recall(self) -> float:
-        """Right of true signs; NaN where there were none."""
+        """Fraction of true signs that are found; NaN without true signs."""
         return self.right / self.signs if self.signs else float("nan")
 
 
@@ -57,14 +57,14 @@ def judge(
     min_overlap: float,
     min_height_px: float = 0.0,
 ) -> Judged:
-    """Which detections of one frame are right: each true sign counts once, the best first.
+    """Match the detections of one frame to true signs, each at most once, best scores first.
 
     Args:
         boxes_px: Shape (N, 4).
         scores: Shape (N,).
         truth_px: Shape (M, 4): boxes of the true signs.
-        min_overlap: Intersection over union that makes a detection right.
-        min_height_px: True signs that are lower do not count, whether they are found or not.
+        min_overlap: Minimum intersection over union of a correct detection.
+        min_height_px: Height below which true signs and their detections are ignored.
     """
     heights = truth_px[:, 3] - truth_px[:, 1]
     order = np.argsort(-scores, kind="stable")
@@ -82,7 +82,7 @@ def judge(
 
 
 def together(parts: list[Judged]) -> Judged:
-    """Several frames as one."""
+    """Concatenate the judged detections of several frames."""
     return Judged(
         np.concatenate([np.empty(0), *(part.scores for part in parts)]),
         np.concatenate([np.empty(0, np.bool_), *(part.is_right for part in parts)]),
@@ -91,15 +91,15 @@ def together(parts: list[Judged]) -> Judged:
 
 
 def rates_at(judged: Judged, score: float) -> Rates:
-    """Counts at a threshold."""
+    """Count detections at a threshold."""
     keep = judged.scores >= score
     return Rates(int(keep.sum()), int((keep & judged.is_right).sum()), judged.signs)
 
 
 def threshold_for(judged: Judged, precision: float) -> float | None:
-    """The lowest score whose precision, and that of all higher ones, is enough; None where none is.
+    """Lowest score at which, and above which, the precision is reached; None if there is no such.
 
-    Asking it of all higher scores keeps a lucky dip from being chosen.
+    The condition on all higher scores excludes chance fluctuations.
     """
     chosen: float | None = None
     for score in np.unique(judged.scores)[::-1].tolist():

@@ -1,4 +1,4 @@
-"""Calibrations fitted to detections that are known to be right or wrong."""
+"""Fit calibrations to judged detections."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ def fit_platt(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Platt
 
     Args:
         scores: Shape (N,), in [0, 1].
-        is_right: Shape (N,), some of each.
+        is_right: Shape (N,); both values occur.
     """
     from scipy.optimize import minimize
 
     kept = np.clip(scores, 1e-6, 1.0 - 1e-6)
     logit = np.log(kept / (1.0 - kept))
     right = int(is_right.sum())
-    # Platt's targets: one more right and one more wrong than were seen.
+    # Platt's targets: one more correct and one more wrong detection than observed.
     target = np.where(is_right, (right + 1) / (right + 2), 1 / (len(is_right) - right + 2))
 
     def cost(at: NDArray[np.float64]) -> float:
@@ -33,7 +33,7 @@ def fit_platt(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Platt
 
 
 def fit_isotonic(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Isotonic:
-    """The rising steps nearest to what was seen, joined at their middles.
+    """Isotonic regression, with its steps joined at their centres.
 
     Args:
         scores: Shape (N,), in [0, 1].

@@ -1,9 +1,9 @@
-"""Training twice with one seed gives one result, bit for bit, on one machine.
+"""Make training reproducible bit for bit, for one seed on one machine.
 
-On a CPU every operation used has a deterministic form, which torch is asked to take; sums depend
-on the number of threads. On a GPU some have none (the gradient of RoI Align adds in any order):
-there torch takes what there is. What decides the bits is written into the checkpoint, so that two
-that differ say why.
+On a CPU, every operation used has a deterministic implementation, which torch is set to use; sums
+depend on the number of threads. On a GPU, some operations have none, such as the gradient of RoI
+Align, which adds in any order. The checkpoint records all that affects the bits, so that a
+difference between two checkpoints can be explained.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ CUBLAS_VARIABLE: Final = "CUBLAS_WORKSPACE_CONFIG"
 
 @contextmanager
 def reproducible(device: torch.device) -> Iterator[None]:
-    """Within the ``with`` block, torch takes deterministic operations.
+    """Use torch's deterministic operations within the ``with`` block.
 
     Args:
-        device: Where the training runs. Operations without a deterministic form raise
-            ``RuntimeError`` on a CPU (none exist in our networks) and are taken on others.
+        device: Device of the training. Operations without a deterministic implementation raise
+            ``RuntimeError`` on a CPU (crosscue's networks have none) and are permitted elsewhere.
     """
-    # cuBLAS reads it when it is first used, and is not deterministic without.
+    # cuBLAS reads this on first use, and is not deterministic without it.
     os.environ.setdefault(CUBLAS_VARIABLE, ":4096:8")
     before = torch.are_deterministic_algorithms_enabled()
     warned = torch.is_deterministic_algorithms_warn_only_enabled()
@@ -46,7 +46,7 @@ def reproducible(device: torch.device) -> Iterator[None]:
 
 
 def decides_bits(device: torch.device) -> dict[str, str | int | float]:
-    """What two trainings must have in common to give the same bits, for a checkpoint's recipe."""
+    """Properties that two trainings must share for identical bits, for a checkpoint's recipe."""
     found: dict[str, str | int | float] = {f"on.{name}": installed(name) for name in LIBRARIES}
     found["on.device"] = device.type
     found["on.threads"] = torch.get_num_threads()
@@ -61,7 +61,7 @@ def decides_bits(device: torch.device) -> dict[str, str | int | float]:
 
 
 def _cpu_name() -> str:
-    """The processor's own name where Linux reports it."""
+    """Name of the processor, where Linux reports it."""
     try:
         with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
             lines = (line.partition(":") for line in file)

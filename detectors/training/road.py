@@ -1,8 +1,8 @@
-"""Training of road networks: pictures with their fraction of road a pixel in, weights out.
+"""Train road networks on pictures with the fraction of road in each pixel.
 
-AdamW with a warm-up and a cosine; pixels near the road's edge weigh more, since the near road,
-which is most of it, is soon learnt. State is kept as safetensors, so training goes on after a kill
-as if none had come.
+It uses AdamW with a warm-up and a cosine schedule. Pixels near the road's edge have more weight,
+because most of the road is near and soon learnt. The state is stored as safetensors; an interrupted
+training resumes with the same result.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from crosscue.replay.files.made_of import NOTHING, refuse_another
 
 STATE_KEY: Final = "crosscue_road_training"
 MAX_BYTES: Final = 1024 * MIB
-"""Of a state; the network and its moments take a few."""
+"""Maximum size of a state file; the network and its moments need a few MB."""
 EDGE_WEIGHT: Final = 6.0
 EDGE_PX: Final = 9
 GRADIENT_LIMIT: Final = 5.0
@@ -43,15 +43,15 @@ GRADIENT_LIMIT: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class RoadSchedule:
-    """How long and how fast to learn.
+    """Number of steps, learning rates and related settings.
 
     Attributes:
-        steps: Batches altogether.
-        batch: Pictures in one.
-        rate: Highest learning rate.
-        warm_up: Steps until that is reached.
-        decay: Of weights.
-        seed: Everything random comes from it.
+        steps: Total number of batches.
+        batch: Number of pictures per batch.
+        rate: Maximum learning rate.
+        warm_up: Number of steps until the maximum rate is reached.
+        decay: Weight decay.
+        seed: Seed of all random numbers.
     """
 
     steps: int = 1200
@@ -70,15 +70,15 @@ class RoadSchedule:
 
 
 class RoadTraining:
-    """A network that learns; ``steps`` continues, ``save`` and ``resume`` keep and restore it.
+    """A network in training; ``steps`` trains, ``save`` and ``resume`` store and restore its state.
 
     Attributes:
-        network: Learns.
-        done: Steps taken.
+        network: The network in training.
+        done: Number of steps done.
     """
 
     def __init__(self, schedule: RoadSchedule, device: torch.device) -> None:
-        """Begin with random weights."""
+        """Start with random weights."""
         torch.manual_seed(schedule.seed)
         self.schedule, self.device = schedule, device
         self.network = RoadNetwork().to(device).to(memory_format=torch.channels_last)
@@ -88,11 +88,11 @@ class RoadTraining:
         )
 
     def steps(self, pixels: Bytes, road: Bytes) -> Iterator[tuple[int, float]]:
-        """Number and loss of each step until all are done.
+        """Train, and yield number and loss of each step.
 
         Args:
             pixels: Shape (N, H, W, 3), uint8, blue, green, red.
-            road: Shape (N, H, W), uint8: fraction of road, 255 for all.
+            road: Shape (N, H, W), uint8: fraction of road; 255 is 1.
         """
         self.network.train()
         while self.done < self.schedule.steps:
@@ -118,10 +118,10 @@ class RoadTraining:
         return float(loss.detach())
 
     def save(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> None:
-        """All that ``resume`` needs.
+        """Store everything that ``resume`` needs.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         tensors = {
             f"network.{k}": v.detach().cpu().contiguous().clone()
@@ -138,11 +138,11 @@ class RoadTraining:
         write_bytes(path, serialised(tensors, header))
 
     def resume(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> None:
-        """Go on where ``save`` left off.
+        """Restore the state of ``save``.
 
         Raises:
-            SchemaError: Not such a file.
-            UsageError: Of a training of something else, or of another seed.
+            SchemaError: The file is not a valid state.
+            UsageError: The file is of another training or another seed.
         """
         from safetensors import SafetensorError
         from safetensors.torch import load
@@ -159,9 +159,9 @@ class RoadTraining:
             self._fill(tensors)
         except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
             why = one_line(error, 120)
-            raise SchemaError(f"{path}: cannot go on from it ({why}); start over") from None
+            raise SchemaError(f"{path}: cannot resume from it ({why}); start over") from None
         if seed != self.schedule.seed:
-            raise UsageError(f"{path}: of seed {seed}, not {self.schedule.seed}; give that --seed")
+            raise UsageError(f"{path}: of seed {seed}, not {self.schedule.seed}; use --seed {seed}")
         self.done = done
 
     def _fill(self, tensors: dict[str, Tensor]) -> None:
@@ -179,7 +179,7 @@ class RoadTraining:
 
 
 def edge_weight(wanted: Tensor) -> Tensor:
-    """1 for pixels far from the road's edge, up to ``EDGE_WEIGHT`` more at it."""
+    """Weight of each pixel: 1 far from the road's edge, up to ``EDGE_WEIGHT`` more at the edge."""
     around = functional.avg_pool2d(
         wanted[:, None], EDGE_PX, 1, EDGE_PX // 2, count_include_pad=False
     )[:, 0]
@@ -187,7 +187,7 @@ def edge_weight(wanted: Tensor) -> Tensor:
 
 
 def varied(pixels: Bytes, road: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
-    """Another picture of the same place: mirrored, nearer, higher, darker, noisier."""
+    """Augment a picture: mirror, zoom, shift, change brightness and add noise."""
     import cv2
 
     high, wide = road.shape
@@ -214,13 +214,13 @@ def varied(pixels: Bytes, road: Bytes, rng: np.random.Generator) -> tuple[Bytes,
 
 @dataclass(frozen=True, slots=True)
 class RoadScore:
-    """Over all pixels of all pictures, those half covered left out.
+    """Score of a road network over all pixels; partly covered pixels are left out.
 
     Attributes:
-        iou: Pixels rightly called road over those that are road or were called so.
-        precision: Over those called road.
-        recall: Over those that are road.
-        pictures: How many.
+        iou: Intersection over union of predicted and true road.
+        precision: Fraction of predicted road that is road.
+        recall: Fraction of road that is predicted.
+        pictures: Number of pictures.
     """
 
     iou: float
@@ -230,7 +230,7 @@ class RoadScore:
 
 
 def road_score(network: RoadNetwork, pixels: Bytes, road: Bytes, device: torch.device) -> RoadScore:
-    """How well a network does on pictures it has not seen."""
+    """Score a network on held-out pictures."""
     network.eval()
     right = called = there = 0
     with torch.inference_mode():

@@ -1,7 +1,7 @@
-"""Training samples: windows of pictures, zoomed, mirrored and recoloured, from seeds.
+"""Draw training samples: windows of pictures, zoomed, mirrored and recoloured, from a seed.
 
-Signs and lights are small and rare. A window therefore lies about an object as a rule, and classes
-that are rare among the annotations are picked more often.
+Signs and lights are small and rare. Most windows are therefore placed around an object, and rare
+classes are selected more often.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from crosscue.replay.base import Bytes, Floats, LogError, SchemaError
 from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 
 NEAR_OBJECT: Final = 0.85
-"""Fraction of windows that are laid about an object."""
+"""Fraction of windows that are placed around an object."""
 MIN_SIDE_PX: Final = 3.0
-"""Of an object in the window; a smaller one cannot be recognised."""
-MIN_SHARE: Final = 0.3
-"""Of an object's pixels within the window; a thinner slice is not requested."""
+"""Minimum side of an object in the window; a smaller object cannot be recognised."""
+MIN_FRACTION: Final = 0.3
+"""Minimum fraction of an object's pixels within the window for it to count as present."""
 MAX_OBJECTS: Final = 24
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Size and variety of samples.
+    """Size and augmentation of samples.
 
     Attributes:
-        width_px: Of a sample.
-        height_px: Of a sample.
-        zoom: Least and most, of the scale that the network will see.
-        mirror: Chance.
-        balance: 0 picks each object as often, 1 each class as often, whatever their numbers.
+        width_px: Width of a sample.
+        height_px: Height of a sample.
+        zoom: Minimum and maximum factor on the network's scale.
+        mirror: Probability of mirroring.
+        balance: 0 selects all objects equally often, 1 all classes, regardless of their numbers.
     """
 
     width_px: int = 544
@@ -49,13 +49,13 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """One window.
+    """One training sample.
 
     Attributes:
         pixels: Shape (3, H, W), float32, normalised.
         boxes_px: Shape (N, 4), float32.
         labels: Shape (N,), int64, from 1.
-        masks: Shape (N, H, W), uint8; the box where the object has no mask.
+        masks: Shape (N, H, W), uint8; the filled box where the object has no mask.
         has_mask: Shape (N,), bool.
     """
 
@@ -67,11 +67,11 @@ class Sample:
 
 
 def read_picture(picture: LabelledPicture) -> Bytes:
-    """Pixels, blue green red, (H, W, 3).
+    """Read and decode a picture, shape (H, W, 3), blue, green, red.
 
     Raises:
-        LogError: No picture, or cut short.
-        SchemaError: Of another size than annotated.
+        LogError: The file is not a picture, or is damaged.
+        SchemaError: The picture is not of the annotated size.
     """
     try:
         pixels, size = decode(read_file(picture.path))
@@ -84,15 +84,14 @@ def read_picture(picture: LabelledPicture) -> Bytes:
     if size != picture.size_px:
         width, height = picture.size_px
         raise SchemaError(
-            f"{picture.path}: expected a picture of {width} x {height}, as its "
-            f"annotations say, got {size[0]} x {size[1]}; repair the file or leave it out of the "
-            "annotations"
+            f"{picture.path}: expected a picture of {width} x {height} as annotated, got "
+            f"{size[0]} x {size[1]}; repair the file or leave it out of the annotations"
         )
     return pixels
 
 
 def normalised(pixels: Bytes) -> NDArray[np.float32]:
-    """From (H, W, 3) blue, green, red to (3, H, W) as the networks expect it."""
+    """Convert (H, W, 3) blue, green, red to the networks' normalised input (3, H, W)."""
     scaled = pixels[:, :, ::-1].astype(np.float32)
     mean, spread = np.array(MEAN, np.float32), np.array(SPREAD, np.float32)
     scaled = (scaled - 255.0 * mean) * (1.0 / (255.0 * spread))
@@ -100,16 +99,16 @@ def normalised(pixels: Bytes) -> NDArray[np.float32]:
 
 
 class Sampler:
-    """Draws samples; the same seed and number give the same sample."""
+    """Draws samples; the same seed and number yield the same sample."""
 
     def __init__(self, labelled: LabelledSet, plan: Plan, window: Window, seed: int) -> None:
-        """Count classes."""
+        """Count the objects of each class."""
         self._set, self._plan, self._window, self._seed = labelled, plan, window, seed
         places: list[tuple[int, Box]] = []
         kinds: list[int] = []
         for i, picture in enumerate(labelled.pictures):
             own = [(one.label, one.box_px) for one in picture.objects if not one.is_crowd]
-            # What belongs to no class but was worth annotating is what they are mistaken for.
+            # Annotated objects of other classes are those that networks confuse with these.
             for kind, box in own + [(len(labelled.classes), box) for box in picture.decoys_px]:
                 if _is_big_enough(box, picture, plan):
                     places.append((i, box))
@@ -119,9 +118,10 @@ class Sampler:
         self._places, self._chance = places, weight / max(weight.sum(), 1e-12)
 
     def __call__(self, number: int) -> Sample:
-        """One sample.
+        """Draw the sample of a number.
 
         Raises:
+            LogError: As ``read_picture``.
             SchemaError: As ``read_picture``.
         """
         rng = np.random.default_rng([self._seed, number])
@@ -157,7 +157,7 @@ def _corner(
     plan: Plan,
     rng: Generator,
 ) -> Floats:
-    """Top left of the window in the picture; it may stick out where the picture is smaller."""
+    """Top left of the window in the picture; the window may exceed a smaller picture."""
     span = np.array([window.width_px, window.height_px]) / scale
     low = np.array([0.0, plan.top * size_px[1]])
     high = np.array([size_px[0], (1.0 - plan.bottom) * size_px[1]]) - span
@@ -188,14 +188,14 @@ def _warped(pixels: Bytes, warp: Floats, window: Window) -> Bytes:
 
 
 def _to_middles(warp: Floats) -> Floats:
-    """From coordinates at pixel corners, as boxes have, to those at pixel middles, as OpenCV."""
+    """Convert a transform of pixel corners, as of boxes, to one of pixel centres, as in OpenCV."""
     moved = warp.copy()
     moved[:, 2] += 0.5 * (warp[:, 0] + warp[:, 1]) - 0.5
     return moved
 
 
 def recoloured(pixels: Bytes, rng: Generator) -> Bytes:
-    """Other light, contrast, colour and noise."""
+    """Vary lighting, contrast, colour and noise."""
     import cv2
 
     gain = rng.uniform(0.7, 1.35) * rng.uniform(0.9, 1.1, 3)
@@ -230,7 +230,7 @@ def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Windo
         box = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
         scale = np.hypot(*warp[0, :2])
         fraction = mask.sum() / max(float(whole.sum()) * scale * scale, 1.0)
-        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE_PX and fraction >= MIN_SHARE:
+        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE_PX and fraction >= MIN_FRACTION:
             boxes.append(box)
             labels.append(one.label + 1)
             masks.append(mask)

@@ -1,4 +1,4 @@
-"""Average precision on labelled pictures, by COCO's rules (pycocotools)."""
+"""Average precision on annotated pictures, by COCO's rules (pycocotools)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .annotations import LabelledPicture, LabelledSet, mask_of
 from .samples import read_picture
 
 MIN_AREA_PX: Final = 24
-"""Smaller truth is neither asked for nor wrong when found."""
+"""Area below which true objects are ignored: found or not, they do not count."""
 HALF: Final = 0.5
 SIZES: Final = ("all", "small", "medium", "large")
-"""COCO's: small below 32 x 32 pixels, large above 96 x 96."""
+"""COCO's sizes: small below 32 x 32 pixels, large above 96 x 96."""
 
 
 def detections_on(
     labelled: LabelledSet, detect: Callable[[Sequence[Frame]], Sequence[Any]]
 ) -> Iterator[Detections]:
-    """A detector's results picture by picture.
+    """Yield a detector's results, picture by picture.
 
     Raises:
         LogError: A picture cannot be read.
@@ -41,12 +41,12 @@ def detections_on(
 def average_precisions(
     labelled: LabelledSet, found: Sequence[Detections]
 ) -> dict[str, float | None]:
-    """AP by COCO's rules, of boxes and masks: overall, by class and by size; in percent.
+    """Compute AP by COCO's rules, of boxes and masks, by class and by size; in percent.
 
-    Names are ``box``, ``box50`` (overlap of one half), ``box car``, ``box small``, ``box50 car``,
-    ``box car small``, and likewise ``mask``. None where the truth has no such object, or nobody
-    found or labelled a mask. For masks, objects without one are left out, and so are detections of
-    their class whose box overlaps theirs by half.
+    Names are ``box``, ``box50`` (overlap of 0.5), ``box car``, ``box small``, ``box50 car``,
+    ``box car small``, and likewise ``mask``. A value is None if the truth has no such object, or if
+    no mask was detected or annotated. For masks, objects without a mask are left out, and so are
+    detections of their class whose boxes overlap theirs by 0.5.
 
     Raises:
         UsageError: pycocotools is not installed.
@@ -80,7 +80,7 @@ def average_precisions(
 
 
 def _named(kind: str, precision: Any, classes: Sequence[str]) -> dict[str, float | None]:
-    """From COCO's table (overlap, recall, class, size, most detections), its last column."""
+    """Name the results of COCO's table (overlap, recall, class, size, max. detections)."""
     table = np.asarray(precision)[..., -1]
     scores = {kind: _mean(table[:, :, :, 0]), f"{kind}50": _mean(table[0, :, :, 0])}
     for i, size in enumerate(SIZES[1:], 1):
@@ -156,6 +156,6 @@ def _answers(
 
 
 def _is_unmasked(picture: LabelledPicture, label: int, box_px: Floats) -> bool:
-    """Whether a detection is on an object of its class that has no mask to compare with."""
+    """Whether a detection is on an object of its class without an annotated mask."""
     bare = [one.box_px for one in picture.objects if one.label == label and one.mask is None]
     return bool(bare) and bool((overlaps(box_px, np.array(bare)) >= HALF).any())

@@ -1,4 +1,4 @@
-"""What a Mask R-CNN reaches on labelled pictures, as text for a person and as a tree for JSON."""
+"""Format the results of a Mask R-CNN on annotated pictures as text and for JSON."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ COLUMNS: Final = (
     (" medium", "medium"),
     (" large", "large"),
 )
-"""How a kind's name continues, and what stands above the column."""
+"""Suffix of a kind's name, and heading of its column."""
 
 
 def measured_text(network: str, pictures: int, proposals: int, reached: Measured) -> str:
-    """A table of average precision and one of precision and recall."""
+    """Format a table of average precision and one of precision and recall."""
     heads = " ".join(f"{head:>6}" for _, head in COLUMNS)
     lines = [
         f"{network} on {pictures} pictures, {proposals} proposals: {reached.cpu_s:.3f} CPU s each",
@@ -40,7 +40,7 @@ def _row(ap: Mapping[str, float | None], kind: str, name: str) -> str:
 
 
 def _key(kind: str, name: str, column: str) -> str:
-    """As ``average_precisions`` names it: ``box50 car``, ``box car small``."""
+    """Name of a result in ``average_precisions``: ``box50 car``, ``box car small``."""
     if column == "50":
         return f"{kind}50 {name}".rstrip()
     return f"{kind} {name}".rstrip() + column
@@ -56,7 +56,7 @@ def _fraction(right: int, of: int) -> str:
 
 
 def measured_tree(proposals: int, reached: Measured) -> dict[str, object]:
-    """The same for JSON."""
+    """Return the same results as a tree for JSON."""
     rates: Sequence[dict[str, object]] = [
         {"label": name, "score": score, "found": at.found, "right": at.right, "objects": at.signs}
         for name, by_score in reached.rates.items()

@@ -84,7 +84,7 @@ def test_a_file_that_is_no_state_is_refused(tmp_path: Path, content: bytes) -> N
 def test_a_state_of_another_seed_is_refused(tmp_path: Path) -> None:
     RoadTraining(RoadSchedule(seed=1), CPU).save(tmp_path / "state")
 
-    with pytest.raises(UsageError, match="of seed 1, not 2"):
+    with pytest.raises(UsageError, match="of seed 1, not 2; use --seed 1"):
         RoadTraining(RoadSchedule(seed=2), CPU).resume(tmp_path / "state")
 
 
@@ -110,14 +110,16 @@ def test_files_that_are_no_road_networks_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, other)
 
-    with pytest.raises(VehicleError, match=r"cut.safetensors: no safetensors file"):
+    with pytest.raises(VehicleError, match=r"cut.safetensors: not a safetensors file"):
         load_road(cut)
     flipped = tmp_path / "flipped.safetensors"
     flipped.write_bytes(whole.read_bytes()[:-1] + bytes([whole.read_bytes()[-1] ^ 1]))
 
     with pytest.raises(VehicleError, match=r"flipped.safetensors: damaged"):
         load_road(flipped)
-    with pytest.raises(VehicleError, match=r"other.safetensors: not what crosscue train road"):
+    with pytest.raises(
+        VehicleError, match=r"other.safetensors: expected a file written by crosscue train road"
+    ):
         load_road(other)
     with pytest.raises(VehicleError, match=r"r.pth: expected .safetensors"):
         load_road(tmp_path / "r.pth")

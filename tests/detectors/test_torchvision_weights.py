@@ -161,14 +161,17 @@ def test_nested_and_prefixed_weights_are_found_and_reported(tmp_path: Path) -> N
 
     _, guess = recognise_weights(tmp_path / "my.pth", None)
 
-    assert guess.reasons[:2] == ("its weights lie under 'model'", "its names begin with 'module.'")
+    assert guess.reasons[:2] == (
+        "its weights are stored under 'model'",
+        "its tensor names begin with 'module.'",
+    )
 
 
 def test_coco_s_classes_are_known_and_others_are_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "my.pth"
-    for classes, said in ((91, None), (4, "3 classes and no names in the file")):
+    for classes, said in ((91, None), (4, "3 classes without names")):
         torch.save(hollow("ssdlite320_mobilenet_v3_large", classes), path)
         state = run(["model", "init", str(path), "--overwrite"])
         error = capsys.readouterr().err
@@ -203,11 +206,11 @@ def _with_code(folder: Path) -> object:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (_with_code, "holds code or objects besides tensors (posix.mkdir)"),
-        (lambda folder: argparse.Namespace(epoch=1), "besides tensors (argparse.Namespace)"),
+        (_with_code, "holds code or objects other than tensors (posix.mkdir)"),
+        (lambda folder: argparse.Namespace(epoch=1), "other than tensors (argparse.Namespace)"),
         (
             lambda folder: network("ssdlite320_mobilenet_v3_large"),
-            "besides tensors (torchvision.models.detection",
+            "other than tensors (torchvision.models.detection",
         ),
         (lambda folder: {"epoch": 3}, "'epoch' is int, not a tensor"),
         (lambda folder: [torch.zeros(2)], "list; expected a state dict"),
@@ -253,10 +256,10 @@ def _bomb() -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("my.pth", b"", "not a whole file of weights"),
-        ("my.pth", b"half of it", "not a whole file of weights"),
+        ("my.pth", b"", "not a complete weights file"),
+        ("my.pth", b"half of it", "not a complete weights file"),
         ("my.pth", _bomb(), "unpacks to 3,221,225,472 bytes"),
-        ("my.safetensors", b"half of it", "no safetensors file"),
+        ("my.safetensors", b"half of it", "not a safetensors file"),
     ],
 )
 def test_a_damaged_file_is_one_line(
@@ -311,7 +314,7 @@ def test_weights_of_our_own_training_need_no_card(
             'architecture = "ssd301"',
             "ssdlite320_mobilenet_v3_large",
         ),
-        ("width_px = 320", "width_px = 321", "takes pictures of 320 x 320"),
+        ("width_px = 320", "width_px = 321", "accepts pictures of 320 x 320"),
         ('fit = "network"', 'fit = "stretch"', 'input.fit = "network" is required with [network]'),
         ('colour = "rgb"', 'colour = "bgr"', 'need colour = "rgb"'),
     ],

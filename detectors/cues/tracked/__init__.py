@@ -1,1 +1,1 @@
-"""Cues of cars that are followed over frames."""
+"""Cues of cars that are tracked over frames."""

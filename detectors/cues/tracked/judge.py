@@ -1,19 +1,21 @@
-"""What followed cars do: cross, stand across the road, come towards the ego vehicle or go away.
+"""Classify tracked cars: crossing, parked across the road, oncoming, outgoing.
 
-* **Cross traffic** moves steadily across the ego vehicle's heading, significantly so.
-* **Parked** is a car that surely stands, seen from the side, with a nose that most frames agree on,
-  at an intersection whose distance is known: a car in a lot before it says nothing about its roads.
+* **Cross traffic** moves steadily and significantly across the ego vehicle's heading.
+* A **parked** car certainly stands, is seen from the side, and has the same nose in most frames. It
+  is at an intersection of known distance, because a car in a lot before the intersection is no
+  evidence of its roads.
 * **Oncoming and outgoing** cars move steadily along the ego vehicle's heading past the end of the
-  intersection: where they drive, a road goes on. The source hears of such vehicles from a Mobileye
-  (``far_side``). A camera knows a car's distance only by its height, to 15 %, so a car is past the
-  end where that is 86 % probable, its own distance and the intersection's range taken together. One
-  whose lower end is behind another car looks lower, hence further away, than it is, and says
-  nothing, nor does a box narrower than high, which is a part of a car; one that only stands may be
-  in a lot.
+  intersection, so a road continues there. The dissertation gets such vehicles from a Mobileye
+  (``far_side``). A camera measures a car's distance only by its height, to 15 %. A car is past the
+  end if that is 86 % probable, given the uncertainty of its distance and of the intersection's
+  range. Three kinds of boxes do not count. A car whose lower end is behind another car looks lower,
+  hence further away, than it is. A box narrower than high shows only a part of a car. A standing
+  car may be in a lot.
 
-A car parked along the street is seen from the side, too, once it is far off the axis: at a bearing
-``a`` its outline is about ``width + length * tan(a)`` long, that of a car across the street
-``length + width * tan(a)``. Half way between lies ``length_per_height * (1 + |tan(a)|)`` heights.
+A car parked along the street is also seen from the side if it is far off the axis. At bearing ``a``
+its outline is about ``width + length * tan(a)`` long; that of a car across the street is
+``length + width * tan(a)``. The bound is half way between: ``length_per_height * (1 + |tan(a)|)``
+heights.
 """
 
 from __future__ import annotations
@@ -27,45 +29,45 @@ from crosscue.detectors.cues.tracked.motion import HEIGHT_FRACTION, CarMotion
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 MAX_BEARING: Final = 0.6
-"""Further off the axis a car along the street is as long as one across it."""
+"""Bearing beyond which a car along the street looks as long as one across it."""
 SIGMAS: Final = 3.0
 MIN_NOSE: Final = 0.5
-"""Three of four frames agree on the nose."""
+"""Minimum magnitude of the mean nose: three of four frames agree."""
 LIKELY: Final = 1.08
-"""Standard deviations; one side of a Gaussian holds 86 % within them. That is for a car at the
-limit; most that count are further past it (``PAST_PRECISION`` in the table of cues)."""
+"""Number of standard deviations for a one-sided probability of 86 %. It applies to a car at the
+limit; most cars that count are further past it (``PAST_PRECISION`` in the table of cues)."""
 COMES_OR_GOES: Final = 2.0
-"""Standard deviations of its speed; less is asked than across, since a standing car of another
-height that is taken for a moving one is on that road, too."""
+"""Minimum speed along the road, in its standard deviations. It is lower than for cross traffic,
+because a standing car of unusual height that appears to move is on that road, too."""
 MIN_LONG: Final = 1.0
-"""Width over height of a car seen from ahead or behind; a sedan has 1.2, a van 1.0. A box that is
-narrower shows a part of a car, often together with what hides the rest, so its height is not the
-car's, and seems to come or go as more of it shows."""
+"""Minimum width over height of a car seen from the front or rear; a sedan has 1.2, a van 1.0. A
+narrower box shows a part of a car, often with the object that hides the rest. Its height is not
+the car's, and the car appears to move as more of it becomes visible."""
 MAX_SLANT: Final = 0.5
-"""Speed across over speed along; what moves at more than 27 degrees to the road turns."""
+"""Maximum of speed across over speed along; a car at more than 27 degrees to the road turns."""
 
 
 def crossing(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
-    """Cars that move steadily across the ego vehicle's heading."""
+    """Select cars that move steadily across the ego vehicle's heading."""
     return [car for car in cars if not crossing_gates(car, settings)]
 
 
 def crossing_gates(car: CarMotion, settings: Cars) -> list[str]:
-    """What speaks against a car's crossing; nothing for one that does."""
+    """Reasons why a car does not count as crossing; empty if it does."""
     fast_mps = max(settings.crossing_mps, SIGMAS * car.right_sd_mps)
     gates = {
-        "seen too seldom": car.frames < settings.min_frames,
+        "seen in too few frames": car.frames < settings.min_frames,
         "too far": car.distance_m > settings.within_m,
         "no steady motion": not car.is_steady,
         "not seen from the side": car.long <= settings.length_per_height,
-        "not surely across": abs(car.right_mps) <= fast_mps,
+        "not significantly across": abs(car.right_mps) <= fast_mps,
         "moves along": abs(car.ahead_mps) > abs(car.right_mps) + 2.0 * car.ahead_sd_mps,
     }
     return [gate for gate, is_failed in gates.items() if is_failed]
 
 
 def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
-    """Cars that surely stand, across the ego vehicle's heading, with a nose."""
+    """Select cars that certainly stand across the ego vehicle's heading, with a known nose."""
     return [
         car
         for car in cars
@@ -88,16 +90,16 @@ def judge(
     settings: Cars,
     place: Place | None,
 ) -> Judged:
-    """Count what cars do, at the intersection and elsewhere.
+    """Count cars by behaviour, at the intersection and elsewhere.
 
     Args:
-        cars: Those followed.
-        standing: The same, by ``CarTracks.standing``; parked ones are among them.
-        seen: How many cars were whole and near enough.
-        camera: Where it sits.
+        cars: Tracked cars.
+        standing: The same cars by ``CarTracks.standing``, from which parked ones are selected.
+        seen: Number of cars that were completely visible and near enough.
+        camera: Mounting of the camera.
         settings: Thresholds.
-        place: Of the intersection; None where unknown: cross traffic then counts anywhere, and
-            parked cars nowhere.
+        place: Position of the intersection. If None, cross traffic counts anywhere, and parked
+            cars count nowhere.
     """
     moving, still = crossing(cars, settings), parked(standing, settings)
     moving_here = [c for c in moving if place is None or is_at(c, camera, place)]
@@ -120,13 +122,13 @@ def judge(
 def cars_past(
     cars: Sequence[CarMotion], camera: Camera, settings: Cars, place: Place | None
 ) -> Ways | None:
-    """Cars that come and go past the end of the intersection; None where unknown.
+    """Count oncoming and outgoing cars past the end of the intersection; None where unknown.
 
     Args:
-        cars: Those followed, by ``CarTracks.longer``.
-        camera: Where it sits.
+        cars: Tracked cars, by ``CarTracks.longer``.
+        camera: Mounting of the camera.
         settings: Thresholds.
-        place: Of the intersection.
+        place: Position of the intersection.
     """
     if place is None or place.end_m <= 0.0:
         return None
@@ -136,7 +138,7 @@ def cars_past(
 
 
 def along(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
-    """Cars that move steadily along the ego vehicle's heading, no further aside than its road."""
+    """Select cars that move steadily along the ego vehicle's heading, within its road's width."""
     return [
         car
         for car in cars
@@ -151,13 +153,13 @@ def along(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
 
 
 def is_past(car: CarMotion, camera: Camera, place: Place) -> bool:
-    """Is a car past the end of the intersection, with 86 % probability?"""
+    """Whether a car is past the end of the intersection, with a probability of 86 %."""
     sd_m = math.hypot(HEIGHT_FRACTION * car.distance_m, place.sd_m)
     return car.distance_m + camera.x_m > place.end_m + LIKELY * sd_m
 
 
 def is_at(car: CarMotion, camera: Camera, place: Place) -> bool:
-    """Is a car between the start and the end of the intersection, as far as can be known?"""
+    """Whether a car is between the intersection's start and end, within the uncertainty."""
     away_m = car.distance_m + camera.x_m
     doubt_m = 2.0 * place.sd_m + HEIGHT_FRACTION * car.distance_m
     return place.start_m - doubt_m <= away_m <= place.end_m + doubt_m

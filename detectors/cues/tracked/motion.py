@@ -1,14 +1,14 @@
-"""How a car moves in the plane of the road, from its boxes while the camera moves, too.
+"""Estimate a car's motion in the road plane from its boxes, with a moving camera.
 
-Every observation becomes a position: its bearing from the picture, its distance from its height
-(``focal_px * CAR_HEIGHT_M / height``), the camera's place and heading from odometry. A standing car
-stays where it is, whatever the camera does: its motion in the image is thereby removed. Fitted is a
-steady motion by generalised least squares, with errors along the line of sight that are much larger
-than those across it. A car taller or lower than assumed only seems to move along the camera's own
-way, never across it.
+Each observation is converted to a position. The bearing is measured in the picture, the distance
+follows from the height (``focal_px * CAR_HEIGHT_M / height``), and odometry provides the camera's
+position and heading. This removes the camera's own motion, so a standing car has a constant
+position. A constant velocity is fitted by generalised least squares, with errors along the line of
+sight that are much larger than those across it. A car taller or lower than assumed only appears to
+move along the camera's path, never across it.
 
-Both ends of a car are followed apart, and it moves sideways as little as either does: a car that
-comes out from behind another one grows to one side only.
+Both ends of a car are tracked separately, and the smaller sideways speed of the two is used,
+because a car that emerges from behind another grows on one side only.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 CAR_HEIGHT_M: Final = 1.55
-"""Of a usual car; between 1.4 (sports car) and 1.8 (van), so 15 % either way."""
+"""Height of a typical car; it varies by 15 %, from 1.4 (sports car) to 1.8 (van)."""
 HEIGHT_FRACTION: Final = 0.15
 USUAL_MPS: Final = 10.0
-"""Standard deviation of a car's speed, before anything is known of it."""
+"""Prior standard deviation of a car's speed."""
 ALONG_ASIDE_MPS: Final = 0.3
-"""Likewise to the side, of one that drives along the ego vehicle's road: 10 m/s at 2 degrees."""
+"""Prior standard deviation of sideways speed on the ego vehicle's road: 10 m/s at 2 degrees."""
 MAX_MISFIT: Final = 4.0
-"""Of residuals, squared, per degree of freedom: beyond it the motion is not steady."""
+"""Sum of squared residuals per degree of freedom above which the motion is not steady."""
 
 
 class Observation(NamedTuple):
@@ -36,14 +36,15 @@ class Observation(NamedTuple):
 
     Attributes:
         t_s: Time.
-        pose: Of the camera: x, y, heading in the plane of the road.
-        edges_rad: Bearings of its left and right end, to the right of straight ahead.
-        distance_m: From its height.
-        error: Standard deviation of the distance as a fraction, from the box alone.
+        pose: Pose of the camera: x, y, heading in the road plane.
+        edges_rad: Bearings of the car's left and right end, positive to the right.
+        distance_m: Distance from its height.
+        error: Relative standard deviation of the distance, from the box's error only.
         long: Length over height.
         nose: -1 left, 1 right, 0 unknown.
-        is_hidden: Another car's box covers its lower end, so it may be higher and nearer.
-        is_sure: Its score is that of a cue; others only carry on what sure ones began.
+        is_hidden: True if another car's box covers its lower end; the car may then be higher and
+            nearer.
+        is_sure: True if its score is high enough for a cue; otherwise it can only continue a track.
     """
 
     t_s: float
@@ -58,23 +59,24 @@ class Observation(NamedTuple):
 
 
 class CarMotion(NamedTuple):
-    """What is known of one car in the newest frame.
+    """Estimated motion of one car in the newest frame.
 
     Attributes:
-        number: Of its track, from 1.
-        frames: In how many it was seen.
-        distance_m: From the camera along its axis.
-        bearing: Tangent, to the right.
-        right_mps: Speed across the ego vehicle's heading, to the right; 0 where its ends disagree.
-        right_sd_mps: Its standard deviation.
-        ahead_mps: Speed along it.
-        ahead_sd_mps: Its standard deviation.
-        is_steady: One speed fits all frames.
+        number: Number of its track, from 1.
+        frames: Number of frames in which it was seen.
+        distance_m: Distance from the camera, along its axis.
+        bearing: Tangent of the bearing, positive to the right.
+        right_mps: Speed across the ego vehicle's heading, positive to the right; 0 if the signs of
+            its two ends differ.
+        right_sd_mps: Standard deviation of ``right_mps``.
+        ahead_mps: Speed along the ego vehicle's heading.
+        ahead_sd_mps: Standard deviation of ``ahead_mps``.
+        is_steady: True if a constant velocity fits all frames.
         long: Length over height, median.
-        nose: Mean of the noses seen, -1 to 1.
-        is_hidden: Another car covers its lower end in this frame.
+        nose: Mean of the observed noses, -1 to 1.
+        is_hidden: True if another car covers its lower end in this frame.
         box_px: x0, y0, x1, y1.
-        step_px: How its middle moved since it was seen last.
+        step_px: Displacement of its centre since the previous observation.
     """
 
     number: int
@@ -94,19 +96,19 @@ class CarMotion(NamedTuple):
 
     @property
     def center_px(self) -> tuple[float, float]:
-        """Middle of its box."""
+        """Centre of its box."""
         x0, y0, x1, y1 = self.box_px
         return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
 
 
 def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarMotion:
-    """Fit a steady motion to a car's observations, of which there is at least one.
+    """Fit a constant velocity to one or more observations of a car.
 
     Args:
-        seen: From the oldest on.
-        aside_mps: Standard deviation of its speed across before anything is known of it. Of a car
-            on the ego vehicle's road that is small, and how its bearing changes then says how fast
-            it comes or goes, far sooner than how it grows.
+        seen: Observations, oldest first.
+        aside_mps: Prior standard deviation of its sideways speed. It is small for a car on the ego
+            vehicle's road. The change of bearing then determines the speed along the road far
+            sooner than the change of size.
     """
     newest = seen[-1]
     ends = [_fit(seen, side, aside_mps) for side in (0, 1)]
@@ -137,7 +139,7 @@ def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarM
 def _fit(
     seen: Sequence[Observation], side: int, aside_mps: float
 ) -> tuple[float, float, float, float, float]:
-    """Speed to the right and its s.d., speed ahead and its s.d., misfit; of one end of a car."""
+    """Fit one end of a car: speed to the right with s.d., speed ahead with s.d., and misfit."""
     newest = seen[-1]
     places = np.array([place_of_end(one, side, newest) for one in seen])
     weights = _weights(seen, side, newest)
@@ -156,7 +158,7 @@ def _fit(
 
 
 def place_of_end(one: Observation, side: int, newest: Observation) -> tuple[float, float]:
-    """Where an end of the car was, ahead and to the right of the newest camera."""
+    """Position of one end of the car, ahead and to the right of the newest camera pose."""
     x, y, heading = one.pose
     sight = heading - one.edges_rad[side]
     far_m = one.distance_m / math.cos(one.edges_rad[side])

@@ -1,8 +1,9 @@
-"""Cars followed over frames in the plane of the road, where the camera moves.
+"""Track cars over frames in the road plane, with a moving camera.
 
-The source takes a car's motion in the image for its own (eq. 15, 16), so a standing car beside the
-road crosses, and a parked one moves. Here a car is followed over three or more frames, each box
-being a position on the road (``car_motion``), and looked for where a standing car must be now.
+The dissertation uses a car's motion in the image (eq. 15, 16), so a standing car next to the road
+appears to cross, and a parked one appears to move. Here a car is tracked over three or more frames.
+Each box is converted to a position on the road (``motion``), and a car is also searched for where
+it would be if it stood.
 """
 
 from __future__ import annotations
@@ -31,25 +32,26 @@ from crosscue.detectors.ranging.object_tracks import Motion, iou
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 BOX_PX: Final = 1.0
-"""Standard deviation of a box's height ..."""
+"""Constant part of the standard deviation of a box's height."""
 BOX_FRACTION: Final = 0.03
-"""... and what is added, in squares, of the height itself."""
+"""Part of that standard deviation proportional to the height; the two add in squares."""
 FASTEST_MPS: Final = 25.0
-"""A car that would have gone faster between two frames is another one."""
+"""Maximum speed of a car between two frames; a faster one is a different car."""
 HIDDEN_FRACTION: Final = 0.15
-"""Instead of ``BOX_FRACTION`` then."""
+"""Replaces ``BOX_FRACTION`` for a car whose lower end is hidden."""
 MIN_OVERLAP: Final = 0.4
-"""Intersection over union of a car's box with where it was on its way to."""
+"""Minimum intersection over union of a car's box with the predicted box."""
 NEWEST: Final = 0.5
-"""Weight of the newest step in the speed of a box's edges: boxes tremble."""
+"""Weight of the newest step in the smoothed speed of a box's edges, because boxes jitter."""
 ERRORS: Final = 2.0
-"""Standard deviations by which heights of one car in two frames may differ, beside its motion."""
+"""Maximum difference of one car's heights in two frames, in standard deviations, apart from its
+motion."""
 GROWTH: Final = 1.4
-"""Heights of one car in consecutive frames differ by less than this factor."""
+"""Maximum ratio of one car's heights in consecutive frames."""
 BORDER_PX: Final = 2.0
-"""A box that reaches the picture's edge is cut."""
+"""Distance to the picture's edge within which a box counts as cut."""
 MAX_COVERED: Final = 0.3
-"""Of a box's width; with more of its lower end behind another car, its height is not the car's."""
+"""Fraction of a box's lower end behind another car above which its height is not the car's."""
 
 
 @dataclass(slots=True)
@@ -61,7 +63,7 @@ class _Track:
     step_px: tuple[float, float] = (0.0, 0.0)
 
     def take(self, box_px: NDArray[np.float64], one: Observation, settings: Cars) -> None:
-        """The car in the newest frame."""
+        """Add the observation of the newest frame."""
         steps_px = box_px - self.box_px
         edges_pxps = steps_px / (one.t_s - self.seen[-1].t_s)
         is_first = len(self.seen) == 1
@@ -76,10 +78,10 @@ class _Track:
 
 
 class CarTracks:
-    """Follows the cars in view; memory holds the newest observations of each.
+    """Tracks the cars in view; it stores the newest observations of each.
 
     Attributes:
-        seen: Cars in the newest frame that were whole and near enough.
+        seen: Number of cars in the newest frame that were completely visible and near enough.
     """
 
     def __init__(self, camera: Camera, settings: Cars) -> None:
@@ -97,14 +99,14 @@ class CarTracks:
         self._tracks.clear()
 
     def __call__(self, found: Sequence[Detections], ego: Motion) -> list[CarMotion]:
-        """Take the next frame.
+        """Update the tracks with the next frame.
 
         Args:
             found: One or more detectors' results for it.
-            ego: Motion since the frame before; its way is known.
+            ego: Motion since the previous frame, with a known path.
 
         Returns:
-            One entry for each car that is surely in this frame and was in earlier ones, too.
+            One entry for each car that is certainly in this frame and was also in earlier ones.
         """
         self._axle = _moved(self._axle, ego)
         x, y, heading = self._axle
@@ -121,11 +123,11 @@ class CarTracks:
         return [_motion(track, self._settings.max_frames) for track in self._again]
 
     def longer(self) -> list[CarMotion]:
-        """The same cars by their newest ``past_frames``: far ones grow slowly.
+        """Fit the same cars to their newest ``past_frames``, because distant cars grow slowly.
 
-        They are taken for cars on the ego vehicle's road (``ALONG_ASIDE_MPS``). Fewer frames
-        count, but not fewer than ``max_frames``, where no steady motion fits all of them: the car
-        has begun to move, or was taken for another one.
+        The cars are assumed to be on the ego vehicle's road (``ALONG_ASIDE_MPS``). If no constant
+        velocity fits all frames, fewer are used, but at least ``max_frames``: the car has started
+        to move, or two cars were confused.
         """
         settings = self._settings
         return [
@@ -134,9 +136,9 @@ class CarTracks:
         ]
 
     def standing(self) -> list[CarMotion]:
-        """The same cars by their newest ``parked_frames``: standing shows late.
+        """Fit the same cars to their newest ``parked_frames``, because standing shows late.
 
-        Fewer count where no steady motion fits all of them, as in ``longer``.
+        If no constant velocity fits all frames, fewer are used, as in ``longer``.
         """
         settings = self._settings
         return [_steady_motion(track, settings.parked_frames, settings) for track in self._again]
@@ -188,11 +190,11 @@ class CarTracks:
         )
 
     def _assign(self, cars: Sequence[tuple[NDArray[np.float64], Observation]]) -> list[_Track]:
-        """Cars that are where they were on their way to first; new cars begin a track.
+        """Assign boxes to tracks; the remaining boxes start new tracks.
 
-        What is left after that is looked for where a standing car must be now. A box that is not
-        sure only carries on a track, where it is on the car's way: the score of a far or half
-        hidden car falls below the threshold in every other frame.
+        Boxes are matched to predicted boxes first, and the rest to the positions of standing cars.
+        A box of low score only continues a track, at its predicted box, because the score of a
+        distant or half hidden car falls below the threshold in every other frame.
         """
         used: set[int] = set()
         again: list[_Track] = []
@@ -220,10 +222,10 @@ class CarTracks:
 
 
 def are_hidden(boxes_px: NDArray[np.float64], are_sure: NDArray[np.bool_]) -> list[bool]:
-    """Which of N boxes, shape (N, 4), have their lower end behind another car's box.
+    """Mark the boxes, shape (N, 4), whose lower end is behind another car's box.
 
-    On a road the lower edge of a nearer car is the lower one. A box that is not sure hides none: it
-    may be the same car's.
+    On a road, the nearer car has the lower bottom edge. A box of low score hides no other, because
+    it may be of the same car.
     """
     x0, y0, x1, y1 = boxes_px.T
     shared = np.minimum(x1[:, None], x1) - np.maximum(x0[:, None], x0)
@@ -239,7 +241,7 @@ def _motion(track: _Track, frames: int, aside_mps: float = USUAL_MPS) -> CarMoti
 
 
 def _moved(axle: tuple[float, float, float], motion: Motion) -> tuple[float, float, float]:
-    """The rear axle's pose after an arc."""
+    """Pose of the rear axle after an arc."""
     x, y, heading = axle
     middle, way_m = heading + 0.5 * motion.turned_rad, motion.way_m or 0.0
     return (
@@ -260,9 +262,9 @@ def _steady_motion(
 
 
 def _astray(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
-    """How little a box overlaps with the one predicted from how its edges moved; infinite if not.
+    """Cost of a box by its overlap with the predicted box; infinite if it does not match.
 
-    Nothing is predicted of a car that was seen once.
+    A car that was seen only once has no prediction.
     """
     last = track.seen[-1]
     predicted = track.box_px + (one.t_s - last.t_s) * track.edges_pxps
@@ -272,7 +274,10 @@ def _astray(track: _Track, box_px: NDArray[np.float64], one: Observation) -> flo
 
 
 def _away(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
-    """Metres across the line of sight from where a standing car must be; infinite if another's."""
+    """Distance of a box from the position of a standing car, across the line of sight.
+
+    It is infinite if the box cannot be the same car.
+    """
     last = track.seen[-1]
     places = [place_of_end(last, side, one) for side in (0, 1)]
     ahead_m = 0.5 * (places[0][0] + places[1][0])

@@ -1,6 +1,6 @@
-"""Checkpoints: weights as safetensors, with what they are written in the file's own header.
+"""Save and load checkpoints: weights as safetensors, with their description in the header.
 
-Nothing that unpickles is ever opened: a pickle runs whatever program its maker put in.
+Pickles are never opened, because a pickle can run any program when it is read.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ KEY: Final = "crosscue"
 VERSION: Final = 1
 MAX_BYTES: Final = 2 << 30
 _PICKLES: Final = frozenset({".pth", ".pt", ".pkl", ".pickle", ".bin", ".ckpt", ".joblib", ".npy"})
-"""Suffixes under which pickles travel."""
+"""Usual suffixes of pickles."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Calibration(Settings):
-    """From a network's score s to the fraction of such detections that are right.
+    """Maps a network's score s to the fraction of such detections that are correct.
 
     The logit of the fraction is ``slope * logit(s) + offset`` (Platt 1999).
     """
@@ -42,16 +42,16 @@ class Calibration(Settings):
 
 
 class Facts(Settings):
-    """What a checkpoint says of itself.
+    """Description of a checkpoint, stored in its file.
 
     Attributes:
-        version: Of this description.
-        plan: What to build.
-        calibration: By class; a class without one keeps its scores.
+        version: Version of this description.
+        plan: Architecture and input of the network.
+        calibration: Calibration by class; a class without one keeps its scores.
         measured: Average precisions, precisions and recalls on held-out pictures, by name.
-        recipe: How it was made, in words and numbers.
-        has_masks: Whether the mask head has learnt these classes; if not, detections have boxes
-            only.
+        recipe: Settings of the training and its results.
+        has_masks: True if the mask head was trained on these classes; otherwise detections have
+            boxes only.
     """
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
@@ -67,9 +67,9 @@ class Checkpoint:
     """A network with its weights.
 
     Attributes:
-        facts: Of the file.
+        facts: Description of the network.
         network: A torchvision ``MaskRCNN`` in evaluation mode.
-        sha256: Of the file, hexadecimal.
+        sha256: Hash of the file, hexadecimal.
     """
 
     facts: Facts
@@ -78,16 +78,16 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, network: Any, facts: Facts, *, halve: bool = True) -> None:
-    """Write weights and facts.
+    """Write weights and their description.
 
     Args:
-        path: Where, ending in ``.safetensors``.
+        path: File name, ending in ``.safetensors``.
         network: A torchvision ``MaskRCNN``.
-        facts: Of it.
-        halve: Keep 16 bits of each weight.
+        facts: Description of the network.
+        halve: Store 16 bits of each weight.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     tensors = {name: _stored(value, halve) for name, value in network.state_dict().items()}
     content = packed(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
@@ -100,7 +100,7 @@ def _stored(value: Tensor, halve: bool) -> Tensor:
 
 
 def embedded_path() -> Path:
-    """The checkpoint that comes with crosscue."""
+    """Path of the checkpoint that is part of crosscue."""
     return embedded("compact_simulated.safetensors")
 
 
@@ -108,8 +108,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
     """Read weights and build their network.
 
     Raises:
-        VehicleError: Not there, a pickle, damaged, not made by crosscue, or facts and weights do
-            not fit each other.
+        VehicleError: The file is missing, a pickle, damaged or not written by crosscue, or its
+            description and weights do not match.
     """
     content = _content(path)
     description, tensors = unpacked(content, KEY, path)
@@ -123,7 +123,7 @@ def _content(path: Path) -> bytes:
     if path.suffix.lower() in _PICKLES:
         raise VehicleError(
             f"{path}: weights of this kind can run programs when read; expected .safetensors; "
-            "for weights of torchvision's networks write a card: crosscue model init"
+            "for weights of torchvision networks write a card: crosscue model init"
         )
     try:
         content = read_at_most(path, MAX_BYTES)
@@ -137,9 +137,8 @@ def _content(path: Path) -> bytes:
 def _facts(description: str | None, path: Path) -> Facts:
     if description is None:
         raise VehicleError(
-            f"{path}: says nothing of its classes and size; expected one that "
-            "crosscue train mask-rcnn wrote; for weights of torchvision's networks write a card: "
-            "crosscue model init"
+            f"{path}: has no description of classes and size; expected a file written by crosscue "
+            "train mask-rcnn; for weights of torchvision networks write a card: crosscue model init"
         )
     try:
         return Facts.model_validate_json(description)
@@ -147,12 +146,12 @@ def _facts(description: str | None, path: Path) -> Facts:
         first = error.errors(include_url=False)[0]
         name = ".".join(str(part) for part in first["loc"])
         raise VehicleError(
-            f"{path}: its description does not fit: {name}: {first['msg'].lower()}; train it again"
+            f"{path}: its description is invalid: {name}: {first['msg'].lower()}; train it again"
         ) from None
 
 
 def fill(network: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Put weights into a network.
+    """Load weights into a network.
 
     Raises:
         VehicleError: A weight is missing, unknown, of another shape, or not finite.
@@ -161,13 +160,13 @@ def fill(network: Any, tensors: Mapping[str, Tensor], path: Path) -> None:
     if missing := sorted(set(wanted) ^ set(tensors)):
         raise VehicleError(
             f"{path}: weights do not fit the network it names: {missing[0]} "
-            f"(and {len(missing) - 1} more) in only one of them; take the file it was trained as"
+            f"(and {len(missing) - 1} more) in only one of them; use an unmodified file"
         )
     for name, value in sorted(tensors.items()):
         if value.shape != wanted[name].shape:
             raise VehicleError(
                 f"{path}: {name}: expected shape {tuple(wanted[name].shape)} for its classes, "
-                f"got {tuple(value.shape)}; take the file it was trained as"
+                f"got {tuple(value.shape)}; use an unmodified file"
             )
         if value.is_floating_point() and not bool(value.isfinite().all()):
             raise VehicleError(f"{path}: {name}: holds values that are not finite; train it again")

@@ -1,7 +1,7 @@
-"""Torchvision's Mask R-CNN networks with COCO weights, fetched by torchvision on a user's machine.
+"""Torchvision's Mask R-CNN networks with COCO weights, which torchvision fetches on first use.
 
-The file is checked against the hash in its name, and read with ``weights_only=True``, which refuses
-everything but tensors.
+The file is verified against the hash in its name and read with ``weights_only=True``, which
+rejects everything but tensors.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ COCO_NETWORKS: Final[Mapping[str, str]] = {
     "resnet50": "MaskRCNN_ResNet50_FPN_Weights",
     "resnet50-v2": "MaskRCNN_ResNet50_FPN_V2_Weights",
 }
-"""From our names to torchvision's sets of weights."""
+"""Names of networks and of torchvision's weights for them."""
 NO_EPSILON: Final = frozenset({"resnet50"})
-"""Learnt when torchvision's frozen normalisation added nothing to variances; so run that way."""
+"""Networks that run with epsilon 0 in normalisation, because they were trained with it."""
 WIDTH_PX: Final = 1333
-"""Torchvision scales a 16:9 picture to this width."""
+"""Width to which torchvision scales a 16:9 picture."""
 
 
 def load_coco(name: str) -> Checkpoint:
-    """One of ``COCO_NETWORKS``, fetched if it is not yet on this machine.
+    """Load one of ``COCO_NETWORKS``; its weights are fetched if necessary.
 
     Raises:
-        VehicleError: It cannot be fetched, or is not the file that torchvision means.
+        VehicleError: The weights cannot be fetched, or their hash is wrong.
     """
     from torchvision.models import detection
 
@@ -48,7 +48,7 @@ def load_coco(name: str) -> Checkpoint:
     except (URLError, TimeoutError, ConnectionError) as error:
         raise VehicleError(
             f"detector mask-rcnn: {name}: cannot fetch {weights.url} ({error}); fetch it elsewhere "
-            f'and put it at {place}, or take network = "embedded"'
+            f'and copy it to {place}, or use network = "embedded"'
         ) from None
     except (OSError, RuntimeError, ValueError) as error:
         why = one_line(error, 160)
@@ -59,11 +59,11 @@ def load_coco(name: str) -> Checkpoint:
 
 
 def _check_whole(path: Path) -> None:
-    """What torchvision does with a file that it has just fetched, and not with one it finds.
+    """Verify a file's hash; torchvision does so only for a file that it has just fetched.
 
     Raises:
-        ValueError: Its hash is not the one in its name.
-        OSError: It cannot be read.
+        ValueError: The hash is not the one in the file's name.
+        OSError: The file cannot be read.
     """
     wanted = path.stem.rsplit("-", 1)[-1]
     with path.open("rb") as file:
@@ -73,7 +73,7 @@ def _check_whole(path: Path) -> None:
 
 
 def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Checkpoint:
-    """Torchvision's weights in the network they are for, with the names of COCO's classes."""
+    """Load torchvision's weights into their network, with the names of COCO's classes."""
     classes = tuple(None if c == "N/A" else str(c) for c in weights.meta["categories"][1:])
     plan = Plan.model_validate({"architecture": name, "classes": classes, "width_px": WIDTH_PX})
     network = build_network(plan)
@@ -82,6 +82,6 @@ def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Chec
         for module in network.modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.eps = 0.0
-    # The file's name carries the start of its own hash, which torchvision has compared.
+    # The file's name contains the start of its hash, which has been verified.
     digest = hashlib.sha256(weights.url.encode()).hexdigest()
     return Checkpoint(Facts(plan=plan), network.eval(), digest)

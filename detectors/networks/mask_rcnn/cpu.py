@@ -1,9 +1,9 @@
-"""A copy of a Mask R-CNN that a processor runs faster, with the same results up to rounding.
+"""Optimise a Mask R-CNN for a CPU, with the same results up to rounding.
 
-Batch normalisation is folded into the convolutions before it, and means of 2 x 2 places are sums
-of slices. Convolutions of 3 x 3 run by Winograd's way (Lavin and Gray 2016), which torch holds in
-NNPACK: two to three times fewer multiplications than there are in the plain sum, and errors no
-larger than those of folding.
+Batch normalisation is folded into the convolutions before it. Average pooling of 2 x 2 cells is a
+sum of slices. Convolutions of 3 x 3 use the Winograd algorithm (Lavin and Gray 2016), which torch
+provides through NNPACK. It needs two to three times fewer multiplications than direct convolution,
+and its errors are no larger than those of folding.
 """
 
 from __future__ import annotations
@@ -17,15 +17,18 @@ from torch.nn import functional
 
 MIN_CHANNELS: Final = 48
 MIN_PIXELS: Final = 256
-"""Below these the plain sum is as fast: measured from 32 to 512 channels, 100 to 24,000 pixels."""
+"""Number of pixels below which direct convolution is as fast.
+
+Measured with 32 to 512 channels and 100 to 24,000 pixels.
+"""
 
 
 def for_cpu(network: Any) -> Any:
-    """A copy for detecting on a processor; the network given stays as it is."""
+    """Return an optimised copy for inference on a CPU."""
     own = copy.deepcopy(network).eval().to(memory_format=torch.contiguous_format)
     _fold(own)
     _take_slices(own.backbone)
-    # Asking is also what makes NNPACK ready.
+    # This call also initialises NNPACK.
     if torch.backends.nnpack.is_available():  # type: ignore[no-untyped-call]
         for part in (own.backbone, own.rpn.head):
             _take_winograd(part)
@@ -33,7 +36,7 @@ def for_cpu(network: Any) -> Any:
 
 
 def _fold(module: nn.Module) -> None:
-    """Put every batch normalisation into the convolution before it."""
+    """Fold every batch normalisation into the convolution before it."""
     before: tuple[str, nn.Module] | None = None
     for name, child in list(module.named_children()):
         if (
@@ -76,15 +79,15 @@ def _is_suited(convolution: nn.Conv2d) -> bool:
 
 
 class Halved(nn.Module):
-    """Means of 2 x 2 places: several times as fast as torch's own pooling on one thread."""
+    """Average pooling of 2 x 2 cells, several times as fast as torch's on one thread."""
 
     def __init__(self, plain: nn.AvgPool2d) -> None:
-        """In place of a plain one, which is still asked where a side is odd."""
+        """Replace ``plain``, which is still used where a side is odd."""
         super().__init__()
         self.plain = plain
 
     def forward(self, x: Tensor) -> Tensor:
-        """Half the size."""
+        """Return features of half the size."""
         if x.shape[2] % 2 or x.shape[3] % 2:
             pooled: Tensor = self.plain(x)
             return pooled
@@ -93,17 +96,17 @@ class Halved(nn.Module):
 
 
 class Winograd(nn.Module):
-    """A 3 x 3 convolution of stride 1 that pads with zeros; detects only, never learns."""
+    """A 3 x 3 convolution of stride 1 with zero padding, for inference only."""
 
     def __init__(self, plain: nn.Conv2d) -> None:
-        """With the weights of a plain one."""
+        """Use the weights of ``plain``."""
         super().__init__()
         bias = torch.zeros(plain.out_channels) if plain.bias is None else plain.bias
         self.weight = nn.Parameter(plain.weight.detach().contiguous(), requires_grad=False)
         self.bias = nn.Parameter(bias.detach(), requires_grad=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same size."""
+        """Return features of the same size."""
         if x.shape[2] * x.shape[3] < MIN_PIXELS:
             return functional.conv2d(x, self.weight, self.bias, padding=1)
         return torch._nnpack_spatial_convolution(x, self.weight, self.bias, (1, 1), (1, 1))

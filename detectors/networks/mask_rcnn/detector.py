@@ -1,13 +1,14 @@
-"""Mask R-CNN as a detector: boxes, scores and masks of cars, stop signs and traffic lights.
+"""The detector ``mask-rcnn``: boxes, scores and masks of cars, stop signs and traffic lights.
 
 Settings: ``network`` (``embedded``, ``resnet50``, ``resnet50-v2``, or a ``.safetensors`` file),
 ``score``, ``proposals``, ``objectness``, ``batch``, ``device``, ``backend``, ``threads``.
 
-Faster than torchvision's own loop with equal results: masks only for boxes that pass the score, and
-laid into their box, never into the picture; on a processor also convolutions by Winograd's way
-(``mask_rcnn_cpu``) or OpenVINO (``mask_rcnn_openvino``), and of many proposals a rough look first
-(``box_screening``). Fewer proposals save the rest. The whole network exported as ONNX gives the
-same detections in 1.2 to 1.5 times the CPU time (``benchmarks/mask_rcnn.py --onnx``).
+It is faster than torchvision's own loop and has equal results. Masks are computed only for boxes
+above the minimum score, and only inside their box. On a CPU, convolutions use the Winograd
+algorithm (module ``cpu``) or OpenVINO (module ``openvino``), and a large number of proposals is
+screened first (module ``screening``). Fewer proposals save more time. The complete network exported
+as ONNX returns the same detections in 1.2 to 1.5 times the CPU time
+(``benchmarks/mask_rcnn.py --onnx``).
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ from .cpu import for_cpu
 from .network import MEAN, STRIDE, Plan, set_limits
 from .openvino import OpenVinoParts
 from .parts import Parts, TorchParts, detected
-from .screening import FEWEST, ScreenedParts, can_screen
+from .screening import MIN_PROPOSALS, ScreenedParts, can_screen
 
 VERSION: Final = 3
-"""Counts up when the same pixels, weights and settings would give other numbers."""
+"""Incremented when the same pixels, weights and settings yield different numbers than before."""
 EMBEDDED: Final = "embedded"
 GPU_BATCH: Final = 8
 PROPOSALS: Final = 100
@@ -46,32 +47,32 @@ _PAD: Final = np.rint(np.array(MEAN[::-1]) * 255.0).astype(np.uint8)
 
 
 class MaskRcnnSettings(Settings):
-    """How to run it."""
+    """Settings of the detector ``mask-rcnn``."""
 
     network: str = EMBEDDED
     """``embedded``, ``resnet50``, ``resnet50-v2``, or the file name of a checkpoint."""
     score: Proportion = 0.5
-    """Least score of a detection that is given; the cues have their own, higher ones."""
+    """Minimum score of a detection; cues have their own, higher thresholds."""
     proposals: Annotated[int, Field(ge=1, le=2000)] = PROPOSALS
-    """Most places that are examined more closely; torchvision's own number is 1000."""
+    """Maximum number of proposals that the box head examines; torchvision's default is 1000."""
     objectness: Proportion = 0.0
-    """Least probability that such a place holds anything; torchvision's own is 0."""
+    """Minimum objectness of a proposal, a probability; torchvision's default is 0."""
     batch: Annotated[int, Field(ge=1, le=256)] | None = None
-    """Pictures at a time; without it 1 on a CPU and 8 on a GPU."""
+    """Number of pictures per batch; by default 1 on a CPU and 8 on a GPU."""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     backend: Literal["torch", "openvino"] = "torch"
-    """What runs the layers; ``openvino`` on a CPU only."""
+    """Back end that runs the layers; ``openvino`` works on a CPU only."""
     threads: Annotated[int, Field(ge=1, le=256)] = 1
-    """On a CPU."""
+    """Number of threads on a CPU."""
     halve: bool = True
-    """On a GPU, compute in 16 bits where that is safe."""
+    """True to compute in 16 bits on a GPU, where that is safe."""
 
 
 def build(**given: Any) -> Detector:
-    """The detector.
+    """Build the detector.
 
     Raises:
-        VehicleError: Settings, checkpoint, device or back end do not fit, or weights cannot be
+        VehicleError: Settings, checkpoint, device or back end are invalid, or weights cannot be
             fetched.
     """
     settings = settings_of(MaskRcnnSettings, given, "detector mask-rcnn")
@@ -80,12 +81,15 @@ def build(**given: Any) -> Detector:
 
 
 SOURCE_SCORES: Final = {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
-"""The source's thresholds, for its network: the embedded one stands in for it, and torchvision's
-of COCO is it. Scores of any other network mean something else."""
+"""Thresholds of the dissertation.
+
+They apply to its network, which is torchvision's for COCO, and to the embedded network, which
+replaces it. Scores of other networks are not comparable.
+"""
 
 
 def checkpoint_named(name: str) -> Checkpoint:
-    """The embedded checkpoint, one that torchvision fetches, or one from a file.
+    """Load the embedded checkpoint, one that torchvision fetches, or one from a file.
 
     Raises:
         VehicleError: As ``build``.
@@ -97,8 +101,8 @@ def checkpoint_named(name: str) -> Checkpoint:
     if "." not in Path(name).name:
         names = ", ".join((EMBEDDED, *COCO_NETWORKS))
         raise VehicleError(
-            f"detector mask-rcnn: network: {name!r} is not one of {names}; or give "
-            "a .safetensors file"
+            f"detector mask-rcnn: network: expected one of {names} or a .safetensors file, got "
+            f"{name!r}"
         )
     return load_checkpoint(Path(name))
 
@@ -117,7 +121,7 @@ def _device_of(settings: MaskRcnnSettings) -> torch.device:
 def detector_of(
     checkpoint: Checkpoint, settings: MaskRcnnSettings, device: torch.device
 ) -> MaskRcnnDetector:
-    """A detector around a network."""
+    """Build a detector from a loaded network."""
     network = checkpoint.network.to(device).eval()
     lowest = min(
         raw_score(settings.score, checkpoint.facts.calibration.get(name or "", Calibration()))
@@ -135,7 +139,7 @@ def _parts(network: Any, settings: MaskRcnnSettings, device: torch.device) -> Pa
         return OpenVinoParts(network, settings.threads)
     if device.type == "cpu":
         own = for_cpu(network)
-        if settings.proposals >= FEWEST and can_screen(own):
+        if settings.proposals >= MIN_PROPOSALS and can_screen(own):
             return ScreenedParts(own)
         return TorchParts(own, device)
     return TorchParts(network.to(memory_format=torch.channels_last), device)
@@ -143,14 +147,14 @@ def _parts(network: Any, settings: MaskRcnnSettings, device: torch.device) -> Pa
 
 @dataclass(slots=True)
 class _Batch:
-    """Pictures at a time; shrinks when memory runs out."""
+    """Batch size, which is reduced when memory runs out."""
 
     size: int
 
 
 @dataclass(frozen=True, slots=True)
 class MaskRcnnDetector:
-    """Boxes and masks."""
+    """Detector of boxes and masks."""
 
     checkpoint: Checkpoint
     settings: MaskRcnnSettings
@@ -165,18 +169,18 @@ class MaskRcnnDetector:
 
     @property
     def min_scores(self) -> dict[str, float]:
-        """The source's thresholds, for the source's network only."""
+        """The dissertation's thresholds, for its network only."""
         is_source = self.settings.network in (EMBEDDED, *COCO_NETWORKS)
         return dict(SOURCE_SCORES) if is_source else {}
 
     @property
     def view(self) -> View:
-        """No finer than the network's input."""
+        """The resolution of the network's input."""
         return View(min_width_px=self.checkpoint.facts.plan.width_px)
 
     @property
     def identity(self) -> str:
-        """Of weights, settings, device kind and torch."""
+        """Text that changes with weights, settings, kind of device and version of torch."""
         asked = self.settings.model_dump(
             include={"score", "proposals", "objectness", "halve", "backend"}
         )
@@ -190,10 +194,10 @@ class MaskRcnnDetector:
         )
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Detect.
+        """Return the detections in each frame.
 
         Raises:
-            CrosscueError: Not even one picture fits into memory.
+            CrosscueError: A single picture does not fit into memory.
         """
         found: list[Found] = []
         while len(found) < len(frames):
@@ -209,7 +213,7 @@ class MaskRcnnDetector:
             width = self.checkpoint.facts.plan.width_px
             raise CrosscueError(
                 f"detector mask-rcnn: no memory on {self.device} for one picture {width} pixels "
-                'wide; close other programs, set device = "cpu", or take a smaller network'
+                'wide; close other programs, set device = "cpu", or use a smaller network'
             ) from None
         self._batch.size = max(tried // 2, 1)
         if self.device.type == "cuda":
@@ -224,11 +228,11 @@ class MaskRcnnDetector:
             with torch.autocast(self.device.type, enabled=is_halved):
                 raw = detected(self.checkpoint.network, self.parts, pictures)
             return [
-                self._report_text(frame, one, tensors)
+                self._detections(frame, one, tensors)
                 for frame, one, tensors in zip(frames, placed, raw, strict=True)
             ]
 
-    def _report_text(self, frame: Frame, placed: Placed, raw: dict[str, Tensor]) -> Detections:
+    def _detections(self, frame: Frame, placed: Placed, raw: dict[str, Tensor]) -> Detections:
         facts = self.checkpoint.facts
         names = [facts.plan.classes[int(label) - 1] for label in raw["labels"].tolist()]
         boxes, raw_scores, masks = (
@@ -263,7 +267,7 @@ class MaskRcnnDetector:
 
 
 def _alike(frames: Sequence[Frame]) -> Sequence[Frame]:
-    """The first of them that are of one size."""
+    """Leading frames that have the size of the first."""
     shape = frames[0].pixels.shape
     count = next((i for i, f in enumerate(frames) if f.pixels.shape != shape), len(frames))
     return frames[:count]
@@ -271,12 +275,12 @@ def _alike(frames: Sequence[Frame]) -> Sequence[Frame]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """A picture as a network sees it.
+    """A picture as the network's input.
 
     Attributes:
-        pixels: Shape (H, W, 3), uint8, blue green red; scaled, cut and padded.
-        scale: From the given pixels to the scaled ones, along x and y.
-        corner_px: Column and row of the network's first pixel in the scaled picture.
+        pixels: Shape (H, W, 3), uint8, blue, green, red; scaled, cropped and padded.
+        scale: Factors from original to scaled pixels, along x and y.
+        corner_px: Column and row of the input's first pixel in the scaled picture.
     """
 
     pixels: Bytes
@@ -285,7 +289,7 @@ class Placed:
 
 
 def place(pixels: Bytes, plan: Plan) -> Placed:
-    """Scale a picture to the plan's width, cut off top and bottom, pad to whole strides."""
+    """Scale a picture to the plan's width, crop top and bottom, and pad to the stride."""
     import cv2
 
     if pixels.ndim == 2:
@@ -309,7 +313,7 @@ def _whole(side: int) -> int:
 
 
 def calibrated(score: float, by: Calibration) -> float:
-    """From a network's score to the fraction of such detections that are right."""
+    """Convert a network's score to the fraction of such detections that are correct."""
     if by == Calibration():
         return score
     kept = min(max(score, 1e-9), 1.0 - 1e-9)
@@ -318,7 +322,7 @@ def calibrated(score: float, by: Calibration) -> float:
 
 
 def raw_score(score: float, by: Calibration) -> float:
-    """The network's score that ``calibrated`` turns into this one."""
+    """Convert a calibrated score back to the network's; the inverse of ``calibrated``."""
     kept = min(max(score, 1e-9), 1.0 - 1e-9)
     if by == Calibration():
         return score
@@ -327,10 +331,10 @@ def raw_score(score: float, by: Calibration) -> float:
 
 
 def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int]) -> bytes:
-    """A mask of its box as runs over the picture; where it is likelier object than not.
+    """Encode the pixels of a box's mask whose probability exceeds 0.5, as runs over the picture.
 
     Args:
-        mask: Shape (28, 28): likelihoods over the box.
+        mask: Shape (28, 28): probabilities over the box.
         box_px: x0, y0, x1, y1.
         size_px: Width and height of the picture.
     """
@@ -346,7 +350,7 @@ def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int])
     )
     rim = np.pad(mask, 1)
     step = np.maximum(box_px[2:] - box_px[:2], 1e-6) / mask.shape[::-1]
-    # Pixel middles in the mask's grid, whose own first middle is at 1 because of the rim.
+    # Pixel centres in the mask's grid, whose first centre is at 1 because of the padding.
     columns = (np.arange(x0, x1) + 0.5 - box_px[0]) / step[0] + 0.5
     rows = (np.arange(y0, y1) + 0.5 - box_px[1]) / step[1] + 0.5
     grid = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))

@@ -1,7 +1,8 @@
-"""Mask R-CNN networks: torchvision's own with a ResNet-50, and a compact one for a CPU.
+"""Mask R-CNN networks: torchvision's with a ResNet-50, and a compact one for a CPU.
 
-The compact one has a small residual body with three levels (strides 8, 16, 32), 64 channels
-throughout the pyramid and small heads: 3 million parameters, trained from nothing on a CPU.
+The compact network has a small residual backbone with three levels (strides 8, 16, 32), 64
+channels throughout the pyramid, and small heads. It has 3 million parameters and was trained from
+scratch on a CPU.
 """
 
 from __future__ import annotations
@@ -18,28 +19,28 @@ from crosscue.detectors.settings import Proportion, Settings
 
 Architecture = Literal["compact", "resnet50", "resnet50-v2"]
 CHANNELS: Final = 64
-"""Of the compact network's pyramid and heads."""
+"""Number of channels of the compact network's pyramid and heads."""
 MEAN: Final = (0.485, 0.456, 0.406)
 SPREAD: Final = (0.229, 0.224, 0.225)
 """Mean and standard deviation of red, green and blue, as torchvision's weights expect them."""
 STRIDE: Final = 32
-"""Pictures are padded to a multiple of it, as torchvision pads them."""
+"""Multiple to which pictures are padded, as in torchvision."""
 ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))
 ASPECTS: Final = (0.45, 1.0, 2.6)
-"""Height over width: an upright light, a sign, a car from the side."""
+"""Height over width of the anchors: a car from the side, a sign, an upright light."""
 MAX_BEFORE_SUPPRESSION: Final = 1000
-"""Boxes of a level that compete to be proposals; torchvision's own number."""
+"""Number of boxes per level before suppression; torchvision's default."""
 
 
 class Plan(Settings):
-    """What a network must be built as, before weights fit it.
+    """Architecture and input of a network.
 
     Attributes:
-        architecture: Which.
-        classes: Names of the classes, without the background; None in places not used.
-        width_px: Pictures are scaled to this width.
-        top: Fraction of the picture's height above what the network examines.
-        bottom: Likewise below.
+        architecture: Name of the architecture.
+        classes: Names of the classes, without the background; None for unused numbers.
+        width_px: Width to which pictures are scaled.
+        top: Fraction of the picture's height to crop at the top.
+        bottom: Fraction of the picture's height to crop at the bottom.
     """
 
     architecture: Architecture
@@ -56,9 +57,9 @@ class Plan(Settings):
 
 
 def build_network(plan: Plan) -> Any:
-    """A torchvision ``MaskRCNN`` with random weights.
+    """Build a torchvision ``MaskRCNN`` with random weights.
 
-    Nothing is fetched; for the proposals and scores asked of it, see ``set_limits``.
+    Nothing is fetched. ``set_limits`` sets the number of proposals and the minimum score.
     """
     from torchvision.models import detection
 
@@ -73,16 +74,16 @@ def build_network(plan: Plan) -> Any:
 
 
 def set_limits(network: Any, proposals: int, score: float, objectness: float = 0.0) -> None:
-    """Which places the network examines more closely, and the minimum score of what it returns.
+    """Set the number of proposals and the minimum score of a detection.
 
-    Boxes below the score never reach the mask head, so this is also where the masks' time is saved.
+    Boxes below the score do not reach the mask head, so a higher score also saves time.
 
     Args:
         network: A torchvision ``MaskRCNN``.
-        proposals: The most places of a picture.
-        score: Of a detection, from 0 to 1.
-        objectness: Least probability that a place holds anything, from 0 to 1; torchvision's own
-            is 0, so that most of its 1000 places are plain background.
+        proposals: Maximum number of proposals per picture.
+        score: Minimum score of a detection, from 0 to 1.
+        objectness: Minimum objectness of a proposal, from 0 to 1. Torchvision's default is 0, so
+            that most of its 1000 proposals are background.
     """
     rpn, heads = network.rpn, network.roi_heads
     before = max(proposals, min(3 * proposals, MAX_BEFORE_SUPPRESSION))
@@ -120,7 +121,7 @@ def _compact(classes: int) -> Any:
 
 
 class _BoxPredictor(nn.Module):
-    """Class scores and, for each class, a box."""
+    """Predicts class scores and one box per class."""
 
     def __init__(self, inputs: int, classes: int) -> None:
         super().__init__()
@@ -132,7 +133,7 @@ class _BoxPredictor(nn.Module):
 
 
 class CompactBackbone(nn.Module):
-    """From pictures (N, 3, H, W) to levels of 64 channels at strides 8, 16, 32 and 64."""
+    """Maps pictures (N, 3, H, W) to levels of 64 channels at strides 8, 16, 32 and 64."""
 
     def __init__(self) -> None:
         """Random weights."""
@@ -150,7 +151,7 @@ class CompactBackbone(nn.Module):
         )
 
     def forward(self, pictures: Tensor) -> OrderedDict[str, Tensor]:
-        """All levels, finest first."""
+        """Return all levels, finest first."""
         fine = self.level0(self.stem(pictures))
         middle = self.level1(fine)
         coarse = self.level2(middle)
@@ -161,7 +162,7 @@ class CompactBackbone(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two 3 x 3 convolutions beside a short cut (He et al. 2016, fig. 2)."""
+    """Two 3 x 3 convolutions with a shortcut connection (He et al. 2016, fig. 2)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         """Random weights."""
@@ -181,7 +182,7 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """The same size, or half of it."""
+        """Return features of the same size, or half of it with a stride."""
         sum_of_both = self.second(self.first(x))
         sum_of_both += self.short_cut(x)
         return functional.relu_(sum_of_both)
@@ -196,21 +197,21 @@ def _conv(inputs: int, outputs: int, stride: int) -> nn.Sequential:
 
 
 def freeze_masks(network: Any, *, is_frozen: bool) -> None:
-    """Whether a training leaves the mask head as it is."""
+    """Exclude the mask head from training, or include it again."""
     for part in (network.roi_heads.mask_head, network.roi_heads.mask_predictor):
         part.requires_grad_(not is_frozen)
 
 
 def forward_training(network: Any, pictures: Tensor, targets: list[dict[str, Tensor]]) -> Tensor:
-    """Sum of all losses of a batch of normalised pictures (N, 3, H, W) of one size.
+    """Compute the sum of all losses of a batch of normalised pictures (N, 3, H, W) of one size.
 
-    Torchvision's own transform is left out: it would scale pictures that have their size already.
-    Its loop over regions is written out here, since its mask loss wants a mask of every object.
+    Torchvision's own transform is not used, because it would scale the pictures again. Its code for
+    regions is repeated here, because its mask loss requires a mask of every object.
 
     Args:
-        network: A torchvision ``MaskRCNN``; without a mask loss where ``freeze_masks`` froze it.
+        network: A torchvision ``MaskRCNN``; there is no mask loss if ``freeze_masks`` froze it.
         pictures: The batch.
-        targets: Of each picture, ``boxes``, ``labels``, ``masks`` and ``has_mask``.
+        targets: ``boxes``, ``labels``, ``masks`` and ``has_mask`` of each picture.
     """
     from torchvision.models.detection.image_list import ImageList
     from torchvision.models.detection.roi_heads import fastrcnn_loss
@@ -240,11 +241,11 @@ def _mask_loss(
     sizes: list[tuple[int, int]],
     targets: list[dict[str, Tensor]],
 ) -> Tensor:
-    """Of the regions on objects that have a mask."""
+    """Compute the mask loss over the regions on objects that have a mask."""
     from torchvision.models.detection.roi_heads import maskrcnn_loss
 
     learnt = [
-        # A picture without objects has nothing to ask of; its regions are all background.
+        # A picture without objects has only background regions and cannot be indexed.
         torch.where((label > 0) & target["has_mask"][index])[0]
         if len(target["has_mask"])
         else torch.where(label > 0)[0]

@@ -1,7 +1,7 @@
-"""The likeliest boxes of a picture that do not cover each other, on a processor.
+"""Non-maximum suppression of a picture's proposals on a CPU.
 
-As torchvision's ``RegionProposalNetwork.filter_proposals``, which compares every box of a level
-with all that follow it; here it ends as soon as there are as many as requested.
+The result is that of torchvision's ``RegionProposalNetwork.filter_proposals``, which compares every
+box of a level with all that follow it. This implementation stops at the requested number of boxes.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from torch import Tensor
 
 Boxes = NDArray[np.float32]
 FEW: Final = 1000
-"""Up to as many, torchvision compares boxes that it moved far apart, which rounds otherwise."""
+"""Number of boxes up to which torchvision separates levels by offsets, with other rounding."""
 
 
 def likeliest_apart(
     rpn: Any, boxes: Tensor, logits: Tensor, levels: NDArray[np.int64], size_px: tuple[int, int]
 ) -> Tensor:
-    """Those of one picture that are likely and large enough, the best first; shape (M, 4).
+    """Select the proposals of one picture, best first, shape (M, 4).
 
     Args:
-        rpn: Its limits are taken.
-        boxes: Shape (N, 4), in pixels; cut off at the picture's rim.
-        logits: Shape (N,): of holding anything.
-        levels: Shape (N,): boxes of different levels never compete.
+        rpn: Region proposal network, whose limits are used.
+        boxes: Shape (N, 4), in pixels; clipped to the picture here.
+        logits: Shape (N,): objectness.
+        levels: Shape (N,): boxes of different levels do not suppress each other.
         size_px: Height and width of the picture.
     """
     from torchvision.ops import boxes as box_ops
@@ -48,7 +48,7 @@ def likeliest_apart(
 def _apart(
     boxes: Boxes, levels: NDArray[np.int64], overlap: float, max_kept: int
 ) -> NDArray[np.int64]:
-    """Rows of boxes that no better kept one of their level overlaps more than that."""
+    """Rows of sorted boxes that overlap no better box of their level by more than ``overlap``."""
     kept = np.empty(min(max_kept, len(boxes)), np.int64)
     areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     count = 0

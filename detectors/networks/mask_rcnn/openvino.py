@@ -1,7 +1,7 @@
-"""The heavy parts of a Mask R-CNN in OpenVINO, converted from torch's when a detector is made.
+"""Run the layers of a Mask R-CNN in OpenVINO, converted from torch when a detector is built.
 
-The body is compiled for one picture of one size, which is when OpenVINO is fastest; the heads take
-any number of boxes. All compute in 32 bits, since OpenVINO would else take 16 on some processors.
+The body is compiled for one picture of a fixed size, where OpenVINO is fastest. The heads accept
+any number of boxes. All compute in 32 bits, because OpenVINO would use 16 on some processors.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from .network import MEAN, SPREAD, STRIDE
 from .parts import Body
 
 KEPT_SIZES: Final = 4
-"""Bodies kept ready; a camera has one size, a drive few cameras."""
+"""Maximum number of compiled bodies; a camera has one size, and a drive has few cameras."""
 
 
 class OpenVinoParts:
-    """All parts on a processor."""
+    """All parts in OpenVINO on a CPU."""
 
     def __init__(self, network: Any, threads: int) -> None:
-        """Convert a network; bodies are compiled when a size is first seen.
+        """Convert a network; the body is compiled when a size first occurs.
 
         Raises:
-            VehicleError: OpenVINO is not installed, or cannot take this network.
+            VehicleError: OpenVINO is not installed, or cannot convert this network.
         """
         try:
             self._openvino: Final = import_openvino()
         except ImportError as error:
             raise VehicleError(
-                f"detector mask-rcnn: backend openvino: not installed or not whole ({error}); "
+                f"detector mask-rcnn: backend openvino: not installed or incomplete ({error}); "
                 "pip install 'crosscue[openvino]', or set backend = \"torch\""
             ) from None
         self._core: Final = self._openvino.Core()
@@ -86,7 +86,7 @@ class OpenVinoParts:
         return logits
 
     def _body(self, height: int, width: int) -> Any:
-        """Compiled for bytes of one picture: (1, height, width, 3), blue, green, red."""
+        """Compile the body for one picture, bytes (1, height, width, 3), blue, green, red."""
         ov = self._openvino
         model = self._any_size.clone()
         model.reshape([1, 3, height, width])
@@ -109,7 +109,7 @@ class OpenVinoParts:
         ov = self._openvino
         try:
             with warnings.catch_warnings(), torch.inference_mode():
-                # It traces with torch.jit, which warns that it will be replaced.
+                # OpenVINO traces with torch.jit, which warns of its deprecation.
                 warnings.simplefilter("ignore")
                 return ov.convert_model(
                     layers.eval(), example_input=example, input=[ov.PartialShape(shape)]
@@ -117,7 +117,7 @@ class OpenVinoParts:
         except Exception as error:
             why = one_line(error, 200)
             raise VehicleError(
-                f"detector mask-rcnn: backend openvino: openvino {ov.__version__} cannot take this "
+                f"detector mask-rcnn: backend openvino: openvino {ov.__version__} cannot run this "
                 f'network ({why}); set backend = "torch"'
             ) from None
 
@@ -126,7 +126,7 @@ class OpenVinoParts:
 
 
 class _WholeBody(nn.Module):
-    """Backbone, pyramid and the layers that propose, as one."""
+    """Backbone, pyramid and region proposal layers as one module."""
 
     def __init__(self, network: Any) -> None:
         super().__init__()
@@ -140,6 +140,6 @@ class _WholeBody(nn.Module):
 
 
 def _tensors(request: Any, given: Array) -> list[Tensor]:
-    """Outputs of a run, in order; they stay as they are when the next run begins."""
+    """Run and copy the outputs, in order, so that the next run does not overwrite them."""
     found = request.infer([np.ascontiguousarray(given)], share_inputs=True)
     return [torch.from_numpy(found[i]) for i in range(len(found))]

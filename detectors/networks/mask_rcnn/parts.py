@@ -1,8 +1,8 @@
-"""Mask R-CNN in parts: the heavy ones behind whichever back end runs them, the rest in torchvision.
+"""Mask R-CNN in parts: layers run in a back end, the rest in torchvision.
 
-A back end computes levels and scores of the picture, the box head and the mask head. Proposals,
-pooling and suppression are the same for all: torchvision's own functions, and on a processor ours
-that give the same boxes.
+A back end computes the pyramid and proposal scores of the picture, the box head and the mask head.
+Proposals, pooling and suppression are common to all back ends: torchvision's functions, or faster
+ones on a CPU that return the same boxes.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from .roi_align import Pooler
 
 
 class Body(NamedTuple):
-    """What a picture's pyramid says, one tensor a level, finest first.
+    """Outputs of a picture's feature pyramid, one tensor per level, finest first.
 
     Attributes:
-        levels: Shape (N, channels, H, W).
-        objectness: Shape (N, anchors, H, W), logits.
-        shifts: Shape (N, 4 * anchors, H, W), from anchors to boxes.
+        levels: Features, shape (N, channels, H, W).
+        objectness: Logits, shape (N, anchors, H, W).
+        shifts: Offsets from anchors to boxes, shape (N, 4 * anchors, H, W).
     """
 
     levels: Sequence[Tensor]
@@ -36,27 +36,30 @@ class Body(NamedTuple):
 
 
 class Parts(Protocol):
-    """The parts of a Mask R-CNN that take the time."""
+    """The layers of a Mask R-CNN in a back end."""
 
     def body(self, pictures: NDArray[np.uint8], /) -> Body:
-        """Of pictures (N, H, W, 3), blue, green, red, sides in whole strides."""
+        """Run the pyramid on pictures (N, H, W, 3), blue, green, red, padded to the stride."""
         ...
 
     def boxes(self, pooled: Tensor, /) -> tuple[Tensor, Tensor]:
-        """Class logits and box shifts of pooled proposals (M, channels, 7, 7)."""
+        """Return class logits and box offsets of pooled proposals (M, channels, 7, 7)."""
         ...
 
     def masks(self, pooled: Tensor, /) -> Tensor:
-        """Mask logits (M, classes, 28, 28) of pooled boxes (M, channels, 14, 14)."""
+        """Return mask logits (M, classes, 28, 28) of pooled boxes (M, channels, 14, 14)."""
         ...
 
 
 def detected(network: Any, parts: Parts, pictures: NDArray[np.uint8]) -> list[dict[str, Tensor]]:
-    """Boxes in the pixels given, labels, scores and masks (M, 1, 28, 28), never pasted.
+    """Detect objects: boxes in pixels of the input, labels, scores and masks (M, 1, 28, 28).
+
+    Masks cover their box only.
 
     Args:
-        network: Its anchors, limits and poolers are taken, none of its layers.
-        parts: What runs the layers.
+        network: A torchvision ``MaskRCNN``; its anchors, limits and poolers are used, not its
+            layers.
+        parts: The layers.
         pictures: Shape (N, H, W, 3), blue, green, red.
     """
     from torchvision.models.detection.roi_heads import maskrcnn_inference
@@ -81,7 +84,7 @@ def detected(network: Any, parts: Parts, pictures: NDArray[np.uint8]) -> list[di
 def _pooler(
     heads: Any, body: Body, sizes: list[tuple[int, int]]
 ) -> Callable[[Any, list[Tensor]], Tensor]:
-    """What cuts boxes out of the levels: our own pooler on a processor, else torchvision's."""
+    """Return the function that pools boxes: on a CPU ``roi_align``'s, else torchvision's."""
     names = heads.box_roi_pool.featmap_names
     if body.levels[0].device.type == "cpu":
         return Pooler(body.levels[: len(names)], sizes[0][0])
@@ -90,10 +93,10 @@ def _pooler(
 
 
 def _proposals(rpn: Any, body: Body, sizes: list[tuple[int, int]]) -> list[Tensor]:
-    """The likeliest boxes of each picture, as ``RegionProposalNetwork.forward`` returns them.
+    """Return the proposals of each picture, as ``RegionProposalNetwork.forward`` does.
 
-    That decodes every anchor and then takes the likeliest of each level; here the likeliest are
-    taken first, which leads to the same boxes.
+    Torchvision decodes all anchors and then selects the best of each level. Here they are selected
+    first, which yields the same boxes.
     """
     pictures = len(sizes)
     boxes, scores = [], []
@@ -119,12 +122,12 @@ def _proposals(rpn: Any, body: Body, sizes: list[tuple[int, int]]) -> list[Tenso
 
 
 def _anchors(base: Tensor, at: Tensor, grid: Sequence[int], size_px: tuple[int, int]) -> Tensor:
-    """Anchors (M, 4) of a level by their numbers, as torchvision's generator counts them.
+    """Anchors (M, 4) of a level, by their indices in the order of torchvision's generator.
 
     Args:
-        base: Shape (anchors, 4): of the first place.
-        at: Shape (M,): (row * columns + column) * anchors + anchor.
-        grid: Rows and columns of places.
+        base: Shape (anchors, 4): anchors of the first cell.
+        at: Shape (M,): indices, (row * columns + column) * anchors + anchor.
+        grid: Number of rows and columns of cells.
         size_px: Height and width of the picture.
     """
     place, which = at // len(base), at % len(base)
@@ -134,7 +137,7 @@ def _anchors(base: Tensor, at: Tensor, grid: Sequence[int], size_px: tuple[int, 
 
 
 def _flat_shifts(shifts: Tensor, anchors: int) -> Tensor:
-    """From (N, 4 * anchors, H, W) to (N, H * W * anchors, 4), in the anchors' order."""
+    """Reshape (N, 4 * anchors, H, W) to (N, H * W * anchors, 4), in the anchors' order."""
     pictures, _, height, width = shifts.shape
     apart = shifts.view(pictures, anchors, 4, height, width)
     return apart.permute(0, 3, 4, 1, 2).reshape(pictures, -1, 4)
@@ -144,7 +147,7 @@ class TorchParts:
     """All parts in torch, on any device."""
 
     def __init__(self, network: Any, device: torch.device) -> None:
-        """Of a network that is on the device."""
+        """Use the layers of a network that is on the device."""
         self._network = network
         self._device = device
 
@@ -169,7 +172,7 @@ class TorchParts:
 
 
 def as_input(pictures: NDArray[np.uint8], device: torch.device) -> Tensor:
-    """From (N, H, W, 3) blue, green, red bytes to normalised (N, 3, H, W)."""
+    """Normalise blue, green, red bytes (N, H, W, 3) to a tensor (N, 3, H, W)."""
     mean, spread = (255.0 * torch.tensor(v, device=device)[:, None] for v in (MEAN, SPREAD))
     if device.type == "cpu":
         table = (torch.arange(256.0)[None] - mean) / spread
@@ -180,7 +183,7 @@ def as_input(pictures: NDArray[np.uint8], device: torch.device) -> Tensor:
 
 
 def _looked_up(pictures: NDArray[np.uint8], table: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Planes of red, green and blue, each byte replaced by its entry in the colour's row."""
+    """Planes of red, green and blue, with each byte replaced by its entry in the colour's row."""
     import cv2
 
     count, height, width, _ = pictures.shape

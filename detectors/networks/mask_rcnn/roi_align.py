@@ -1,7 +1,7 @@
-"""Boxes cut out of a pyramid's levels, each to the same small grid (RoIAlign; He et al. 2017).
+"""Pool boxes of a pyramid's levels to a small grid on a CPU (RoIAlign; He et al. 2017).
 
-As torchvision's ``MultiScaleRoIAlign``, with the channels of a place side by side in memory, so
-that all of them are interpolated together: several times as fast on a processor.
+The result is that of torchvision's ``MultiScaleRoIAlign``. The channels of a cell are adjacent in
+memory and interpolated together, which is several times as fast.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from torch import Tensor
 
 Grid = NDArray[np.float32]
 _ROUNDING: Final = 1e-6
-"""Added before a level is rounded down, as torchvision does."""
+"""Value added to a level before it is rounded down, as in torchvision."""
 
 
 class Pooler:
     """Pools boxes of the pictures of one batch."""
 
     def __init__(self, levels: Sequence[Tensor], height_px: int) -> None:
-        """Of levels (N, channels, H, W) on a processor, finest first.
+        """Rearrange the levels in memory.
 
         Args:
-            levels: All that boxes may be cut from.
-            height_px: Of the pictures.
+            levels: Features (N, channels, H, W) on a CPU, finest first.
+            height_px: Height of the pictures.
         """
         self._levels: Final = [level.permute(0, 2, 3, 1).contiguous().numpy() for level in levels]
         self._halvings: Final = [
@@ -36,11 +36,11 @@ class Pooler:
         ]
 
     def __call__(self, pool: Any, boxes: Sequence[Tensor]) -> Tensor:
-        """Shape (M, channels, side, side), channels last: of all boxes, picture after picture.
+        """Pool all boxes, in order of pictures; shape (M, channels, side, side), channels last.
 
         Args:
-            pool: A ``MultiScaleRoIAlign``; its sizes are taken.
-            boxes: For each picture shape (M, 4), in pixels.
+            pool: A ``MultiScaleRoIAlign``, whose sizes are used.
+            boxes: Boxes of each picture, shape (M, 4), in pixels.
         """
         every = torch.cat(list(boxes))
         pictures = np.repeat(np.arange(len(boxes)), [len(of_one) for of_one in boxes])
@@ -62,7 +62,7 @@ class Pooler:
         return torch.from_numpy(pooled).permute(0, 3, 1, 2)
 
     def _levels_of(self, boxes: Tensor, pool: Any) -> NDArray[np.int64]:
-        """Larger boxes from coarser levels (Lin et al. 2017, eq. 1)."""
+        """Level of each box; larger boxes use coarser levels (Lin et al. 2017, eq. 1)."""
         width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
         size = torch.sqrt(width * height) / pool.canonical_scale
         exact = torch.floor(pool.canonical_level + torch.log2(size) + _ROUNDING)
@@ -80,15 +80,15 @@ def _places(
     high: NDArray[np.int64],
     fraction: Grid,
 ) -> None:
-    """Where samples fall between the places of a row, and how far from the lower one.
+    """Compute each sample's neighbouring cells in a row, and its distance from the lower one.
 
-    A sample more than one place outside has a lower place of -1.
+    The lower cell is -1 if a sample is more than one cell outside.
     """
     for i in range(low.size):
-        # In torchvision's order of sums, so that both round alike.
+        # Summed in torchvision's order, for the same rounding.
         at = start + np.float32(i // samples) * cell
         at += (np.float32(i % samples) + np.float32(0.5)) * cell / np.float32(samples)
-        # Written so that a number that is not one is outside too.
+        # Negated so that NaN counts as outside.
         if not (at >= np.float32(-1.0) and at <= np.float32(size)):
             low[i] = -1
             continue

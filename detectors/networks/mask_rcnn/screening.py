@@ -1,9 +1,9 @@
-"""A rough look at every proposal, and a close one at those that it does not rule out.
+"""Screen proposals with an approximate box head, and run the exact one on the remaining ones.
 
-Of a thousand proposals about fifty hold an object, yet the box head costs as much for each. Its
-first layer is most of that, and a product of two thin matrices stands in for it roughly (truncated
-singular values; Girshick 2015, section 3.1). Rough scores only rule out: what is
-found was examined closely.
+About fifty of a thousand proposals contain an object, but the box head costs the same for each.
+Most of that is its first layer, which the product of two thin matrices approximates (truncated SVD;
+Girshick 2015, section 3.1). Approximate scores only reject proposals; every detection has exact
+scores.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from torch.nn import functional
 
 from .parts import TorchParts
 
-FEWEST: Final = 200
-"""Proposals from which it pays."""
+MIN_PROPOSALS: Final = 200
+"""Number of proposals above which screening saves time."""
 RANK: Final = 3 / 16
-"""Of the thin matrices, as a fraction of the layer's outputs."""
+"""Rank of the approximation, as a fraction of the layer's outputs."""
 MARGIN: Final = 2.5
-"""Log-odds by which a rough score may be too low before a detection could be lost."""
+"""Maximum error of an approximate score, in log-odds, that does not lose a detection."""
 CHECKED: Final = 40
-"""Every so many proposals one is examined closely in any case, to see how wrong the rough is."""
+"""Interval of proposals that always get exact scores, to measure the approximation's error."""
 
 
 def can_screen(network: Any) -> bool:
-    """Whether its box head is torchvision's of two layers, with scores from a third."""
+    """Whether a network's box head is torchvision's of two layers, with scores from a third."""
     from torchvision.models.detection.faster_rcnn import TwoMLPHead
 
     heads = network.roi_heads
@@ -36,16 +36,19 @@ def can_screen(network: Any) -> bool:
 
 
 class ScreenedParts(TorchParts):
-    """All parts in torch on a processor; what cannot reach the least score gets rough logits."""
+    """All parts in torch on a CPU, with approximate logits for proposals of low score."""
 
     def __init__(self, network: Any) -> None:
-        """Of a network that ``can_screen``; its least score is taken as it is now."""
+        """Approximate the first layer of a network that ``can_screen``.
+
+        The network's minimum score must be set before.
+        """
         super().__init__(network, torch.device("cpu"))
         self._heads: Final = network.roi_heads
         self._min_logit: Final = float(torch.logit(torch.tensor(float(self._heads.score_thresh))))
         first = self._heads.box_head.fc6
         with torch.inference_mode():
-            # The left singular vectors, from a matrix that is small however wide the layer is.
+            # The left singular vectors, from a matrix whose size is independent of the inputs.
             _, left = torch.linalg.eigh(first.weight @ first.weight.T)
             rank = max(round(RANK * first.out_features), 1)
             self._wide: Final = left[:, -rank:].contiguous()
@@ -55,7 +58,7 @@ class ScreenedParts(TorchParts):
             self._narrow: Final = thin.transpose(1, 2).flatten(1).contiguous()
 
     def boxes(self, pooled: Tensor, /) -> tuple[Tensor, Tensor]:
-        """As ``Parts``; shifts are 0 where logits are rough."""
+        """As ``Parts``; offsets are 0 where logits are approximate."""
         logits = self._rough(pooled)
         rough = _log_odds(logits)
         is_close = rough >= self._min_logit - MARGIN
@@ -80,5 +83,5 @@ class ScreenedParts(TorchParts):
 
 
 def _log_odds(logits: Tensor) -> Tensor:
-    """Of each row's likeliest class that is not background."""
+    """Log-odds of each row's most probable class other than the background."""
     return torch.logit(functional.softmax(logits, 1)[:, 1:].amax(1))

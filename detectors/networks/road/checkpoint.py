@@ -1,4 +1,4 @@
-"""A road network's weights as safetensors, with the picture size they were trained at."""
+"""Save and load a road network's weights as safetensors, with a description."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MAX_BYTES: Final = 64 << 20
 
 
 class RoadFacts(Settings):
-    """What the file says of itself.
+    """Description of a road checkpoint, stored in its file.
 
     Attributes:
-        version: Of this description.
-        width_px: Pictures are brought to this size.
-        height_px: Likewise.
-        recipe: How it was made, and what it reached, in words and numbers.
+        version: Version of this description.
+        width_px: Width to which pictures are resized.
+        height_px: Height to which pictures are resized.
+        recipe: Settings of the training and its measured results.
     """
 
     version: Annotated[int, Field(ge=1, le=1)] = 1
@@ -47,10 +47,10 @@ class RoadCheckpoint:
 
 
 def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
-    """Write weights, 16 bits each, and facts.
+    """Write weights, 16 bits each, and their description.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     kept = {
         name: value.detach().cpu().contiguous().half() if value.is_floating_point() else value.cpu()
@@ -61,10 +61,10 @@ def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
 
 
 def load_road(path: Path) -> RoadCheckpoint:
-    """Read weights and put them into the network.
+    """Read weights and load them into a network.
 
     Raises:
-        VehicleError: Not there, no safetensors, damaged, or not of a road network.
+        VehicleError: The file is missing, not safetensors, damaged, or not of a road network.
     """
     if path.suffix != ".safetensors":
         raise VehicleError(f"{path}: expected .safetensors; other files can run programs when read")
@@ -76,14 +76,12 @@ def load_road(path: Path) -> RoadCheckpoint:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
     description, tensors = unpacked(content, KEY, path)
     if description is None:
-        raise VehicleError(f"{path}: not what crosscue train road wrote; give such a file")
+        raise VehicleError(f"{path}: expected a file written by crosscue train road")
     try:
         facts = RoadFacts.model_validate_json(description)
     except ValidationError as error:
         why = one_line(error, 120)
-        raise VehicleError(
-            f"{path}: its description does not fit ({why}); train it again"
-        ) from None
+        raise VehicleError(f"{path}: its description is invalid ({why}); train it again") from None
     network = RoadNetwork()
     if not all(bool(value.isfinite().all()) for value in tensors.values()):
         raise VehicleError(f"{path}: holds values that are not finite; train it again")

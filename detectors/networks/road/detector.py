@@ -1,4 +1,6 @@
-"""The detector ``road``: road pixels by a road network; the embedded one knows simulated scenes.
+"""The detector ``road``: road pixels by a neural network.
+
+The embedded network was trained on simulated scenes only.
 
 Settings: ``checkpoint``, ``device``, ``probability``.
 """
@@ -24,24 +26,24 @@ from .checkpoint import RoadCheckpoint, load_road
 from .network import embedded_path, logits_of
 
 VERSION: Final = 1
-"""Counts up when the same pixels, weights and settings would give another mask."""
+"""Incremented when the same pixels, weights and settings yield a different mask than before."""
 
 
 class RoadSettings(Settings):
-    """How to run a road network."""
+    """Settings of the detector ``road``."""
 
     checkpoint: str | None = None
     """A safetensors file; None for the embedded one."""
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     probability: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """A pixel with more is road."""
+    """Probability above which a pixel is road."""
 
 
 def build(**given: Any) -> RoadNetworkDetector:
-    """The detector.
+    """Build the detector.
 
     Raises:
-        VehicleError: The settings or the checkpoint do not fit.
+        VehicleError: The settings or the checkpoint are invalid.
     """
     settings = settings_of(RoadSettings, given, "detector road")
     path = embedded_path() if settings.checkpoint is None else Path(settings.checkpoint)
@@ -53,7 +55,7 @@ def build(**given: Any) -> RoadNetworkDetector:
 
 @dataclass(frozen=True, slots=True)
 class RoadNetworkDetector:
-    """Road pixels at the network's resolution."""
+    """Detector of road pixels, at the network's resolution."""
 
     checkpoint: RoadCheckpoint
     settings: RoadSettings
@@ -61,22 +63,22 @@ class RoadNetworkDetector:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """None: road is not an object."""
+        """Empty: road is not an object."""
         return ()
 
     @property
     def view(self) -> View:
-        """No finer than the network's input."""
+        """The resolution of the network's input."""
         return View(min_width_px=self.checkpoint.facts.width_px)
 
     @property
     def identity(self) -> str:
-        """Of weights, settings and what runs them."""
+        """Text that changes with weights, settings and back end."""
         runs = (torch.__version__, self.device.type, self.settings.probability)
         return identity_of("road", VERSION, self.checkpoint.sha256, runs)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Segment."""
+        """Return the road pixels of each frame."""
         if not frames:
             return []
         size = (self.checkpoint.facts.width_px, self.checkpoint.facts.height_px)
@@ -92,7 +94,7 @@ class RoadNetworkDetector:
 
 
 def resized(pixels: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """A picture at the network's size, grey ones as three equal channels."""
+    """Resize a picture to the network's size; grey pictures get three equal channels."""
     import cv2
 
     coloured = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)

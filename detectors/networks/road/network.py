@@ -1,7 +1,7 @@
-"""Road pixels from a small network of our own: an hourglass of separable convolutions.
+"""A small road segmentation network: an encoder and decoder of separable convolutions.
 
-The embedded weights know only simulated scenes (``crosscue train road``); a file of one's own goes
-in as ``checkpoint``.
+The embedded weights were trained on simulated scenes only (``crosscue train road``). The setting
+``checkpoint`` selects other weights.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from torch.nn import functional
 from crosscue.detectors.weights_file import embedded
 
 WIDTHS: Final = (16, 32, 64, 96)
-"""Channels at a half, a quarter, an eighth and a sixteenth of the input's size."""
+"""Number of channels at 1/2, 1/4, 1/8 and 1/16 of the input's size."""
 DILATIONS: Final = (1, 2, 4, 1)
 
 
 class _Separable(nn.Module):
-    """A 3 x 3 filter of each channel, then a mixing of channels; added to what it was given."""
+    """A separable convolution, residual where its shape permits: 3 x 3 per channel, then a mix."""
 
     def __init__(self, given: int, made: int, stride: int = 1, dilation: int = 1) -> None:
         super().__init__()
@@ -34,17 +34,17 @@ class _Separable(nn.Module):
         self._adds = stride == 1 and given == made
 
     def forward(self, x: Tensor) -> Tensor:
-        """Same size, or half where strided."""
+        """Return features of the same size, or half of it with a stride."""
         y = functional.relu(self.norm_alone(self.alone(x)))
         y = self.norm(self.mix(y))
         return functional.relu(x + y if self._adds else y)
 
 
 class RoadNetwork(nn.Module):
-    """Blue, green, red in [0, 1], shape (N, 3, H, W), to a logit of road a pixel, (N, H, W)."""
+    """Maps blue, green, red in [0, 1], (N, 3, H, W), to a logit of road per pixel, (N, H, W)."""
 
     def __init__(self) -> None:
-        """Random weights."""
+        """Initialise random weights."""
         super().__init__()
         half, quarter, eighth, deep = WIDTHS
         self.stem = nn.Sequential(
@@ -67,12 +67,12 @@ class RoadNetwork(nn.Module):
         self.last = nn.Conv2d(half, 1, 3, 1, 1)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Logits at the pictures' own size."""
+        """Return logits at the pictures' size."""
         half = self.stem(pictures - 0.45)
         quarter = self.quarter(half)
         eighth = self.eighth(quarter)
         deep = self.deep(eighth)
-        # What the whole picture is like, light above all, shifts every place alike.
+        # Features of the whole picture, above all its lighting, shift all pixels equally.
         deep = deep + self.whole(deep.mean(dim=(2, 3), keepdim=True))
         eighth = self.at_eighth(eighth + _grown(self.to_eighth(deep), eighth))
         quarter = self.at_quarter(quarter + _grown(self.to_quarter(eighth), quarter))
@@ -86,7 +86,7 @@ def _grown(small: Tensor, like: Tensor) -> Tensor:
 
 
 def embedded_path() -> Path:
-    """The checkpoint that comes with crosscue."""
+    """Path of the checkpoint that is part of crosscue."""
     return embedded("road.safetensors")
 
 

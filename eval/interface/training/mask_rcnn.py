@@ -168,7 +168,7 @@ def train_mask_rcnn(
     from crosscue.detectors.training.job import run_job
     from crosscue.eval.interface.training.curve import draw_curve
 
-    facts = run_job(job, train, held_out, resume=resume, overwrite=overwrite, tell=report)
+    facts = run_job(job, train, held_out, resume=resume, overwrite=overwrite, report=report)
     draw_curve(job.curve_path, path.with_suffix(".curve.png"))
     return TrainedMaskRcnn(path, facts)
 
