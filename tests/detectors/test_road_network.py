@@ -77,7 +77,7 @@ def test_going_on_after_an_interruption_is_as_if_there_was_none(tmp_path: Path) 
 def test_a_file_that_is_no_state_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "state").write_bytes(content)
 
-    with pytest.raises(SchemaError, match="state: cannot go on"):
+    with pytest.raises(SchemaError, match="state: cannot resume from it"):
         RoadTraining(RoadSchedule(), CPU).resume(tmp_path / "state")
 
 
