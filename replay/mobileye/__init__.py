@@ -1,1 +1,1 @@
-"""Mobileye 560 over CAN: our own table as data, decoding and encoding in columns."""
+"""Decode and encode Mobileye 560 data on CAN in columns, from a table of its signals."""

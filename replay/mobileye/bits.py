@@ -1,6 +1,6 @@
-"""Bits of many payloads at once, into whole numbers and back.
+"""Extract integers from the bits of many payloads at once, and write them.
 
-A payload of up to 8 bytes is one 64-bit word, bit 0 being the lowest of byte 0.
+A payload of up to 8 bytes is one 64-bit word, whose bit 0 is the lowest bit of byte 0.
 """
 
 from __future__ import annotations
@@ -11,26 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 Words: TypeAlias = NDArray[np.uint64]
-"""Shape (N,): payloads."""
+"""Payloads, shape (N,)."""
 
 
 def words_of(payloads: NDArray[np.uint8]) -> Words:
-    """The first 8 bytes of each row of ``payloads``, shape (N, W), as words."""
+    """Return the first 8 bytes of each row of ``payloads``, shape (N, W), as words."""
     first = np.ascontiguousarray(payloads[:, :8])
     return first.view("<u8").ravel().astype(np.uint64, copy=False)
 
 
 def payloads_of(words: Words) -> NDArray[np.uint8]:
-    """The words as bytes, shape (N, 8)."""
+    """Return the words as bytes, shape (N, 8)."""
     return words.astype("<u8").view(np.uint8).reshape(-1, 8)
 
 
 def extract(
     words: Words, start: int, bits: int, is_signed: bool, is_big_endian: bool
 ) -> NDArray[np.int64]:
-    """Bits ``start`` to ``start + bits - 1`` of each word.
+    """Return bits ``start`` to ``start + bits - 1`` of each word.
 
-    Big-endian numbers must fill whole bytes: ``start`` is then the first bit of the first byte.
+    Big-endian numbers must consist of complete bytes; ``start`` is then the first bit of the first
+    byte.
     """
     if is_big_endian:
         left = np.uint64(start)
@@ -44,7 +45,7 @@ def extract(
 
 
 def place(raw: NDArray[np.int64], start: int, bits: int, is_big_endian: bool) -> Words:
-    """Words that hold the low ``bits`` bits of ``raw`` at ``start``, and nothing else."""
+    """Return words that hold the low ``bits`` bits of ``raw`` at ``start``; other bits are 0."""
     low = raw.view(np.uint64) & np.uint64((1 << bits) - 1)
     if is_big_endian:
         return (low << np.uint64(64 - start - bits)).byteswap()

@@ -1,8 +1,8 @@
-"""Which frames of an image belong together.
+"""Join the frames of an image.
 
-A status frame (0x738) opens the burst of one image and says how many obstacles follow; each comes
-as a triple A, B, C in its slot. Nothing is joined across two status frames, and a frame that fits
-nowhere is reported with its reason, never joined.
+A status frame (0x738) starts the burst of one image and announces the number of obstacles. Each
+obstacle is a triple of frames A, B, C in its slot. Frames are never joined across two status
+frames, and a frame that cannot be assigned is reported with its reason.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ SLOTS_AT_MOST: Final = 16
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Status:
-    """Status frames that open a burst, and the bursts' numbers.
+    """Status frames that start a burst, and the bursts' numbers.
 
     Attributes:
-        number: Shape (M,), int64, rising by one: the burst.
-        log_ns: Shape (M,).
-        image_ns: Shape (M,).
-        count: Shape (M,), int64: obstacles announced.
-        variant: Shape (M,), int8: revision.
+        number: Number of the burst, shape (M,), int64, increasing by one.
+        log_ns: Log time, shape (M,).
+        image_ns: Image time, shape (M,).
+        count: Number of announced obstacles, shape (M,), int64.
+        variant: Revision, shape (M,), int8.
     """
 
     number: Int64s
@@ -53,12 +53,12 @@ class Status:
         return len(self.number)
 
     def at(self, burst: Int64s) -> Int64s:
-        """Places of bursts by their numbers; numbers of none of them give places outside."""
+        """Return the indices of bursts by number; unknown numbers yield indices out of range."""
         places: Int64s = burst - self.number[0]
         return places
 
     def take(self, index: NDArray[np.intp] | slice) -> Status:
-        """The statuses picked by ``index``."""
+        """Return the statuses selected by ``index``."""
         return Status(
             self.number[index],
             self.log_ns[index],
@@ -78,21 +78,21 @@ class Status:
 
 
 def no_status() -> Status:
-    """No status frame yet."""
+    """Return an empty ``Status``."""
     none = np.zeros(0, dtype=np.int64)
     return Status(none, none, none, none, np.zeros(0, dtype=np.int8))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """Frames that are one part of something of several parts, in the order of the log.
+    """Frames that are parts of obstacles or lanes, in the order of the log.
 
     Attributes:
-        burst: Shape (N,), int64: number of the last status frame before, or ``NO_BURST``.
-        place: Shape (N,), int64: obstacle slot, or instance of a lane.
-        part: Shape (N,), int64: 0 for A, 1 for B, 2 for C.
-        log_ns: Shape (N,).
-        words: Shape (N,): payloads.
+        burst: Number of the last status frame before, or ``NO_BURST``, shape (N,), int64.
+        place: Obstacle slot, or instance of a lane, shape (N,), int64.
+        part: 0 for A, 1 for B, 2 for C, shape (N,), int64.
+        log_ns: Log time, shape (N,).
+        words: Payloads, shape (N,).
     """
 
     burst: Int64s
@@ -105,7 +105,7 @@ class Parts:
         return len(self.burst)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Parts:
-        """The frames picked by ``index``."""
+        """Return the frames selected by ``index``."""
         return Parts(
             self.burst[index],
             self.place[index],
@@ -125,18 +125,18 @@ class Parts:
 
 
 def no_parts() -> Parts:
-    """No frames."""
+    """Return an empty ``Parts``."""
     none = np.zeros(0, dtype=np.int64)
     return Parts(none, none, none, none, np.zeros(0, dtype=np.uint64))
 
 
 class Fault(NamedTuple):
-    """Frames not joined, and why.
+    """Frames that were not joined, and the reason.
 
     Attributes:
-        reason: Short, the same for all of a kind.
-        log_ns: Shape (K,): of each frame.
-        burst: Shape (K,): the burst each is in.
+        reason: Short reason, equal for all frames of a kind.
+        log_ns: Log time of each frame, shape (K,).
+        burst: Burst of each frame, shape (K,).
     """
 
     reason: str
@@ -145,7 +145,7 @@ class Fault(NamedTuple):
 
 
 class Triples(NamedTuple):
-    """Whole obstacles: rows of A, B and C, ordered by burst and slot."""
+    """Complete obstacles: rows of A, B and C, ordered by burst and slot."""
 
     a: Parts
     b: Parts
@@ -153,12 +153,12 @@ class Triples(NamedTuple):
 
 
 class Shortage(NamedTuple):
-    """Frames that status frames announced and that did not come.
+    """Frames that status frames announced and that are missing.
 
     Attributes:
-        number: Shape (K,): the burst.
-        log_ns: Shape (K,): of its status frame.
-        frames: Shape (K,): how many are missing.
+        number: Number of the burst, shape (K,).
+        log_ns: Log time of its status frame, shape (K,).
+        frames: Number of missing frames, shape (K,).
     """
 
     number: Int64s
@@ -169,17 +169,17 @@ class Shortage(NamedTuple):
 def sift(
     parts: Parts, status: Status, within_ns: int, kept: int = 0, is_closed: bool = False
 ) -> tuple[Parts, list[Fault], bool]:
-    """Leave out obstacle frames that belong to no burst, or to one that cannot be determined.
+    """Remove obstacle frames that belong to no burst, or whose burst is ambiguous.
 
     Args:
-        parts: In the order of the log.
-        status: Holds every burst that ``parts`` name.
-        within_ns: How far from its status frame a frame may be.
-        kept: So many at the front were sifted before.
-        is_closed: The first burst of ``status`` can take no further frame.
+        parts: Frames in the order of the log.
+        status: Status frames of all bursts of ``parts``.
+        within_ns: Max time from its status frame to a frame.
+        kept: Number of frames at the front that were sifted before.
+        is_closed: True if the first burst of ``status`` accepts no further frames.
 
     Returns:
-        The frames left; the others; and whether the last burst can take no further frame.
+        The remaining frames; the others; and whether the last burst accepts no further frames.
     """
     faults: list[Fault] = []
     parts = _leave(parts, parts.burst == NO_BURST, NO_STATUS, faults)
@@ -191,7 +191,7 @@ def sift(
     parts = _leave(parts, parts.place >= status.count[at], BEYOND_COUNT, faults)
     first = _first_of_slot(parts)
     is_again = first != np.arange(len(parts))
-    # From the first slot that comes again with other content on, frames are of another image.
+    # A slot that is repeated with other content belongs to another image, like all later frames.
     is_next = _from_first(is_again & (parts.words != parts.words[first]), parts.burst)
     if is_closed:
         is_next |= (np.arange(len(parts)) >= kept) & (parts.burst == status.number[0])
@@ -203,7 +203,7 @@ def sift(
 
 
 def join(parts: Parts) -> tuple[Triples, list[Fault]]:
-    """Obstacles of finished bursts; ``parts`` are sifted, so no part comes twice."""
+    """Join the obstacles of finished bursts; ``parts`` are sifted, so that no part is repeated."""
     obstacle = parts.burst * SLOTS_AT_MOST + parts.place
     order = np.lexsort((parts.part, obstacle))
     obstacle = obstacle[order]
@@ -218,7 +218,7 @@ def join(parts: Parts) -> tuple[Triples, list[Fault]]:
 
 
 def shortage(parts: Parts, status: Status, slots: int) -> Shortage:
-    """What finished bursts lack: three frames an obstacle announced, less those that came."""
+    """Return missing frames of finished bursts: three per announced obstacle, minus those found."""
     wanted = 3 * np.minimum(status.count, slots)
     at = status.at(parts.burst) if len(parts) else parts.burst
     came = np.bincount(at, minlength=len(status))
@@ -228,16 +228,16 @@ def shortage(parts: Parts, status: Status, slots: int) -> Shortage:
 
 
 def pair(parts: Parts, within_ns: int, is_last: bool) -> tuple[Parts, Parts, Parts, list[Fault]]:
-    """Lanes: each A with the B of the same lane that follows it in the same burst.
+    """Pair each frame A of a lane with the B of the same lane that follows in the same burst.
 
     Args:
-        parts: In the order of the log; those kept from before first.
-        within_ns: How long after its A a B may come.
-        is_last: No more frames will follow.
+        parts: Frames in the order of the log; frames kept from before are first.
+        within_ns: Max time from A to its B.
+        is_last: True if no more frames will follow.
 
     Returns:
-        The A and the B of whole lanes, ordered as the B in the log; A that may yet get their B;
-        the others.
+        The A and the B of complete lanes, ordered like the B in the log; frames A whose B may still
+        follow; the others.
     """
     order = np.argsort(parts.place, kind="stable")
     ordered = parts.take(order)
@@ -267,7 +267,7 @@ def _leave(parts: Parts, out: NDArray[np.bool_], reason: str, faults: list[Fault
 
 
 def _first_of_slot(parts: Parts) -> NDArray[np.intp]:
-    """For each frame, the first one with the same burst, slot and part."""
+    """Return, for each frame, the first frame with the same burst, slot and part."""
     key = (parts.burst * SLOTS_AT_MOST + parts.place) * 3 + parts.part
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     places: NDArray[np.intp] = first[inverse]
@@ -275,7 +275,7 @@ def _first_of_slot(parts: Parts) -> NDArray[np.intp]:
 
 
 def _from_first(is_mark: NDArray[np.bool_], burst: Int64s) -> NDArray[np.bool_]:
-    """True from the first mark of each burst to its end; ``burst`` never decreases."""
+    """Return a mask from the first mark of each burst to its end; ``burst`` never decreases."""
     marks = np.cumsum(is_mark, dtype=np.int64)
     before = marks - is_mark.astype(np.int64)
     _, start, inverse = np.unique(burst, return_index=True, return_inverse=True)
@@ -283,9 +283,9 @@ def _from_first(is_mark: NDArray[np.bool_], burst: Int64s) -> NDArray[np.bool_]:
 
 
 def events(fault: Fault, at_most: int) -> Iterator[tuple[int, int, int]]:
-    """Of each burst that a fault concerns: its number, first log time and frames; then the rest.
+    """Yield number, first log time and number of frames of each burst with a fault.
 
-    Beyond ``at_most`` bursts the remaining frames come as one, under the next burst's number.
+    Beyond ``at_most`` bursts, the remaining frames are one event with the next burst's number.
     """
     number, start, count = np.unique(fault.burst, return_index=True, return_counts=True)
     for k in range(min(len(number), at_most)):

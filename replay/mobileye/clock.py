@@ -1,18 +1,18 @@
-"""The 8-bit millisecond counter of 0x738, unwrapped against the log's clock.
+"""Unwrap the 8-bit millisecond counter of 0x738 with the log's clock.
 
-The counter holds the low 8 bits of the device's image-grab time in milliseconds. It says exactly
-how far apart images are, modulo 256 ms; the log says roughly when each frame arrived. Together:
+The counter holds the low 8 bits of the device's image-grab time in milliseconds. It determines the
+time between images exactly, modulo 256 ms. The log records approximately when each frame arrived:
 
     log time = image time + latency,    image time = counter + 256 ms * k + (device - log offset).
 
-**What this can and cannot tell.** The device's clock has no known relation to the log's, so the
-latency is known only up to a constant: the fastest frame is given ``min_latency_ns`` (0 unless
-you know better), and the others what they took more. And it is known only modulo 256 ms: a frame
-that the host held back for 240 ms or more longer than the fastest is placed 256 ms late. Where that
-shows (the next image would come first), or a counter restarts, a notice says so.
+**Limits.** The device's clock has no known relation to the log's, so the latency is known only up
+to a constant. The fastest frame has the latency ``min_latency_ns`` (0 unless it is known), and the
+others have their additional delay. The latency is also known only modulo 256 ms: a frame that the
+host delayed by at least 240 ms more than the fastest frame has an image time that is 256 ms late. A
+notice reports this where it is visible (the next image would be earlier), or if a counter restarts.
 
-The offset follows the fastest frames: down as quickly as keeps images in order, up by no more than
-a crystal drifts.
+The offset follows the fastest frames: downwards as fast as the order of images allows, and upwards
+by at most the drift of a crystal.
 """
 
 from __future__ import annotations
@@ -26,32 +26,33 @@ MS: Final = 1_000_000
 WRAP_NS: Final = 256 * MS
 
 DRIFT: Final = 200e-6
-"""A crystal is off by 100 parts in a million at worst; two of them by twice that."""
+"""Max drift between two clocks; a crystal is off by at most 100 parts per million."""
 FIRST_EARLY_NS: Final = 128 * MS
 LAST_EARLY_NS: Final = 16 * MS
 SETTLED_AFTER: Final = 15
-"""The first frame may be a slow one: until so many have come, half a wrap of them may be faster."""
+"""Number of frames after which the offset is settled. The first frame may be slow, so earlier
+frames may be faster by up to half a wrap."""
 GAP_NS: Final = 60_000 * MS
-"""After this long without a frame, drift may have moved the counter: start over."""
+"""Time without a frame after which the offset restarts, because of possible drift."""
 WATCHED: Final = 32
 STEP_NS: Final = 12 * MS
-"""If none of ``WATCHED`` frames is this near the fastest, the counter or a clock was set."""
+"""If none of ``WATCHED`` frames is this close to the fastest, the counter or a clock was set."""
 
-WENT_BACK: Final = "the log's clock went back, image times restart"
-LONG_GAP: Final = "a gap too long to follow the clocks' drift, image times restart"
+WENT_BACK: Final = "the log's clock was set back, image times restart"
+LONG_GAP: Final = "a gap is too long to follow the clocks' drift, image times restart"
 SET_ANEW: Final = "the millisecond counter was reset, or every frame takes longer than before"
 OUT_OF_ORDER: Final = (
-    "an image would come before the one before it: a frame 240 ms late, or a counter reset"
+    "an image would precede its predecessor: a frame is 240 ms late, or the counter was reset"
 )
 
 
 class Unwrapped(NamedTuple):
-    """Image times on the log's clock, and what was noticed.
+    """Image times on the log's clock, and notices.
 
     Attributes:
-        image_ns: Shape (N,), int64; never after the frame's log time, never decreasing while the
-            log times do not.
-        notices: Plain sentences.
+        image_ns: Image times, shape (N,), int64; never after the frame's log time, and never
+            decreasing unless the log times decrease.
+        notices: Warnings in plain English.
     """
 
     image_ns: NDArray[np.int64]
@@ -61,12 +62,12 @@ class Unwrapped(NamedTuple):
 def unwrap(
     counter_ms: NDArray[np.integer], log_ns: NDArray[np.int64], min_latency_ns: int = 0
 ) -> Unwrapped:
-    """When the image of each status frame was grabbed, on the log's clock.
+    """Return the time on the log's clock at which the image of each status frame was grabbed.
 
     Args:
-        counter_ms: Shape (N,), 0 to 255.
-        log_ns: Shape (N,).
-        min_latency_ns: What the fastest frame took.
+        counter_ms: Counter, shape (N,), 0 to 255.
+        log_ns: Log time, shape (N,).
+        min_latency_ns: Latency of the fastest frame.
     """
     clock = CounterClock(min_latency_ns)
     image_ns = clock.feed(counter_ms, log_ns)
@@ -74,7 +75,7 @@ def unwrap(
 
 
 class CounterClock:
-    """``unwrap`` for a stream: the same answers however it is cut into pieces."""
+    """Incremental ``unwrap``; the result does not depend on the division into pieces."""
 
     def __init__(self, min_latency_ns: int = 0) -> None:
         self._min_ns = min_latency_ns
@@ -87,13 +88,13 @@ class CounterClock:
         self._noticed: dict[str, tuple[int, int]] = {}
 
     def feed(self, counter_ms: NDArray[np.integer], log_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Image times of the next frames, shape (N,)."""
+        """Return the image times of the next frames, shape (N,)."""
         pairs = zip(counter_ms.tolist(), log_ns.tolist(), strict=True)
         return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._min_ns
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What was noticed so far, how often, and when first."""
+        """Return the notices so far, with their count and first time."""
         return tuple(
             f"{what} ({count} times, first at {first_ns} ns)"
             for what, (first_ns, count) in self._noticed.items()
@@ -130,7 +131,7 @@ class CounterClock:
         return int(FIRST_EARLY_NS + fraction * (LAST_EARLY_NS - FIRST_EARLY_NS))
 
     def _follow(self, over_ns: int, elapsed_ns: int) -> int:
-        """Move the offset towards the fastest frames; what is left over."""
+        """Move the offset towards the fastest frames, and return the remainder."""
         if over_ns < 0:
             change_ns = max(over_ns, -(elapsed_ns // 2))
         else:
@@ -139,7 +140,7 @@ class CounterClock:
         return over_ns - change_ns
 
     def _watch(self, over_ns: int, log_ns: int) -> int:
-        """Restart the offset where frames no longer come near it."""
+        """Restart the offset if frames are no longer close to it."""
         self._fastest_ns = min(self._fastest_ns, over_ns)
         self._watched += 1
         if self._watched < WATCHED:

@@ -1,4 +1,4 @@
-"""From the device's reference point to the rear axle and back.
+"""Transform between the device's reference point and the rear axle.
 
 Both frames have x ahead and y to the left (ISO 8855, REP-103). A lane is the cubic
 y(x) = c0 + c1 x + c2 x**2 + c3 x**3 from the reference point to the end of the view range.
@@ -18,12 +18,13 @@ Floats: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Where the device's reference point lies: a calibration entry.
+    """Position of the device's reference point, from calibration.
 
     Attributes:
-        x_m: Ahead of the rear axle. The device measures from a reference point, not its camera.
-        y_m: Left of the vehicle's middle.
-        yaw_rad: Turn of the device's axes to the left of the vehicle's.
+        x_m: Distance ahead of the rear axle. The device measures from a reference point, not from
+            its camera.
+        y_m: Distance to the left of the vehicle's centre line.
+        yaw_rad: Rotation of the device's axes to the left of the vehicle's axes.
     """
 
     x_m: float = 0.0
@@ -36,7 +37,7 @@ AT_REAR_AXLE: Final = Mounting()
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Place and turn of one frame's axes in another's: ``target_T_source``."""
+    """Position and rotation of one frame in another: ``target_T_source``."""
 
     x_m: float
     y_m: float
@@ -44,37 +45,37 @@ class Pose:
 
 
 def vehicle_T_device(mounting: Mounting) -> Pose:  # noqa: N802 - the frames' names
-    """From the device's axes to the vehicle's."""
+    """Return the transform from the device's frame to the vehicle's."""
     return Pose(mounting.x_m, mounting.y_m, mounting.yaw_rad)
 
 
 def device_T_vehicle(mounting: Mounting) -> Pose:  # noqa: N802 - the frames' names
-    """From the vehicle's axes to the device's."""
+    """Return the transform from the vehicle's frame to the device's."""
     c, s = cos(mounting.yaw_rad), sin(mounting.yaw_rad)
     x, y = mounting.x_m, mounting.y_m
     return Pose(-(c * x + s * y), s * x - c * y, -mounting.yaw_rad)
 
 
 def move_points(pose: Pose, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
-    """Points given in the source frame, in the target frame."""
+    """Transform points from the source frame to the target frame."""
     c, s = cos(pose.yaw_rad), sin(pose.yaw_rad)
     return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
 
 
 def move_cubic(pose: Pose, c: Floats) -> Floats:
-    """Cubics given in the source frame, in the target frame.
+    """Transform cubics from the source frame to the target frame.
 
-    A turned cubic is not one; it is developed to third order about its start. For turns of a few
-    degrees that is exact to far below a step of the wire; without a turn it is exact.
+    A rotated cubic is not a cubic; it is expanded to third order about its start. For rotations of
+    a few degrees the error is far below a step of the wire; without rotation the result is exact.
 
     Args:
         pose: ``target_T_source``.
-        c: Shape (4, N): c0 to c3.
+        c: Coefficients c0 to c3, shape (4, N).
     """
     if pose.yaw_rad == 0.0:
         return _shift(np.vstack([c[:1] + pose.y_m, c[1:]]), pose.x_m)
     co, si = cos(pose.yaw_rad), sin(pose.yaw_rad)
-    # x = x0 + a1 s + a2 s^2 + a3 s^3 along the cubic, y likewise with b; invert x, put into y.
+    # x = x0 + a1 s + a2 s^2 + a3 s^3 along the cubic, y likewise with b; invert x, insert in y.
     a1, a2, a3 = co - si * c[1], -si * c[2], -si * c[3]
     b1, b2, b3 = si + co * c[1], co * c[2], co * c[3]
     s1, s2, s3 = 1 / a1, -a2 / a1**3, (2 * a2**2 - a1 * a3) / a1**5
@@ -90,7 +91,7 @@ def move_cubic(pose: Pose, c: Floats) -> Floats:
 
 
 def _shift(c: Floats, x0_m: float | Floats) -> Floats:
-    """The cubic in x - x0 as one in x."""
+    """Convert a cubic in x - x0 to a cubic in x."""
     return np.vstack(
         [
             c[0] - x0_m * (c[1] - x0_m * (c[2] - x0_m * c[3])),
@@ -102,7 +103,7 @@ def _shift(c: Floats, x0_m: float | Floats) -> Floats:
 
 
 def turn_slope(yaw_rad: float, c1: Floats, c2_per_m: Floats) -> tuple[Floats, Floats]:
-    """Slope and half curvature of a line at one point, in axes turned by -``yaw_rad``."""
+    """Return slope and half curvature of a line at a point, in axes rotated by -``yaw_rad``."""
     if yaw_rad == 0.0:
         return c1, c2_per_m
     co, si = cos(yaw_rad), sin(yaw_rad)
@@ -111,6 +112,6 @@ def turn_slope(yaw_rad: float, c1: Floats, c2_per_m: Floats) -> tuple[Floats, Fl
 
 
 def evaluate(c: Floats, x_m: Floats) -> Floats:
-    """Values of cubics of shape (4, N) at ``x_m``."""
+    """Return the values of cubics of shape (4, N) at ``x_m``."""
     y: Floats = c[0] + x_m * (c[1] + x_m * (c[2] + x_m * c[3]))
     return y

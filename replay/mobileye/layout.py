@@ -1,4 +1,4 @@
-"""Our own table of what a Mobileye 560 says on CAN, kept as data in ``layout.toml``."""
+"""Table of the messages and signals of a Mobileye 560 on CAN, stored in ``layout.toml``."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from crosscue.replay.base import SchemaError, toml_tree
 
 Column: TypeAlias = NDArray[np.generic]
 Columns: TypeAlias = dict[str, Column]
-"""By name: the columns of a message's fields, or of a table."""
+"""Columns of a message's fields, or of a table, by name."""
 Kind: TypeAlias = Literal["real", "code", "flag"]
 Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
 
 VARIANTS: Final = ("classic", "2.32", "extended", "tsr", "basic")
-"""Layouts that some field is ``only`` in; a frame's is a place in this tuple, or ``UNKNOWN``."""
+"""Variants named by ``only``; a frame's variant is an index in this tuple, or ``UNKNOWN``."""
 UNKNOWN: Final = -1
 Variant: TypeAlias = NDArray[np.int8]
-"""Shape (N,): the variant of each frame as a place in ``VARIANTS``, or ``UNKNOWN``."""
+"""Variant of each frame as an index in ``VARIANTS``, or ``UNKNOWN``; shape (N,)."""
 WORD_BITS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One signal: where its bits lie and what they mean.
+    """One signal: the position of its bits and their meaning.
 
-    Value on the wire = (raw - zero) * scale / per. The file's head explains each key.
+    Value on the wire = (raw - zero) * scale / per. The head of ``layout.toml`` explains each key.
     """
 
     name: str
@@ -58,35 +58,35 @@ class Field:
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse a field that cannot be."""
+        """Refuse an invalid field."""
         whole_bytes = self.start % 8 == 0 and self.bits % 8 == 0
         if self.bits < 1 or self.start < 0 or self.start + self.width > WORD_BITS:
-            raise SchemaError(f"{self.name}: bits {self.start}+{self.width} are not in 8 bytes")
+            raise SchemaError(f"{self.name}: bits {self.start}+{self.width} do not fit 8 bytes")
         if self.order == "big" and not whole_bytes:
-            raise SchemaError(f"{self.name}: a big-endian field must fill whole bytes")
+            raise SchemaError(f"{self.name}: a big-endian field must consist of complete bytes")
         if self.only and self.only not in VARIANTS:
             raise SchemaError(f"{self.name}: only {self.only!r}; there are: {', '.join(VARIANTS)}")
 
     @property
     def kind(self) -> Kind:
-        """How its column is kept: float64, int16 or a flag."""
+        """Kind of its column: float64, int16 or a flag."""
         if self.unit:
             return "real"
         return "flag" if self.bits == 1 else "code"
 
     @property
     def width(self) -> int:
-        """Bits written when encoding."""
+        """Number of bits written when encoding."""
         return max(self.bits, self.fill)
 
     @property
     def may_be_missing(self) -> bool:
-        """Is there a frame in which it has no value?"""
+        """True if it may be missing in a frame."""
         return bool(self.missing or self.missing_with or self.needs or self.only)
 
     @property
     def raw_range(self) -> tuple[int, int]:
-        """Smallest and largest raw number that is not a sign of a missing value by itself."""
+        """Smallest and largest raw number without codes for a missing value."""
         lowest, highest = 0, (1 << self.bits) - 1
         if self.signed:
             lowest, highest = -(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1
@@ -103,17 +103,17 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One kind of frame, in one or several instances of consecutive meaning.
+    """One kind of frame, with one or several instances.
 
     Attributes:
-        name: Ours.
-        says: What it holds, in a few words.
-        table: The table its columns go to.
-        ids: Identifier of each instance (obstacle slot, lane side, sign place).
-        lengths: Payload lengths it may have.
+        name: Name in this table.
+        says: Short description of its content.
+        table: Table of its columns.
+        ids: Identifier of each instance (obstacle slot, lane side, position of a sign).
+        lengths: Valid payload lengths.
         fields: Its signals.
-        variant: What chooses between fields with ``only``.
-        variants: From a length to a variant, where the length chooses.
+        variant: Property that selects among fields with ``only``.
+        variants: Variant by length, if the length selects it.
         ros_type: Message of ``mobileye_560_660_msgs`` with the same content, or empty.
     """
 
@@ -128,7 +128,7 @@ class Message:
     ros_type: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse fields that overlap or do not fit the shortest payload they may come in."""
+        """Refuse fields that overlap or do not fit the shortest payload that contains them."""
         for variant in {"", *(f.only for f in self.fields)}:
             taken = 0
             for f in self.fields:
@@ -136,7 +136,7 @@ class Message:
                     continue
                 mask = ((1 << f.width) - 1) << f.start
                 if taken & mask:
-                    raise SchemaError(f"{self.name}.{f.name}: its bits are taken already")
+                    raise SchemaError(f"{self.name}.{f.name}: its bits overlap another field")
                 if f.start + f.bits > 8 * self._shortest(f.only):
                     raise SchemaError(f"{self.name}.{f.name}: does not fit the payload")
                 taken |= mask
@@ -146,14 +146,14 @@ class Message:
         return min(lengths, default=0)
 
     def length_of(self, variant: str) -> int:
-        """Payload length when encoding ``variant``: the longest that fits."""
+        """Return the payload length for encoding ``variant``, which is the longest that fits."""
         named = [n for n, name in self.variants.items() if name == variant]
         return max(named or self.lengths)
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """All messages, and which of them makes which table."""
+    """All messages, and the tables of their columns."""
 
     messages: tuple[Message, ...]
 
@@ -165,7 +165,7 @@ class Layout:
         return {m.name: m for m in self.messages}
 
     def of_table(self, table: str) -> tuple[Message, ...]:
-        """The messages whose columns make ``table``, in the order of the file."""
+        """Return the messages of a table, in the order of the file."""
         return tuple(m for m in self.messages if m.table == table)
 
     @property
@@ -175,7 +175,7 @@ class Layout:
 
 
 class LayoutRow(NamedTuple):
-    """One line of the printed table: a field in all instances of its message."""
+    """One row of the printed table: a field in all instances of its message."""
 
     ids: str
     lengths: str
@@ -191,10 +191,10 @@ class LayoutRow(NamedTuple):
 
 @cache
 def layout() -> Layout:
-    """The table, read once.
+    """Return the layout, which is read once.
 
     Raises:
-        SchemaError: The file that was installed is not the one that was written.
+        SchemaError: The installed file is damaged.
     """
     text = files(__package__).joinpath("layout.toml").read_text(encoding="utf-8")
     try:
@@ -204,12 +204,12 @@ def layout() -> Layout:
 
 
 def parse(text: str) -> Layout:
-    """A table from TOML text.
+    """Parse a layout from TOML text.
 
     Raises:
-        SchemaError: Fields overlap or cannot be.
+        SchemaError: Fields overlap or are invalid.
         KeyError: A message lacks a key.
-        TypeError: A key that no message or field has.
+        TypeError: A message or field has an unknown key.
     """
     entries: list[dict[str, Any]] = toml_tree(text)["message"]
     messages: dict[str, Message] = {}
@@ -217,7 +217,7 @@ def parse(text: str) -> Layout:
         messages[entry["name"]] = _message(dict(entry), messages)
     claimed = [i for m in messages.values() for i in m.ids]
     if len(set(claimed)) != len(claimed):
-        raise SchemaError("layout.toml: two messages claim one identifier")
+        raise SchemaError("layout.toml: two messages have the same identifier")
     return Layout(tuple(messages.values()))
 
 
@@ -248,7 +248,7 @@ def _field(entry: Mapping[str, Any]) -> Field:
 
 
 def describe() -> Iterator[LayoutRow]:
-    """The table as a person reads it, a field a row."""
+    """Yield the layout for display, one row for each field."""
     for message in layout().messages:
         ids = ", ".join(f"0x{i:03X}" for i in message.ids[:3]) + (
             f", ... 0x{message.ids[-1]:03X}" if len(message.ids) > 3 else ""
@@ -275,10 +275,10 @@ def _formula(f: Field) -> str:
 
 
 def unit_of(f: Field) -> str:
-    """Unit of the column where its name does not carry it, as for ``Table.units``."""
+    """Return the unit of a column unless its name includes it, as for ``Table.units``."""
     return f.unit.rstrip("?") + " (unverified)" if f.unit.endswith("?") else ""
 
 
 def variant_number(name: str) -> int:
-    """Place of a variant in ``VARIANTS``, or ``UNKNOWN``."""
+    """Return the index of a variant in ``VARIANTS``, or ``UNKNOWN``."""
     return VARIANTS.index(name) if name in VARIANTS else UNKNOWN

@@ -1,4 +1,4 @@
-"""A Mobileye's lanes and obstacles as the samples that estimators take, from CAN or from ROS."""
+"""Extract samples of a Mobileye's lanes and obstacles for estimators, from CAN or ROS."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .settings import MobileyeSettings
 
 
 class MobileyeStream:
-    """Reads one device, from frames of its bus or from messages, a block at a time."""
+    """Reader of one device, from frames of its bus or from messages, a block at a time."""
 
     def __init__(
         self,
@@ -29,35 +29,35 @@ class MobileyeStream:
         *,
         is_shared_bus: bool,
     ) -> None:
-        """Prepare.
+        """Prepare the decoders.
 
         Args:
-            bus: Topic of the bus; for messages any name.
-            ledger: Records what could not be used.
-            section: The vehicle file's.
-            types: Of the topics with messages, from their names.
-            is_shared_bus: The car's own signals are read from the same bus.
+            bus: Topic of the bus; any name for messages.
+            ledger: Ledger that records unusable rows.
+            section: The Mobileye's section of the vehicle file.
+            types: Message types by topic name.
+            is_shared_bus: True if the vehicle's signals are read from the same bus.
         """
         settings = settings_of(section, is_shared_bus=is_shared_bus)
         self._of_frames = MobileyeDecoder(bus, ledger, settings) if not types else None
         self._of_messages = RosMobileye(bus, types, ledger, settings) if types else None
 
     def __call__(self, block: Block) -> Iterator[Samples]:
-        """The samples of a block of frames, or of decoded messages."""
+        """Yield the samples of a block of frames, or of decoded messages."""
         if self._of_frames is not None and isinstance(block.rows, CanFrames):
             yield from samples_of(self._of_frames(block))
         elif self._of_messages is not None:
             yield from samples_of(self._of_messages(block))
 
     def flush(self) -> Iterator[Samples]:
-        """What was held back until it was known to be whole; call it once, at the log's end."""
+        """Yield the samples held back as incomplete; to be called once, at the log's end."""
         reader = self._of_frames or self._of_messages
         if reader is not None:
             yield from samples_of(reader.flush())
 
 
 def settings_of(section: Mobileye, *, is_shared_bus: bool) -> MobileyeSettings:
-    """The decoder's settings from the vehicle file's; without ``x_m`` the mounting is unknown."""
+    """Return the decoder's settings from the vehicle file; without ``x_m`` there is no mounting."""
     mounting = None if section.x_m is None else Mounting(section.x_m, section.y_m, section.yaw_rad)
     return MobileyeSettings(
         section.revision, section.family, section.slots, mounting, is_shared_bus=is_shared_bus
@@ -65,7 +65,7 @@ def settings_of(section: Mobileye, *, is_shared_bus: bool) -> MobileyeSettings:
 
 
 def samples_of(blocks: Iterable[Block]) -> Iterator[Samples]:
-    """Tables of the decoder as samples, at their log times."""
+    """Convert tables of the decoder to samples, at their log times."""
     for block in blocks:
         name = block.topic.rpartition("/")[2]
         if isinstance(block.rows, Table) and name in _TABLES:

@@ -1,4 +1,4 @@
-"""How one Mobileye is read."""
+"""Settings of the decoder of a Mobileye."""
 
 from __future__ import annotations
 
@@ -16,24 +16,26 @@ LaneSign: TypeAlias = Literal["auto", "right", "left"]
 
 @dataclass(frozen=True, slots=True)
 class MobileyeSettings:
-    """How frames become columns.
+    """Settings for converting frames to columns.
 
     Attributes:
-        revision: Protocol revision; ``auto`` takes it from the length of the status frame (0x738),
-            6 bytes for ``classic`` and 7 for ``2.32``.
-        family: Which of two families of devices sends 0x700; ``auto`` decides when a bit is set
-            that only one of them has.
-        slots: Obstacle slots, 10 or 13; with 10 the identifiers above 0x756 are foreign. 0x760 is
-            always the vehicle signals.
-        mounting: None counts as at the rear axle, with a notice.
-        within_ns: How long after its 0x738 a frame of the same image may come, and how long after
-            its first half the second half of a lane. Below the shortest time between two images.
-        repeat_within_ns: A status frame equal to the one before and this close after it is a
+        revision: Protocol revision; ``auto`` determines it from the length of the status frame
+            (0x738), 6 bytes for ``classic`` and 7 for ``2.32``.
+        family: Family of devices that sends 0x700; ``auto`` decides as soon as a bit is set that
+            only one of the two families has.
+        slots: Number of obstacle slots, 10 or 13; with 10, identifiers above 0x756 are not the
+            Mobileye's. 0x760 always contains the vehicle signals.
+        mounting: Mounting of the device; None means at the rear axle, with a notice.
+        within_ns: Max time from 0x738 to a frame of the same image, and from the first half of a
+            lane to its second half. It must be below the shortest time between two images.
+        repeat_within_ns: Max time between two equal status frames of which the second is a
             repetition, not a new image.
-        min_latency_ns: What the fastest frame took from image to log; the log alone cannot tell.
-        is_shared_bus: Another decoder reads the same bus and accounts for what is not the device's.
-        ros_lane_sign: Which way lanes in ROS messages are positive; ``auto`` examines which side
-            the left and right lane lie.
+        min_latency_ns: Latency of the fastest frame from image to log, which cannot be determined
+            from the log alone.
+        is_shared_bus: True if another decoder reads the same bus and accounts for frames of other
+            devices.
+        ros_lane_sign: Positive direction of lanes in ROS messages; ``auto`` determines it from the
+            positions of the left and the right lane.
     """
 
     revision: Revision = "auto"
@@ -47,10 +49,10 @@ class MobileyeSettings:
     ros_lane_sign: LaneSign = "auto"
 
     def __post_init__(self) -> None:
-        """Refuse times that cannot be.
+        """Check the settings.
 
         Raises:
-            ValueError: Naming the field and what was wanted.
+            ValueError: A setting is out of range; the message names it and the valid range.
         """
         for name in ("within_ns", "repeat_within_ns"):
             if getattr(self, name) <= 0:
@@ -63,10 +65,10 @@ DEFAULTS: Final = MobileyeSettings()
 
 
 def mounting_of(settings: MobileyeSettings, bus: str, ledger: Ledger) -> Mounting:
-    """Where the reference point lies; if not stated, at the rear axle, which is reported."""
+    """Return the mounting; the default is at the rear axle, with a notice."""
     if settings.mounting is None:
         ledger.notice(
-            f"{bus}: where the Mobileye's reference point lies is not given; distances count "
-            "from it as if it were the rear axle; calibrate x_m and y_m in the vehicle file"
+            f"{bus}: the position of the Mobileye's reference point is not set; it is assumed to "
+            "be at the rear axle; calibrate x_m and y_m in the vehicle file"
         )
     return settings.mounting or AT_REAR_AXLE

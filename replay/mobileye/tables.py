@@ -1,10 +1,10 @@
-"""The tables that frames and ROS messages alike become, and the way back.
+"""Tables of decoded frames and ROS messages, and their conversion between reference points.
 
 Every table begins with ``t_ns`` (image time for obstacles and status, log time for the others) and
-``burst`` (number of the last status frame, from 0; -1 before the first). Places are metres from the
-rear axle, x ahead and y to the left; lanes are cubics y(x) in the same frame. ``layout`` is the
-variant that a row was read by, as a place in ``layout.VARIANTS``, -1 if it is not known. What each
-further column is says ``crosscue.replay.mobileye.layout.describe``.
+``burst`` (number of the last status frame, from 0; -1 before the first). Positions are in metres
+from the rear axle, x ahead and y to the left; lanes are cubics y(x) in the same frame. ``layout``
+is the variant of a row, as an index in ``layout.VARIANTS``; -1 if it is unknown.
+``crosscue.replay.mobileye.layout.describe`` describes the other columns.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from .layout import Column, Columns, layout, unit_of
 LEFT: Final = 1
 RIGHT: Final = -1
 NO_LANE_C0_M: Final = 1.875
-"""A side without a marking sends type 2, quality 0, no range, and half of a usual lane's width."""
+"""Lateral position sent for a side without a marking, half of a usual lane's width; such a side
+also has type 2, quality 0 and no range."""
 NO_LANE_TYPE: Final = 2
 
 _CUBIC: Final = ("c0_m", "c1", "c2_per_m", "c3_per_m2")
@@ -41,24 +42,24 @@ _CUBIC: Final = ("c0_m", "c1", "c2_per_m", "c3_per_m2")
 def table_block(
     bus: str, name: str, log_ns: Int64s, columns: Columns, image_ns: Int64s | None = None
 ) -> Block:
-    """Rows of one table as a block called ``BUS/mobileye/NAME``."""
+    """Return the rows of one table as a block with topic ``BUS/mobileye/NAME``."""
     units = {f.name: unit_of(f) for m in layout().of_table(name) for f in m.fields if unit_of(f)}
     return Block(f"{bus}/mobileye/{name}", log_ns, Table(columns, units), header_ns=image_ns)
 
 
 def floats(column: Column) -> Floats:
-    """A float64 column as such."""
+    """Return a column as float64."""
     return cast("Floats", column)
 
 
 def side_of_lane(table: str, instance: Int64s) -> NDArray[np.int8]:
-    """``LEFT`` or ``RIGHT`` of an instance of a lane message; further lanes alternate."""
+    """Return ``LEFT`` or ``RIGHT`` of an instance of a lane message; further lanes alternate."""
     is_left = instance % 2 == 0 if table == "next_lanes" else instance == 0
     return np.where(is_left, LEFT, RIGHT).astype(np.int8)
 
 
 def instance_of_lane(table: str, columns: Mapping[str, Column]) -> Int64s:
-    """The other way round."""
+    """Return the instances of a lane message from the columns of ``lane_places``."""
     is_right: Int64s = (columns["side"] == RIGHT).astype(np.int64)
     if table != "next_lanes":
         return is_right
@@ -67,7 +68,7 @@ def instance_of_lane(table: str, columns: Mapping[str, Column]) -> Int64s:
 
 
 def lane_places(table: str, instance: Int64s) -> Columns:
-    """The columns that say which lane a row is; ``index`` counts outwards from 0."""
+    """Return the columns that identify the lane of a row; ``index`` counts outwards from 0."""
     places: Columns = {"side": side_of_lane(table, instance)}
     if table == "next_lanes":
         places["index"] = (instance // 2).astype(np.int8)
@@ -75,7 +76,7 @@ def lane_places(table: str, instance: Int64s) -> Columns:
 
 
 def to_vehicle(table: str, columns: Columns, mounting: Mounting) -> Columns:
-    """Columns seen from the device's reference point, seen from the rear axle instead."""
+    """Convert columns from the device's reference point to the rear axle."""
     pose = vehicle_T_device(mounting)
     if table in ("lanes", "next_lanes"):
         return _lanes_to_vehicle(columns, pose)
@@ -83,7 +84,7 @@ def to_vehicle(table: str, columns: Columns, mounting: Mounting) -> Columns:
 
 
 def to_device(table: str, columns: Columns, mounting: Mounting) -> Columns:
-    """The other way round; columns that are missing stay so."""
+    """Convert columns from the rear axle to the device's reference point; some may be missing."""
     pose = device_T_vehicle(mounting)
     if table in ("lanes", "next_lanes"):
         return _lanes_to_device(columns, pose)

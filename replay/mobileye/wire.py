@@ -1,8 +1,8 @@
-"""Between payloads and columns, one message at a time, as the layout table says.
+"""Convert between payloads and columns, one message at a time, according to the layout table.
 
-Columns here are in SI and left-positive, but still seen from the device's reference point: what the
-mounting changes is in ``geometry``. A missing value is NaN in a float64 column and -1 in an int16
-or int8 one. A flag is bool, or int8 where it may be missing.
+Columns here are in SI units and left-positive, but relative to the device's reference point;
+``geometry`` applies the mounting. A missing value is NaN in a float64 column and -1 in an int16 or
+int8 column. A flag is bool, or int8 if it may be missing.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ _TO_SI: Final[Mapping[str, float]] = {"deg": pi / 180, "deg/s": pi / 180, "km/h"
 
 MISSING_CODE: Final = -1
 _SNAP: Final = 0.05
-"""A value given this close to a step of the raw number, in steps, is that step (float32 fields)."""
+"""Max distance, in steps, of a value from the raw step that it represents (float32 fields)."""
 
 
 def values_of(message: Message, words: Words, variant: Variant) -> dict[str, NDArray[np.float64]]:
-    """Values on the wire, NaN where missing, of every field.
+    """Return the values on the wire of every field, NaN where missing.
 
     Args:
-        message: Its layout.
-        words: Shape (N,).
-        variant: Shape (N,); unknown leaves the fields missing that depend on it.
+        message: Layout of the message.
+        words: Payloads, shape (N,).
+        variant: Variants, shape (N,); fields that depend on an unknown variant are missing.
     """
     values: dict[str, NDArray[np.float64]] = {}
     for f in message.fields:
@@ -45,7 +45,7 @@ def values_of(message: Message, words: Words, variant: Variant) -> dict[str, NDA
 
 
 def from_raw(f: Field, raw: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(raw - zero) * scale / per, NaN for the codes that mean missing."""
+    """Return (raw - zero) * scale / per, NaN for the codes that mean missing."""
     value = raw.astype(np.float64)
     if f.zero:
         value -= f.zero
@@ -59,7 +59,7 @@ def from_raw(f: Field, raw: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def from_given(f: Field, given: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values that another program took off the wire, back on the table's steps and codes."""
+    """Round values that another program decoded to the table's steps and codes."""
     steps = given * f.per / f.scale + f.zero
     whole = np.rint(steps)
     is_near = np.abs(steps - whole) <= _SNAP
@@ -68,7 +68,7 @@ def from_given(f: Field, given: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def blank_dependent(message: Message, values: dict[str, NDArray[np.float64]]) -> None:
-    """Make missing what hangs on another field that is missing or 0."""
+    """Set fields to missing if a field that they depend on is missing or 0."""
     for f in message.fields:
         if f.missing_with and f.missing_with in values:
             values[f.name] = np.where(np.isnan(values[f.missing_with]), np.nan, values[f.name])
@@ -77,7 +77,7 @@ def blank_dependent(message: Message, values: dict[str, NDArray[np.float64]]) ->
 
 
 def columns_of(message: Message, values: Mapping[str, NDArray[np.float64]]) -> Columns:
-    """SI, left-positive, each column in its type."""
+    """Return columns in SI units, left-positive, each with its dtype."""
     columns: Columns = {}
     for f in {f.name: f for f in message.fields}.values():
         value = values[f.name]
@@ -90,7 +90,7 @@ def columns_of(message: Message, values: Mapping[str, NDArray[np.float64]]) -> C
 
 
 def dtype_of(message: Message, name: str) -> np.dtype[np.generic]:
-    """The type of a column of ``message``."""
+    """Return the dtype of a column of ``message``."""
     same = [f for f in message.fields if f.name == name]
     if same[0].kind == "real":
         return np.dtype(np.float64)
@@ -110,13 +110,14 @@ def _whole(value: NDArray[np.float64], dtype: np.dtype[np.generic]) -> Column:
 def words_from(
     message: Message, columns: Mapping[str, Column], variant: Variant, topic: str
 ) -> Words:
-    """The payloads that say ``columns``, rounded to the nearest step.
+    """Return the payloads for ``columns``, rounded to the nearest step.
 
-    A column that is not given is missing where the message can say so, else its default. Columns of
-    another variant than a row's are not examined.
+    An absent column is sent as missing if the message has a code for it, else as its default.
+    Columns of another variant than that of a row are ignored.
 
     Raises:
-        ValueError: A value that the field cannot carry, with column, row, value and range.
+        ValueError: A field cannot represent a value; the message names column, row, value and
+            range.
     """
     words = np.zeros(len(variant), dtype=np.uint64)
     for f in message.fields:
@@ -145,7 +146,7 @@ def _raw_from(
         row = int(np.flatnonzero(is_bad)[0])
         low, high = sorted(float(from_raw(f, np.array([r]))[0]) for r in (lowest, highest))
         raise ValueError(
-            f"{topic} {f.name}, row {row}: cannot send {column[row]}; "
+            f"{topic} {f.name}, row {row}: cannot encode {column[row]}; "
             f"expected {low:g} to {high:g} {f.unit} on the wire"
         )
     nearest = np.clip(np.rint(steps), lowest, highest)
@@ -158,14 +159,14 @@ def _inside(steps: NDArray[np.float64], lowest: int, highest: int) -> NDArray[np
 
 
 def _beside_missing(f: Field, nearest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A value on a code that means missing moves to the step before it."""
+    """Move values that equal a code for missing to the step before it."""
     for code in f.missing:
         nearest = np.where(nearest == code, code - 1 if code > 0 else code + 1, nearest)
     return nearest
 
 
 def _on_wire(f: Field, column: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """A column in the wire's unit and sign, and where it is missing."""
+    """Return a column in the wire's unit and sign, and a mask of its missing values."""
     value = column.astype(np.float64)
     if f.kind != "real":
         return value, value == MISSING_CODE

@@ -1,1 +1,1 @@
-"""A Mobileye on a CAN bus: its frames told apart, decoded and encoded."""
+"""Identify, decode and encode the frames of a Mobileye on a CAN bus."""

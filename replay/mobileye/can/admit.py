@@ -1,4 +1,4 @@
-"""Which frames of a bus are the Mobileye's, and what each of them is."""
+"""Identify the frames of a Mobileye on a bus, and their messages."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class Admitted(NamedTuple):
     """Frames of the Mobileye, in the order of the log.
 
     Attributes:
-        message: Shape (N,), int64: place of each one's message in ``layout().messages``.
-        instance: Shape (N,), int64: slot, side or place of it.
-        length: Shape (N,), uint8.
-        log_ns: Shape (N,).
-        words: Shape (N,).
+        message: Index of each frame's message in ``layout().messages``, shape (N,), int64.
+        instance: Slot, side or position of the message, shape (N,), int64.
+        length: Payload lengths, shape (N,), uint8.
+        log_ns: Log times, shape (N,).
+        words: Payloads, shape (N,).
     """
 
     message: Int64s
@@ -46,7 +46,7 @@ class Admitted(NamedTuple):
         return len(self.message)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Admitted:
-        """The frames picked by ``index``."""
+        """Return the frames selected by ``index``."""
         return Admitted(
             self.message[index],
             self.instance[index],
@@ -57,7 +57,7 @@ class Admitted(NamedTuple):
 
 
 class Admission:
-    """Takes the Mobileye's frames of a bus and reports every other one to the ledger."""
+    """Filter for the Mobileye's frames of a bus, which reports all others in the ledger."""
 
     def __init__(self, bus: str, ledger: Ledger, settings: MobileyeSettings) -> None:
         self._bus = bus
@@ -75,7 +75,7 @@ class Admission:
             self._fits[k, LENGTH_UNKNOWN] = True
 
     def __call__(self, frames: CanFrames, log_ns: Int64s) -> Admitted:
-        """The frames that can be decoded."""
+        """Return the frames that can be decoded."""
         message = self._message.take(frames.arbitration_id, mode="clip")
         is_plain = (frames.kind == DATA) & ~frames.is_extended & ~frames.is_fd
         good = is_plain & (message >= 0) & self._fits[message, frames.length]
@@ -93,7 +93,7 @@ class Admission:
         self, frames: CanFrames, message: Int64s, bad: NDArray[np.bool_], log_ns: Int64s
     ) -> None:
         if self._is_shared_bus:
-            # The bus's own decoder reports the rest; these identifiers it leaves to this one.
+            # The decoder of the bus reports all other identifiers.
             bad = bad & (frames.kind == DATA) & ~frames.is_extended & (message >= 0)
         rows = np.flatnonzero(bad)
         which = np.select(
@@ -117,17 +117,17 @@ class Admission:
 
 
 def ids_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
-    """The identifiers that ``message`` has on this device."""
+    """Return the identifiers of ``message`` on this device."""
     return message.ids[: settings.slots] if message.table == "obstacles" else message.ids
 
 
 def all_ids(settings: MobileyeSettings) -> frozenset[int]:
-    """Every identifier of this device."""
+    """Return all identifiers of this device."""
     return frozenset(i for message in layout().messages for i in ids_of(message, settings))
 
 
 def lengths_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
-    """The lengths that ``message`` may have; a revision that is set leaves one for the status."""
+    """Return the valid lengths of ``message``; a set revision determines that of the status."""
     if message.name == "status" and settings.revision != "auto":
         return tuple(n for n, name in message.variants.items() if name == settings.revision)
     return message.lengths

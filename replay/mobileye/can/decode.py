@@ -1,7 +1,7 @@
-"""Frames of a Mobileye's bus to tables, in columns.
+"""Decode the frames of a Mobileye's bus into tables.
 
-Obstacles are joined by burst and slot, lanes from their two halves; see ``bursts``. What cannot be
-joined or understood is reported to the ledger under the bus's name, with its log time.
+Obstacles are joined by burst and slot, lanes from their two halves; see ``bursts``. Frames that
+cannot be joined or decoded are reported in the ledger under the bus's name, with their log time.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ _LANE_PARTS: Final = {
 }
 REPEATED_STATUS: Final = "repeated status frame"
 KNOWN_PROTOCOLS: Final = (1, 3)
-"""Protocol versions met with status frames of 6 bytes."""
+"""Known protocol versions with status frames of 6 bytes."""
 
 
 class Statuses:
-    """Reads the status frames of one bus, in the order of the log.
+    """Reader of the status frames of one bus, in the order of the log.
 
     Attributes:
-        last: The last one that opened a burst, if any.
+        last: The last status frame that started a burst, if any.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Statuses:
         self._log_ns = np.zeros(0, dtype=np.int64)
 
     def __call__(self, frames: Admitted) -> tuple[Status, Block | None, Int64s]:
-        """The bursts opened, their rows, and the burst that each frame is in."""
+        """Return the bursts that start, their rows, and the burst of each frame."""
         at = np.flatnonzero(frames.message == self._number)
         opens = self._opens(frames.words[at], frames.log_ns[at])
         self._report_repeated(frames.log_ns[at[~opens]])
@@ -144,32 +144,31 @@ class Statuses:
         if len(np.unique(both)) > 1:
             self._ledger.notice(
                 f"{self._bus}: status frames of both revisions (6 and 7 bytes) on one bus; each "
-                "frame is read by its own; are there two devices?"
+                "frame is read by its own revision; check whether there are two devices"
             )
         is_classic = variant == variant_number("classic")
         strange = np.setdiff1d(protocol[is_classic], KNOWN_PROTOCOLS)
         if len(strange):
             self._ledger.notice(
                 f"{self._bus}: protocol version {int(strange[0])} with status frames of 6 bytes is "
-                "new to us; read as the classic layout by length; check a known drive, or set the "
-                "revision"
+                "unknown; read with the classic layout; check a known drive, or set the revision"
             )
 
 
 class MobileyeDecoder:
-    """Decodes the frames of one Mobileye's bus, a block at a time.
+    """Decoder of the frames of one Mobileye's bus, a block at a time.
 
-    Give it the blocks of the bus in the order of the log, then call ``flush`` once: the last burst
-    is held back until it is known to be whole. How the log is cut into blocks changes nothing.
+    Pass the blocks of the bus in the order of the log, then call ``flush`` once: the last burst is
+    held back while it may be incomplete. The result does not depend on the division into blocks.
     """
 
     def __init__(self, bus: str, ledger: Ledger, settings: MobileyeSettings = DEFAULTS) -> None:
-        """Prepare.
+        """Prepare the decoder.
 
         Args:
-            bus: Topic of the frames; tables are called ``BUS/mobileye/TABLE``.
-            ledger: Records every frame not used; the reader has counted those found.
-            settings: How to read this device.
+            bus: Topic of the frames; tables have the topic ``BUS/mobileye/TABLE``.
+            ledger: Records every unused frame; the reader has counted those found.
+            settings: Settings of this device.
         """
         self._bus = bus
         self._ledger = ledger
@@ -187,11 +186,11 @@ class MobileyeDecoder:
         """Decode the frames of a block.
 
         Returns:
-            One block for each table that gained rows. Rows of obstacles carry the log time of their
+            One block for each table with new rows. Rows of obstacles have the log time of their
             status frame, and their image time as ``header_ns``.
 
         Raises:
-            ValueError: The rows are no ``CanFrames``.
+            ValueError: The rows are not ``CanFrames``.
         """
         if not isinstance(block.rows, CanFrames):
             raise ValueError(f"{block.topic}: expected CanFrames, got {type(block.rows).__name__}")
@@ -212,7 +211,7 @@ class MobileyeDecoder:
         return given
 
     def flush(self) -> list[Block]:
-        """The last burst, as far as it came, and what a person should know about the whole."""
+        """Return the rows of the last, possibly incomplete burst, and report final notices."""
         given = self._finish(self._open, self._statuses.last, is_end=True)
         self._open = no_parts()
         for table in _LANE_PARTS:
@@ -247,7 +246,7 @@ class MobileyeDecoder:
             if is_end:
                 self._ledger.notice(
                     f"{self._bus}: the log ends within an image's burst; {count} obstacle frames "
-                    "of it are not there"
+                    "of it are missing"
                 )
             else:
                 self._ledger.drop(self._bus, NOT_COME, count, f"burst {number}", log_ns)
@@ -304,8 +303,8 @@ class MobileyeDecoder:
         is_early = burst == NO_BURST
         if is_early.any():
             self._ledger.notice(
-                f"{self._bus}: frames 0x{message.ids[0]:03X} before the first status frame; what "
-                "depends on the protocol revision is missing there; set the revision"
+                f"{self._bus}: frames 0x{message.ids[0]:03X} before the first status frame; fields "
+                "that depend on the protocol revision are missing there; set the revision"
             )
         if is_early.all():
             return _unknown(len(frames))
@@ -344,7 +343,7 @@ def _unknown(n: int) -> Variant:
 
 
 def by_length(message: Message, length: NDArray[np.uint8], settings: MobileyeSettings) -> Variant:
-    """The variant of frames by length; where the log keeps none, by a revision that is set."""
+    """Return the variant of frames by length; if the log has no lengths, by the set revision."""
     stand_in = variant_number(settings.revision) if message.name == "status" else UNKNOWN
     of_length = np.full(256, stand_in, dtype=np.int8)
     for n, name in message.variants.items():

@@ -1,7 +1,7 @@
-"""Tables to the frames of a Mobileye: the decoder's inverse, for simulated drives and tests.
+"""Encode tables as the frames of a Mobileye, the inverse of the decoder, for simulation and tests.
 
-Values are rounded to the wire's steps. What a field does outside its range is in the layout
-table: most refuse, some clip, and an obstacle too far away is not sent at all.
+Values are rounded to the wire's steps. The layout table specifies the treatment of values outside a
+field's range: most fields refuse them, some clip them, and an obstacle too far away is not sent.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from crosscue.replay.mobileye.tables import floats, instance_of_lane, table_bloc
 from crosscue.replay.mobileye.wire import words_from
 
 FRAME_NS: Final = 250_000
-"""One frame of 8 bytes takes about this long at 500 kbit/s."""
+"""Approximate duration of a frame of 8 bytes at 500 kbit/s."""
 LATENCY_NS: Final = 80 * MS
-"""From image to status frame, unless configured: a plausible figure, measured nowhere."""
+"""Default time from image to status frame, a plausible value that was not measured."""
 
 _OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
 _LANE_PARTS: Final = {
@@ -54,22 +54,22 @@ class _Sent(NamedTuple):
 def encode_tables(
     tables: Iterable[Block], settings: MobileyeSettings = DEFAULTS, bus: str = "mobileye"
 ) -> Block:
-    """Frames that say what the tables say, in the order of their times.
+    """Encode tables as frames, in the order of their times.
 
-    A status frame is sent at its row's log time; the obstacles of its burst follow it, slot by
-    slot, a frame every ``FRAME_NS``; the second half of a lane follows its first. Columns that are
-    derived (``x_start_m``, ``latency_ns``, ...) are not examined; columns that are not there are
-    sent as missing, or as the layout's default.
+    A status frame is sent at its row's log time. The obstacles of its burst follow it, slot by
+    slot, one frame every ``FRAME_NS``. The second half of a lane follows its first. Derived columns
+    (``x_start_m``, ``latency_ns``, ...) are ignored. Absent columns are sent as missing, or as the
+    layout's default.
 
     Args:
-        tables: Blocks of a ``MobileyeDecoder``; the part of the topic after the last ``/``
-            says which table.
-        settings: The revision (``auto``: classic, except where a status row says) and family
+        tables: Blocks of a ``MobileyeDecoder``; the part of the topic after the last ``/`` is the
+            name of the table.
+        settings: Revision (``auto``: classic, unless a status row specifies it) and family
             (``auto``: extended) to send, and the mounting.
         bus: Topic of the frames.
 
     Raises:
-        ValueError: An unknown table, a value that cannot be sent, a burst without its status.
+        ValueError: A table is unknown, a value cannot be encoded, or a burst lacks its status.
     """
     named = [(block.topic.rpartition("/")[2], block) for block in tables]
     order = {name: place for place, name in enumerate(layout().tables)}
@@ -78,7 +78,7 @@ def encode_tables(
         raise ValueError(f"no such table: {', '.join(unknown)}; there are: {', '.join(order)}")
     _check_bursts(named)
     sent: list[_Sent] = []
-    # At equal times the status goes first, since it opens the burst of what follows.
+    # At equal times the status is sent first, because it starts the burst of the other frames.
     for name, block in sorted(named, key=lambda one: order[one[0]]):
         sent += _sent(name, block, settings)
     return _frames(sent, bus)
@@ -92,27 +92,27 @@ def bursts_of(
     latency_ns: int | Int64s = LATENCY_NS,
     bus: str = "mobileye",
 ) -> list[Block]:
-    """Objects as the tables ``status`` and ``obstacles``, ready for ``encode_tables``.
+    """Convert objects to the tables ``status`` and ``obstacles`` for ``encode_tables``.
 
-    Of each image the nearest objects get the slots, nearest first. Objects beyond what the device
-    reports (250 m ahead, behind it, 32 m aside) get none.
+    The nearest objects of each image are assigned to the slots, nearest first. Objects outside the
+    range of the device (250 m ahead, behind it, 32 m to the side) are omitted.
 
     Args:
-        image_ns: Shape (M,), rising: when images were grabbed, those without objects too.
-        objects: Columns as the table ``obstacles``; ``t_ns`` is one of ``image_ns``.
+        image_ns: Grab times of all images, including those without objects, shape (M,), increasing.
+        objects: Columns of the table ``obstacles``; ``t_ns`` is one of ``image_ns``.
         settings: Slots and mounting.
-        latency_ns: From image to status frame, of all or of each image.
+        latency_ns: Time from image to status frame, of all images or of each.
         bus: First part of the topics.
 
     Raises:
-        ValueError: An object of no image, or image times that do not rise.
+        ValueError: An object belongs to no image, or image times do not increase.
     """
     if np.any(np.diff(image_ns) <= 0):
-        raise ValueError("image_ns: expected rising times")
+        raise ValueError("image_ns: expected increasing times")
     t_ns = objects["t_ns"].astype(np.int64)
     burst = np.searchsorted(image_ns, t_ns)
     if np.any(burst == len(image_ns)) or np.any(image_ns[burst] != t_ns):
-        raise ValueError("objects t_ns: expected times out of image_ns")
+        raise ValueError("objects t_ns: expected times from image_ns")
     mounting = settings.mounting or AT_REAR_AXLE
     ahead_m, seen = _seen(objects, mounting)
     order = np.lexsort((ahead_m[seen], burst[seen]))
@@ -147,7 +147,7 @@ def _check_bursts(named: Iterable[tuple[str, Block]]) -> None:
 
 
 def _seen(objects: Table, mounting: Mounting) -> tuple[Floats, NDArray[np.bool_]]:
-    """Distance ahead of the device, and which objects it would report."""
+    """Return distances ahead of the device, and a mask of the objects that it would report."""
     on_device = to_device("obstacles", dict(objects.columns), mounting)
     seen = np.ones(len(objects), dtype=np.bool_)
     for f in layout()["obstacle_a"].fields:
@@ -205,7 +205,7 @@ def _message(
     if np.any((instance < 0) | (instance >= len(message.ids))):
         raise ValueError(f"{topic}: expected places 0 to {len(message.ids) - 1}, got {instance}")
     words = words_from(message, columns, variant, topic)
-    length_of = [message.length_of(name) for name in (*VARIANTS, "")]  # the last for UNKNOWN
+    length_of = [message.length_of(name) for name in (*VARIANTS, "")]  # the last is for UNKNOWN
     return _Sent(
         log_ns,
         np.array(message.ids, dtype=np.int64)[instance],

@@ -1,7 +1,7 @@
-"""Which of two families of devices sends 0x700: they read the same bits in opposite ways.
+"""Determine which of two families of devices sends 0x700, whose bits they define differently.
 
-A bit that only one family has, and that is set, decides; nothing else does. Both kinds of bits in
-one log decide nothing.
+The family is decided by a set bit that only one family defines. If bits of both families are set in
+one log, it is undecided.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ def _mask(*bits: int) -> np.uint64:
 
 
 ONLY_EXTENDED: Final = _mask(7, 36, 37)
-"""Sound suppressed, left and right crossing."""
+"""Bits that only the extended family defines: sound suppressed, left and right crossing."""
 ONLY_TSR: Final = _mask(13, 14, 15, *range(24, 32), *range(43, 51), 58)
-"""Zero speed, high beam, error (inverted, so usually set), reminders, TSR, repeatable headway."""
+"""Bits that only the TSR family defines: zero speed, high beam, error (inverted, so usually set),
+reminders, TSR, repeatable headway."""
 
 
 class FamilyEvidence:
-    """Remembers what the frames so far have shown."""
+    """Evidence of the family from the frames so far."""
 
     def __init__(self, bus: str, family: Family) -> None:
         self._bus = bus
@@ -36,7 +37,7 @@ class FamilyEvidence:
         self._undecided = 0
 
     def __call__(self, words: Words) -> Variant:
-        """The family of each frame, by all frames up to it."""
+        """Return the family of each frame, from the evidence of all frames up to it."""
         if self._set != UNKNOWN:
             return np.full(len(words), self._set, dtype=np.int8)
         extended = np.logical_or.accumulate(words & ONLY_EXTENDED != 0) | self._extended
@@ -49,13 +50,11 @@ class FamilyEvidence:
         return family.astype(np.int8)
 
     def notices(self) -> list[str]:
-        """What a person should know at the end."""
+        """Return notices for the end of the log."""
         if not self._undecided:
             return []
-        why = (
-            "shows bits of both" if self._extended and self._tsr else "at first shows bits of none"
-        )
+        why = "has bits of both" if self._extended and self._tsr else "at first has bits of neither"
         return [
             f"{self._bus}: 0x700 {why} families of devices; in {self._undecided} frames the bits "
-            "that they read differently are missing; set the family (extended or tsr)"
+            "that they define differently are missing; set the family (extended or tsr)"
         ]

@@ -1,1 +1,1 @@
-"""Mobileye messages as ROS topics."""
+"""Read Mobileye messages from ROS topics."""

@@ -1,4 +1,4 @@
-"""Which status message an obstacle message belongs to, across two topics of a bag."""
+"""Assign obstacle messages to status messages, across two topics of a bag."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Obstacles:
     """Obstacle messages.
 
     Attributes:
-        stamp_ns: Shape (N,).
-        log_ns: Shape (N,).
-        columns: Each of shape (N,).
+        stamp_ns: Header stamps, shape (N,).
+        log_ns: Log times, shape (N,).
+        columns: Columns by name, each of shape (N,).
     """
 
     stamp_ns: Int64s
@@ -31,7 +31,7 @@ class Obstacles:
     columns: Columns
 
     def take(self, index: NDArray[np.bool_]) -> Obstacles:
-        """The messages picked by ``index``."""
+        """Return the messages selected by ``index``."""
         picked = {name: column[index] for name, column in self.columns.items()}
         return Obstacles(self.stamp_ns[index], self.log_ns[index], picked)
 
@@ -42,7 +42,7 @@ class Obstacles:
 
 
 class RosBursts:
-    """Holds obstacles back until the status messages up to their time have come."""
+    """Buffer of obstacles until the status messages up to their time are read."""
 
     def __init__(self, topic: str, ledger: Ledger, settings: MobileyeSettings) -> None:
         self.has_status = True
@@ -56,7 +56,7 @@ class RosBursts:
         self._held: Obstacles | None = None
 
     def add_status(self, stamp_ns: Int64s, image_ns: Int64s, count: Int64s) -> Int64s:
-        """Status messages; their numbers."""
+        """Add status messages, and return their burst numbers."""
         number = self._added + np.arange(len(stamp_ns), dtype=np.int64)
         self._added += len(stamp_ns)
         stamp_ns = np.concatenate([self._stamp_ns, stamp_ns])
@@ -68,19 +68,19 @@ class RosBursts:
         return number
 
     def hold(self, obstacles: Obstacles) -> Obstacles | None:
-        """Obstacle messages; those that are ready, with the columns of their bursts."""
+        """Add obstacle messages, and return those that are ready, with columns of their bursts."""
         self._held = obstacles if self._held is None else self._held + obstacles
         return self.release()
 
     def release(self, is_last: bool = False) -> Obstacles | None:
-        """Whole bursts among the obstacles held, or all of them at the end."""
+        """Return obstacles of complete bursts, or all of them at the end."""
         held = self._held
         if held is None or not len(held.stamp_ns):
             if is_last:
                 self._settle(np.zeros(0, dtype=np.intp), len(self._stamp_ns) - 1)
             return None
         at = np.searchsorted(self._stamp_ns, held.stamp_ns, side="right") - 1
-        # Obstacles of the newest burst may still come, and so may the status of the newest ones.
+        # Obstacles of the newest burst, or the status of the newest obstacles, may still follow.
         newest = len(self._stamp_ns) - 1 if is_last else int(at.max())
         ready = np.full(len(at), is_last or not self.has_status) | (at < newest)
         if not ready.any():
@@ -113,7 +113,7 @@ class RosBursts:
         return Obstacles(stamp_ns, obstacles.log_ns, leading | obstacles.columns)
 
     def _settle(self, at: NDArray[np.intp], upto: int) -> None:
-        """Report announced obstacles that did not come, and forget the bursts before ``upto``."""
+        """Report announced obstacles that are missing, and discard the bursts before ``upto``."""
         upto = max(upto, 0)
         came = np.bincount(at[at >= 0], minlength=upto)[:upto]
         lacking = np.minimum(self._count[:upto], self._slots) - came
@@ -125,7 +125,7 @@ class RosBursts:
 
 
 def _rank(number: Int64s) -> Int64s:
-    """Place of each row among those of its burst, in order."""
+    """Return the index of each row within its burst."""
     order = np.argsort(number, kind="stable")
     ordered = number[order]
     rank = np.empty(len(number), dtype=np.int64)

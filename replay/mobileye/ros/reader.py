@@ -1,21 +1,23 @@
-"""``mobileye_560_660_msgs`` from a bag to the very same tables that frames give.
+"""Read ``mobileye_560_660_msgs`` from a bag into the same tables as frames.
 
-The messages carry the frames' fields one for one, named as in the layout table (``ros``), but say
-nothing of units, signs or codes for no value. What could be checked, and what is done:
+The messages have the fields of the frames, named as in the layout table (``ros``), but do not
+document units, signs or codes for missing values. The reader uses these conventions:
 
-* Obstacles: users of the driver put ``obstacle_pos_x`` and ``obstacle_pos_y`` straight into a frame
-  with y to the left, which is how the wire has them. Taken as on the wire. Should place and angle
-  ever have the same sign, a notice says so.
-* Lanes: on the wire they are positive to the right, yet two public programs draw the messages'
-  polynomials unturned in a frame with y to the left. So ``ros_lane_sign = "auto"`` examines which
-  side the left and the right lane are on, and says what it found.
-* ``Lane`` (0x737), reference points and signs: nothing to check by; taken as on the wire.
-* Codes for no value are recognised by their value on the wire (length 31.5 m, radar 255.9375 m).
-* ``next_lka_lanes`` does not say which lane a message is: ``index`` is -1, ``side`` by its place.
-  ``Tsr`` does not say which sign: ``sign`` is -1. ``FixedFoe`` has no counterpart on CAN.
+* Obstacles: users of the driver treat ``obstacle_pos_x`` and ``obstacle_pos_y`` as a frame with y
+  to the left, as on the wire. The reader does so too. A notice reports lateral positions and angles
+  with the same sign.
+* Lanes: on the wire they are positive to the right, but two public programs draw the messages'
+  polynomials unchanged in a frame with y to the left. ``ros_lane_sign = "auto"`` therefore
+  determines the sign from the positions of the left and the right lane, and reports it.
+* ``Lane`` (0x737), reference points and signs: as on the wire, which could not be verified.
+* Codes for missing values are recognized by their value on the wire (length 31.5 m, radar
+  255.9375 m).
+* ``next_lka_lanes`` does not identify the lane of a message: ``index`` is -1, and ``side`` follows
+  from its position. ``Tsr`` does not identify the sign: ``sign`` is -1. ``FixedFoe`` has no
+  counterpart on CAN.
 
-Each obstacle message is whole, so none is dropped for want of a status message: it then has its own
-time and burst -1. Tables other than status and obstacles have burst -1 throughout.
+Each obstacle message is complete, so a missing status message does not drop it: it then has its own
+time and burst -1. Tables other than status and obstacles always have burst -1.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ LACKS_FIELDS: Final = "message lacks fields of its type"
 NOT_COLUMNS: Final = "message was not decoded to columns"
 
 _SIDED: Final = (("LkaLane", "lanes"), ("AftermarketLane", "aftermarket lanes"))
-"""Messages whose sign is looked for, and what a notice calls them."""
+"""Messages whose sign is determined, and their names in notices."""
 _VARIANT_OF: Final[Mapping[str, str]] = {
     "status": "classic",
     "lane_details": "classic",
@@ -50,11 +52,11 @@ _VARIANT_OF: Final[Mapping[str, str]] = {
     "warnings": "extended",
     "sign": "basic",
 }
-"""The only variant whose fields the messages have."""
+"""Variant whose fields the messages have."""
 
 
 class RosMobileye:
-    """Turns decoded messages into tables, a block at a time; call ``flush`` once at the end."""
+    """Converter of decoded messages to tables, a block at a time; call ``flush`` at the end."""
 
     def __init__(
         self,
@@ -63,12 +65,12 @@ class RosMobileye:
         ledger: Ledger,
         settings: MobileyeSettings = DEFAULTS,
     ) -> None:
-        """Prepare.
+        """Prepare the converter.
 
         Args:
             bus: First part of the tables' names, ``BUS/mobileye/TABLE``.
-            types: From topic to message type, as the log spells it; other topics are left alone.
-            ledger: Records, under the topic's name, messages not used.
+            types: Message types by topic, as spelled in the log; other topics are ignored.
+            ledger: Records unused messages under the topic's name.
             settings: Mounting, slots and the lanes' sign.
         """
         self._bus = bus
@@ -87,7 +89,7 @@ class RosMobileye:
         self._mounting = mounting_of(settings, bus, ledger)
 
     def __call__(self, block: Block) -> list[Block]:
-        """The tables that a block of decoded messages adds to."""
+        """Return the new rows of tables from a block of decoded messages."""
         name = self._types.get(block.topic)
         if name is None:
             return []
@@ -109,7 +111,7 @@ class RosMobileye:
         return [self._plain(block, block.rows, message) for message in messages]
 
     def flush(self) -> list[Block]:
-        """What waited for later messages."""
+        """Return the rows that were held back for later messages."""
         given = self._obstacles(self._bursts.release(is_last=True))
         for name, votes in self._votes.items():
             votes.close()
@@ -154,8 +156,8 @@ class RosMobileye:
         is_same = y_m[is_clear] * angle_rad[is_clear] > 0  # both left-positive columns
         if len(is_same) and is_same.mean() < 0.5:
             self._ledger.notice(
-                f"{self._bus}: obstacle_pos_y and obstacle_angle have the same sign, which they "
-                "have not on the wire; check on a picture which side obstacles are on"
+                f"{self._bus}: obstacle_pos_y and obstacle_angle have the same sign, unlike on the "
+                "wire; compare the obstacles' sides with a picture"
             )
 
     def _obstacles(self, ready: Obstacles | None) -> list[Block]:
@@ -184,7 +186,7 @@ class RosMobileye:
         return leading
 
     def _sided(self, block: Block, rows: Table, name: str) -> list[Block]:
-        """Rows whose sign depends on which way the messages are positive; held until known."""
+        """Hold rows until the sign of their messages is known, and return them then."""
         votes = self._votes[name]
         side = _side_of_topic(block.topic)
         if name == "AftermarketLane":
@@ -230,7 +232,7 @@ class RosMobileye:
 
 
 def stamps_of(block: Block) -> Int64s:
-    """The messages' own time, or the recorder's where they have none."""
+    """Return the messages' own times, or the recorder's where they are missing."""
     if block.header_ns is None:
         return block.log_ns
     return np.where(block.header_ns > 0, block.header_ns, block.log_ns)
@@ -251,12 +253,12 @@ def _lacking(messages: Iterable[Message], rows: Table) -> list[str]:
 
 
 def _values(message: Message, rows: Table, is_mirrored: bool = False) -> dict[str, Floats]:
-    """Values on the wire, NaN where missing.
+    """Return values on the wire, NaN where missing.
 
     Args:
-        message: Whose fields.
+        message: Layout of the message.
         rows: The messages.
-        is_mirrored: They are positive to the left where the wire is to the right.
+        is_mirrored: True if they are positive to the left, while the wire is positive to the right.
     """
     values: dict[str, Floats] = {}
     for f in message.fields:

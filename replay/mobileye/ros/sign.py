@@ -1,4 +1,4 @@
-"""Which way lanes in ROS messages are positive, found from the sides they must be on."""
+"""Determine the sign of lanes in ROS messages from the sides of the left and the right lane."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from crosscue.replay.mobileye.settings import LaneSign
 
 VOTES_WANTED: Final = 50
-"""Some 3 s of lanes on both sides: longer than a change of lanes puts them on the wrong ones."""
+"""Number of votes required, about 3 s of lanes on both sides. That is longer than a lane change, in
+which lanes are on the wrong side."""
 USABLE_QUALITY: Final = 2
 CLEAR_OF_MIDDLE_M: Final = 0.3
 
 
 class LaneSignVotes:
-    """Each usable lane beside the vehicle votes for the sign that puts it on its own side."""
+    """Votes of all usable lanes next to the vehicle for the sign that puts them on their side."""
 
     def __init__(self, says: str, sign: LaneSign) -> None:
         self._says = says
@@ -26,7 +27,7 @@ class LaneSignVotes:
         self._was_set = sign != "auto"
 
     def add(self, side: int, c0_m: NDArray[np.float64], quality: NDArray[np.float64]) -> None:
-        """Lanes of one side (1 left, -1 right), as the messages have them."""
+        """Add lanes of one side (1 left, -1 right), with the sign of the messages."""
         clear = c0_m[(quality >= USABLE_QUALITY) & (np.abs(c0_m) > CLEAR_OF_MIDDLE_M)]
         left = int((clear * side > 0).sum())
         self._left += left
@@ -35,13 +36,13 @@ class LaneSignVotes:
             self.close()
 
     def close(self) -> None:
-        """Decide by the votes there are; without any, as on the wire."""
+        """Decide by the available votes; without votes, the sign is that of the wire."""
         if not self.is_decided:
             self.is_decided = True
             self.is_left_positive = self._left > self._right
 
     def notices(self) -> list[str]:
-        """What a person should know at the end."""
+        """Return notices for the end of the log."""
         total = self._left + self._right
         if not total:
             return []
@@ -49,11 +50,9 @@ class LaneSignVotes:
         said = "left" if self.is_left_positive else "right"
         if 2 * against > total:
             return [
-                f"{self._says} are read as positive to the {said}, but most then lie on the "
-                "wrong side; check ros_lane_sign"
+                f"{self._says} are read as positive to the {said}, but most of them are then on "
+                "the wrong side; check ros_lane_sign"
             ]
         if self._was_set or not self.is_left_positive:
             return []
-        return [
-            f"{self._says} in the messages are positive to the left, unlike on the wire; read so"
-        ]
+        return [f"{self._says} in the messages are positive to the left, unlike on the wire"]

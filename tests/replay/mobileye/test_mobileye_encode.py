@@ -269,10 +269,10 @@ def test_a_side_without_a_marking_is_sent_as_such() -> None:
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("width_m", np.nan, r"obstacles width_m, row 0: cannot send nan; expected 0 to 12.5 m"),
-        ("type", 9, r"obstacles type, row 0: cannot send 9; expected 0 to 7"),
-        ("obstacle_id", -1, r"obstacles obstacle_id, row 0: cannot send -1; expected 0 to 255"),
-        ("radar_x_m", 400.0, r"obstacles radar_x_m, row 0: cannot send"),
+        ("width_m", np.nan, r"obstacles width_m, row 0: cannot encode nan; expected 0 to 12.5 m"),
+        ("type", 9, r"obstacles type, row 0: cannot encode 9; expected 0 to 7"),
+        ("obstacle_id", -1, r"obstacles obstacle_id, row 0: cannot encode -1; expected 0 to 255"),
+        ("radar_x_m", 400.0, r"obstacles radar_x_m, row 0: cannot encode"),
     ],
 )
 def test_what_the_wire_cannot_carry_is_refused(column: str, value: float, message: str) -> None:
@@ -294,7 +294,7 @@ def test_tables_and_bursts_that_do_not_fit_are_refused() -> None:
     lonely: Columns = {"burst": times + 4, "slot": times, "x_m": times + 9.0, "y_m": times + 0.0}
     with pytest.raises(ValueError, match="obstacles of burst 4: expected a status row"):
         encode_tables([table_block("can1", "obstacles", times, lonely)])
-    with pytest.raises(ValueError, match="expected rising times"):
+    with pytest.raises(ValueError, match="expected increasing times"):
         bursts_of(np.array([1, 1]), Table({"t_ns": times, "x_m": times, "y_m": times}))
-    with pytest.raises(ValueError, match="expected times out of image_ns"):
+    with pytest.raises(ValueError, match="expected times from image_ns"):
         bursts_of(np.array([1, 2]), Table({"t_ns": times, "x_m": times, "y_m": times}))

@@ -174,9 +174,9 @@ def test_describe_lists_every_field_once() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('fields = [{name = "a", start = 60, bits = 8}]', "a: bits 60+8 are not in 8 bytes"),
+        ('fields = [{name = "a", start = 60, bits = 8}]', "a: bits 60+8 do not fit 8 bytes"),
         ('fields = [{name = "a", start = 0, bits = 8}, {name = "b", start = 7, bits = 1}]', "b"),
-        ('fields = [{name = "a", start = 4, bits = 8, order = "big"}]', "must fill whole bytes"),
+        ('fields = [{name = "a", start = 4, bits = 8, order = "big"}]', "consist of complete bytes"),
         ('fields = [{name = "a", start = 0, bits = 8, only = "new"}]', "only 'new'; there are"),
         ('fields = [{name = "a", start = 24, bits = 9}]', "m.a: does not fit the payload"),
     ],
@@ -189,7 +189,7 @@ def test_a_table_that_cannot_be_is_refused(text: str, message: str) -> None:
 
 def test_two_messages_with_one_identifier_are_refused() -> None:
     one = '[[message]]\nname = "{}"\nsays = ""\ntable = "t"\nid = 1\nlengths = [4]\nfields = []\n'
-    with pytest.raises(SchemaError, match="two messages claim one identifier"):
+    with pytest.raises(SchemaError, match="two messages have the same identifier"):
         parse(one.format("a") + one.format("b"))
 
 

@@ -242,7 +242,7 @@ def test_a_mirrored_obstacle_is_noticed() -> None:
     assert isinstance(obstacles.rows, Table)
     mirrored = {**obstacles.rows.columns, "obstacle_angle": np.array([-49.4])}
     _, ledger = from_bag([statuses, replace(obstacles, rows=Table(mirrored))])
-    assert any("which side obstacles are on" in n for n in ledger.notices)
+    assert any("compare the obstacles' sides with a picture" in n for n in ledger.notices)
 
 
 def test_messages_not_used_are_reported_under_their_topic() -> None:
