@@ -1,4 +1,4 @@
-"""What ``crosscue`` exports: a recorded drive, a run and their scores, each in a line or two.
+"""The public interface of ``crosscue``: logs, runs, scores, fits, training and studies.
 
-The commands call these functions, and so do the notebooks; nothing else is promised to stay.
+The commands and the notebooks call these functions. Everything else is private and may change.
 """

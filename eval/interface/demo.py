@@ -1,4 +1,4 @@
-"""A drive replayed, scored and shown in one call: simulated here, or a real one fetched."""
+"""The demonstration: replay, score and show a simulated or a downloaded drive in one call."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from crosscue.replay.base import CrosscueError, UsageError, write_text
 REAL: Final = "pandaset_002"
 MODEL: Final = "yolox-nano"
 FOLLOWED: Final = """
-# Cars are followed on the road over several frames, not in pairs of frames as the source has it.
+# Cars are tracked on the road over several frames. The published method uses pairs of frames.
 [cars]
 kind = "tracks"
 """
@@ -25,14 +25,14 @@ kind = "tracks"
 
 @dataclass(frozen=True, slots=True)
 class KnownDrive:
-    """A drive with all that it takes to replay and to score it.
+    """A drive with the files needed to replay and score it.
 
     Attributes:
         log: The recording.
-        vehicle: Its vehicle file.
-        truth: What is there to be found.
-        attribution: Whom to name wherever its pictures are shown; empty if simulated.
-        detectors: Names of detectors; None for the vehicle file's own.
+        vehicle: The vehicle file.
+        truth: The truth file.
+        attribution: Credit to print wherever the pictures are shown; empty if simulated.
+        detectors: Names of detectors; None for those of the vehicle file.
     """
 
     log: Path
@@ -44,13 +44,13 @@ class KnownDrive:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Demo:
-    """What a demonstration made; printed as ``crosscue demo`` prints it.
+    """Result of a demonstration; its repr is the output of ``crosscue demo``.
 
     Attributes:
-        drive: What was replayed.
-        run: The replay.
-        scored: The replay beside the truth.
-        recording: The replay as a Rerun recording, the true track and ranges with it.
+        drive: The replayed drive.
+        run: The run.
+        scored: Scores of the run.
+        recording: Rerun recording of the run, with the true track and ranges.
     """
 
     drive: KnownDrive
@@ -59,7 +59,7 @@ class Demo:
     recording: Path
 
     def as_dict(self) -> dict[str, object]:
-        """As ``crosscue demo --json`` prints it."""
+        """Return the JSON output of ``crosscue demo``."""
         return {
             "log": str(self.drive.log),
             "vehicle": str(self.drive.vehicle),
@@ -87,18 +87,18 @@ def fetch_drive(
     *,
     on_fetch: Callable[[str, int, int], None] = lambda file, done, of: None,
 ) -> KnownDrive:
-    """Bring PandaSet's sequence 002 and the network yolox-nano to this machine, once, checked.
+    """Download PandaSet's sequence 002 and the network yolox-nano once, and verify them.
 
-    Recording and weights are kept in the user's cache. They come from ``source``, else from
-    ``$CROSSCUE_DATA``, else from their publishers (25 MB).
+    Recording and weights are kept in the user's cache. They are copied from ``source`` or from
+    ``$CROSSCUE_DATA``, or else downloaded from their publishers (25 MB).
 
     Args:
-        source: A folder that holds recording and weights; nothing is fetched.
-        on_fetch: Called with a file's name, the bytes that are there, and of how many.
+        source: Folder with the recording and the weights, to be used without a network.
+        on_fetch: Called with a file's name, the number of bytes present, and their total.
 
     Raises:
-        CrosscueError: One of them cannot be had; the line names all that is needed.
-        UsageError: ``source`` has another recording, or none.
+        CrosscueError: A file cannot be obtained; the message lists all required files.
+        UsageError: ``source`` has no recording, or another one.
     """
     from crosscue.datasets.real import recordings
     from crosscue.detectors.catalog.entries import entry
@@ -134,26 +134,27 @@ def demo(
     on_frames: Callable[[int, int | None], None] = lambda done, of: None,
     on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
 ) -> Demo:
-    """Replay a drive up to an intersection, score it, and write report and recording.
+    """Replay a drive to an intersection, score it, and write a report and a recording.
 
     Args:
-        folder: Gets the run, and a simulated drive; ``demo``, or ``demo-real``, if left out.
-        real: Take the drive of ``fetch_drive``; else one that is simulated on this machine.
-        source: As of ``fetch_drive``.
-        layout: Of a simulated drive, as of ``simulate_approach``.
-        run: Likewise.
-        seed: Likewise.
-        width_px: Likewise.
+        folder: Output folder of the run and of a simulated drive; default: ``demo``, or
+            ``demo-real``.
+        real: Use the drive of ``fetch_drive`` instead of simulating one.
+        source: As in ``fetch_drive``.
+        layout: Layout of the simulated drive, as in ``simulate_approach``.
+        run: Run of the simulated drive, as in ``simulate_approach``.
+        seed: Seed of the simulated drive, as in ``simulate_approach``.
+        width_px: Width of the simulated pictures, as in ``simulate_approach``.
         overwrite: Replace an earlier demonstration.
-        on_fetch: As of ``fetch_drive``.
+        on_fetch: As in ``fetch_drive``.
         on_drive: Called with the drive before it is replayed.
-        on_frames: As of ``replay_drive``.
-        on_time: As of ``replay_drive``.
+        on_frames: As in ``replay_drive``.
+        on_time: As in ``replay_drive``.
 
     Raises:
         CrosscueError: Recording or weights are missing and cannot be fetched.
         UsageError: ``source`` without ``real``.
-        RunError: The folder holds something else.
+        RunError: The folder has other contents.
     """
     place = Path(folder or ("demo-real" if real else "demo"))
     if real:
@@ -161,7 +162,7 @@ def demo(
     elif source is None:
         drive = _simulated(place, layout, run, seed, width_px, overwrite)
     else:
-        raise UsageError("demo: source is for the real drive; add real=True")
+        raise UsageError("demo: source applies only to the real drive; add real=True")
     on_drive(drive)
     return _shown(drive, place, overwrite, on_frames, on_time)
 
@@ -169,9 +170,9 @@ def demo(
 def _simulated(
     folder: Path, layout: str, run: int, seed: int, width_px: int, overwrite: bool
 ) -> KnownDrive:
-    """A drive as of ``simulate_approach`` in ``folder/drive``, for the embedded networks.
+    """Simulate a drive in ``folder/drive``, to be replayed with the embedded networks.
 
-    Its vehicle file has cars followed on the road: of the published pairs most are wrong there.
+    Its vehicle file tracks cars on the road, because most published pairs are wrong there.
     """
     from crosscue.detectors.registry import EMBEDDED
 
@@ -189,7 +190,7 @@ def _shown(
     on_frames: Callable[[int, int | None], None],
     on_time: Callable[[float, float], None],
 ) -> Demo:
-    """Replay and score a drive in ``folder/run``; arguments as of ``replay_drive``."""
+    """Replay and score a drive in ``folder/run``; arguments as in ``replay_drive``."""
     run = replay_drive(
         drive.log,
         folder / "run",
@@ -204,6 +205,6 @@ def _shown(
 
 
 def _below(folder: Path, name: str) -> Path | None:
-    """A file of that name in a folder or its ``weights``; None: it may be in the cache."""
+    """Return the file's path in a folder or its ``weights``; None if it is in neither."""
     found = [*sorted(folder.glob(name)), *sorted(folder.glob(f"weights/*/{name}"))]
     return found[0] if found else None

@@ -1,4 +1,4 @@
-"""Landmark databases: made, listed, searched, and the match threshold fitted."""
+"""Landmark databases: add, list and match landmarks."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class AddedLandmarks:
-    """What became of the pictures that were to be landmarks; printed in a line.
+    """Result of adding landmarks; its repr is one line.
 
     Attributes:
         path: The database.
-        counts: Pictures, by what became of them.
-        is_whole: Nothing of the log was dropped.
+        counts: Numbers of pictures that were added or left out, by reason.
+        is_whole: True if nothing of the log was dropped.
     """
 
     path: Path
@@ -46,7 +46,7 @@ class AddedLandmarks:
     is_whole: bool = True
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue landmarks add --json`` prints."""
+        """Return the JSON output of ``crosscue landmarks add``."""
         return {"database": str(self.path), **asdict(self.counts)}
 
     def __repr__(self) -> str:
@@ -56,24 +56,24 @@ class AddedLandmarks:
             for count, why in (
                 (counts.too_near, "too near the last"),
                 (counts.without_pose, "without a pose at their time"),
-                (counts.undecodable, "do not decode"),
-                (counts.blank, "show too little"),
+                (counts.undecodable, "cannot be decoded"),
+                (counts.blank, "with too few features"),
             )
             if count
         ]
-        rest = f"; not: {', '.join(left_out)}" if left_out else ""
-        return f"{self.path}: {counts.added} landmarks added of {counts.pictures} pictures{rest}"
+        rest = f"; left out: {', '.join(left_out)}" if left_out else ""
+        return f"{self.path}: {counts.added} landmarks added from {counts.pictures} pictures{rest}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LandmarkList:
-    """Landmarks of a database; printed in a line each.
+    """Landmarks of a database; its repr has one line per landmark.
 
     Attributes:
         path: The database.
-        kind: The matcher whose features it holds.
-        total: How many landmarks it has.
-        places: Those that were asked for.
+        kind: Name of the matcher that its features belong to.
+        total: Number of landmarks in the database.
+        places: The selected landmarks.
     """
 
     path: Path
@@ -82,7 +82,7 @@ class LandmarkList:
     places: tuple[Place, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue landmarks list --json`` prints."""
+        """Return the JSON output of ``crosscue landmarks list``."""
         listed = [
             {
                 "name": place.name,
@@ -112,13 +112,13 @@ def _place_line(place: Place) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LandmarkMatches:
-    """The landmarks that one picture resembles most; printed in a line each.
+    """The landmarks that are most similar to a picture; its repr has one line per landmark.
 
     Attributes:
-        points: Found in the picture.
-        compared: Landmarks it was compared with.
-        min_score: A match has at least so much.
-        best: Names and matches, the best first.
+        points: Number of feature points found in the picture.
+        compared: Number of landmarks that it was compared with.
+        min_score: Lowest score of a match.
+        best: Names and matches, best first.
     """
 
     points: int
@@ -127,7 +127,7 @@ class LandmarkMatches:
     best: tuple[tuple[str, Match], ...]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue landmarks match --json`` prints."""
+        """Return the JSON output of ``crosscue landmarks match``."""
         rows = [
             {
                 "name": name,
@@ -147,8 +147,8 @@ class LandmarkMatches:
 
     def __repr__(self) -> str:
         lines = [
-            f"{self.points} points; {self.compared} landmarks compared; a match from "
-            f"{self.min_score:g} on"
+            f"{self.points} points; {self.compared} landmarks compared; min score of a match "
+            f"{self.min_score:g}"
         ]
         for name, match in self.best:
             word = "match" if match.score >= self.min_score else "no"
@@ -170,21 +170,22 @@ def add_landmarks(
     source: str | None = None,
     matcher: str | None = None,
 ) -> AddedLandmarks:
-    """Add landmarks of a drive with known poses to a database, all of them or none.
+    """Add landmarks of a drive with known poses to a database, either all of them or none.
 
     Args:
-        database: Created if it is missing.
+        database: The database; created if it does not exist.
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         poses: A run, or a truth file.
-        vehicle: Camera and matcher; None for the defaults.
+        vehicle: Vehicle file with the camera and the matcher; None for the defaults.
         every_m: Distance between landmarks.
-        sd_m: Of the vehicle's position at a match, added to the error of the poses.
-        source: Name of the drive; the log's, if left out.
-        matcher: ``orb``, or ``module:factory``; the vehicle file's, if left out.
+        sd_m: Standard deviation of the vehicle's position at a match, added to the error of the
+            poses.
+        source: Name of the drive; default: the log's name.
+        matcher: ``orb``, or ``module:factory``; default: the vehicle file's.
 
     Raises:
-        EmptyResultError: No picture became a landmark; the database is as it was.
-        VehicleError: No camera, or several.
+        EmptyResultError: No picture became a landmark; the database is unchanged.
+        VehicleError: The drive has no camera, or several.
     """
     settings = vehicle_given(vehicle)
     describing = matcher_for(settings, matcher)
@@ -212,19 +213,19 @@ def add_landmark_images(
     source: str | None = None,
     matcher: str | None = None,
 ) -> AddedLandmarks:
-    """Add pictures with known positions to a database, all of them or none.
+    """Add pictures with known positions to a database, either all of them or none.
 
     Args:
-        database: Created if it is missing.
+        database: The database; created if it does not exist.
         images: Folder of the pictures.
-        coordinates: CSV file ``image,x_m,y_m,sd_m``, or with a covariance for ``sd_m``.
-        vehicle: Camera and matcher; None for the defaults.
-        source: Name of the pictures; the folder's, if left out.
-        matcher: ``orb``, or ``module:factory``; the vehicle file's, if left out.
+        coordinates: CSV file ``image,x_m,y_m,sd_m``, or with a covariance instead of ``sd_m``.
+        vehicle: Vehicle file with the camera and the matcher; None for the defaults.
+        source: Name of the pictures; default: the folder's name.
+        matcher: ``orb``, or ``module:factory``; default: the vehicle file's.
 
     Raises:
-        SchemaError: The coordinates cannot be understood; with the line.
-        EmptyResultError: No picture became a landmark; the database is as it was.
+        SchemaError: The coordinates are not valid; the message names the line.
+        EmptyResultError: No picture became a landmark; the database is unchanged.
     """
     describing, folder = matcher_for(vehicle_given(vehicle), matcher), Path(images)
     name = visible(source or folder.resolve().name)
@@ -244,14 +245,14 @@ def _added(
     with LandmarkWriter(path, matcher.kind) as writer:
         found = AddedLandmarks(path, *add(writer))
         if not found.counts.added:
-            # Within the writer's block, which then takes all back.
+            # Raised inside the writer's block, so that the writer undoes all changes.
             raise EmptyResultError(f"{found}; give other pictures or poses")
     return found
 
 
 @contextmanager
 def frames_of(drive: Log, vehicle: Vehicle) -> Iterator[tuple[Iterator[Frame], list[Ledger]]]:
-    """The camera's pictures; what is missing of them is warned of in the end."""
+    """Yield the camera's pictures; warn about missing ones at the end."""
     ledgers = [Ledger(str(log.path)) for log in drive.logs]
     yield camera_frames(drive.logs, vehicle, drive.selection, ledgers), ledgers
     for ledger in ledgers:
@@ -261,15 +262,15 @@ def frames_of(drive: Log, vehicle: Vehicle) -> Iterator[tuple[Iterator[Frame], l
 def list_landmarks(
     database: Path | str, near: tuple[float, float, float] | str | None = None, limit: int = 100
 ) -> LandmarkList:
-    """The landmarks of a database, all or near a place.
+    """Return all landmarks of a database, or those near a place.
 
     Args:
         database: The file.
-        near: East, north and radius in metres, or as text, ``-12.5,80,50``; None for all.
-        limit: Of so many at most.
+        near: East, north and radius in metres, also as text, ``-12.5,80,50``; None for all.
+        limit: Max number of landmarks to return.
 
     Raises:
-        UsageError: No place, or a limit below 0.
+        UsageError: ``near`` is not a place, or ``limit`` is below 0.
         LogError: The file cannot be read.
     """
     place = _near(near)
@@ -294,18 +295,18 @@ def match_landmarks(
     best: int = 5,
     matcher: str | None = None,
 ) -> LandmarkMatches:
-    """Match one picture against a database, all of it or near a place.
+    """Match one picture against all landmarks of a database, or those near a place.
 
     Args:
         database: The file.
         image: PNG, JPEG or WebP.
-        vehicle: Camera and matcher; None for the defaults.
+        vehicle: Vehicle file with the camera and the matcher; None for the defaults.
         near: As in ``list_landmarks``.
-        best: How many matches to return.
-        matcher: ``orb``, or ``module:factory``; the vehicle file's, if left out.
+        best: Number of matches to return.
+        matcher: ``orb``, or ``module:factory``; default: the vehicle file's.
 
     Raises:
-        UsageError: No place, or features of another matcher.
+        UsageError: ``near`` is not a place, or the database has features of another matcher.
         LogError: The picture or the file cannot be read.
     """
     place = _near(near)
@@ -320,7 +321,7 @@ def match_landmarks(
         for one in iter(known) if place is None else known.within(*place):
             match = comparing.match(seen, known.features(one.key))
             compared += 1
-            # Of equal scores the first added comes first.
+            # Equal scores are in the order in which landmarks were added.
             found.append((match.score, -one.key, match, one.place.name))
             if len(found) > 2 * best:
                 found = heapq.nlargest(best, found, key=lambda row: row[:2])

@@ -1,4 +1,4 @@
-"""What installed packages add to crosscue, and why it does not load if it does not."""
+"""List plug-ins of installed packages, with the reasons of those that do not load."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from crosscue.replay.vehicle.vehicle import BUILTIN_CUES, CueSpec
 
 
 class Plugins(Listing[Plugin]):
-    """Plug-ins, printed as a table."""
+    """Plug-ins; its repr is a table."""
 
     head = ("name", "kind", "package", "version", "state")
 
     def cells(self, row: Plugin) -> tuple[object, ...]:
-        """One line."""
+        """Return the cells of a row."""
         return (row.name, row.kind, row.package, row.version, row.problem or "loaded")
 
 
 def plugins() -> Plugins:
-    """The detectors, cues, readers and data sets that installed packages offer.
+    """Return the detectors, cues, readers and data sets that installed packages register.
 
-    Each is loaded, so that ``problem`` says why one cannot be.
+    Each plug-in is loaded; ``problem`` is the reason why one cannot be loaded.
     """
     taken: dict[Kind, Collection[str]] = {
         "detector": BUILTIN,
@@ -50,7 +50,7 @@ def plugins() -> Plugins:
             except ImportError as error:
                 problem = str(error)
             if not problem and point.name in seen:
-                problem = "its name is taken; give it another"
+                problem = "its name is already in use; rename it"
             if not problem:
                 seen.add(point.name)
             found.append(described(point, kind, problem))

@@ -1,4 +1,4 @@
-"""What the objects of the interface print in a notebook: tables of plain text."""
+"""Plain-text tables that the public objects print in a notebook."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ T = TypeVar("T")
 
 
 def listing(head: Sequence[str], rows: Sequence[Sequence[object]], text_columns: int = 1) -> str:
-    """Lines of a table; a dash stands for what is not known.
+    """Return the text of a table, with a dash for unknown values.
 
     Args:
         head: Column names.
-        rows: Cells; None for what is not known.
-        text_columns: How many of the first columns hold text and not numbers.
+        rows: Cells; None where unknown.
+        text_columns: Number of leading columns that contain text instead of numbers.
     """
     cells = [["-" if cell is None else _cell(cell) for cell in row] for row in rows]
     return "\n".join(table(head, cells, terminal_width(), range(text_columns)))
@@ -30,17 +30,17 @@ def _cell(value: object) -> str:
 
 
 class Listing(Sequence[T]):
-    """Records in order, printed as a table of text."""
+    """Sequence of records; its repr is a text table."""
 
     head: ClassVar[tuple[str, ...]]
 
     def __init__(self, rows: Sequence[T]) -> None:
-        """Keep the records."""
+        """Store the records."""
         self._rows = tuple(rows)
 
     @abstractmethod
     def cells(self, row: T) -> tuple[object, ...]:
-        """What is printed of a record, in the order of ``head``."""
+        """Return the cells of a record, in the order of ``head``."""
 
     @overload
     def __getitem__(self, which: int) -> T: ...

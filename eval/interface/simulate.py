@@ -1,4 +1,4 @@
-"""Simulated drives with truth, made on this machine from a seed; nothing is downloaded."""
+"""Simulate drives with truth from a seed; nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 
 class SimulatedDrives(Listing["SceneFiles"]):
-    """Simulated drives, printed as a table."""
+    """Simulated drives; its repr is a table."""
 
     head = ("drive", "log", "images", "seconds")
 
     def cells(self, row: SceneFiles) -> tuple[object, ...]:
-        """One line."""
+        """Return the cells of a row."""
         return (row.log.parent.name, row.log, row.pictures, row.seconds)
 
     def as_dict(self) -> list[dict[str, object]]:
-        """What ``crosscue simulate --json`` prints."""
+        """Return the JSON output of ``crosscue simulate``."""
         return [
             {
                 "name": one.log.parent.name,
@@ -51,23 +51,23 @@ def simulate_approach(
     rate_hz: int = 10,
     overwrite: bool = False,
 ) -> SceneFiles:
-    """Simulate a drive up to an intersection, with camera, CAN, Mobileye and truth.
+    """Simulate a drive to an intersection, with camera, CAN, Mobileye and truth.
 
     Args:
-        folder: Gets ``drive.mcap``, ``vehicle.toml`` and ``truth.json``.
-        layout: Which intersection: A to H, or L0, L1, ... to learn from.
-        run: Which drive up to it, from 1.
-        seed: Of what differs from run to run.
-        width_px: Of a picture, a multiple of 16; it is 9/16 high.
-        rate_hz: Pictures a second: 10, 20, 25 or 50.
+        folder: Output folder for ``drive.mcap``, ``vehicle.toml`` and ``truth.json``.
+        layout: Layout of the intersection: A to H, or L0, L1, ... for training.
+        run: Number of the drive on this layout, from 1.
+        seed: Seed of everything that differs between runs.
+        width_px: Picture width, a multiple of 16; the height is 9/16 of it.
+        rate_hz: Pictures per second: 10, 20, 25 or 50.
         overwrite: Replace an earlier drive.
 
     Returns:
         Paths of ``log``, ``vehicle`` and ``truth``.
 
     Raises:
-        UsageError: A value out of range.
-        OutputError: The folder holds a drive already, or cannot be written.
+        UsageError: A value is out of range.
+        OutputError: The folder already contains a drive, or cannot be written.
     """
     from crosscue.datasets.scenes.drive import write_scene
 
@@ -90,19 +90,20 @@ def simulate_approaches(
     """Simulate every run of every layout; see ``simulate_approach``.
 
     Args:
-        folder: Gets a folder for each drive.
-        layouts: Which intersections.
-        runs: Which drives up to each of them.
-        seed: Of what differs from run to run.
-        width_px: Of a picture, a multiple of 16; it is 9/16 high.
-        rate_hz: Pictures a second: 10, 20, 25 or 50.
-        workers: How many drives are made side by side.
+        folder: Output folder, with one folder per drive.
+        layouts: Layouts of the intersections.
+        runs: Numbers of the drives on each layout.
+        seed: Seed of everything that differs between runs.
+        width_px: Picture width, a multiple of 16; the height is 9/16 of it.
+        rate_hz: Pictures per second: 10, 20, 25 or 50.
+        workers: Number of drives in parallel.
         overwrite: Replace drives of the same settings.
-        on_drive: Called with each drive once it is written, how many are done, and of how many.
+        on_drive: Called with each drive after it is written, the number of drives done, and their
+            total.
 
     Raises:
-        UsageError: A value out of range, a layout named twice, or a folder with another drive.
-        OutputError: A drive is there already, or cannot be written.
+        UsageError: A value is out of range, a layout is named twice, or a folder has another drive.
+        OutputError: A drive already exists, or cannot be written.
     """
     from crosscue.datasets.scenes.drive import refuse_other_drive
     from crosscue.replay.processes import in_processes
@@ -130,22 +131,22 @@ def draw_contact_sheet(
     rate_hz: int = 10,
     overwrite: bool = False,
 ) -> tuple[str, ...]:
-    """Draw one picture of each of many simulated drives onto one sheet, a JPEG file.
+    """Draw a contact sheet with one picture per simulated drive.
 
     Args:
-        path: The file.
+        path: JPEG file to write.
         layouts: As in ``simulate_approaches``.
         runs: As in ``simulate_approaches``.
         seed: As in ``simulate_approaches``.
         width_px: As in ``simulate_approaches``.
         rate_hz: As in ``simulate_approaches``.
-        overwrite: Replace a file that is there.
+        overwrite: Replace an existing file.
 
     Returns:
         Names of the drives.
 
     Raises:
-        UsageError: A value out of range.
+        UsageError: A value is out of range.
         OutputError: The file exists, or cannot be written.
     """
     from crosscue.datasets.scenes.export.contact_sheet import contact_sheet, sheet_jpeg
@@ -168,10 +169,10 @@ def _write_scene(settings: SceneSettings, output: Path, overwrite: bool) -> Scen
 def _scenes(
     layouts: Sequence[str], runs: Sequence[int], seed: int, width_px: int, rate_hz: int
 ) -> list[SceneSettings]:
-    """Every run of every layout.
+    """Return the settings of every run of every layout.
 
     Raises:
-        UsageError: A value out of range, or a layout named twice.
+        UsageError: A value is out of range, or a layout is named twice.
     """
     from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 
@@ -194,16 +195,17 @@ def simulate_drive(
     """Simulate a drive through streets without a camera: CAN, gyro, compass and truth.
 
     Args:
-        folder: Gets ``drive.mcap``, ``vehicle.toml``, a DBC file and ``truth.json``.
-        seed: Everything random comes from it.
-        blocks: Street blocks driven, 120 m each.
+        folder: Output folder for ``drive.mcap``, ``vehicle.toml``, a DBC file and ``truth.json``.
+        seed: Seed of all random numbers.
+        blocks: Number of street blocks to drive, 120 m each.
         overwrite: Replace an earlier drive.
 
     Returns:
         Paths of ``log``, ``vehicle`` and ``truth``.
 
     Raises:
-        OutputError: The folder holds a drive already, or cannot be written.
+        UsageError: ``blocks`` is below 1.
+        OutputError: The folder already contains a drive, or cannot be written.
     """
     from crosscue.datasets.simulated.drive import DriveSettings
     from crosscue.datasets.simulated.log_files import write_drive
@@ -215,20 +217,23 @@ def simulate_drive(
 
 
 def draw_sign(kind: str, height_px: int) -> Bytes:
-    """A sign as the detector knows it, grey, uint8 of shape (H, W), to make test pictures of.
+    """Draw the template of a sign, to compose test pictures.
 
     Args:
         kind: ``one way left``, ``one way right``, ``do not enter`` or ``no entry``.
-        height_px: Of the sign.
+        height_px: Height of the sign.
+
+    Returns:
+        Grey picture, uint8, shape (H, W).
 
     Raises:
-        UsageError: No such sign, or too low.
+        UsageError: The sign does not exist, or ``height_px`` is too small.
     """
     from crosscue.detectors.signs.templates import KINDS, MARGIN_PX, draw
 
     known = next((one for one in KINDS if one == kind), None)
     if known is None:
-        raise UsageError(f"kind: {kind!r}; there are: {', '.join(KINDS)}")
+        raise UsageError(f"kind: expected one of {', '.join(KINDS)}; found {kind!r}")
     try:
         return draw(known, height_px).grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
     except ValueError as error:

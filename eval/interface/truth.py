@@ -1,4 +1,4 @@
-"""The truth that data sets carry, and what a truth file may say."""
+"""Write the truth of data sets and of GNSS, and return the schema of truth files."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 
 def write_truth(log: Path | str, output: Path | str, *, limits: Limits = DEFAULT_LIMITS) -> Path:
-    """Write the truth that a data set carries: ``truth.json`` and its tracks.
+    """Write the truth that a data set contains: ``truth.json`` and its tracks.
 
     Args:
         log: Folder of the data set.
         output: Folder for the files.
-        limits: What the log is read with.
+        limits: Limits for reading the logs.
 
     Returns:
         The truth file.
 
     Raises:
-        EmptyResultError: The log's format carries no truth.
+        EmptyResultError: The log's format contains no truth.
         OutputError: The files cannot be written.
     """
     with open_log(log, limits) as opened:
@@ -35,18 +35,19 @@ def write_truth(log: Path | str, output: Path | str, *, limits: Limits = DEFAULT
 def truth_from_gnss(
     log: Log | Path | str, output: Path | str, vehicle: Vehicle | Path | str | None = None
 ) -> Path:
-    """Write a drive's own GNSS as truth: ``truth.json`` and the antenna's track.
+    """Write a drive's GNSS positions as truth: ``truth.json`` and the antenna's track.
 
     Args:
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         output: Folder for the files.
-        vehicle: The vehicle file: the antenna's place, and how good positions are that do not say.
+        vehicle: Vehicle file with the antenna's mounting, and the standard deviation of positions
+            that have none.
 
     Returns:
         The truth file.
 
     Raises:
-        EmptyResultError: No position, or none with a heading.
+        EmptyResultError: The log has no position, or none with a heading.
         OutputError: The files cannot be written.
     """
     settings = vehicle_given(vehicle)
@@ -55,5 +56,5 @@ def truth_from_gnss(
 
 
 def truth_schema() -> dict[str, Any]:
-    """The JSON Schema of ``truth.json``, for editors and other tools."""
+    """Return the JSON Schema of ``truth.json``, for editors and other tools."""
     return truth_file.json_schema()

@@ -1,4 +1,4 @@
-"""A first vehicle file, made from what a drive holds."""
+"""Draft a vehicle file from a drive, and check a vehicle file on a drive."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from crosscue.replay.vehicle.vehicle import Vehicle, parse, vehicle_given
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class VehicleDraft:
-    """A first vehicle file; printed as its text.
+    """A first vehicle file; its repr is the file's text.
 
     Attributes:
-        text: TOML, with comments on what is to be checked.
-        path: Where it was written; None where it was not.
+        text: TOML, with comments on the values to check.
+        path: Path of the written file; None if it was not written.
     """
 
     text: str
@@ -32,11 +32,11 @@ class VehicleDraft:
 
     @property
     def vehicle(self) -> Vehicle:
-        """Its settings; DBC files are named as seen from its folder."""
+        """Settings of the file, with DBC files relative to its folder."""
         return parse(self.text, "the draft")
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue vehicle init --json`` prints."""
+        """Return the JSON output of ``crosscue vehicle init``."""
         return {"vehicle": None if self.path is None else str(self.path), "text": self.text}
 
     def __repr__(self) -> str:
@@ -55,26 +55,27 @@ def draft_vehicle(
     camera_pitch_deg: float | None = None,
     camera_yaw_deg: float | None = None,
 ) -> VehicleDraft:
-    """Write a first vehicle file from what a drive holds.
+    """Draft a vehicle file from the contents of a drive.
 
-    Wheel speeds, yaw rate and steering are chosen by how well signals agree with GNSS and with each
-    other; pitch and yaw of the camera, if not given, by pictures of a straight road.
+    Wheel speeds, yaw rate and steering are the signals that agree best with GNSS and with each
+    other. Pitch and yaw of the camera, unless given, are estimated from pictures of a straight
+    road.
 
     Args:
         log: The drive, or its path.
         databases: DBC, KCD, ARXML or SYM files of its CAN buses.
-        output: The file; if left out, the text is returned only.
-        overwrite: Replace a file that is there.
-        camera_x_m: How far the camera sits ahead of the rear axle, as measured on the car.
-        camera_y_m: How far to the left of the car's middle.
-        camera_height_m: How far above the road.
-        camera_pitch_deg: How far its axis points below the horizon.
-        camera_yaw_deg: How far it points to the left.
+        output: File to write; default: the text is only returned.
+        overwrite: Replace an existing file.
+        camera_x_m: Distance of the camera ahead of the rear axle, as measured on the car.
+        camera_y_m: Distance of the camera to the left of the car's centre line.
+        camera_height_m: Height of the camera above the road.
+        camera_pitch_deg: Angle of the camera's axis below the horizon.
+        camera_yaw_deg: Angle of the camera's axis to the left.
 
     Raises:
-        UsageError: A number of the mounting that cannot be.
-        EmptyResultError: No topic plays a role in a vehicle file.
-        SchemaError: A database cannot be understood.
+        UsageError: A number of the mounting is out of range.
+        EmptyResultError: No topic has a role in a vehicle file.
+        SchemaError: A database is not valid.
         OutputError: The file exists, or cannot be written.
     """
     path = None if output is None else Path(output)
@@ -99,11 +100,13 @@ def draft_vehicle(
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class VehicleCheck:
-    """What a vehicle file makes of a drive, and what contradicts what; printed as a table.
+    """Signals of a drive as decoded with a vehicle file, and their contradictions.
+
+    Its repr is a table.
 
     Attributes:
-        path: The page or picture; None where none was asked for.
-        part: Which seconds were examined, in words.
+        path: The page or picture; None if it was not requested.
+        part: Seconds of the drive that were examined, in words.
     """
 
     path: Path | None
@@ -112,11 +115,11 @@ class VehicleCheck:
 
     @property
     def contradictions(self) -> tuple[str, ...]:
-        """Sentences; empty where nothing contradicts anything."""
+        """Contradictions between signals, one sentence each."""
         return self._found.contradictions
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue vehicle check --json`` prints."""
+        """Return the JSON output of ``crosscue vehicle check``."""
         picture = self._found.picture
         return {
             "page": None if self.path is None else str(self.path),
@@ -150,7 +153,7 @@ def _size_px(picture: Shown) -> tuple[int, int]:
 
 
 def _known(row: dict[str, object]) -> dict[str, object]:
-    """The same, with None where JSON has no number."""
+    """Return the row with None in place of NaN and infinities, which JSON does not have."""
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in row.items()
@@ -166,22 +169,22 @@ def check_vehicle(
     seconds: float = 10.0,
     overwrite: bool = False,
 ) -> VehicleCheck:
-    """Read a few seconds of a drive as a vehicle file says, and hold its signals together.
+    """Read a few seconds of a drive with a vehicle file, and compare its signals.
 
     Args:
         log: The drive, or its path.
         vehicle: The vehicle file, or its settings.
-        output: A page (``.html``) or a picture (``.jpg``, ``.png``) with the horizon, metres on the
-            road and the regions; if left out, none is written.
-        start_s: Seconds after the first row at which to begin.
-        seconds: How many to read.
-        overwrite: Replace a file that is there.
+        output: Page (``.html``) or picture (``.jpg``, ``.png``) to write, with the horizon,
+            distances along the road, and the searched regions; default: none is written.
+        start_s: Start, in seconds after the first message.
+        seconds: Number of seconds to read.
+        overwrite: Replace an existing file.
 
     Raises:
         VehicleError: The vehicle file does not fit the drive.
-        UsageError: A span that cannot be, or an output that is not a page or picture.
+        UsageError: The time span is out of range, or the output is neither a page nor a picture.
         OutputError: The file exists, or cannot be written.
-        EmptyResultError: Nothing in those seconds: no signal and no picture.
+        EmptyResultError: Those seconds contain neither a signal nor a picture.
     """
     path = None if output is None else Path(output)
     if path is not None:
@@ -193,7 +196,7 @@ def check_vehicle(
         part = drive.part(start_s, start_s + seconds)
         found = check(part.logs, settings, part.selection)
         names = [name_of(one) for one in part.logs]
-    words = f"{seconds:g} s from {start_s:g} s on"
+    words = f"{seconds:g} s starting at {start_s:g} s"
     if not found.signals and found.picture is None:
         why = "; ".join(f"{signal}: {text}" for signal, text in found.missing.items())
         raise EmptyResultError(f"{', '.join(names)}: {words}: no signal and no picture: {why}")
@@ -213,7 +216,7 @@ def _given(
 
 
 def _mounting(examined: Examined, given: Mounting) -> Mounting:
-    """What was given, and what pictures of a straight road show."""
+    """Return the given mounting, completed by estimates from pictures of a straight road."""
     camera = camera_of(examined.logs)
     if camera is None:
         return given
@@ -222,7 +225,7 @@ def _mounting(examined: Examined, given: Mounting) -> Mounting:
     for name in ("pitch_rad", "yaw_rad"):
         seen: Measured | None = getattr(estimate, name)
         if getattr(given, name) is not None and seen is not None:
-            notes.append(f"{name} of the pictures, not used: {seen.source}")
+            notes.append(f"{name} from the pictures, not used: {seen.source}")
     return given._replace(
         pitch_rad=given.pitch_rad or estimate.pitch_rad,
         yaw_rad=given.yaw_rad or estimate.yaw_rad,

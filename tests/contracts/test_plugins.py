@@ -175,7 +175,7 @@ def test_plugins_are_listed_with_what_is_wrong_with_them(site: Path) -> None:
         ("reader", "lines"),
     ]
     assert "no_such_thing" in ours["detector", "broken"]
-    assert "name is taken" in ours["detector", "signs"]
+    assert "name is already in use" in ours["detector", "signs"]
     assert "is CueSpec; expected Format" in ours["reader", "wrong"]
 
 

@@ -219,14 +219,14 @@ def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Pat
     ("flags", "says"),
     [
         (["--layouts", "A"], "only for scoring"),
-        (["--layouts", "L1", "--val-layouts", "L1"], "also trained on"),
+        (["--layouts", "L1", "--val-layouts", "L1"], "also in --layouts"),
         (["--layouts", "Q"], "is not a layout"),
-        (["--layouts", "L2-L1"], "expected the lower one first"),
+        (["--layouts", "L2-L1"], "expected the lower layout first"),
         (["--layouts", "L1", "--test-layouts", "Z"], "is not a layout"),
         (["--layouts", "L1", "L0-L3"], "L1: named twice"),
         (["--layouts", "L1", "--seed", "-1"], "expected 0 or more"),
         (["--layouts", "L1", "--threads", "-1"], "expected 0 or more"),
-        (["--measure", "embedded", "--test-layouts", "A"], "not with -o"),
+        (["--measure", "embedded", "--test-layouts", "A"], "cannot be combined with -o"),
         ([], "give --layouts"),
     ],
 )

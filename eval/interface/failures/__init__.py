@@ -1,1 +1,1 @@
-"""Failures of runs: found, browsed, exported for labelling."""
+"""Find failures of runs, browse them, and export them for labelling."""

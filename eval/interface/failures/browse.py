@@ -1,4 +1,4 @@
-"""Failures as a static site, for a person to browse."""
+"""Write failures as a static site to browse."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from crosscue.replay.processes import in_processes
 from .failures import ENDINGS, Failures, failures
 
 PRINTED: Final = 3
-"""Reasons of missing pictures."""
+"""Number of reasons for missing pictures to print."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Site:
-    """A static site of failures; printed as ``crosscue browse`` prints it.
+    """A static site of failures; its repr is the output of ``crosscue browse``.
 
     Attributes:
-        index: Its first page.
-        failures: How many it shows.
-        pictures: How many frames have a picture.
-        without_picture: Failures without one.
-        reasons: Why pictures of a run are missing.
-        found: How the failures were found; None where a table named them.
+        index: First page of the site.
+        failures: Number of failures.
+        pictures: Number of frames with a picture.
+        without_picture: Number of failures without a picture.
+        reasons: Reasons for missing pictures.
+        found: The failures; None if they were read from a table.
     """
 
     index: Path
@@ -52,11 +52,11 @@ class Site:
 
     @property
     def is_whole(self) -> bool:
-        """Every run could be examined."""
+        """True if every run could be examined."""
         return self.found is None or not self.found.failed
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue browse --json`` prints."""
+        """Return the JSON output of ``crosscue browse``."""
         return {
             "index": str(self.index),
             "failures": self.failures,
@@ -99,23 +99,23 @@ def browse(
     """Write failures as a static site: pages, pictures and charts that need no server.
 
     Args:
-        runs: As for ``failures``; or a table that ``failures`` wrote.
+        runs: As in ``failures``; or a table that ``failures`` wrote.
         output: Folder of the site, new or empty.
-        truth: As for ``failures``.
-        top: As for ``failures``.
-        threshold: As for ``failures``.
-        any_log: As for ``failures``.
-        logs: Where the runs' logs have moved to, if they have.
-        limits: What the logs are read with.
-        has_recordings: Write a recording of each moment beside its page; megabytes each.
+        truth: As in ``failures``.
+        top: As in ``failures``.
+        threshold: As in ``failures``.
+        any_log: As in ``failures``.
+        logs: Folder that the runs' logs have moved to.
+        limits: Limits for reading the logs.
+        has_recordings: Also write a recording of each failure, of some megabytes each.
         overwrite: Replace an earlier site.
-        workers: How many runs are drawn side by side.
-        on_runs: Called with the number of runs that are drawn, and of how many.
+        workers: Number of runs to draw in parallel.
+        on_runs: Called with the number of runs drawn, and their total.
 
     Raises:
-        UsageError: A value out of range, or a table beside other runs.
-        EmptyResultError: Nothing went wrong.
-        OutputError: The folder holds something else, or cannot be written.
+        UsageError: A value is out of range, or a table is combined with other runs.
+        EmptyResultError: There is no failure.
+        OutputError: The folder has other contents, or cannot be written.
     """
     folder = Path(output)
     _check_place(folder, overwrite)
@@ -159,9 +159,9 @@ def _check_place(folder: Path, overwrite: bool) -> None:
     except OSError as error:
         raise cannot_write(folder, error) from None
     if there and not (folder / MARKER).is_file():
-        raise OutputError(f"{folder}: holds something that is not a site; give another folder")
+        raise OutputError(f"{folder}: contains something other than a site; use another folder")
     if there and not overwrite:
-        raise OutputError(f"{folder}: holds a site; give another folder or --overwrite")
+        raise OutputError(f"{folder}: contains a site; use another folder or --overwrite")
 
 
 def _given(
@@ -172,11 +172,11 @@ def _given(
     any_log: bool,
     workers: int,
 ) -> tuple[tuple[Failure, ...], Failures | None]:
-    """The failures of runs, or those of a table."""
+    """Return the failures of runs or of a table, and, for runs, how they were found."""
     given = [Path(one) for one in ([runs] if isinstance(runs, Path | str) else runs)]
     if any(one.suffix in ENDINGS for one in given):
         if len(given) > 1 or top is not None:
-            raise UsageError(f"{given[0]}: expected a table alone, without --top, or runs")
+            raise UsageError(f"{given[0]}: expected either runs, or one table without --top")
         return ranked(read_failures(given[0])), None
     found = failures(
         [str(one) for one in given],

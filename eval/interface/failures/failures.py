@@ -1,4 +1,4 @@
-"""What went wrong in runs, worst first, by cause."""
+"""Find the failures of runs, worst first, by cause."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ ENDINGS: Final = (".parquet", ".json")
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Failures:
-    """What went wrong in runs; printed as ``crosscue failures`` prints it.
+    """Failures of runs; its repr is the output of ``crosscue failures``.
 
     Attributes:
-        failures: Those asked for: all, the most severe first, or a diverse few.
-        groups: Over all failures that were found: kind, what it is about, and cause.
-        found: How many there are in all.
-        runs: How many runs were examined.
+        failures: All failures, most severe first, or the requested number of diverse ones.
+        groups: All failures that were found, grouped by kind, feature or cue, and cause.
+        found: Total number of failures.
+        runs: Number of runs examined.
         without_truth: Runs without truth, of which only flipped beliefs are known.
-        failed: Runs that could not be examined, and why.
-        output: The table that was written; None without one.
+        failed: Errors of the runs that could not be examined.
+        output: Table that was written; None without one.
     """
 
     failures: tuple[Failure, ...]
@@ -50,11 +50,11 @@ class Failures:
 
     @property
     def table(self) -> pa.Table:
-        """A row for each failure."""
+        """Return a table with one row per failure."""
         return failure_table(self.failures)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue failures --json`` prints."""
+        """Return the JSON output of ``crosscue failures``."""
         return {
             "runs": self.runs,
             "found": self.found,
@@ -110,14 +110,14 @@ class Failures:
 
 @dataclass(frozen=True, slots=True)
 class FindWork:
-    """What is done for one run, here or in another process."""
+    """Search of one run for failures, in this process or in another."""
 
     truth: Path | None
     threshold: float
     any_log: bool
 
     def __call__(self, path: Path) -> tuple[tuple[Failure, ...], bool] | CrosscueError:
-        """Its failures, and whether it has truth; or why it could not be examined."""
+        """Return its failures and whether it has truth, or the error if it cannot be examined."""
         try:
             run = open_run(path)
             try:
@@ -141,24 +141,25 @@ def failures(
     workers: int = 1,
     on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> Failures:
-    """What went wrong in runs: missed, late, false, range outside its interval, belief flipped.
+    """Find failures: missed, late or false, range outside its interval, belief flipped.
 
     Nothing is written into the runs. A run that cannot be examined does not stop the others.
 
     Args:
-        runs: Run folders, folders of them, patterns, or ``@list.txt``; what ``Catalog.select``
-            returns.
-        truth: Truth of all runs; None for the ``truth.json`` beside each run's log.
+        runs: Run folders, folders of them, patterns, ``@list.txt``, or the result of
+            ``Catalog.select``.
+        truth: Truth of all runs; None for the ``truth.json`` next to each run's log.
         output: Table to write: ``.parquet`` or ``.json``.
-        top: Only so many, of as many causes and runs as possible; None for all, by severity.
-        threshold: A feature is believed above this probability.
-        any_log: Take a truth that names the hash of another file: the same drive, converted.
-        workers: How many runs are examined side by side.
-        on_runs: Called with the number of runs that are done, and of how many.
+        top: Max number of failures, from as many causes and runs as possible; None for all, by
+            severity.
+        threshold: Probability above which a feature counts as believed.
+        any_log: Accept truth made for another file of the same drive, such as a converted log.
+        workers: Number of runs to examine in parallel.
+        on_runs: Called with the number of runs done, and their total.
 
     Raises:
-        UsageError: A value out of range, or an output of another kind.
-        RunError: Not one run could be examined.
+        UsageError: A value is out of range, or the output has another suffix.
+        RunError: No run could be examined.
     """
     path = _checked_output(output)
     if top is not None and top < 1:
@@ -193,13 +194,13 @@ def failures(
 
 
 def read_failures(table: Path | str) -> tuple[Failure, ...]:
-    """Failures as ``failures`` wrote them.
+    """Read the table that ``failures`` wrote.
 
     Args:
-        table: ``.parquet`` or ``.json``; runs are found relative to its folder.
+        table: ``.parquet`` or ``.json`` file; paths of runs are relative to its folder.
 
     Raises:
-        SchemaError: It is missing, damaged, or another table.
+        SchemaError: The table is missing, damaged, or of another kind.
     """
     return read_table(Path(table))
 

@@ -1,4 +1,4 @@
-"""The labelling loop: failing frames exported for a labelling tool, and taken back corrected."""
+"""Export failing frames for a labelling tool, and import the corrected labels."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ INDEX: Final = "crosscue_export.json"
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ExportedLabels:
-    """Pictures for a labelling tool; printed as ``crosscue export`` prints it.
+    """Pictures exported for a labelling tool; its repr is the output of ``crosscue export``.
 
     Attributes:
-        file: What to give to the tool.
-        format: One of the table of formats.
-        pictures: How many.
-        boxes: Detections in them, as pre-labels.
+        file: File or folder to import into the tool.
+        format: Name of the format.
+        pictures: Number of pictures.
+        boxes: Number of detections in them, as pre-labels.
         labels: Classes to choose from.
-        left_out: What was not exported, by reason.
-        failed: Runs that could not be read, and why.
+        left_out: Numbers of frames that were not exported, by reason.
+        failed: Errors of the runs that could not be read.
     """
 
     file: Path
@@ -61,7 +61,7 @@ class ExportedLabels:
     failed: Mapping[str, CrosscueError]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue export --json`` prints."""
+        """Return the JSON output of ``crosscue export``."""
         return {
             "file": str(self.file),
             "format": self.format,
@@ -99,19 +99,19 @@ def export(
 
     Args:
         failures: A table that ``failures`` wrote, or failures.
-        output: Folder, new or empty.
+        output: Output folder, new or empty.
         to: ``coco``, ``cvat``, ``yolo``, ``fiftyone`` or ``labelstudio``.
-        classes: Labels to choose from; those that the runs' cues are made of if empty.
-        logs: Where the runs' logs have moved to, if they have.
-        limits: What the logs are read with.
+        classes: Labels to choose from; default: the labels that the runs' cues use.
+        logs: Folder that the runs' logs have moved to.
+        limits: Limits for reading the logs.
         overwrite: Replace an earlier export.
-        on_runs: Called with the number of runs that are exported, and of how many.
+        on_runs: Called with the number of runs exported, and their total.
 
     Raises:
-        UsageError: Another format.
-        EmptyResultError: No picture to export; nothing was written.
-        CrosscueError: Not one run could be read.
-        OutputError: The folder holds something else, or cannot be written.
+        UsageError: The format is not supported.
+        EmptyResultError: There is no picture to export; nothing is written.
+        CrosscueError: No run could be read.
+        OutputError: The folder has other contents, or cannot be written.
     """
     if to not in LABEL_FORMATS:
         raise UsageError(f"--to {to}: expected one of {', '.join(LABEL_FORMATS)}")
@@ -144,7 +144,7 @@ def export(
         if not found.pictures:
             if failed:
                 raise next(iter(failed.values()))
-            why = "none of its frames has one" if by_run else "no failure in it"
+            why = "no frame has a picture" if by_run else "the table has no failure"
             raise EmptyResultError(f"{where}: no picture to export: {why}")
         file = kind.write(made, found)
         index = [one.as_index(folder) for one in runs if one.pictures]
@@ -168,16 +168,16 @@ def export(
 def _check_place(folder: Path, overwrite: bool) -> None:
     there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     if there and not (folder / INDEX).is_file():
-        raise OutputError(f"{folder}: holds something that is not an export; give another folder")
+        raise OutputError(f"{folder}: contains something other than an export; use another folder")
     if there and not overwrite:
-        raise OutputError(f"{folder}: holds an export; give another folder or --overwrite")
+        raise OutputError(f"{folder}: contains an export; use another folder or --overwrite")
 
 
 def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:
-    """The pictures of all runs.
+    """Join the pictures of all runs.
 
     Raises:
-        UsageError: Two runs have one name and a frame in common.
+        UsageError: Two runs of the same name have a frame in common.
     """
     names = [one.name for run in runs for one in run.pictures]
     twice = sorted({name for name in names if names.count(name) > 1}) if len(runs) > 1 else []
@@ -189,14 +189,14 @@ def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ImportedLabels:
-    """Corrected labels, drive by drive; printed as ``truth import --export`` prints it.
+    """Corrected labels by drive; its repr is the output of ``crosscue truth import --export``.
 
     Attributes:
-        coco: All pictures together, to train and fit with.
-        images: Folder of the pictures, as exported.
-        drives: By name of the drive.
-        missing: Exported pictures that the file does not have.
-        ignored: Shapes and tasks that were not taken, by kind.
+        coco: COCO file with all pictures, for training and fitting.
+        images: Folder of the exported pictures.
+        drives: Imported truth by name of the drive.
+        missing: Number of exported pictures that the annotations lack.
+        ignored: Numbers of shapes and tasks that were not imported, by kind.
     """
 
     coco: Path
@@ -206,7 +206,7 @@ class ImportedLabels:
     ignored: Mapping[str, int]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue truth import --export --json`` prints."""
+        """Return the JSON output of ``crosscue truth import --export``."""
         return {
             "coco": str(self.coco),
             "images": str(self.images),
@@ -218,10 +218,12 @@ class ImportedLabels:
     def __repr__(self) -> str:
         pictures = sum(one.pictures for one in self.drives.values())
         things = sum(one.things for one in self.drives.values())
-        lines = [f"pictures   {pictures:,} with {things:,} things, of {len(self.drives):,} drives"]
+        lines = [f"pictures   {pictures:,} with {things:,} objects, of {len(self.drives):,} drives"]
         if self.missing:
-            lines.append(f"missing    {self.missing:,} exported pictures did not come back")
-        lines += [f"not taken  {count:,} {visible(kind)}" for kind, count in self.ignored.items()]
+            lines.append(
+                f"missing    {self.missing:,} exported pictures are not in the annotations"
+            )
+        lines += [f"ignored    {count:,} {visible(kind)}" for kind, count in self.ignored.items()]
         lines += [f"truth      {visible(str(one.truth))}" for one in self.drives.values()]
         lines.append(f"to train   --data {visible(str(self.coco))} --images {self.images}")
         return "\n".join(lines)
@@ -239,22 +241,22 @@ def import_labels(
     kind: str | None = None,
     limits: Limits = DEFAULT_LIMITS,
 ) -> ImportedLabels:
-    """Take corrected labels of an export back: truth and objects of each drive, and one COCO file.
+    """Import corrected labels of an export: truth and objects of each drive, and one COCO file.
 
     Args:
-        annotations: What the labelling tool exported, in any of the formats of ``export``.
-        exported: The folder that ``export`` wrote, which knows the time of each picture.
-        output: Folder; gets a folder for each drive, and ``coco.json``.
-        vehicle: Cues of the user's own.
-        labels: From label to cue; an empty cue leaves the label out.
-        add: Keep everything but cues and objects of truth files that are there.
-        overwrite: Replace truth files that are there.
-        kind: The format; recognised if left out.
-        limits: What the logs are read with.
+        annotations: Annotations from the labelling tool, in any of the formats of ``export``.
+        exported: Folder that ``export`` wrote, with an index of the time of each picture.
+        output: Output folder, with one folder per drive, and ``coco.json``.
+        vehicle: Vehicle file that defines your own cues.
+        labels: Cue by label; an empty cue ignores the label.
+        add: Replace only the cues and objects of existing truth files.
+        overwrite: Replace existing truth files.
+        kind: Format of the annotations; default: detected.
+        limits: Limits for reading the logs.
 
     Raises:
         SchemaError: The labels or the export cannot be read, or a picture was not exported, has
-            another size, or comes twice.
+            another size, or occurs twice.
         OutputError: A truth file exists, or cannot be written.
     """
     source, folder, target = Path(annotations), Path(exported), Path(output)
@@ -267,7 +269,7 @@ def import_labels(
     placed = tuple(_placed(one, known, read.where) for one in read.pictures)
     for name, count in Counter(one.name for one in placed).items():
         if count > 1:
-            raise SchemaError(f"{read.where}: {name}: {count} times; expected each picture once")
+            raise SchemaError(f"{read.where}: {name}: expected once, found {count} times")
     settings = vehicle_given(vehicle)
     exported_as = {label: cue for one in drives for label, cue in one["labels"].items()}
     meant = {label: cue for label, cue in exported_as.items() if label in read.labels}
@@ -276,7 +278,7 @@ def import_labels(
     there = {one["drive"]: target / one["drive"] / FILE for one in drives}
     for path in there.values():
         if path.exists() and not (add or overwrite):
-            raise OutputError(f"{path}: exists; --add to it, --overwrite it, or give another name")
+            raise OutputError(f"{path}: exists; use --add, --overwrite, or another name")
     done: dict[str, ImportedTruth] = {}
     for one in drives:
         mine = tuple(picture for picture in placed if picture.name in one["pictures"])
@@ -288,7 +290,7 @@ def import_labels(
         path = there[one["drive"]]
         done[one["drive"]] = import_part(part, cues, log, path, settings, add=keeps, limits=limits)
     if not done:
-        raise EmptyResultError(f"{source}: not one labelled picture of the export in it")
+        raise EmptyResultError(f"{source}: contains no labelled picture of the export")
     whole = replace(read, pictures=placed)
     coco = write_coco(target, whole).replace(target / "coco.json")
     images = folder / LABEL_FORMATS[_format(folder)].pictures
@@ -299,24 +301,26 @@ def import_labels(
 def _placed(
     picture: Picture, known: Mapping[str, tuple[str, Mapping[str, Any]]], where: str
 ) -> Picture:
-    """With its exported name and its time.
+    """Return a picture with its name and time in the export.
 
     Raises:
-        SchemaError: It was not exported, or has another size.
+        SchemaError: The picture was not exported, or has another size.
     """
     stem = re.split(r"[/\\]", picture.name)[-1]
     found = known.get(stem) or known.get(re.sub(r"\.[A-Za-z]+$", "", stem))
     if found is None:
-        # CVAT and Label Studio put a prefix of their own before names of uploaded files.
+        # CVAT and Label Studio add a prefix to the names of uploaded files.
         ends = [name for name in known if re.sub(r"\.[A-Za-z]+$", "", stem).endswith(name)]
         found = known[ends[0]] if len(ends) == 1 else None
     if found is None:
-        raise SchemaError(f"{where}: {picture.name}: no such picture was exported; give its export")
+        raise SchemaError(
+            f"{where}: {picture.name}: not in the export; use the export that contains it"
+        )
     name, row = found
     if picture.size_px != (row["width"], row["height"]):
         raise SchemaError(
-            f"{where}: {picture.name}: {picture.size_px[0]} x {picture.size_px[1]} pixels; "
-            f"exported were {row['width']} x {row['height']}: label pictures as exported"
+            f"{where}: {picture.name}: expected {row['width']} x {row['height']} pixels, found "
+            f"{picture.size_px[0]} x {picture.size_px[1]}; label pictures in their exported size"
         )
     return replace(picture, name=name, t_ns=row["t_ns"])
 
@@ -333,7 +337,7 @@ def _read_index(folder: Path) -> list[dict[str, Any]]:
                 assert all(isinstance(row[name], int) for name in ("t_ns", "width", "height"))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError):
         raise AnnotationError(
-            f"{path}: missing or damaged; give the folder that crosscue export wrote"
+            f"{path}: missing or damaged; use a folder that crosscue export wrote"
         ) from None
     return list(drives)
 

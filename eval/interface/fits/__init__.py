@@ -1,1 +1,1 @@
-"""Fits of a vehicle file's values to drives."""
+"""Fit sensors, detectors, ranges and beliefs to drives."""

@@ -1,4 +1,4 @@
-"""A compass fitted to a drive."""
+"""Fit a compass to a drive."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedCompass:
-    """Mounting, hard and soft iron as far as a drive shows them; printed with its section.
+    """Fitted mounting, hard and soft iron of a compass.
 
     Attributes:
-        fitted: The fit, and how far to trust it.
-        path: The vehicle file it was written to; None where it was not.
+        fitted: Fitted values, their uncertainty, and the parameters that are not observable.
+        path: Vehicle file that was written; None without one.
     """
 
     fitted: CompassFit
@@ -34,7 +34,7 @@ class FittedCompass:
         return section_of(self.fitted)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit compass --json`` prints."""
+        """Return the JSON output of ``crosscue fit compass``."""
         fitted = self.fitted
         return {
             "compass": self.section,
@@ -55,7 +55,7 @@ class FittedCompass:
             f"readings    {fitted.readings_used} of {fitted.readings} used; headings cover "
             f"{fitted.coverage_deg} degrees of the circle",
             f"fitted      {', '.join(fitted.observable) or 'nothing'}",
-            *(f"not seen    {name}: {reason}" for name, reason in fitted.not_observable),
+            *(f"not fitted  {name}: {reason}" for name, reason in fitted.not_observable),
             *_residual(fitted),
             "",
             "[compass]",
@@ -68,7 +68,7 @@ class FittedCompass:
 
 def _residual(fitted: CompassFit) -> list[str]:
     if math.isnan(fitted.residual_sd_rad):
-        return ["residual    not known: there is no reference heading"]
+        return ["residual    unknown: there is no reference heading"]
     yaw_deg = math.degrees(fitted.settings.mounting_yaw_rad)
     bound = "at least " if fitted.persists_is_bound else ""
     return [
@@ -85,19 +85,20 @@ def fit_compass(
     *,
     overwrite: bool = False,
 ) -> FittedCompass:
-    """Fit a compass to a drive: mounting, hard and soft iron, as far as the drive shows them.
+    """Fit a compass to a drive: its mounting angle, and hard and soft iron.
 
-    The reference is the GNSS course. What a drive cannot show keeps its value and is named.
+    The reference is the GNSS course. Parameters that the drive does not determine keep their values
+    and are listed.
 
     Args:
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         vehicle: The vehicle file; None for the defaults.
-        output: The vehicle file to write, with the fit; may be ``vehicle`` itself.
-        overwrite: Replace another file that is there.
+        output: Vehicle file to write, with the fit; may be ``vehicle`` itself.
+        overwrite: Replace another existing file.
 
     Raises:
-        EmptyResultError: No magnetometer.
-        VehicleError: Too few readings with a reference.
+        EmptyResultError: The drive has no magnetometer.
+        VehicleError: The drive has too few readings with a reference.
         OutputError: The output exists, or cannot be written.
     """
     check_output(vehicle, output, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""A detector's thresholds and calibrations, fitted to labelled boxes and written into its card."""
+"""Fit a detector's thresholds and calibrations to labelled boxes, and write them to its card."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedDetector:
-    """Thresholds and calibrations by class; printed as ``crosscue fit detector`` prints them.
+    """Thresholds and calibrations by class; its repr is the output of ``crosscue fit detector``.
 
     Attributes:
-        detector: As it ran.
-        classes: Of every class that labels and detector have.
-        precision: That was required.
-        fitted_to: Pictures.
-        held_out: Other pictures.
-        left_out: What of the labels was left out, by reason.
-        card: The card that was written; None without one.
-        is_whole: Nothing was dropped when the runs were made.
+        detector: The detector, as it ran.
+        classes: Fits of all classes that the labels and the detector have in common.
+        precision: Required precision.
+        fitted_to: Number of pictures that were fitted to.
+        held_out: Number of pictures that were held out.
+        left_out: Numbers of labels that were left out, by reason.
+        card: Card that was written; None without one.
+        is_whole: True if nothing was dropped when the runs were made.
     """
 
     detector: DetectorRow
@@ -58,11 +58,11 @@ class FittedDetector:
 
     @property
     def has_threshold(self) -> bool:
-        """At least one class has a threshold."""
+        """True if at least one class has a threshold."""
         return any(one.scores and one.scores.threshold is not None for one in self.classes)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit detector --json`` prints."""
+        """Return the JSON output of ``crosscue fit detector``."""
         return {
             "detector": self.detector.name,
             "precision": self.precision,
@@ -165,35 +165,35 @@ def fit_detector(
     logs: Path | str | None = None,
     limits: Limits = DEFAULT_LIMITS,
 ) -> FittedDetector:
-    """Fit thresholds and calibrations to labelled boxes.
+    """Fit a detector's thresholds and calibrations to labelled boxes.
 
-    For each class the lowest threshold whose precision is high enough by a one-sided bound, and a
-    calibration that makes scores probabilities. Pictures that are held out show the result: those
-    of ``test``, or the last ones of each run.
+    Each class gets the lowest threshold whose one-sided bound on precision is high enough, and a
+    calibration from scores to probabilities. The result is tested on held-out pictures: those of
+    ``test``, or the last ones of each run.
 
     Args:
-        runs: With stored detections of one detector, uncalibrated.
-        labels: Of each run, in the same order; see ``score_detector``.
-        output: The card to write; None for none.
-        precision: Required, in (0, 1).
+        runs: Runs with stored, uncalibrated detections of one detector.
+        labels: Labels of each run, in the same order; see ``score_detector``.
+        output: Card to write; None for none.
+        precision: Required precision, in (0, 1).
         calibration: ``platt``, ``isotonic`` or ``none``.
-        test: Other runs that show the result.
-        test_labels: Of each of these.
-        hold_out: Without ``test``, this fraction of each run's pictures, its end, is held out.
-        card: The detector's card, where the run does not say.
-        detector: Its name, where several ran.
-        kind: Format of the labels.
-        class_names: Of YOLO labels in their order, or a file with one per line.
-        meanings: From a class of the labels or of the detector to the class that it counts as.
-        overlap: That makes a detection right.
-        date: Of the fit, for the card; the date of the first picture if left out.
-        overwrite: Replace a card that is there.
-        logs: Where the runs' logs have moved to, if they have.
-        limits: What the logs are read with.
+        test: Other runs to test the result on.
+        test_labels: Labels of each run of ``test``, in the same order.
+        hold_out: Fraction of each run's pictures, at its end, to hold out if ``test`` is empty.
+        card: Card of the detector, if the run does not name it.
+        detector: Name of the detector, if the runs have several.
+        kind: Format of the labels; default: detected.
+        class_names: Class names of YOLO labels in their order, or a file with one per line.
+        meanings: Class that a class of the labels or of the detector counts as.
+        overlap: Min IoU of a correct detection with a label.
+        date: Date of the fit, for the card; default: the date of the first picture.
+        overwrite: Replace an existing card.
+        logs: Folder that the runs' logs have moved to.
+        limits: Limits for reading the logs.
 
     Raises:
-        UsageError: A value out of range, runs of different detectors, or scores that are
-            calibrated already.
+        UsageError: A value is out of range, runs have different detectors, or scores are already
+            calibrated.
         SchemaError: Labels cannot be read, or do not belong to the run.
         VehicleError: The card cannot be read.
         OutputError: The card cannot be written.
@@ -208,7 +208,7 @@ def fit_detector(
         )
 
     if card is not None:
-        # What is wrong with a file is reported before any run is opened.
+        # Errors in the card are reported before any run is opened.
         read_card(Path(card))
     places = [run.path if isinstance(run, Run) else run for run in (*given, *test)]
     folders = [open_run(place, logs, limits=limits).folder for place in places]
@@ -267,13 +267,13 @@ def _one_detector(parts: Sequence[LabelledRun]) -> DetectorRow:
     for part in parts:
         if part.detector.identity != row.identity:
             raise UsageError(
-                f"{part.run.path}: {part.detector.name} is another detector, or has other settings "
-                f"or weights, than that of {parts[0].run.path}; replay both alike"
+                f"{part.run.path}: {part.detector.name} differs from the detector of "
+                f"{parts[0].run.path}, or has other settings or weights; replay both with the same"
             )
         if part.detector.calibrated:
             raise UsageError(
                 f"{part.run.path}: scores of {', '.join(part.detector.calibrated)} are calibrated "
-                "already; replay with the card as it was before the fit"
+                "already; replay with the card from before the fit"
             )
     return row
 
@@ -287,7 +287,7 @@ def _card_of(row: DetectorRow, card: Path | str | None, *, is_needed: bool) -> P
     if row.kind in names():
         return card_path(row.kind)
     if is_needed:
-        raise UsageError(f"-o: {row.name} has no model card; give one with --card, or leave out -o")
+        raise UsageError(f"-o: {row.name} has no model card; name one with --card, or omit -o")
     return None
 
 
@@ -297,7 +297,7 @@ def _common(parts: Sequence[LabelledRun], others: Sequence[LabelledRun]) -> list
 
 
 def _ends_at(part: LabelledRun, hold_out: float) -> np.typing.NDArray[np.bool_]:
-    """The first pictures in time, shape (P,)."""
+    """Return a mask of the pictures that are not held out, the first in time, shape (P,)."""
     n = len(part.names)
     return np.arange(n) < n - round(hold_out * n)
 
@@ -312,7 +312,7 @@ def _judged(
     name: str,
     overlap: float,
 ) -> Judged:
-    """One class in some pictures of some runs."""
+    """Match detections of one class to labels, in the chosen pictures of each run."""
     scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
     for part, chosen in zip(parts, which, strict=True):
         matched = match(*part.part(chosen), part.classes.index(name), overlaps=np.array([overlap]))
@@ -328,7 +328,7 @@ def _log_names(parts: Sequence[LabelledRun]) -> str:
 
 
 def _date_of(parts: Sequence[LabelledRun]) -> str:
-    """Of the first picture, where the log's clock knows it."""
+    """Return the date of the first picture in parentheses, or "" if the log has no real time."""
     first = min(int(part.t_ns[0]) for part in parts)
     if first < YEAR_2000_NS:
         return ""

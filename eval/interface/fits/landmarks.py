@@ -1,4 +1,4 @@
-"""The threshold of landmark matches, fitted to labelled pictures."""
+"""Fit the threshold of landmark matches to labelled pictures."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedLandmarks:
-    """A match threshold and what it is worth; printed with its rates.
+    """A fitted match threshold and its rates.
 
     Attributes:
         fitted: The threshold, and the rates on both halves of the pictures.
-        matcher: Whose scores it is for.
-        path: The vehicle file it was written to; None where it was not.
+        matcher: Matcher that the threshold is for.
+        path: Vehicle file that was written; None without one.
     """
 
     fitted: LandmarkFit
@@ -35,7 +35,7 @@ class FittedLandmarks:
     path: Path | None
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit landmarks --json`` prints."""
+        """Return the JSON output of ``crosscue fit landmarks``."""
         return {
             **asdict(self.fitted),
             "is_shown": self.fitted.is_shown,
@@ -86,29 +86,30 @@ def fit_landmarks(
     matcher: str | None = None,
     overwrite: bool = False,
 ) -> FittedLandmarks:
-    """Choose the match threshold for a wanted false-match rate, from labelled pictures.
+    """Choose the match threshold for a required false-match rate, from labelled pictures.
 
-    Half of the query pictures choose it, the rates are of the other half. Pairs come from a table,
-    or from a drive with known poses against a database that another drive made.
+    The threshold is chosen on half of the query pictures, and the rates are measured on the other
+    half. Pairs are read from a table, or are made from a drive with known poses and a database from
+    another drive.
 
     Args:
-        pairs: CSV file ``query,known,same``; instead of ``log``, ``database`` and ``poses``.
+        pairs: CSV file ``query,known,same``, instead of ``log``, ``database`` and ``poses``.
         log: The drive, or its path.
-        database: Landmarks of another drive.
-        poses: Of the drive: a run, or a truth file.
-        vehicle: Camera and matcher; None for the defaults.
-        output: The vehicle file to write, with the threshold; may be ``vehicle`` itself.
-        false_match_rate: Max fraction of pairs from different places that match.
+        database: Landmark database made from another drive.
+        poses: Poses of the drive: a run, or a truth file.
+        vehicle: Vehicle file with the camera and the matcher; None for the defaults.
+        output: Vehicle file to write, with the threshold; may be ``vehicle`` itself.
+        false_match_rate: Max fraction of pairs from different places that may match.
         every_m: Distance between the frames used.
         same_within_m: Max distance of a landmark of the same place.
         different_beyond_m: Min distance of a landmark of another place.
-        max_landmarks: Per frame.
-        matcher: ``orb``, or ``module:factory``; the vehicle file's, if left out.
-        overwrite: Replace another file that is there.
+        max_landmarks: Max number of landmarks per frame.
+        matcher: ``orb``, or ``module:factory``; default: the vehicle file's.
+        overwrite: Replace another existing file.
 
     Raises:
-        UsageError: Neither pairs nor a drive, or values that exclude each other.
-        SchemaError: Too few pairs.
+        UsageError: Neither pairs nor a drive are passed, or values contradict each other.
+        SchemaError: There are too few pairs.
         OutputError: The output exists, or cannot be written.
     """
     check_output(vehicle, output, overwrite=overwrite)
@@ -146,10 +147,10 @@ def fit_landmarks(
     elif pairs is None and log is not None and database is not None and poses is not None:
         scored = of_drive(log, Path(database), Path(poses))
     else:
-        raise UsageError("fit landmarks: give --pairs, or LOG... with --database and --poses")
+        raise UsageError("fit landmarks: expected --pairs, or LOG... with --database and --poses")
     try:
         fitted = fit_threshold(scored, false_match_rate)
     except ValueError as error:
-        raise SchemaError(f"fit landmarks: {error}; give more labelled pictures") from None
+        raise SchemaError(f"fit landmarks: {error}; use more labelled pictures") from None
     path = write_fit(vehicle, output, lambda text: with_min_score(text, fitted.min_score))
     return FittedLandmarks(fitted, comparing.kind, path)

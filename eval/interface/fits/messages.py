@@ -1,4 +1,4 @@
-"""The reliability of each cue, learned from annotated drives."""
+"""Learn the reliability of each cue from annotated drives."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from crosscue.replay.base import EmptyResultError, write_text
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedMessages:
-    """The reliability of each cue; printed with its counts.
+    """Learned reliability of each cue.
 
     Attributes:
-        fitted: Rates, fades and exponents.
-        used: Approaches of the runs, by what they were.
-        runs: How many runs were read.
-        path: Where the section was written to; None where it was not.
+        fitted: Rates, decorrelation scales and exponents.
+        used: Number of approaches of the runs, by kind.
+        runs: Number of runs.
+        path: File that the section was written to; None without one.
     """
 
     fitted: MessageFit
@@ -43,7 +43,7 @@ class FittedMessages:
         return _section_of(self.fitted)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit messages --json`` prints."""
+        """Return the JSON output of ``crosscue fit messages``."""
         return {
             "approaches": self.fitted.approaches,
             "used": dict(self.used),
@@ -77,16 +77,16 @@ class FittedMessages:
 
 
 def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
-    lines = [f"{runs} runs, {fitted.approaches} approaches to learn from"]
+    lines = [f"{runs} runs, {fitted.approaches} annotated approaches"]
     lines += [f"  {count:5} {what}" for what, count in sorted(used.items())]
-    lines += ["", "fractions of positive frames, feature there and not there (95 % intervals)"]
+    lines += ["", "fractions of positive frames, with and without the feature (95 % intervals)"]
     lines += [_rate_text(one) for one in fitted.rates if one.rates is not None]
-    lines += ["", "too little seen, so the published message stands"]
+    lines += ["", "too few observations, so the published message is kept"]
     lines += [_unlearned_text(one) for one in fitted.rates if one.rates is None]
     lines += ["", "frames become independent over"]
     lines += [_fade_text(one) for one in fitted.fades]
     scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
-    lines += ["", f"exponents: {scales or 'none: no feature was both there and not there'}", ""]
+    lines += ["", f"exponents: {scales or 'none: no feature was both present and absent'}", ""]
     return "\n".join(lines)
 
 
@@ -97,12 +97,12 @@ def _name_of(one: RateFit) -> str:
 def _rate_text(one: RateFit) -> str:
     assert one.rates is not None
     there, missing = one.rates.if_there, one.rates.if_not
-    says = math.log(there / missing)
-    silence = math.log((1.0 - there) / (1.0 - missing))
+    detected = math.log(there / missing)
+    not_detected = math.log((1.0 - there) / (1.0 - missing))
     return (
-        f"{_name_of(one)}\n    there     {_side_text(one.there)}\n"
-        f"    not there {_side_text(one.missing)}\n"
-        f"    log odds of a detection {says:+.2f}, of none {silence:+.2f}"
+        f"{_name_of(one)}\n    present   {_side_text(one.there)}\n"
+        f"    absent    {_side_text(one.missing)}\n"
+        f"    log odds of a detection {detected:+.2f}, of no detection {not_detected:+.2f}"
     )
 
 
@@ -120,14 +120,14 @@ def _side_text(side: Side) -> str:
     by_place = TOO_FEW if math.isnan(low) else f"{low:.2f} to {high:.2f}"
     return (
         f"{reported.rate:.2f} ({reported.wilson.low:.2f} to {reported.wilson.high:.2f} by "
-        f"{side.looks:.0f} looks in {side.frames} frames; {by_place} by {side.places} places)"
+        f"{side.looks:.0f} independent frames of {side.frames}; {by_place} by {side.places} places)"
     )
 
 
 def _fade_text(one: FadeFit) -> str:
     fade = one.fade
     scale = f"{fade.way_m:.1f} m" if fade.way_m is not None else f"{fade.time_s:.2f} s"
-    why = "" if one.is_learned else ", not learned: too few positive, or always so"
+    why = "" if one.is_learned else ", not learned: too few positive frames, or all positive"
     return f"  {one.cue:20} {scale:>8}  {one.positives} positive of {one.looks} frames{why}"
 
 
@@ -142,12 +142,11 @@ def _side_json(side: Side) -> dict[str, object]:
 
 
 class _SideRate(NamedTuple):
-    """A rate and how sure it is.
+    """A rate and its intervals.
 
     Attributes:
-        rate: Mean over places; NaN without any.
-        wilson: Interval by independent observations; rounding them to whole ones costs less than
-            pretending that every frame is one.
+        rate: Mean over places; NaN without places.
+        wilson: Interval from the number of independent observations, rounded to an integer.
         places: Interval over places; NaN for fewer than four.
     """
 
@@ -157,7 +156,7 @@ class _SideRate(NamedTuple):
 
 
 def _rates_of(side: Side) -> _SideRate:
-    """A side's rate with both intervals."""
+    """Return a side's rate with both intervals."""
     looks = round(side.looks)
     rates = np.array(side.rates)
     return _SideRate(
@@ -168,7 +167,7 @@ def _rates_of(side: Side) -> _SideRate:
 
 
 def _section_of(fit: MessageFit) -> str:
-    """The vehicle file's section, with counts as comments."""
+    """Return the vehicle file's section, with counts as comments."""
     lines = ["[fusion.calibrated]", "rates = ["]
     lines += [_rate_line(one) for one in fit.rates if one.rates is not None]
     lines += ["]", "", "[fusion.calibrated.exponents]"]
@@ -207,12 +206,12 @@ def fit_messages(
     Args:
         runs: Finished runs.
         truth: The truth of each, in the same order.
-        output: TOML file for the section; it is only returned, if left out.
-        overwrite: Replace a file that is there.
-        on_runs: Called with the number of runs that are read, and of how many.
+        output: TOML file for the section; default: it is only returned.
+        overwrite: Replace an existing file.
+        on_runs: Called with the number of runs read, and their total.
 
     Raises:
-        UsageError: Not a truth for each run, or runs of different cues.
+        UsageError: The numbers of runs and truth files differ, or runs have different cues.
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
@@ -225,13 +224,13 @@ def fit_messages(
         on_runs(done, len(folders))
     if not found.approaches:
         raise EmptyResultError(
-            "fit messages: no approach of any run lies in an annotated one; give more"
+            "fit messages: no approach of any run matches an annotated one; use more drives"
         )
     fitted = fit_approaches(found.approaches, graph)
     if all(one.rates is None for one in fitted.rates):
         raise EmptyResultError(
-            f"fit messages: nothing can be learned of {len(found.approaches)} approaches, so every "
-            "published message stands; give more drives and their truth"
+            f"fit messages: {len(found.approaches)} approaches are too few to learn from, so every "
+            "published message is kept; use more drives with truth"
         )
     if path is not None:
         write_text(path, _section_of(fitted))

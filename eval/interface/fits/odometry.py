@@ -1,4 +1,4 @@
-"""Odometry fitted to a drive."""
+"""Fit odometry to a drive."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedOdometry:
-    """What a drive shows of a car's odometry, tested on its second half; printed with its section.
+    """Odometry fitted to the first half of a drive and tested on the second.
 
     Attributes:
-        fitted: The fit of each source of turns, with errors before and after on both halves.
-        path: The vehicle file it was written to; None where it was not.
+        fitted: Fit for each source of the turn rate, with errors before and after on both halves.
+        path: Vehicle file that was written; None without one.
     """
 
     fitted: DriveFit
@@ -35,11 +35,11 @@ class FittedOdometry:
 
     @property
     def camera_yaw_rad(self) -> float | None:
-        """The camera's mounting yaw; None where the positions are not the camera's track."""
+        """Mounting yaw of the camera; None unless the positions are the camera's track."""
         return camera_yaw_of(self.fitted)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit odometry --json`` prints."""
+        """Return the JSON output of ``crosscue fit odometry``."""
         found = self.fitted
         return {
             "odometry": self.section,
@@ -77,7 +77,7 @@ class FittedOdometry:
         for one in found.sources:
             lines += ["", *_source(one)]
         low, high = found.nees_band
-        lines += ["", f"NEES of x, y is honest for one drive from {low:.2f} to {high:.2f}"]
+        lines += ["", f"NEES of x, y is consistent for one drive between {low:.2f} and {high:.2f}"]
         lines += [f"not fitted  {name}: {why}" for name, why in found.not_fitted.items()]
         lines += ["", "[odometry]"]
         lines += [f"{key} = {value}" for key, value in self.section.items() if key != "fitted"]
@@ -92,7 +92,7 @@ def _source(one: SourceFit) -> list[str]:
     fit, before, after = one.fit, one.before, one.after
     width = max(len(name) for name in [*(v.parameter for v in fit.fitted), "gyro_bias_radps"])
     lines = [
-        f"turned by {fit.source}: {fit.fixes} positions of s.d. {fit.fix_sd_m:.2f} m, "
+        f"turns from {fit.source}: {fit.fixes} positions of s.d. {fit.fix_sd_m:.2f} m, "
         f"{fit.outliers} outliers"
     ]
     lines += [
@@ -103,7 +103,9 @@ def _source(one: SourceFit) -> list[str]:
     if one.camera_yaw_rad is not None:
         degrees = math.degrees(one.camera_yaw_rad)
         sure = math.degrees(one.camera_yaw_sd_rad)
-        lines.append(f"  heading of the true track less the car's: {degrees:.2f} +- {sure:.2f} deg")
+        lines.append(
+            f"  heading of the true track minus the car's: {degrees:.2f} +- {sure:.2f} deg"
+        )
     lines += [
         f"  odometry alone, rms    fitted half {before.fitted_m:9.2f} m -> {after.fitted_m:8.2f} m"
         f"   NEES {after.fitted_nees:6.2f}",
@@ -125,20 +127,20 @@ def fit_odometry(
 ) -> FittedOdometry:
     """Fit odometry to the first half of a drive, and test it on the second.
 
-    Scales, biases, geometry, delays and noise are fitted to GNSS or to a true track. What the
-    drive cannot show keeps its value and is named.
+    Scales, biases, geometry, delays and noise are fitted to GNSS or to a true track. Parameters
+    that the drive does not determine keep their values and are listed.
 
     Args:
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         vehicle: The vehicle file; None for the defaults.
-        output: The vehicle file to write, with the fit; may be ``vehicle`` itself.
+        output: Vehicle file to write, with the fit; may be ``vehicle`` itself.
         truth: Truth file with the positions; None for the log's GNSS.
-        overwrite: Replace another file that is there.
+        overwrite: Replace another existing file.
 
     Raises:
-        EmptyResultError: No wheel speeds, or no positions.
-        VehicleError: Too few positions, or too short a drive.
-        SchemaError: The truth file does not fit, or holds no pose.
+        EmptyResultError: The drive has no wheel speeds, or no positions.
+        VehicleError: The drive has too few positions, or is too short.
+        SchemaError: The truth file does not fit the drive, or contains no pose.
         OutputError: The output exists, or cannot be written.
     """
     check_output(vehicle, output, overwrite=overwrite)

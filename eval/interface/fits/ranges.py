@@ -1,4 +1,4 @@
-"""The curve from an object's height in pixels to its range, fitted to pairs."""
+"""Fit a curve from an object's height in pixels to its range."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ PUBLISHED_SD_M: Final = {"stop_sign": 1.7, "traffic_light": 5.9}
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedRanges:
-    """Curves from heights to ranges; printed with residuals by distance and a section.
+    """Fitted curves from heights to ranges, with residuals by distance.
 
     Attributes:
-        cue: Whose objects were measured.
-        fits: One for each family.
-        tested: The best curve's residuals on other drives; None where none were given.
+        cue: Cue whose objects were measured.
+        fits: One fit per family of curves.
+        tested: Residuals of the best curve on other drives; None without such drives.
     """
 
     cue: str
@@ -40,7 +40,7 @@ class FittedRanges:
         return min(self.fits, key=lambda fit: fit.curve.residual_sd_m)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit ranges --json`` prints."""
+        """Return the JSON output of ``crosscue fit ranges``."""
         tree: dict[str, object] = {
             "cue": self.cue,
             "best": self.best.curve.family,
@@ -121,24 +121,24 @@ def fit_ranges(
 ) -> FittedRanges:
     """Fit a curve from an object's height in pixels to its range.
 
-    Pairs come from a table, from the annotated objects of drives, or from what the detectors of
-    runs found.
+    Pairs are read from a table, from the annotated objects of drives, or from the detections of
+    runs.
 
     Args:
         cue: ``stop_sign`` or ``traffic_light``.
-        table: CSV or Parquet file with ``height_px`` and ``range_m``, to the rear axle.
+        table: CSV or Parquet file with ``height_px`` and ``range_m``, from the rear axle.
         truth: Drives with annotated objects and ranges, instead of a table.
-        runs: Take the heights from these runs, one for each of ``truth``.
+        runs: Runs with detections to measure heights in, one for each drive of ``truth``.
         test: Other drives to measure the best curve on.
-        min_score: Of a detection of the runs.
-        family: Fit only this one.
+        min_score: Min score of a detection of the runs.
+        family: Fit only this family of curves.
         bin_m: Width of the distance bins.
-        figure: PNG file for pairs, curves and residuals.
-        overwrite: Replace a figure that is there.
+        figure: PNG file to write, with pairs, curves and residuals.
+        overwrite: Replace an existing figure.
 
     Raises:
-        UsageError: Neither table nor truth, or a value out of range.
-        EmptyResultError: No pairs in the drives.
+        UsageError: Neither a table nor truth is passed, or a value is out of range.
+        EmptyResultError: The drives contain no pairs.
         OutputError: The figure exists, or cannot be written.
     """
     picture = None if figure is None else Path(figure)
@@ -162,7 +162,7 @@ def fit_ranges(
     if test:
         others = together(pairs_of_truth(Path(one), cue) for one in test)
         if not len(others.range_m):
-            raise EmptyResultError(f"--test: no {cue} in it; give other drives")
+            raise EmptyResultError(f"--test: the drives contain no {cue}; use others")
         tested = residuals(*others, found.best.curve, bin_m)
         found = FittedRanges(cue, found.fits, tested)
     if picture is not None:
@@ -180,11 +180,13 @@ def _pairs(
     min_score: float,
 ) -> RangePairs:
     if (table is None) == (not truth):
-        raise UsageError("fit ranges: give a TABLE, or --truth with drives")
+        raise UsageError("fit ranges: expected a TABLE, or --truth with drives")
     if table is not None:
         return pairs_of_table(table)
     if runs and len(runs) != len(truth):
-        raise UsageError(f"--runs: {len(runs)} runs for {len(truth)} drives; pair them")
+        raise UsageError(
+            f"--runs: {len(runs)} runs for {len(truth)} drives; expected one run per drive"
+        )
     parts = (
         [pairs_of_run(r, t, cue, min_score) for r, t in zip(runs, truth, strict=True)]
         if runs
@@ -192,5 +194,5 @@ def _pairs(
     )
     pairs = together(parts)
     if not len(pairs.range_m):
-        raise EmptyResultError(f"--truth: no {cue} with a range in it; give other drives")
+        raise EmptyResultError(f"--truth: the drives contain no {cue} with a range; use others")
     return pairs

@@ -1,4 +1,4 @@
-"""The belief over time, learned from annotated drives."""
+"""Learn the belief over time from annotated drives."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from crosscue.replay.vehicle.temporal import CueChain
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedTemporal:
-    """Chains of cues along a drive; printed as the vehicle file's section.
+    """Learned Markov chains of cues along a drive.
 
     Attributes:
-        fitted: All that was learned.
-        runs: How many runs were read.
-        path: Where the section was written to; None where it was not.
+        fitted: The learned parameters and their scores.
+        runs: Number of runs.
+        path: File that the section was written to; None without one.
     """
 
     fitted: TemporalFit
@@ -35,7 +35,7 @@ class FittedTemporal:
         return _section_of(self.fitted)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit temporal --json`` prints."""
+        """Return the JSON output of ``crosscue fit temporal``."""
         return {
             "runs": self.runs,
             "drives": self.fitted.drives,
@@ -52,7 +52,11 @@ class FittedTemporal:
         end = self.section if self.path is None else f"written to {self.path}"
         learned = self.fitted.temporal
         score = self.fitted.log_scores.get((learned.exponent, learned.lapse))
-        judged = "too few places to judge" if score is None else f"log score {score:.3f} elsewhere"
+        judged = (
+            "too few places to score"
+            if score is None
+            else f"log score {score:.3f} on held-out places"
+        )
         return (
             f"{self.runs} runs, {self.fitted.drives} drives at {self.fitted.places} places, "
             f"{self.fitted.steps} steps\n"
@@ -61,7 +65,7 @@ class FittedTemporal:
 
 
 def _section_of(fit: TemporalFit) -> str:
-    """The vehicle file's section, with what it was learned from."""
+    """Return the vehicle file's section, with the numbers of drives and places as a comment."""
     learned = fit.temporal
     lines = [
         f"# Learned from {fit.drives} drives at {fit.places} places, {fit.steps} steps.",
@@ -104,12 +108,12 @@ def fit_temporal(
     Args:
         runs: Finished runs.
         truth: The truth of each, in the same order.
-        output: TOML file for the section; it is only returned, if left out.
-        overwrite: Replace a file that is there.
-        on_runs: Called with the number of runs that are read, and of how many.
+        output: TOML file for the section; default: it is only returned.
+        overwrite: Replace an existing file.
+        on_runs: Called with the number of runs read, and their total.
 
     Raises:
-        UsageError: Not a truth for each run, or runs of different cues.
+        UsageError: The numbers of runs and truth files differ, or runs have different cues.
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
@@ -124,7 +128,7 @@ def fit_temporal(
         fitted = fit_drives(drives, graph)
     except ValueError as error:
         raise EmptyResultError(
-            f"fit temporal: nothing can be learned of {len(drives)} drives: {error}; give more"
+            f"fit temporal: {len(drives)} drives are too few to learn from: {error}; use more"
         ) from None
     if path is not None:
         write_text(path, _section_of(fitted))

@@ -1,4 +1,4 @@
-"""A vehicle file with the values of a fit in it."""
+"""Write the values of a fit into a vehicle file."""
 
 from __future__ import annotations
 
@@ -10,22 +10,24 @@ from crosscue.replay.base import OutputError, UsageError, write_text
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 
 DEFAULTS: Final = "version = 1\n"
-"""A vehicle file that leaves everything as it is."""
+"""Vehicle file with only default values."""
 
 
 def check_output(
     vehicle: Vehicle | Path | str | None, output: Path | str | None, *, overwrite: bool
 ) -> None:
-    """Refuse, before any work, an output that cannot be written as asked.
+    """Check, before any work, that the output can be written.
 
     Raises:
-        UsageError: The settings are no file, so there is no text to put the fit into.
-        OutputError: The output is another file that exists.
+        UsageError: The vehicle settings are not a file, so there is no text to insert the fit into.
+        OutputError: The output is another existing file.
     """
     if output is None:
         return
     if isinstance(vehicle, Vehicle):
-        raise UsageError("output: needs the vehicle file that gets the fit, not settings; name it")
+        raise UsageError(
+            "output: expected a vehicle file to insert the fit into, found settings; pass its path"
+        )
     path = Path(output)
     is_itself = vehicle is not None and path.exists() and path.samefile(vehicle)
     if path.exists() and not is_itself and not overwrite:
@@ -37,9 +39,10 @@ def write_fit(
     output: Path | str | None,
     with_fit: Callable[[str], str],
 ) -> Path | None:
-    """Write the vehicle file's text with the fit in it, if asked for; once ``check_output``ed.
+    """Write the vehicle file with the fit to ``output``, unless it is None; return its path.
 
-    Without a vehicle file the fit was one of the default settings, and becomes a file of its own.
+    Without a vehicle file, the fit is inserted into a new file with default values. Call
+    ``check_output`` first.
     """
     if output is None:
         return None

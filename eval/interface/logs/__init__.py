@@ -1,1 +1,1 @@
-"""A drive: opened for reading, summarised, converted, sealed."""
+"""Open, summarise, convert and seal recorded drives."""

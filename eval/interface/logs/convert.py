@@ -1,4 +1,4 @@
-"""Any log as one MCAP file of standard ROS 2 types."""
+"""Convert any log to one MCAP file with standard ROS 2 types."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ HEAD: Final = ("topic", "type", "found", "written", "skipped", "dropped")
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Converted:
-    """A log that was converted; printed as a table of its topics.
+    """Result of a conversion; its repr is a table of topics.
 
     Attributes:
-        log: What was read, as given.
-        path: The file that was written.
-        size_bytes: Of that file.
-        written: Messages by topic, as they are called in the file.
-        types: From topic in the file to its ROS 2 type.
-        kept: Messages by topic, as they are called in the log.
-        ledger: What became of every row of the log.
+        log: Path or URL of the log, as passed.
+        path: The written file.
+        size_bytes: Size of that file.
+        written: Number of messages by topic name in the file.
+        types: ROS 2 type by topic name in the file.
+        kept: Number of messages by topic name in the log.
+        ledger: Account of every row of the log.
     """
 
     log: str
@@ -44,17 +44,17 @@ class Converted:
 
     @property
     def is_whole(self) -> bool:
-        """Every row that was asked for is in the file."""
+        """True if every selected row is in the file."""
         return _is_whole(self.ledger)
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What the reader has to say about the log."""
+        """Remarks of the reader on the log."""
         return tuple(visible(notice) for notice in self.ledger.notices)
 
     @property
     def places(self) -> list[dict[str, object]]:
-        """Where rows were dropped or skipped, and why."""
+        """Return the places where rows were dropped or skipped, with reasons."""
         return [
             {
                 "topic": visible(detail.topic),
@@ -69,7 +69,7 @@ class Converted:
 
     @property
     def places_text(self) -> list[str]:
-        """The same in a line each."""
+        """Return the same as ``places``, one line each."""
         lines = []
         for detail in self.ledger.details:
             verb = "dropped" if detail.is_dropped else "skipped"
@@ -79,7 +79,7 @@ class Converted:
         return lines
 
     def as_dict(self) -> dict[str, object]:
-        """Counts and account as dictionaries, lists and scalars; without the places."""
+        """Return counts and account, without places, as dictionaries, lists and scalars."""
         return {
             "log": self.log,
             "output": str(self.path),
@@ -133,31 +133,31 @@ def convert(
 ) -> Converted:
     """Write a log as one MCAP file with standard ROS 2 types, message for message.
 
-    ROS 2 messages are copied byte for byte, ROS 1 messages transcribed, everything else written in
-    the standard type that holds it. The file is read back and its messages are counted.
+    ROS 2 messages are copied byte for byte, ROS 1 messages are transcribed, and everything else is
+    written as the standard type for its contents. The file is read back and its messages counted.
 
     Args:
         log: One log, or its path; ``log.part(...)`` for a part of it.
-        output: The file; its name ends in ``.mcap``.
-        compression: Of the chunks: ``zstd``, ``lz4`` or ``none``.
-        overwrite: Replace a file that is there.
-        on_rows: Called with the rows that are done, and those that the log declares.
+        output: File to write; its name ends in ``.mcap``.
+        compression: Compression of the chunks: ``zstd``, ``lz4`` or ``none``.
+        overwrite: Replace an existing file.
+        on_rows: Called with the number of rows done, and the number that the log declares.
 
     Raises:
-        UsageError: Several logs, another suffix, or the output is the log itself.
-        OutputError: The output exists, has a seal, cannot be written, or reads back differently.
-        EmptyResultError: No row to write.
-        LogError: Damage has left none.
+        UsageError: There are several logs, or the output has another suffix or is the log itself.
+        OutputError: The output exists, has a seal, cannot be written, or differs when read back.
+        EmptyResultError: There is no row to write.
+        LogError: Because of damage, no row can be read.
     """
     path = Path(output)
     with opened(log) as drive:
         if len(drive.logs) != 1:
-            raise UsageError(f"convert: {len(drive.logs)} logs; expected one, convert each")
+            raise UsageError(f"convert: expected one log, found {len(drive.logs)}; convert each")
         _check_output(path, drive.paths[0])
         ledger = Ledger(drive.paths[0])
         with LogWriter(path, ledger, compression=compression, overwrite=overwrite) as writer:
             _copy(drive, ledger, writer, on_rows)
-            # Found = written + skipped, for every topic.
+            # Rows found = rows written + rows skipped, for every topic.
             ledger.check({name: writer.kept[name] for name in ledger.accounts})
             is_read = any(account.handed_on for account in ledger.accounts.values())
             if not writer.written and (_is_whole(ledger) or not (is_read or _refused(ledger))):
@@ -175,7 +175,7 @@ def _check_output(output: Path, log: str) -> None:
         raise UsageError(f"{output}: is the log itself; give another name")
     if seal_path(output).exists():
         raise OutputError(
-            f"{seal_path(output)}: seals what was there before; delete it, or give another -o"
+            f"{seal_path(output)}: seals an earlier file; delete the seal, or use another -o"
         )
 
 
@@ -188,7 +188,7 @@ def _copy(
     done = 0
     for block in ledger.handing_on(log.read(ledger, drive.selection)):
         done += len(block)
-        # A topic may come to light only while a damaged log is read.
+        # In a damaged log, a topic may be found only while reading.
         for topic in log.topics:
             if topic not in known:
                 known.add(topic)
@@ -198,10 +198,10 @@ def _copy(
 
 
 def _read_back(path: Path, writer: LogWriter) -> None:
-    """Count what the file holds, checksums verified.
+    """Count the messages of the written file, and verify its checksums.
 
     Raises:
-        OutputError: It does not hold what was written; the file is removed.
+        OutputError: The counts differ; the file is removed.
     """
     held = Ledger(str(path))
     try:
@@ -214,7 +214,9 @@ def _read_back(path: Path, writer: LogWriter) -> None:
         right = False
     if not right:
         path.unlink(missing_ok=True)
-        raise OutputError(f"{path}: reads back differently than written; check the disk, try again")
+        raise OutputError(
+            f"{path}: read back, differs from what was written; check the disk, and try again"
+        )
 
 
 def _is_whole(ledger: Ledger) -> bool:
@@ -222,7 +224,7 @@ def _is_whole(ledger: Ledger) -> bool:
 
 
 def _refused(ledger: Ledger) -> bool:
-    """Were rows skipped that were asked for?"""
+    """Return whether rows of the selection were skipped."""
     return any(
         reason not in NOT_ASKED
         for account in ledger.accounts.values()

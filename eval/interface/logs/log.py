@@ -1,4 +1,4 @@
-"""A recorded drive, open for reading: its topics as tables, its camera as frames."""
+"""Read a recorded drive: its topics as tables, its camera as frames."""
 
 from __future__ import annotations
 
@@ -57,21 +57,21 @@ NOT_ASKED: Final = (NOT_ASKED_TIME, NOT_ASKED_TOPIC)
 
 
 def open(*paths: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:  # noqa: A001
-    """Open a recorded drive: one log or several, in any format that crosscue reads.
+    """Open a recorded drive: one log or several, in any supported format.
 
-    The log is read when a topic, a frame or a summary is asked for, and only as far as its index
-    says is necessary. Use it in a ``with`` block, or ``close`` it.
+    Data are read when a topic, a frame or a summary is requested and, if the log has an index, only
+    the necessary parts. Use the drive in a ``with`` block, or ``close`` it.
 
     Args:
         paths: Files, folders of data sets, or URLs.
-        limits: The largest chunk, message and file that are read.
+        limits: Largest chunk, message and file to read.
 
     Returns:
-        The drive; ``log.topics`` lists what it holds, ``log["/imu"].table()`` reads.
+        The drive; ``log.topics`` lists its topics, ``log["/imu"].table()`` reads one.
 
     Raises:
-        UnknownFormatError: No reader knows the file or folder; the message lists those there are.
-        LogError: It is missing, not permitted, or has no readable record.
+        UnknownFormatError: No reader supports the file or folder; the message lists the readers.
+        LogError: The log is missing, not permitted, or has no readable record.
     """
     if not paths:
         raise UsageError("open: no log named; expected one path or more")
@@ -86,7 +86,7 @@ def open(*paths: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:  # noqa: A
 
 @contextmanager
 def opened(log: Log | Path | str) -> Iterator[Log]:
-    """The drive, open as long as the ``with`` block lasts; one that was open stays so."""
+    """Open a drive for a ``with`` block; a drive that is already open is not closed."""
     with ExitStack() as files:
         drive = log if isinstance(log, Log) else files.enter_context(open(log))
         with unless_damaged(drive.logs):
@@ -95,15 +95,14 @@ def opened(log: Log | Path | str) -> Iterator[Log]:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Log(Closing):
-    """A recorded drive; make one with ``crosscue.open``.
+    """A recorded drive, returned by ``crosscue.open``.
 
-    ``log[name]`` is one topic. ``part`` restricts everything that follows to a span of time or to
-    some topics.
+    ``log[name]`` is one topic. ``part`` selects a time span or some of the topics.
 
     Attributes:
-        logs: The open readers, in the order given.
-        limits: The largest chunk, message and file that are read.
-        selection: The part that is read.
+        logs: The open readers, in the order of the paths.
+        limits: Largest chunk, message and file to read.
+        selection: The part to read.
     """
 
     logs: tuple[OneLog, ...]
@@ -113,12 +112,12 @@ class Log(Closing):
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """Where the logs are, as given."""
+        """Paths or URLs of the logs, as passed."""
         return tuple(name_of(log) for log in self.logs)
 
     @property
     def topics(self) -> Topics:
-        """What the drive holds, by name; known without reading it wherever the format allows."""
+        """Topics by name; known without reading the messages, if the format allows it."""
         return Topics(self)
 
     def __getitem__(self, name: str) -> LogTopic:
@@ -130,15 +129,15 @@ class Log(Closing):
         end_s: float | None = None,
         topics: Sequence[str] | None = None,
     ) -> Log:
-        """The same drive, of which only a part is read.
+        """Return the same drive, restricted to a part.
 
         Args:
-            start_s: Seconds after the first row, or None for the beginning.
-            end_s: Seconds after the first row, no longer wanted (half open), or None for the end.
-            topics: Names, or None for all.
+            start_s: Start, in seconds after the first row; None for the beginning.
+            end_s: End (exclusive), in seconds after the first row; None for the end.
+            topics: Names of topics; None for all.
 
         Raises:
-            UsageError: An empty span.
+            UsageError: The time span is empty.
             MissingTopicError: The drive has no such topic.
         """
         with unless_damaged(self.logs):
@@ -151,12 +150,13 @@ class Log(Closing):
         quick: bool = False,
         progress: Progress | None = None,
     ) -> DriveSummary:
-        """Topics, counts, rates, gaps, clocks and account, read in one pass.
+        """Return topics, counts, rates, gaps, clocks and account, read in one pass.
 
         Args:
-            vehicle: Where the wheel speeds are, to find gaps; None for what the log itself says.
-            quick: Only what the log says of itself; its body is not read.
-            progress: Passes blocks on while it shows how far the work is.
+            vehicle: Vehicle file with the topic of wheel speeds, to find gaps; None to detect the
+                topic.
+            quick: Return only what the log declares, without reading its messages.
+            progress: Wraps the iterable of blocks, to show progress.
         """
         from crosscue.eval.interface.logs.summary import summary_of
         from crosscue.replay.vehicle.vehicle import Vehicle
@@ -167,24 +167,25 @@ class Log(Closing):
     def signals(
         self, *databases: Path | str, bus: str | None = None, messages: Sequence[str] | None = None
     ) -> Signals:
-        """The signals of raw CAN frames, a table for each message.
+        """Decode the signals of raw CAN frames, into one table per message.
 
         Args:
             databases: DBC, KCD, ARXML or SYM files.
-            bus: The topic of the frames, where the drive has several buses.
-            messages: Only these, by name; None for all.
+            bus: Topic of the frames, if the drive has several buses.
+            messages: Names of messages to decode; None for all.
 
         Returns:
-            Tables by message, units in their columns' metadata; see ``Signals``.
+            Tables by message, with units in their columns' metadata; see ``Signals``.
 
         Raises:
-            UsageError: No CAN bus, several and none chosen, or a message the files lack.
-            SchemaError: A file cannot be understood.
+            UsageError: The drive has no CAN bus, or several and ``bus`` is None, or a message is
+                not in the files.
+            SchemaError: A file is not valid.
         """
         return _signals(self, [Path(name) for name in databases], bus, messages)
 
     def close(self) -> None:
-        """Close the files; nothing can be read afterwards."""
+        """Close the files."""
         self._files.close()
 
     def __repr__(self) -> str:
@@ -194,7 +195,7 @@ class Log(Closing):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Topics(Mapping[str, "LogTopic"]):
-    """The topics of a drive by name; printed as a table."""
+    """The topics of a drive by name; its repr is a table."""
 
     log: Log
 
@@ -230,7 +231,8 @@ class LogTopic:
 
     Attributes:
         log: The drive.
-        sources: The logs that have it, and what each says of it; rows come in this order.
+        sources: Logs that contain it, each with its declaration of the topic, in the order in which
+            rows are read.
     """
 
     log: Log
@@ -238,41 +240,41 @@ class LogTopic:
 
     @property
     def name(self) -> str:
-        """As the log spells it."""
+        """Name, as in the log."""
         return self.sources[0][1].name
 
     @property
     def type_name(self) -> str:
-        """Type of its messages, as the log spells it."""
+        """Type of its messages, as in the log."""
         return self.sources[0][1].type_name
 
     @property
     def encoding(self) -> str:
-        """How its messages are coded."""
+        """Encoding of its messages."""
         return self.sources[0][1].encoding
 
     @property
     def declared(self) -> int | None:
-        """How many messages the format says there are; None where it says nothing."""
+        """Number of messages that the log declares; None if it declares none."""
         counts = [topic.declared for _, topic in self.sources]
         known = [count for count in counts if count is not None]
         return sum(known) if len(known) == len(counts) else None
 
     def table(self, start_s: float | None = None, end_s: float | None = None) -> pa.Table:
-        """Its rows as a table, a column for each field; all of it is held in memory.
+        """Read its rows into one table in memory, with one column per field.
 
-        Columns ``log_t_ns``, ``publish_ns`` and ``header_ns`` are nanoseconds, the latter two where
-        every row has them. What became of every row is in the table's metadata
-        (``table.schema.metadata[b"crosscue"]``, JSON); rows that are dropped or cannot be decoded
-        are warned of, too.
+        Columns ``log_t_ns``, ``publish_ns`` and ``header_ns`` are in nanoseconds; the latter two
+        exist only if every row has them. The account of every row is in the table's metadata
+        (``table.schema.metadata[b"crosscue"]``, JSON). A warning reports rows that are dropped or
+        cannot be decoded.
 
         Args:
-            start_s: Seconds after the drive's first row, or None for the beginning.
-            end_s: Seconds after the drive's first row, no longer wanted, or None for the end.
+            start_s: Start, in seconds after the drive's first row; None for the beginning.
+            end_s: End (exclusive), in seconds after the drive's first row; None for the end.
 
         Raises:
             SchemaError: Its type cannot be decoded.
-            UsageError: It holds pictures; an empty span.
+            UsageError: It contains pictures, or the time span is empty.
         """
         ledgers: list[Ledger] = []
         blocks = [*self._rows(self._selected(start_s, end_s), ledgers)]
@@ -281,7 +283,7 @@ class LogTopic:
     def batches(
         self, start_s: float | None = None, end_s: float | None = None
     ) -> Iterator[pa.RecordBatch]:
-        """As ``table``, a batch at a time: memory does not grow with the log."""
+        """Yield the rows of ``table`` in batches, in bounded memory."""
         ledgers: list[Ledger] = []
         for block in self._rows(self._selected(start_s, end_s), ledgers):
             yield from _table_of([block], {}).to_batches()
@@ -289,14 +291,14 @@ class LogTopic:
     def frames(
         self, start_s: float | None = None, end_s: float | None = None
     ) -> Iterator[CameraFrame]:
-        """Its pictures one by one, still encoded; ``frame.rgb`` decodes. Video comes decoded.
+        """Yield its pictures, still encoded; ``frame.rgb`` decodes them. Video is yielded decoded.
 
         Args:
             start_s: As in ``table``.
             end_s: As in ``table``.
 
         Raises:
-            UsageError: It holds no pictures; an empty span.
+            UsageError: It contains no pictures, or the time span is empty.
             SchemaError: Its type cannot be decoded.
         """
         from crosscue.detectors.images import encoded
@@ -318,14 +320,14 @@ class LogTopic:
         return Selection(frozenset({self.name}), max(starts, default=None), min(ends, default=None))
 
     def _rows(self, selection: Selection, ledgers: list[Ledger]) -> Iterator[Block]:
-        """Blocks of columns."""
+        """Yield blocks of columns."""
         for block in self._blocks(selection, ledgers):
             if isinstance(block.rows, Images):
-                raise UsageError(f"{self.name}: holds pictures; use frames()")
+                raise UsageError(f"{self.name}: contains pictures; use frames()")
             yield block
 
     def _blocks(self, selection: Selection, ledgers: list[Ledger]) -> Iterator[Block]:
-        """Decoded blocks; once exhausted, what is missing has been warned of."""
+        """Yield decoded blocks; at the end, warn about missing rows."""
         decoders = [_decoder(log, topic) for log, topic in self.sources]
         for (log, _), decode in zip(self.sources, decoders, strict=True):
             ledger = Ledger(name_of(log))
@@ -353,11 +355,11 @@ class CameraFrame:
     """One picture of a log.
 
     Attributes:
-        t_ns: When the recorder stored it, log time.
+        t_ns: Log time.
         camera: Topic.
-        encoded: Its bytes as stored.
-        coding: How they are coded: ``jpeg``, ``png``, ``raw``, ...
-        layout: Of a raw picture width, height, bytes a row and pixel format; else None.
+        encoded: Bytes of the picture, as stored.
+        coding: Encoding of the bytes: ``jpeg``, ``png``, ``raw``, ...
+        layout: Width, height, bytes per row and pixel format of a raw picture; else None.
     """
 
     t_ns: int
@@ -368,11 +370,11 @@ class CameraFrame:
 
     @property
     def rgb(self) -> Bytes:
-        """Its pixels in red, green and blue, uint8 of shape (H, W, 3).
+        """Pixels in red, green and blue, uint8, shape (H, W, 3).
 
         Raises:
-            LogFormatError: Damaged, cut short, or of a coding that is not decoded.
-            LogTooLargeError: More pixels than are decoded.
+            LogFormatError: The picture is damaged, truncated, or of an unsupported encoding.
+            LogTooLargeError: The picture has more pixels than the limit.
         """
         from crosscue.detectors.images import Encoded, decode
 
@@ -384,13 +386,13 @@ class CameraFrame:
 
 
 class Signals(Mapping[str, "pa.Table"]):
-    """Tables of CAN messages by name; each column is a signal, its unit in the field's metadata.
+    """Tables of CAN messages by name; each column is a signal, with its unit in the metadata.
 
-    ``account`` says what became of every frame of the bus, by reason.
+    ``account`` has the numbers of decoded, skipped and dropped frames of the bus, with reasons.
     """
 
     def __init__(self, tables: Mapping[str, pa.Table], account: Mapping[str, object]) -> None:
-        """Keep both."""
+        """Store tables and account."""
         self._tables: Final = dict(tables)
         self.account: Final = account
 
@@ -440,7 +442,7 @@ def _signals(
 
 
 def _bus(log: Log, name: str | None) -> LogTopic:
-    """The one CAN bus, or the one that is named."""
+    """Return the named CAN bus, or the only one."""
     from crosscue.replay.vehicle.roles import Role, role_of
 
     if name is not None:
@@ -478,7 +480,7 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
 
 
 def _payloads(rows: object) -> pa.Array:
-    """Bytes of each CAN frame, as many as it carries."""
+    """Return the payload of each CAN frame, in its actual length."""
     import pyarrow as pa
 
     assert isinstance(rows, CanFrames)
@@ -496,7 +498,7 @@ def _metadata(reported: Mapping[str, object]) -> dict[str, str] | None:
 
 
 def _report_text(topic: str, ledgers: Sequence[Ledger]) -> dict[str, object]:
-    """What became of every row of a topic, by log."""
+    """Return the account of every row of a topic, by log."""
     return {
         ledger.log: _account(ledger.topic(topic))
         | {"unattributed": _account(ledger.accounts.get("", TopicAccount()))}
@@ -516,7 +518,7 @@ def _account(of: TopicAccount) -> dict[str, object]:
 
 
 def _warn(ledger: Ledger, topic: str) -> None:
-    """Warn of rows that are dropped or that nobody could decode."""
+    """Warn about rows that are dropped or cannot be decoded."""
     warn_of(ledger)
     for reason, count in sorted(ledger.topic(topic).skipped.items()):
         if reason not in NOT_ASKED:

@@ -1,4 +1,4 @@
-"""Seals of logs: written, and verified."""
+"""Write and verify seals of logs."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Sealed:
     """A log and its seal.
 
     Attributes:
-        log: What was sealed.
-        seal: The seal, beside it.
-        is_new: It was written now; False where it was there and matches.
-        files: How many files it covers.
-        size_bytes: Of those files.
-        blocks: How many blocks of 1 MiB were hashed.
+        log: The sealed log.
+        seal: The seal file, next to the log.
+        is_new: True if the seal was written now; False if it existed and matches.
+        files: Number of files it covers.
+        size_bytes: Total size of those files.
+        blocks: Number of blocks of 1 MiB that were hashed.
     """
 
     log: Path
@@ -43,11 +43,11 @@ class Sealed:
 
     @property
     def is_whole(self) -> bool:
-        """True: now its seal is that of its content."""
+        """True, because a seal that was just written or verified matches the log."""
         return True
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue seal --json`` prints."""
+        """Return the JSON output of ``crosscue seal``."""
         return {
             "log": str(self.log),
             "seal": str(self.seal),
@@ -68,16 +68,16 @@ class Sealed:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class SealCheck:
-    """A log held against its seal.
+    """Result of checking a log against its seal.
 
     Attributes:
-        log: What was read.
-        seal: Its seal, or that of a folder that it is in.
-        sealed_at: UTC, ISO 8601.
-        blocks: How many blocks of 1 MiB the seal has of it.
-        checked: How many of them were read.
-        files_changed: Files that are missing, new, or of another size; a sentence each.
-        damaged: Ranges of bytes that differ.
+        log: The log.
+        seal: Its seal, or that of a folder that contains it.
+        sealed_at: Time of sealing, UTC, ISO 8601.
+        blocks: Number of its blocks of 1 MiB in the seal.
+        checked: Number of blocks that were read.
+        files_changed: Files that are missing, new, or of another size, one sentence each.
+        damaged: Byte ranges that differ.
     """
 
     log: Path
@@ -90,19 +90,19 @@ class SealCheck:
 
     @property
     def is_whole(self) -> bool:
-        """The log is what was sealed."""
+        """True if the log matches its seal."""
         return not self.damaged and not self.files_changed
 
     @property
     def differences(self) -> list[str]:
-        """Each range of bytes that differs, in a line."""
+        """Byte ranges that differ, one line each."""
         return [
             visible(f"{self.log}: {one.name}: bytes {one.start} to {one.stop} differ from the seal")
             for one in self.damaged
         ]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue seal --check --json`` prints."""
+        """Return the JSON output of ``crosscue seal --check``."""
         return {
             "log": str(self.log),
             "seal": str(self.seal),
@@ -124,23 +124,23 @@ class SealCheck:
 
 
 class Seals(Listing[Sealed]):
-    """Logs that were sealed, printed as a table."""
+    """Sealed logs; its repr is a table."""
 
     head = ("log", "seal", "files", "blocks", "state")
 
     def cells(self, row: Sealed) -> tuple[object, ...]:
-        """One line."""
+        """Return the cells of a row."""
         state = "written" if row.is_new else "unchanged"
         return (row.log, row.seal.name, row.files, row.blocks, state)
 
 
 class SealChecks(Listing[SealCheck]):
-    """Logs that were held against their seals, printed as a table."""
+    """Results of checking logs against their seals; its repr is a table."""
 
     head = ("log", "seal", "sealed at", "blocks", "state")
 
     def cells(self, row: SealCheck) -> tuple[object, ...]:
-        """One line."""
+        """Return the cells of a row."""
         state = "matches" if row.is_whole else "differs"
         return (row.log, row.seal.name, row.sealed_at, row.blocks, state)
 
@@ -151,16 +151,16 @@ def seal(
     on_bytes: Callable[[Path, int, int], None] = lambda log, done, of: None,
     on_log: Callable[[Sealed], None] = lambda sealed: None,
 ) -> Seals:
-    """Keep a hash of each MiB of a log beside it, so that later damage is seen and located.
+    """Write a hash of each MiB of a log next to it, so that later damage is detected and located.
 
     Args:
         logs: Files or folders on this machine.
-        overwrite: Replace a seal that the log differs from.
-        on_bytes: Called with the log, the bytes that are hashed, and of how many.
-        on_log: Called with each log once it is sealed.
+        overwrite: Replace a seal that does not match the log.
+        on_bytes: Called with the log, the number of bytes hashed, and their total.
+        on_log: Called with each log after it is sealed.
 
     Raises:
-        UsageError: A URL, or a seal itself; nothing is sealed.
+        UsageError: A log is a URL or a seal; nothing is sealed.
         LogError: A log cannot be read.
         OutputError: A log differs from its seal, or the seal cannot be written.
     """
@@ -182,15 +182,15 @@ def check_seal(
     on_blocks: Callable[[Path, int, int], None] = lambda log, done, of: None,
     on_log: Callable[[SealCheck], None] = lambda checked: None,
 ) -> SealChecks:
-    """Read logs whole and hold them against their seals.
+    """Read complete logs and compare them with their seals.
 
     Args:
         logs: Files or folders on this machine.
-        on_blocks: Called with the log, the blocks that are checked, and of how many.
-        on_log: Called with each log once it is checked.
+        on_blocks: Called with the log, the number of blocks checked, and their total.
+        on_log: Called with each log after it is checked.
 
     Raises:
-        UsageError: A URL, or a seal itself.
+        UsageError: A log is a URL or a seal.
         LogError: A log cannot be read, or its seal is damaged.
         CrosscueError: A log has no seal.
     """
@@ -204,7 +204,7 @@ def check_seal(
 
 def _place(name: Path | str) -> Path:
     if isinstance(name, str) and "://" in name:
-        raise UsageError(f"{name}: a URL cannot be sealed; fetch the log and seal the file")
+        raise UsageError(f"{name}: a URL cannot be sealed; download the log, and seal the file")
     log = Path(name)
     if log.name.endswith(SUFFIX):
         raise UsageError(f"{log}: is a seal itself; name the log, {log.with_suffix('')}")

@@ -1,4 +1,4 @@
-"""What a drive holds, printed as ``crosscue info`` prints it."""
+"""Summaries of drives, printed by ``crosscue info``."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class DriveSummary:
     """Topics, counts, rates, gaps, clocks and account of a drive's logs.
 
     Attributes:
-        logs: One summary for each log.
-        together: What they have in common; None for one log, or a quick look.
-        timeline: The drive's segments of time; None for a quick look.
+        logs: One summary per log.
+        together: Comparison of the logs; None for a single log or a quick summary.
+        timeline: Time segments of the drive; None for a quick summary.
     """
 
     logs: tuple[LogSummary, ...]
@@ -45,16 +45,16 @@ class DriveSummary:
 
     @property
     def has_gaps(self) -> bool:
-        """Its time has gaps, or a clock was set: it has several segments."""
+        """True if the drive has several segments, because of a gap or a clock that was set."""
         return self.timeline is not None and self.timeline.has_gaps
 
     @property
     def is_whole(self) -> bool:
-        """Nothing is known to be dropped."""
+        """True if no row is known to be dropped."""
         return all(one.is_whole for one in self.logs)
 
     def as_dict(self) -> dict[str, object]:
-        """All of it as dictionaries, lists and scalars; what ``crosscue info --json`` prints."""
+        """Return the JSON output of ``crosscue info``, as dictionaries, lists and scalars."""
         reported = None if self.timeline is None else time_segments(self.timeline).as_json()
         return {
             "logs": [plain(one) for one in self.logs],
@@ -80,14 +80,14 @@ def summary_of(
     quick: bool,
     progress: Progress | None = None,
 ) -> DriveSummary:
-    """Read each log once, or only what it says of itself.
+    """Summarise logs, by reading each once or only its declarations.
 
     Args:
-        logs: Of one drive, open.
-        selection: The part that is read.
-        vehicle: Where the wheel speeds are, to find gaps.
-        quick: Do not read the logs' bodies.
-        progress: Passes blocks on while it shows how far the work is.
+        logs: Open logs of one drive.
+        selection: The part to read.
+        vehicle: Vehicle file with the topic of wheel speeds, to find gaps.
+        quick: Do not read messages.
+        progress: Wraps the iterable of blocks, to show progress.
     """
     if quick:
         return DriveSummary(tuple(map(quick_summary, logs)), None)
@@ -111,7 +111,7 @@ def _watched(watch: LogWatch, progress: Progress | None) -> Progress:
 
 
 def plain(value: object) -> object:
-    """A dataclass as dictionaries, lists and scalars, with texts made visible."""
+    """Return a dataclass as dictionaries, lists and scalars, with control characters escaped."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Enum):
@@ -124,7 +124,7 @@ def plain(value: object) -> object:
 
 
 def lines_of(summary: LogSummary, width: int) -> Iterator[str]:
-    """A summary as lines of text no wider than ``width``, as far as its numbers allow."""
+    """Yield a summary as lines of text, no wider than ``width`` unless numbers need more."""
     yield wrapped(f"{summary.path} ({summary.format})", width, "")
     if not summary.is_quick:
         yield wrapped(span_sentence(summary.start_ns, summary.end_ns), width, "  time       ")
@@ -221,7 +221,7 @@ def _losses(summary: LogSummary, width: int) -> Iterator[str]:
     if len(summary.drops) > LOSSES_SHOWN:
         texts.append(f"and {len(summary.drops) - LOSSES_SHOWN} more; --json lists them")
     if summary.drops:
-        texts.append("to write what can be read: crosscue convert LOG -o OUT.mcap --salvage")
+        texts.append("to write the readable part: crosscue convert LOG -o OUT.mcap --salvage")
     yield from _bullets("losses", texts, width)
 
 

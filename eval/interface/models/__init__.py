@@ -1,1 +1,1 @@
-"""Networks and their cards."""
+"""Networks and their model cards."""

@@ -1,4 +1,4 @@
-"""Model cards of one's own networks: drafted from a model file, and checked by running it."""
+"""Draft model cards from model files, and check cards by running their networks."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from crosscue.replay.base import (
 )
 
 _TASKS: Final = ("detect", "segment")
-"""Of those that Ultralytics writes into its exports, the ones that are read."""
+"""Supported tasks in the metadata of Ultralytics' exports."""
 _MAX_TASK_CHARACTERS: Final = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class CardDraft:
-    """A card for a network of one's own, and what a person should look at; printed as text.
+    """A drafted model card, with its assumptions to check.
 
     Attributes:
         path: The card.
-        draft: Its text, the kind of its output, what is certain and what was assumed.
-        picture: The picture with what the network found in it; None without one.
-        boxes: How many it found; None without a picture, and where it finds road.
+        draft: Text of the card, kind of output, and certain and assumed properties.
+        picture: Copy of the picture with detections; None without a picture.
+        boxes: Number of detections; None without a picture, and for a road network.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class CardDraft:
     boxes: int | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue model init --json`` prints."""
+        """Return the JSON output of ``crosscue model init``."""
         return {
             "card": str(self.path),
             "kind": self.draft.kind,
@@ -65,19 +65,19 @@ class CardDraft:
         lines += [f"assumed    {line}" for line in self.draft.assumed]
         if self.picture is not None:
             what = "road" if self.boxes is None else f"{self.boxes} boxes"
-            lines.append(f"picture    {what}, drawn in {self.picture}: please check it")
+            lines.append(f"picture    {what}, drawn in {self.picture}: please check them")
         return "\n".join(lines)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class CardCheck:
-    """A card that fits its network; printed as text.
+    """A card that fits its network.
 
     Attributes:
         path: The card.
-        identity: Of the detector: other cards, weights or versions have another.
-        picture: The picture with what the network found in it; None without one.
-        found: How many objects of each label; None without a picture, and where it finds road.
+        identity: Identity of the detector, unique to its card, weights and version.
+        picture: Copy of the picture with detections; None without a picture.
+        found: Number of detections by label; None without a picture, and for a road network.
     """
 
     path: Path
@@ -86,7 +86,7 @@ class CardCheck:
     found: Mapping[str, int] | None = None
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue model check --json`` prints."""
+        """Return the JSON output of ``crosscue model check``."""
         result: dict[str, object] = {"card": str(self.path), "identity": self.identity}
         if self.picture is not None:
             result["picture"] = str(self.picture)
@@ -112,24 +112,26 @@ def draft_card(
     picture: Path | str | None = None,
     overwrite: bool = False,
 ) -> CardDraft:
-    """Write a model card for a file, from what the file says of itself, and run it with the card.
+    """Write a model card from the contents of a model file, and run the network with it.
 
     Args:
-        weights: An ONNX file, an OpenVINO ``.xml``, or the ``state_dict`` of a network of
-            torchvision's (``.pth``, ``.pt``, ``.safetensors``).
-        output: The card, in the folder of the weights; their name, ``.toml``, if left out.
-        kind: Layout of its outputs, or torchvision's name of the network, where several fit.
-        class_names: In the order of its outputs, or a file with one per line, where it has none.
-        size_px: Width and height of its input, or as text, ``1280x736``, where it allows any.
-        picture: What the network finds in it is drawn beside the card, as
+        weights: An ONNX file, an OpenVINO ``.xml``, or the ``state_dict`` of a torchvision network
+            (``.pth``, ``.pt``, ``.safetensors``).
+        output: Card to write, in the folder of the weights; default: their name with ``.toml``.
+        kind: Layout of the outputs, or torchvision's name of the network, if several fit.
+        class_names: Names in the order of the outputs, or a file with one name per line, if the
+            model file has none.
+        size_px: Width and height of the input, also as text, ``1280x736``, if the network accepts
+            any.
+        picture: Picture to detect in; a copy with detections is written next to the card, as
             ``CARD.PICTURE.found.jpg``.
-        overwrite: Replace a card that is there.
+        overwrite: Replace an existing card.
 
     Raises:
-        UsageError: The card exists, the file is of another kind or damaged, no layout or several
-            fit, or class names are missing.
-        VehicleError: The network does not run with the card, or a file of weights holds more than
-            tensors; no card is left.
+        UsageError: The card exists, the file is damaged or of another kind, no layout or several
+            layouts fit, or class names are missing.
+        VehicleError: The network does not run with the card, or a weights file contains more than
+            tensors; no card is written.
         LogError: The picture cannot be read or decoded.
     """
     path = Path(weights)
@@ -137,7 +139,7 @@ def draft_card(
     if place.exists() and not overwrite:
         raise UsageError(f"{place}: exists; give another name or --overwrite")
     if place.resolve().parent != path.resolve().parent:
-        raise UsageError(f"{place}: a card lies beside its weights, in {path.parent}")
+        raise UsageError(f"{place}: expected a card in the folder of its weights, {path.parent}")
     size = _size(size_px) if isinstance(size_px, str) else size_px
     if path.suffix.lower() in WEIGHTS_SUFFIXES:
         from crosscue.detectors.catalog.recognise_weights import recognise_weights
@@ -153,7 +155,7 @@ def draft_card(
         _try(place, written)
         return CardDraft(place, written)
     seen = Path(picture)
-    # What is wrong with the picture is reported before a card is written.
+    # Errors in the picture are reported before a card is written.
     _pixels_of(seen)
     _try(place, written)
     found = _look(build(card=str(place)), seen, drawing := _drawing(place, seen))
@@ -166,14 +168,14 @@ def check_card(
     """Check that a model card fits its network, by running it.
 
     Args:
-        model: A name in the catalog, or a card's file name, which ends in ``.toml``.
-        picture: Run it on this JPEG, PNG or WebP file, and draw what it finds.
-        output: The drawing; if left out, ``CARD.PICTURE.found.jpg`` beside the card, or in the
-            current folder for a model of the catalog.
+        model: Name in the catalog, or file name of a card, which ends in ``.toml``.
+        picture: JPEG, PNG or WebP file to detect in.
+        output: Copy of the picture with detections; default: ``CARD.PICTURE.found.jpg`` next to the
+            card, or in the current folder for a model of the catalog.
 
     Raises:
         UsageError: The catalog has no such model.
-        VehicleError: Card, weights or back end do not fit one another.
+        VehicleError: Card, weights and back end do not fit each other.
         LogError: The picture cannot be read or decoded.
         OutputError: The drawing cannot be written.
     """
@@ -190,10 +192,10 @@ def check_card(
 
 
 def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
-    """The only layout, or the one asked for.
+    """Return the requested layout of the outputs, or the only one that fits.
 
     Raises:
-        UsageError: None or several; with what the file declares.
+        UsageError: No layout or several fit; the message contains the file's declarations.
     """
     found = guesses(model)
     if kind is not None:
@@ -206,17 +208,17 @@ def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
         task = model.metadata.get("task", "detect")[:_MAX_TASK_CHARACTERS]
         if task not in _TASKS:
             raise UsageError(
-                f"{path}: its metadata says it is for {task!r}; expected one of "
-                f"{', '.join(_TASKS)}; export a network that finds boxes"
+                f"{path}: task in its metadata: expected one of {', '.join(_TASKS)}, found "
+                f"{task!r}; export a network that detects boxes"
             )
         outputs = ", ".join(f"{out.name} {_shape(out.shape)}" for out in model.outputs)
         asked = "" if kind is None else f" as {kind}"
         raise UsageError(
-            f"{path}: outputs {outputs}: not known here{asked}; write a card by hand, "
+            f"{path}: outputs {outputs}: not supported{asked}; write a card by hand, "
             "or a detector (docs: Write a detector)"
         )
     listed = "; ".join(f"{g.settings['kind']} ({', '.join(g.reasons)})" for g in found)
-    raise UsageError(f"{path}: may be {listed}; choose one with --kind")
+    raise UsageError(f"{path}: several kinds fit: {listed}; choose one with --kind")
 
 
 def _shape(shape: tuple[int | str | None, ...]) -> str:
@@ -231,15 +233,15 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _drawing(card: Path, picture: Path) -> Path:
-    """Never beside the picture: its folder may be a log, and every image in it a frame."""
+    """Return where to draw: not next to the picture, whose folder may be a log of images."""
     return card.with_name(f"{card.stem}.{picture.stem}.found.jpg")
 
 
 def _try(place: Path, written: Draft) -> None:
-    """Write the card once the network has run with it.
+    """Write the card if the network runs with it.
 
     Raises:
-        VehicleError: It does not run; no card is left.
+        VehicleError: The network does not run; no card is written.
     """
     trial = place.with_name(f".{place.stem}.trial.toml")
     write_text(trial, written.text)
@@ -257,24 +259,24 @@ def _try(place: Path, written: Draft) -> None:
 
 
 def _pixels_of(picture: Path) -> tuple[Bytes, tuple[int, int]]:
-    """A picture file's pixels, (H, W, 3) blue green red, and its width and height.
+    """Return a picture file's pixels, (H, W, 3), blue green red, and its width and height.
 
     Raises:
-        LogError: It cannot be read or decoded.
+        LogError: The picture cannot be read or decoded.
     """
     try:
         return decode(read_file(picture))
     except OSError as error:
-        raise LogError(f"{picture}: {error.strerror}; give a JPEG, PNG or WebP file") from None
+        raise LogError(f"{picture}: {error.strerror}; use a JPEG, PNG or WebP file") from None
     except LogError as error:
         raise type(error)(f"{picture}: {error}") from None
 
 
 def _look(detector: Detector, picture: Path, output: Path) -> Detections | None:
-    """Run a detector over one picture and draw what it finds; None where it finds road.
+    """Run a detector on one picture and draw its detections; return None for a road network.
 
     Raises:
-        LogError: It cannot be read or decoded.
+        LogError: The picture cannot be read or decoded.
         OutputError: The drawing cannot be written.
     """
     pixels, size = _pixels_of(picture)

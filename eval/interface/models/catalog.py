@@ -1,4 +1,4 @@
-"""Networks: the catalog, a model's card, and its weights brought to this machine."""
+"""The model catalog: list models, show their cards, and fetch their weights."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from crosscue.eval.interface.show import Listing
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Model:
-    """A network that a card describes; printed as ``crosscue model show`` prints it.
+    """A network described by a card; its repr is the output of ``crosscue model show``.
 
     Attributes:
-        name: In the catalog, or the card's file name.
-        card: What it needs as input, what its output means, and what was measured.
+        name: Name in the catalog, or file name of the card.
+        card: Input, meaning of the output, and measured performance.
     """
 
     name: str
@@ -28,30 +28,30 @@ class Model:
 
     @property
     def size_mb(self) -> float:
-        """Of the weights that the publisher offers, in 10^6 bytes."""
+        """Size of the published weights, in 10^6 bytes."""
         return sum(file.size_bytes for file in self.card.files) / 1e6
 
     @property
     def is_fetched(self) -> bool:
-        """All weights that the publisher offers are on this machine."""
+        """True if all published weights are on this machine."""
         return all(place_of(self.card, file).exists() for file in self.card.files)
 
     @property
     def cue_labels(self) -> list[str]:
-        """Labels of its classes that a default cue counts, sorted."""
+        """Labels of its classes that a default cue uses, sorted."""
         card = self.card
         meant = {card.meaning(i) for i in range(len(card.output.classes))}
         return sorted(meant & {*CUE_LABELS})
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue model show --json`` prints."""
+        """Return the JSON output of ``crosscue model show``."""
         return self.card.model_dump(mode="json")
 
     def __repr__(self) -> str:
         card, given = self.card, self.card.input
         resizable = ", resizable" if given.is_resizable else ""
         network = "" if card.network is None else f"{card.network.architecture}, "
-        cues = ", ".join(self.cue_labels) or "none of its classes is counted by a default cue"
+        cues = ", ".join(self.cue_labels) or "no default cue uses any of its classes"
         lines = [
             f"{self.name}: {card.about or 'no description'}",
             f"licence    {card.licence or 'not named'}",
@@ -69,7 +69,7 @@ class Model:
 
 
 def _evidence(one: Evidence) -> str:
-    """A measurement in a line."""
+    """Return a measurement as one line."""
     interval = "" if one.low is None else f" ({one.low:g} to {one.high:g})"
     boxes = "" if one.boxes is None else f", {one.boxes:,} boxes"
     facts = [f"{one.metric}: {one.value:g}{interval} on {one.pictures}{boxes}"]
@@ -79,17 +79,17 @@ def _evidence(one: Evidence) -> str:
 
 
 class Models(Listing[Model]):
-    """Models, printed in a line each."""
+    """Models; its repr has one line per model."""
 
     head = ("name", "size_mb", "licence", "state", "about")
 
     def cells(self, row: Model) -> tuple[str, ...]:
-        """One line."""
+        """Return the cells of a row."""
         state = "fetched" if row.is_fetched else "not fetched"
         return (row.name, f"{row.size_mb:.1f}", row.card.licence, state, row.card.about)
 
     def as_dict(self) -> list[dict[str, object]]:
-        """What ``crosscue model list --json`` prints."""
+        """Return the JSON output of ``crosscue model list``."""
         return [
             {
                 "name": one.name,
@@ -110,18 +110,18 @@ class Models(Listing[Model]):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FetchedModel:
-    """A model's weights on this machine; printed in a line each.
+    """Weights of a model on this machine; its repr has one line per file.
 
     Attributes:
-        name: Of the model.
-        files: Where each file is now, and where it came from.
+        name: Name of the model.
+        files: Path and origin of each file.
     """
 
     name: str
     files: tuple[Fetched, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue model fetch --json`` prints."""
+        """Return the JSON output of ``crosscue model fetch``."""
         return {self.name: [str(file.path) for file in self.files]}
 
     def __repr__(self) -> str:
@@ -129,19 +129,20 @@ class FetchedModel:
 
 
 def models() -> Models:
-    """The models of the catalog."""
+    """Return the models of the catalog."""
     return Models([Model(name, entry(name)) for name in names()])
 
 
 def model(name: Path | str) -> Model:
-    """A model: what it is, what its classes mean to the cues, what was measured.
+    """Return a model: its input and output, the cues' labels of its classes, its performance.
 
     Args:
-        name: In the catalog, or a card's file name, which ends in ``.toml``.
+        name: Name in the catalog, or file name of a card, which ends in ``.toml``.
 
     Raises:
-        UsageError: The catalog has no such model; the nearest is named.
-        VehicleError: The card cannot be read, or a key or value does not fit; with the line.
+        UsageError: The catalog has no such model; the message suggests the nearest.
+        VehicleError: The card cannot be read, or a key or value is not valid; the message names the
+            line.
     """
     return Model(str(name), read_card(card_named(str(name))))
 
@@ -152,19 +153,19 @@ def fetch_model(
     *,
     on_bytes: Callable[[str, int, int], None] = lambda file, done, of: None,
 ) -> FetchedModel:
-    """Bring the weights of a model of the catalog to this machine, checked by their SHA-256.
+    """Fetch the weights of a model of the catalog, and verify them by their SHA-256.
 
-    They are kept in the user's cache, or in ``$CROSSCUE_MODELS``. They come from ``weights``, else
-    from ``$CROSSCUE_DATA``, else from ``$CROSSCUE_MODEL_MIRROR``, else from their publisher.
+    They are kept in the user's cache, or in ``$CROSSCUE_MODELS``. Sources are, in this order,
+    ``weights``, ``$CROSSCUE_DATA``, ``$CROSSCUE_MODEL_MIRROR`` and the publisher.
 
     Args:
-        name: In the catalog.
-        weights: A file, or a folder with the files, to take them from; no network is used.
-        on_bytes: Called with a file's name, the bytes that are there, and of how many.
+        name: Name in the catalog.
+        weights: File, or folder with the files, to copy instead of downloading.
+        on_bytes: Called with a file's name, the number of bytes present, and their total.
 
     Raises:
-        UsageError: No such model, or ``weights`` is not there or another file.
-        CrosscueError: It cannot be had, or is not the file that the catalog means.
+        UsageError: The model does not exist, or ``weights`` is missing or another file.
+        CrosscueError: A file cannot be downloaded, or its SHA-256 differs from the catalog's.
         OutputError: The cache cannot be written.
     """
     given = None if weights is None else Path(weights)

@@ -1,1 +1,1 @@
-"""Runs: made from drives one or many, estimated again, scored, compared, merged."""
+"""Make, re-estimate, score, compare and merge runs of one or many drives."""

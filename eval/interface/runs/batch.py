@@ -1,4 +1,4 @@
-"""Many drives: found by folder, pattern or list, and replayed side by side."""
+"""Find many drives by folder, pattern or list, and replay them in parallel."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from .make import replay_drive
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ReplayedDrives:
-    """The outcomes of many drives; printed in a line each.
+    """Outcomes of many drives; its repr has one line per drive.
 
     Attributes:
-        drives: Each with its job, what the replay counted, or why it failed.
-        merged: Folder of the tables of all runs; None of a shard, whose runs are merged with those
-            of the others when all are done.
-        not_merged: Why they could not be merged, or None.
-        shard: Which part of how many drives these are, as ``2/4 of 100 drives``; empty for all.
+        drives: Job of each drive, with the counts of its replay or with its error.
+        merged: Folder with the tables of all runs; None for a shard, whose runs are merged with
+            those of the other shards at the end.
+        not_merged: Reason why the runs could not be merged, or None.
+        shard: Part of the drives, such as ``2/4 of 100 drives``; empty for all drives.
     """
 
     drives: tuple[Done[Outcome], ...]
@@ -50,12 +50,16 @@ class ReplayedDrives:
 
     @property
     def exit_status(self) -> int:
-        """0 when all is whole; 3 for losses, some failures, or no merged tables; else theirs."""
+        """Exit status of the batch.
+
+        0 if all runs are complete; 3 for losses, some failures, or tables that could not be merged;
+        if every drive failed, their common status, or 1.
+        """
         status = exit_status_of(self.drives)
         return status if self.not_merged is None else status or 3
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue replay --json`` prints of many drives."""
+        """Return the JSON output of ``crosscue replay`` for many drives."""
         return {
             "drives": [_as_dict(one) for one in self.drives],
             "merged": None if self.merged is None else str(self.merged),
@@ -71,14 +75,14 @@ class ReplayedDrives:
                 log = one.job.run / FAILURE
                 lines += [f"         {log}"] if log.exists() else []
             elif one.is_earlier:
-                lines.append(f"earlier  {one.job.name}: done before, kept")
+                lines.append(f"earlier  {one.job.name}: already done, kept")
             else:
                 lost = "" if not one.exit_status else ", with losses"
                 lines.append(f"done     {one.job.name}: {one.seconds:.1f} s{lost}")
         failed = sum(one.error is not None for one in self.drives)
         lines.append(f"drives   {len(self.drives) - failed} of {len(self.drives)}, {failed} failed")
         if self.shard:
-            lines.append(f"shard    {self.shard}; crosscue merge them when every shard is done")
+            lines.append(f"shard    {self.shard}; run crosscue merge when every shard is done")
         if self.not_merged is not None:
             lines.append(f"tables   not merged: {self.not_merged}")
         elif self.merged is not None:
@@ -101,7 +105,7 @@ def _as_dict(one: Done[Outcome]) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """One of many drives, here or in another process; attributes as of ``replay_drives``."""
+    """Replay of one of many drives, in any process; attributes as in ``replay_drives``."""
 
     vehicle: Vehicle | Path | str | None
     detectors: Sequence[str] | None
@@ -116,7 +120,7 @@ class _Work:
     resume: bool
 
     def __call__(self, job: Job) -> Outcome:
-        """Replay it into its run folder."""
+        """Replay the drive into its run folder."""
         with open_drive(*job.logs, limits=self.limits) as log, unless_damaged(log.logs):
             part = part_in_words(log.logs, self.start, self.end, self.topics)
             run = replay_drive(
@@ -128,7 +132,7 @@ class _Work:
                 landmarks=self.landmarks,
                 cache=self.cache,
                 draw=self.draw,
-                # Whether it may be replaced was decided before the drive was handed out.
+                # The caller has already decided that an existing run may be replaced.
                 overwrite=True,
                 resume=self.resume,
             )
@@ -136,11 +140,11 @@ class _Work:
         return run.outcome
 
     def settings(self, drive: DriveInput | Job) -> Vehicle:
-        """The vehicle file asked for, else the drive's own."""
+        """Return the settings of the requested vehicle file, or else of the drive's."""
         return vehicle_given(drive.vehicle if self.vehicle is None else self.vehicle)
 
     def fingerprint(self, drive: DriveInput) -> str:
-        """Of everything that decides a drive's run besides its logs."""
+        """Return a hash of everything besides the logs that determines a drive's run."""
         names = self.detectors
         flags = {
             "detectors": None if names is None else ",".join(names) if names else "none",
@@ -154,32 +158,31 @@ class _Work:
         try:
             settings: object = self.settings(drive).model_dump(mode="json")
         except CrosscueError as error:
-            # This drive's own attempt reports it; the others must not suffer.
+            # Reported when this drive is replayed; the other drives must not fail.
             settings = str(error)
         return fingerprint_of(settings, flags, versions(), files_named_in([settings, flags]))
 
 
 def find_drives(*logs: Path | str, each: bool = False, shard: str | None = None) -> DriveList:
-    """The drives that paths mean: several logs are one drive, merged by time.
+    """Find one drive, whose logs are merged by time, or many drives.
 
     Many drives are a folder of drives, a pattern (``drives/*/drive.mcap``), or ``@drives.txt``, a
-    list with a line for each.
+    list with one drive per line.
 
     Args:
         logs: Paths or URLs.
-        each: Every one of them is a drive, or a folder of drives.
-        shard: ``2/4``: only the drives of the second of four parts, chosen by a hash of each
-            drive's identity; ``auto``: the part that the scheduler's variables say,
+        each: Treat each path as a separate drive, or as a folder of drives.
+        shard: ``2/4`` selects the second of four parts, divided by a hash of each drive's identity;
+            ``auto`` selects the part that the scheduler's variables define,
             ``SLURM_ARRAY_TASK_ID`` and ``_COUNT``, or ``RANK`` and ``WORLD_SIZE``.
 
     Returns:
-        ``drives``, each with its logs, and the vehicle file and the truth beside them; and
-        ``is_many``.
+        ``drives``, each with its logs and the vehicle file and truth next to them; and ``is_many``.
 
     Raises:
         UsageError: Nothing matches, a list cannot be read, a drive is named twice, or ``shard`` is
-            neither or of one drive.
-        LogError: A place that is not there or may not be looked into.
+            not valid or set for one drive.
+        LogError: A path does not exist, or may not be read.
     """
     return drives_of([str(log) for log in logs], each=each, shard=shard)
 
@@ -207,36 +210,36 @@ def replay_drives(
     retry_failed: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> ReplayedDrives:
-    """Replay many drives as ``replay_drive`` does; a second start does only what is missing.
+    """Replay many drives as ``replay_drive`` does; a second start processes only missing ones.
 
-    One that fails does not stop the others. The tables of all runs are merged.
+    A drive that fails does not stop the others. The tables of all runs are merged.
 
     Args:
-        drives: What ``find_drives`` returns; or logs, each of them a drive, and folders of drives.
-        output: Folder that gets one run folder per drive, and ``merged``.
-        vehicle: The vehicle file of all drives; None for the ``vehicle.toml`` beside each.
+        drives: Result of ``find_drives``; or logs, each of them a drive, and folders of drives.
+        output: Output folder, with one run folder per drive, and ``merged``.
+        vehicle: The vehicle file of all drives; None for the ``vehicle.toml`` next to each.
         detectors: As in ``replay_drive``.
-        start: Seconds after a drive's first row, or as text, absolute: ``17...ns``.
-        end: Likewise, no longer wanted.
-        topics: Names; None for all.
-        limits: What the logs are read with.
+        start: Start, in seconds after a drive's first row, or absolute as text, ``17...ns``.
+        end: End (exclusive), in the same form.
+        topics: Names of topics; None for all.
+        limits: Limits for reading the logs.
         gnss: As in ``replay_drive``.
         landmarks: As in ``replay_drive``.
         cache: As in ``replay_drive``.
         draw: As in ``replay_drive``.
-        workers: Drives side by side; one, or the cores of the cluster, if left out.
-        ray: Address of a Ray cluster to work on.
-        cores: What a drive declares to Ray; one core if left out.
-        memory_gib: The same of memory; 2 GiB if left out.
+        workers: Number of drives in parallel; default: 1, or with ``ray`` the cluster's cores.
+        ray: Address of a Ray cluster to run on.
+        cores: Number of cores that a drive declares to Ray; default: 1.
+        memory_gib: Memory that a drive declares to Ray; default: 2 GiB.
         overwrite: Replace runs of other logs or settings.
         resume: As in ``replay_drive``.
-        retry_failed: Only the drives whose last attempt failed; without it they are begun again
-            with all others that are not done.
-        on_progress: Called about once a second with ``total``, ``earlier``, ``done`` and
-            ``failed`` drives.
+        retry_failed: Process only the drives whose last attempt failed; default: all drives that
+            are not done.
+        on_progress: Called about once a second with the numbers of drives ``total``, ``earlier``,
+            ``done`` and ``failed``.
 
     Raises:
-        UsageError: No drive is found, or too few workers.
+        UsageError: No drive is found, or ``workers`` is below 1.
     """
     found = drives if isinstance(drives, DriveList) else find_drives(*_several(drives), each=True)
     engine = engine_of(workers, ray, cores, memory_gib)
@@ -267,7 +270,7 @@ def replay_drives(
     try:
         _merge(done, folder)
     except CrosscueError as error:
-        # The drives are done, and that must be reported, whether or not they could be merged.
+        # The drives are reported as done even if their tables cannot be merged.
         why = str(error)
     return ReplayedDrives(done, folder / FOLDER, why)
 
@@ -277,10 +280,10 @@ def _several(drives: Sequence[Path | str] | Path | str) -> Sequence[Path | str]:
 
 
 def _merge(done: Sequence[Done[Outcome]], output: Path) -> None:
-    """One table of all runs in the folder, those of earlier batches too."""
+    """Merge the tables of all runs in the folder, including those of earlier batches."""
     runs, failures = gathered([output])
     ended = {one.job.name: one.error for one in done}
-    # A drive that failed now has no run, though an earlier start may have left one that was cut.
+    # A drive that failed now has no run, even if an earlier start left an interrupted one.
     runs = {name: run for name, run in runs.items() if ended.get(name) is None}
     failed = {name: why for name, why in ended.items() if why is not None}
     merge_runs(runs, create(output / FOLDER, overwrite=True), {**failures, **failed})

@@ -1,4 +1,4 @@
-"""Two runs compared, or many against many."""
+"""Compare two runs, or two sets of runs."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ def compare_runs(
     tolerances: Sequence[str] = (),
     junit: Path | str | None = None,
 ) -> compare.Comparison:
-    """What changed from one run to another: settings, tables, metrics, and what is worse.
+    """Compare the settings, tables and metrics of two runs.
 
     Args:
-        first: The run to compare with.
+        first: The reference run.
         second: The run to judge.
-        tolerances: How much worse metrics may be: ``0.01``, ``2%`` or ``PATTERN=0.01``.
-        junit: File for a test case of each judged metric, which fails where that is worse.
+        tolerances: Allowed deterioration of metrics: ``0.01``, ``2%`` or ``PATTERN=0.01``.
+        junit: JUnit file to write, with a test case per judged metric that fails if it is worse.
 
     Raises:
-        UsageError: A tolerance that cannot be read, or a URL.
-        RunError: One is no finished run.
+        UsageError: A tolerance is not valid, or a run is a URL.
+        RunError: A path is not a finished run.
     """
     allowed = [compare.read_tolerance(text) for text in tolerances]
     for one in (first, second):
         if not isinstance(one, Run) and is_remote(one):
-            raise UsageError(f"{one}: a run on a store; give --runs and --against, or copy it")
+            raise UsageError(f"{one}: a run on a store; use --runs and --against, or copy it")
     paths = [one.path if isinstance(one, Run) else Path(one) for one in (first, second)]
     before, after = (compare.open_scored(path) for path in paths)
     return _reported(compare.compare_runs(before, after, allowed), junit)
@@ -46,28 +46,28 @@ def compare_many(
     tolerances: Sequence[str] = (),
     junit: Path | str | None = None,
 ) -> compare.Comparison:
-    """Whether many runs are better or worse than others of the same drives, or neither is decided.
+    """Compare many runs with others of the same drives: better, worse or undecided.
 
-    Runs are paired by the identity of their drive. What a verdict means is in the how-to page
-    on comparing fleets.
+    Runs are paired by the identity of their drive. The how-to page on comparing fleets explains the
+    verdicts.
 
     Args:
-        runs: The runs to judge: their folders, or with ``folder`` a query that selects them.
-        against: The runs to compare with, likewise.
-        folder: The folder of all runs, or its URL, whose catalog the queries ask.
-        tolerances: As of ``compare_runs``.
-        junit: As of ``compare_runs``.
+        runs: The runs to judge: their folders or, with ``folder``, a query that selects them.
+        against: The runs to compare with, in the same form.
+        folder: Folder of all runs, or its URL, to which the queries apply.
+        tolerances: As in ``compare_runs``.
+        junit: As in ``compare_runs``.
 
     Raises:
-        UsageError: A query without ``folder``, or that is wrong; two runs of one drive on a side.
+        UsageError: A query is not valid or has no ``folder``, or a side has two runs of one drive.
         RunError: A side has no scored run.
     """
     allowed = [compare.read_tolerance(text) for text in tolerances]
     if folder is not None and is_remote(folder):
-        # Runs on a store have no folders: what is compared comes from their catalog.
+        # Runs on a store have no folders, so their metrics are read from their catalog.
         found = catalog(folder)
         if not (isinstance(runs, str) and isinstance(against, str)):
-            raise UsageError(f"{folder}: runs on a store; give two queries")
+            raise UsageError(f"{folder}: runs on a store; expected two queries")
         there = (found.named(against), found.named(runs))
         judged = many_runs.compare_many(*there, allowed, many_runs.scores_of(found))
     else:
@@ -88,5 +88,5 @@ def _selected(
     if not isinstance(runs, str):
         return tuple(one.path if isinstance(one, Run) else Path(one) for one in runs)
     if folder is None:
-        raise UsageError(f"{runs!r}: a query needs the folder of the runs; give folder")
+        raise UsageError(f"{runs!r}: a query needs the folder of the runs; pass folder")
     return catalog(folder).select(runs)

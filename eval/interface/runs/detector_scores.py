@@ -1,4 +1,4 @@
-"""A detector's boxes in a run, scored against labelled boxes of its pictures."""
+"""Score a detector's boxes in a run against labelled boxes of its pictures."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ MEASURES: Final = ("ap50", "ap", "precision", "recall")
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class DetectorScore:
-    """A detector beside labelled boxes; printed as ``crosscue score detector`` prints it.
+    """Scores of a detector; its repr is the output of ``crosscue score detector``.
 
     Attributes:
-        labelled: What was compared.
-        labels: As they were read.
-        scores: Of each class and part.
-        calibration: Of each class.
-        block_s: Pictures within so many seconds counted as one block.
-        report: The page that shows it.
+        labelled: Detections and labels that were compared.
+        labels: The labels as read.
+        scores: Scores of each class and part.
+        calibration: Calibration of each class.
+        block_s: Pictures within this time count as one block.
+        report: Page with the scores.
     """
 
     labelled: LabelledRun
@@ -58,19 +58,19 @@ class DetectorScore:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing was dropped when the run was made."""
+        """True if nothing was dropped when the run was made."""
         return self.labelled.is_whole
 
     @property
     def parts(self) -> pa.Table:
-        """A row for each class and part, with 95 % intervals."""
+        """Table with one row per class and part, with 95 % intervals."""
         import pyarrow as pa
 
         return pa.Table.from_pylist([_row(one) for one in self.scores])
 
     @property
     def bins(self) -> pa.Table:
-        """A row for each class and tenth of the score: detections, and how many are right."""
+        """Table of detections, and of those that are correct, by class and tenth of the score."""
         import pyarrow as pa
 
         return pa.Table.from_pylist(
@@ -90,7 +90,7 @@ class DetectorScore:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue score detector --json`` prints."""
+        """Return the JSON output of ``crosscue score detector``."""
         of = self.labelled
         return {
             "run": str(of.run.path),
@@ -117,7 +117,7 @@ class DetectorScore:
             f"detector   {visible(of.detector.name)}",
             f"labels     {visible(self.labels.where)} ({self.labels.format}): {len(of.names)} of "
             f"{len(self.labels.pictures)} images in the run, {of.rule};",
-            f"           {asked:,} boxes to be found, {len(of.truth) - asked:,} not judged; "
+            f"           {asked:,} boxes to detect, {len(of.truth) - asked:,} not judged; "
             f"{of.frames - len(of.names):,} frames without labels",
             *(f"left out   {count:,} {visible(why)}" for why, count in of.left_out.items()),
         ]
@@ -137,10 +137,10 @@ class DetectorScore:
             for one in self.calibration
             if one.detections
         ]
-        together = f"in stretches of {self.block_s:g} s" if self.block_s > 0.0 else "each alone"
-        lines.append(f"intervals  95 %, images counted {together}, seed {SEED}")
+        unit = f"blocks of {self.block_s:g} s" if self.block_s > 0.0 else "single images"
+        lines.append(f"intervals  95 %, bootstrap over {unit}, seed {SEED}")
         if any(np.isnan(one.ap50.low) and one.labels for one in self.scores):
-            lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS} such stretches or images, no intervals")
+            lines.append(f"{TOO_FEW}: no intervals below {MIN_CLUSTERS} blocks or images")
         lines.append(f"written to {visible(str(self.report))}")
         return "\n".join(lines)
 
@@ -200,27 +200,28 @@ def score_detector(
     """Score a detector's boxes in a run against labelled boxes.
 
     Args:
-        run: With stored detections.
+        run: Run with stored detections.
         labels: A COCO file, or a folder of YOLO, Pascal VOC or KITTI files.
-        output: Folder for the page and its numbers; ``RUN/score`` if left out.
-        detector: Its name, where several ran.
-        kind: Format of the labels; recognised if left out.
-        class_names: Of YOLO labels in their order, or a file with one per line.
-        meanings: From a class of the labels or of the detector to the class that it counts as;
-            empty for one that is neither to be found nor wrong.
-        overlap: That makes a detection right, for precision, recall and calibration.
-        block_s: Pictures within so many seconds count as one block, for they show the same.
-        draw: So many of the worst pictures.
-        logs: Where the run's logs have moved to, if they have.
-        without_images: Draw none; the logs may be gone.
-        has_figures: Draw the reliability diagram, for which matplotlib is imported.
-        limits: What the logs are read with.
+        output: Folder for the page and its numbers; default: ``RUN/score``.
+        detector: Name of the detector, if the run has several.
+        kind: Format of the labels; default: detected.
+        class_names: Class names of YOLO labels in their order, or a file with one per line.
+        meanings: Class that a class of the labels or of the detector counts as; empty for a class
+            to ignore.
+        overlap: Min IoU of a correct detection, for precision, recall and calibration.
+        block_s: Pictures within this time count as one block, because they are similar.
+        draw: Number of the worst pictures to draw.
+        logs: Folder that the run's logs have moved to.
+        without_images: Draw no pictures, so that the logs are not needed.
+        has_figures: Draw the reliability diagram, which needs matplotlib.
+        limits: Limits for reading the logs.
 
     Raises:
-        UsageError: A value out of range, no such detector, or a class that nobody has.
+        UsageError: A value is out of range, the detector does not exist, or neither labels nor
+            detections have a class.
         SchemaError: The labels cannot be read, or do not belong to the run.
-        EmptyResultError: No labelled box of a class that the detector reports.
-        RunError: No run, damaged, or its log is gone.
+        EmptyResultError: No labelled box has a class that the detector reports.
+        RunError: The run does not exist or is damaged, or its log is missing.
     """
     if not 0.0 < overlap <= 1.0:
         raise UsageError(f"--overlap {overlap}: expected above 0, at most 1")
@@ -271,7 +272,7 @@ def score_detector(
 
 
 def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
-    """How far the scores of each class are probabilities."""
+    """Return the reliability of each class's scores as probabilities."""
     found = []
     for k, name in enumerate(of.classes):
         matched = match(of.truth, of.found, k, overlaps=np.array([overlap]))

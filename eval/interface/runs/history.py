@@ -1,4 +1,4 @@
-"""Metrics of a catalog over versions, commits or tags."""
+"""Show metrics of scored runs over versions, commits or tags."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def history(
     *,
     overwrite: bool = False,
 ) -> History:
-    """Each metric over the versions that runs were made with, and where it changed.
+    """Return each metric by version of the runs, with its change points.
 
     Args:
-        folder: A folder of scored runs.
-        output: HTML page to write; None writes nothing.
+        folder: Folder of scored runs.
+        output: HTML page to write; None for none.
         by: ``commit`` or ``version`` of crosscue, or the name of a tag.
-        metrics: Patterns of metrics' names, such as ``cues.*.recall``; none means all.
+        metrics: Patterns of metrics' names, such as ``cues.*.recall``; default: all metrics.
         overwrite: Replace an existing page.
 
     Raises:
-        RunError: The folder holds no run.
-        EmptyResultError: No scored run says which version it is of, or no metric fits.
+        RunError: The folder contains no run.
+        EmptyResultError: No scored run records its version, or no metric matches.
         OutputError: The page exists, or cannot be written.
     """
     page = None if output is None else Path(output)

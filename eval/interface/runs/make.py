@@ -1,4 +1,4 @@
-"""Runs made from a drive: replayed, detected, estimated again."""
+"""Make runs from a drive: replay, detect, or estimate again."""
 
 from __future__ import annotations
 
@@ -37,28 +37,28 @@ def replay_drive(
     on_frames: Callable[[int, int | None], None] = lambda done, of: None,
     on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
 ) -> Run:
-    """Replay a drive: run detectors over its camera, estimate pose, cues, ranges and belief.
+    """Replay a drive: run detectors on its camera, and estimate pose, cues, ranges and beliefs.
 
     Args:
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         output: Folder for the run.
-        vehicle: The vehicle file; None for the ``vehicle.toml`` beside the log, if there is one.
-        detectors: Names, model cards or ``module:factory``; None for the vehicle file's, and an
-            empty list for pose alone.
-        gnss: What GNSS is for: ``start``, ``truth``, ``fuse`` or ``off``; None for the vehicle
-            file's ``gnss.use``.
+        vehicle: The vehicle file; None for the ``vehicle.toml`` next to the log, if it exists.
+        detectors: Names, model cards or ``module:factory``; None for those of the vehicle file. An
+            empty list estimates only the pose.
+        gnss: Use of GNSS: ``start``, ``truth``, ``fuse`` or ``off``; None for the vehicle file's
+            ``gnss.use``.
         start: The first pose: ``X,Y,HEADING`` in metres and degrees, or a truth file with a track.
-        landmarks: Database that frames are compared with.
-        cache: File in which results of detectors are kept; see ``default_cache``.
-        draw: Up to so many pictures are written with what was found.
+        landmarks: Landmark database to match frames against.
+        cache: Detection cache; see ``default_cache``.
+        draw: Max number of pictures with detections to write.
         overwrite: Replace an earlier run.
-        resume: Keep detections of an earlier start that would be the same.
-        on_frames: Called with the number of frames that are done, and of how many.
-        on_time: Called with the seconds of log that are done, and of how many.
+        resume: Keep valid detections of an interrupted run.
+        on_frames: Called with the number of frames done, and their total.
+        on_time: Called with the seconds of log done, and their total.
 
     Raises:
         VehicleError: The vehicle file does not fit the log.
-        RunError: The folder holds something else.
+        RunError: The folder has other contents.
         EmptyResultError: The result is empty; the folder is unchanged.
     """
     from crosscue.eval.fit.first_pose import with_start
@@ -110,7 +110,7 @@ def detect_drive(
     overwrite: bool = False,
     on_frames: Callable[[int, int | None], None] = lambda done, of: None,
 ) -> Run:
-    """Run detectors over a drive's camera, and nothing else; as ``replay_drive``."""
+    """Run only the detectors on a drive's camera; as ``replay_drive`` otherwise."""
     from crosscue.detectors.registry import known
     from crosscue.eval.pipeline.detect import detect_drive as detect_into
 
@@ -118,7 +118,7 @@ def detect_drive(
         settings = vehicle_of(drive, vehicle)
         choices = choices_for(settings, detectors)
         if not choices:
-            raise UsageError(f"--detectors: none named; there are: {', '.join(known({}))}")
+            raise UsageError(f"--detectors: none named; expected some of {', '.join(known({}))}")
         with created(Path(output), overwrite=overwrite) as folder:
             outcome = detect_into(
                 drive.logs,
@@ -142,19 +142,19 @@ def estimate_run(
     start: Path | str | None = None,
     on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
 ) -> Run:
-    """Estimate again from what detectors found before; no picture is opened.
+    """Estimate again from the stored detections, without reading pictures.
 
     Args:
         run: A finished run.
-        vehicle: Other settings; the run's own, if left out. A first pose that the run took from
-            GNSS or a truth file stays, unless the settings have one.
-        output: A new folder beside the run; if left out, the run's tables are replaced.
-        gnss: As in ``replay_drive``; the first pose is looked for again.
+        vehicle: Other settings; default: those of the run. A first pose that the run took from GNSS
+            or a truth file is kept, unless the settings have one.
+        output: New folder, next to the run; default: the run's tables are replaced.
+        gnss: As in ``replay_drive``; the first pose is determined again.
         start: As in ``replay_drive``.
-        on_time: Called with the seconds of log that are done, and of how many.
+        on_time: Called with the seconds of log done, and their total.
 
     Raises:
-        RunError: The run is damaged, or its log is gone.
+        RunError: The run is damaged, or its log is missing.
         OutputError: The new folder exists.
     """
     from crosscue.eval.pipeline.replay import estimate_run as estimate_in
@@ -174,7 +174,7 @@ def estimate_run(
 def _settings_again(
     folder: RunFolder, vehicle: Vehicle | None, gnss: GnssUse | None, start: str | None
 ) -> Vehicle | None:
-    """Settings to estimate a run again with; None for its own."""
+    """Return the settings for another estimate of a run; None for those of the run."""
     from crosscue.eval.fit.first_pose import with_start, with_start_of, without_found_start
     from crosscue.eval.runs.logs import reopened
 
@@ -190,7 +190,7 @@ def _settings_again(
 
 
 def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choice, ...]:
-    """The detectors asked for; none where neither caller nor vehicle file names any."""
+    """Return the requested detectors, or else those of the vehicle file, which may be none."""
     from crosscue.detectors.registry import chosen
     from crosscue.eval.pipeline.detect import choices_of
 
@@ -200,7 +200,7 @@ def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choi
 
 
 def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
-    """The settings given, or those of the ``vehicle.toml`` beside the log, or none."""
+    """Return the given settings, or those of the ``vehicle.toml`` next to the log, or defaults."""
     if given is not None:
         return vehicle_given(given)
     for one in log.logs:
@@ -211,10 +211,10 @@ def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
 
 
 def _copied(folder: RunFolder, output: Path) -> RunFolder:
-    """The run in a new place, for other estimates beside it."""
+    """Copy a run to a new folder, for another estimate."""
     if output.resolve().parent != folder.path.resolve().parent:
-        # Its manifest holds where its logs are, as seen from the folder.
-        raise UsageError(f"{output}: expected a folder beside the run, {folder.path}")
+        # The manifest's paths of logs are relative to the folder.
+        raise UsageError(f"{output}: expected a folder next to the run, {folder.path}")
     if output.exists():
         raise OutputError(f"{output}: exists; give another folder")
     shutil.copytree(folder.path, output, ignore=shutil.ignore_patterns("score", ".*"))

@@ -1,4 +1,4 @@
-"""A run as a Rerun recording."""
+"""Write a run as a Rerun recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 BEFORE_NS: Final = 2_000_000_000
 BEHIND_NS: Final = 4_000_000_000
-"""So much around a moment is recorded."""
+"""Time recorded after a moment."""
 
 
 def save_recording(
@@ -32,20 +32,21 @@ def save_recording(
 
     Args:
         run: A finished run.
-        output: Name that ends in ``.rrd``; ``drive.rrd`` in the run, if left out.
-        truth: Draw the true track and ranges, too.
-        at: Record only from 2 s before this moment to 4 s behind it, and mark it: seconds from the
+        output: File to write, whose name ends in ``.rrd``; default: ``drive.rrd`` in the run.
+        truth: Truth file, to also draw the true track and ranges.
+        at: Record only from 2 s before this moment to 4 s after it, and mark it: seconds from the
             run's first frame, or nanoseconds as ``17...ns``.
         approach: Record only this approach, by its number in ``belief.parquet``.
         only: Record only some of ``cameras``, ``ahead``, ``belief``, ``ranges``, ``cues``, ``map``,
-            ``pose``, ``notes``; all if empty.
+            ``pose``, ``notes``; default: all.
 
     Returns:
         The recording; ``rerun PATH`` opens it.
 
     Raises:
-        UsageError: Another suffix; a moment, approach or view that the run does not have.
-        RunError: The log with the pictures is gone.
+        UsageError: The file has another suffix, or the run does not have the moment, approach or
+            view.
+        RunError: The log with the pictures is missing.
     """
     from crosscue.eval.recording import save
     from crosscue.eval.scoring.pose.score import truth_track
@@ -69,7 +70,7 @@ def save_recording(
 def _part(
     run: TableFolder, at: float | str | None, approach: int | None, only: Sequence[str]
 ) -> Part:
-    """What to record."""
+    """Return the part of the run to record."""
     from crosscue.eval.recording.part import Part
 
     views = frozenset(only)
@@ -82,6 +83,6 @@ def _part(
         spans = approach_spans(run)
         if approach not in spans:
             there = ", ".join(map(str, spans)) or "none"
-            raise UsageError(f"--approach {approach}: {run.path} has no such one; it has: {there}")
+            raise UsageError(f"--approach {approach}: not in {run.path}; it has: {there}")
         return Part(*spans[approach], None, views)
     return Part(only=views)

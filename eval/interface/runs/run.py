@@ -1,4 +1,4 @@
-"""A run, read back as tables."""
+"""Read runs as tables."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Run:
-    """A run folder; ``replay_drive`` makes one, ``open_run`` reads one.
+    """A run folder, made by ``replay_drive`` or read by ``open_run``.
 
-    Its tables are read when asked for, their checksums verified: ``run["belief"]``, or
-    ``run.belief`` for those that every replay has.
+    Tables are read on access, and their checksums are verified: ``run["belief"]``, or
+    ``run.belief`` for the tables that every replay has.
 
     Attributes:
-        folder: Where its files are.
-        outcome: What the replay or estimate that made it counted; None for a run read from disk.
+        folder: Folder with its files.
+        outcome: Counts of the replay, detection or estimate that made it; None for a run read from
+            disk.
     """
 
     folder: RunFolder
@@ -35,23 +36,23 @@ class Run:
 
     @property
     def path(self) -> Path:
-        """Its folder."""
+        """Path of its folder."""
         return self.folder.path
 
     @property
     def made(self) -> Outcome | DetectOutcome:
-        """What the replay, detection or estimate that made it counted.
+        """Counts of the replay, detection or estimate that made it.
 
         Raises:
             UsageError: The run was read from disk.
         """
         if self.outcome is None:
-            raise UsageError(f"{self.path}: read from disk; its manifest holds what was counted")
+            raise UsageError(f"{self.path}: read from disk; use the counts in its manifest")
         return self.outcome
 
     @property
     def manifest(self) -> Manifest:
-        """Its logs, versions and settings, and the account of every row."""
+        """Logs, versions, settings, and the account of every row."""
         return self.folder.manifest()
 
     @property
@@ -76,7 +77,7 @@ class Run:
 
     @property
     def detections(self) -> pa.Table:
-        """Every object that detectors found."""
+        """Objects found by detectors."""
         return self["detections"]
 
     @property
@@ -101,7 +102,7 @@ def load_vehicle(path: Path | str) -> Vehicle:
     """Read and check a vehicle file.
 
     Raises:
-        VehicleError: It is missing, or a value does not fit; the message names the field.
+        VehicleError: The file is missing, or a value is not valid; the message names the field.
     """
     return load(Path(path))
 
@@ -116,26 +117,27 @@ def open_run(
     """Open a finished run.
 
     Args:
-        path: Its folder.
-        logs: Where its logs have moved to, if they have.
-        without_images: Show it without the images in its logs, which may be gone.
-        limits: What its logs are read with.
+        path: Folder of the run.
+        logs: Folder that its logs have moved to.
+        without_images: Show the run without camera images, so that its logs are not needed.
+        limits: Limits for reading its logs.
 
     Raises:
-        RunError: It is not a run, damaged, of another version, or holds many drives merged.
+        RunError: The folder is not a run, is damaged or of another version, or contains merged
+            drives.
     """
     moved = None if logs is None else Path(logs)
     folder = open_folder(Path(path), moved, without_images=without_images, limits=limits)
-    # Refuses a folder of many drives merged.
+    # Refuses a folder of merged drives.
     folder.drive_manifest()
     return Run(folder)
 
 
 def run_schema() -> dict[str, Any]:
-    """The JSON Schema of a run's ``manifest.json``, for editors and other tools."""
+    """Return the JSON Schema of a run's ``manifest.json``, for editors and other tools."""
     return json_schema()
 
 
 def run_given(run: Run | Path | str) -> Run:
-    """A run as it is, or that of a folder."""
+    """Return a run unchanged, or open the run of a folder."""
     return run if isinstance(run, Run) else open_run(run)

@@ -1,4 +1,4 @@
-"""One run scored, or many side by side; one that fails does not stop the rest."""
+"""Score one run, or many in parallel; a run that fails does not stop the others."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """A run that was scored, its files written.
+    """A scored run, whose files are written.
 
     Attributes:
-        one: Laid beside its truth.
-        metrics: What its ``metrics.json`` holds.
+        one: The run, compared with its truth.
+        metrics: Contents of its ``metrics.json``.
         report: Its page.
-        smoothed: Smoothers beside the filters, if asked for.
+        smoothed: Comparison of smoothers with the filters, if requested.
     """
 
     one: RunScored
@@ -56,7 +56,7 @@ class Failed:
 
     Attributes:
         path: Its folder.
-        error: What would have ended the command for this run alone.
+        error: The error.
     """
 
     path: Path
@@ -65,18 +65,18 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class ScoreWork:
-    """What is done for one run, here or in another process.
+    """Scoring of one run, in this process or in another.
 
     Attributes:
-        truth: The truth of all runs, or None for the one beside each run's log.
-        settings: Of the scores.
+        truth: The truth of all runs; None for the truth next to each run's log.
+        settings: Settings of the scores.
         rpe_m: Distances of the relative pose error.
-        has_smoother: Run the batch smoother as well?
-        any_log: Take truth that names the hash of another file?
-        logs: Where the runs' logs have moved to, if they have.
-        limits: What the runs' logs are read with.
-        has_figures: Draw figures into the report?
-        without_images: Report without pictures of the worst frames, whose logs may be gone?
+        has_smoother: True to also run the batch smoother.
+        any_log: True to accept truth that names the hash of another file.
+        logs: Folder that the runs' logs have moved to.
+        limits: Limits for reading the runs' logs.
+        has_figures: True to draw figures for the report.
+        without_images: True to omit pictures of the worst frames, so that logs are not needed.
     """
 
     truth: Path | None
@@ -93,7 +93,7 @@ class ScoreWork:
         """Score one run and write its files.
 
         Raises:
-            CrosscueError: It cannot be scored.
+            CrosscueError: The run cannot be scored.
         """
         folder = open_run(path, self.logs, without_images=self.without_images, limits=self.limits)
         truth_path = find_truth(folder, self.truth)
@@ -111,7 +111,7 @@ class ScoreWork:
         return Scored(one, metrics, report, smoothed)
 
     def attempt(self, path: Path) -> Scored | Failed:
-        """Score one run; an error of ours becomes a result."""
+        """Score one run; return a ``CrosscueError`` as a result."""
         try:
             return self(path)
         except CrosscueError as error:
@@ -131,7 +131,7 @@ def write_files(
     Returns:
         The report's path.
     """
-    # First what may lack pictures: then nothing is written.
+    # The pictures are read first: if they are missing, nothing is written.
     worst = worst_frames(ones)
     report = write_report(place, ones, scores, metrics, worst, has_figures=has_figures)
     write_scores(place, ones, metrics)
@@ -139,7 +139,7 @@ def write_files(
 
 
 def settings_given(threshold: float, detection: Definition) -> ScoreSettings:
-    """Settings of scores.
+    """Return settings of scores.
 
     Raises:
         UsageError: A value is out of range.
@@ -152,12 +152,12 @@ def settings_given(threshold: float, detection: Definition) -> ScoreSettings:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ScoredRun:
-    """A run beside its truth; printed as ``crosscue score`` prints it.
+    """Scores of a run; its repr is the output of ``crosscue score``.
 
     Attributes:
-        scored: What was measured.
+        scored: The run, compared with its truth.
         metrics: Every metric by name, as in ``metrics.json``.
-        report: The page that shows them.
+        report: Page with the scores.
     """
 
     scored: Scored
@@ -166,12 +166,12 @@ class ScoredRun:
 
     @property
     def headline(self) -> str:
-        """Its folder and most important numbers in one line."""
+        """Folder and most important numbers, in one line."""
         return headline(str(self.scored.one.run.path), metric_values(self.metrics))
 
     @property
     def cues(self) -> pa.Table:
-        """Precision and recall of each cue with 95 % intervals, judged as its row says."""
+        """Precision and recall of each cue with 95 % intervals, and the rule it is judged by."""
         import pyarrow as pa
 
         rows = []
@@ -189,15 +189,15 @@ class ScoredRun:
 
     @property
     def curves(self) -> pa.Table:
-        """Probability of each feature against true distance, a row for each step."""
+        """Probability of each feature and true distance, one row per step."""
         return curve_table([self.scored.one.judged])
 
     @property
     def true_track(self) -> pa.Table:
-        """The truth's positions over time, in the columns t_ns, x_m, y_m, z_m.
+        """True positions over time, in the columns t_ns, x_m, y_m, z_m.
 
         Raises:
-            SchemaError: The truth has none.
+            SchemaError: The truth has no positions.
         """
         import pyarrow as pa
 
@@ -223,21 +223,21 @@ def score_run(
     any_log: bool = False,
     has_figures: bool = True,
 ) -> ScoredRun:
-    """Score a run against its truth; metrics, figures and report go into ``RUN/score``.
+    """Score a run against its truth; write metrics, figures and report to ``RUN/score``.
 
     Args:
         run: A finished run.
-        truth: Its truth; None for the ``truth.json`` beside its log.
-        threshold: A feature is detected above this probability.
-        detection: ``confirmed`` by three frames and a right range, or as ``published``: the first
-            frame counts, with any range.
+        truth: Its truth; None for the ``truth.json`` next to its log.
+        threshold: Probability above which a feature counts as detected.
+        detection: ``confirmed``: a detection counts when three frames confirm it and its range is
+            within its 95 % interval; ``published``: from the first frame, with any range.
         rpe_m: Distances of the relative pose error.
-        any_log: Take a truth that names the hash of another file: the same drive, converted.
-        has_figures: Draw figures, for which matplotlib is imported.
+        any_log: Accept truth made for another file of the same drive, such as a converted log.
+        has_figures: Draw figures, which needs matplotlib.
 
     Raises:
         SchemaError: The truth does not fit the run.
-        UsageError: No truth is given and none is beside the log.
+        UsageError: No truth is passed, and there is no truth next to the log.
     """
     of = run_given(run)
     settings = settings_given(threshold, detection)
@@ -257,5 +257,5 @@ def score_run(
 def score_each(
     paths: Sequence[Path], work: ScoreWork, workers: int = 1
 ) -> Iterator[Scored | Failed]:
-    """Score runs, in order; with several workers in as many processes."""
+    """Score runs and yield the results in order, with ``workers`` processes."""
     return in_processes(work.attempt, paths, workers)

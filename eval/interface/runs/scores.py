@@ -1,4 +1,4 @@
-"""Runs scored, each beside its truth and all together, with gates and the worth of each cue."""
+"""Score runs against their truth, each alone and all together, with gates and ablations."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageErr
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class ScoredRuns:
-    """Runs beside their truth; printed as ``crosscue score`` prints them.
+    """Scores of runs; its repr is the output of ``crosscue score``.
 
     Attributes:
-        runs: Each run that was scored.
-        failed: From the folder of a run that could not be scored to the reason.
-        metrics: Of all runs together, as in ``metrics.json``; of the run where there is one.
-        scores: What the metrics are made of.
-        gates: The outcome of each gate.
-        attribution: What each cue was worth, where that was asked for.
-        report: The page; None for several runs without ``output``.
+        runs: The scored runs.
+        failed: Errors of the runs that could not be scored, by folder.
+        metrics: Metrics of all runs together, as in ``metrics.json``.
+        scores: The scores that the metrics are computed from.
+        gates: Outcome of each gate.
+        attribution: Effect of each cue on the scores, if requested.
+        report: Page with the scores; None for several runs without ``output``.
     """
 
     runs: tuple[ScoredRun, ...]
@@ -67,21 +67,21 @@ class ScoredRuns:
 
     @property
     def is_many(self) -> bool:
-        """Several runs were to be scored."""
+        """True if several runs were to be scored."""
         return len(self.runs) + len(self.failed) > 1
 
     @property
     def is_whole(self) -> bool:
-        """Every run was scored, and nothing was dropped in any."""
+        """True if every run was scored, and nothing was dropped in any."""
         return not self.failed and bool(self.metrics["account"]["is_whole"])
 
     @property
     def has_failed_gate(self) -> bool:
-        """A metric violates a bound."""
+        """True if a metric violates a bound."""
         return any(one.failure for one in self.gates)
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue score --json`` prints."""
+        """Return the JSON output of ``crosscue score``."""
         return {
             "metrics": self.metrics,
             "gates": [
@@ -175,38 +175,37 @@ def score_runs(
 ) -> ScoredRuns:
     """Score runs against their truth, each alone and all together.
 
-    Every run gets metrics, figures and report in ``RUN/score``. One that cannot be scored does not
-    stop the rest.
+    Metrics, figures and report of each run are written to ``RUN/score``. A run that cannot be
+    scored does not stop the others.
 
     Args:
-        runs: Run folders, folders that hold some, patterns, or ``@list.txt``.
-        truth: Of all runs; None for the ``truth.json`` beside each run's log.
+        runs: Run folders, folders of runs, patterns, or ``@list.txt``.
+        truth: Truth of all runs; None for the ``truth.json`` next to each run's log.
         output: Folder for metrics and report of all runs together.
-        gates: File of bounds on metrics; ``junit.xml`` goes into ``output``.
-        threshold: A feature is detected above this probability.
-        detection: ``confirmed`` by three frames and a right range, or as ``published``: the first
-            frame counts, with any range.
+        gates: File with bounds on metrics; ``junit.xml`` is written to ``output``.
+        threshold: Probability above which a feature counts as detected.
+        detection: As in ``score_run``.
         rpe_m: Distances of the relative pose error.
-        has_attribution: Estimate without each cue as well, and report what it was worth.
-        has_smoother: Run a batch smoother on the same measurements as well (needs gtsam).
-        any_log: Take a truth that names the hash of another file: the same drive, converted.
-        logs: Where the runs' logs have moved to, if they have.
-        without_images: Report without pictures, whose logs may be gone.
-        has_figures: Draw figures, for which matplotlib is imported.
-        workers: How many runs are scored side by side.
-        limits: What the runs' logs are read with.
-        on_runs: Called with the number of runs that are done, and of how many.
-        on_run: Called with each of several runs once it is scored.
-        on_failed: Called with each of several runs that cannot be scored, and why.
+        has_attribution: Run an ablation: estimate without each cue, and report the effect.
+        has_smoother: Also run a batch smoother on the same measurements (needs gtsam).
+        any_log: Accept truth made for another file of the same drive, such as a converted log.
+        logs: Folder that the runs' logs have moved to.
+        without_images: Omit pictures from the report, so that logs are not needed.
+        has_figures: Draw figures, which needs matplotlib.
+        workers: Number of runs to score in parallel.
+        limits: Limits for reading the runs' logs.
+        on_runs: Called with the number of runs done, and their total.
+        on_run: Called with each of several runs after it is scored.
+        on_failed: Called with the folder and the error of each of several runs that fail.
 
     Raises:
-        UsageError: A setting out of range, or a gate file that does not fit.
-        CrosscueError: No run can be scored: what is wrong with the first.
+        UsageError: A setting is out of range, or the gate file is not valid.
+        CrosscueError: No run can be scored; the error of the first.
     """
     paths = runs_of([str(one.path if isinstance(one, Run) else one) for one in runs])
     folder = None if output is None else Path(output)
     if gates is not None and len(paths) > 1 and folder is None:
-        raise UsageError("score: several runs and --gate: say with -o DIR where junit.xml goes")
+        raise UsageError("score: several runs with --gate: add -o DIR, the folder for junit.xml")
     if workers < 1:
         raise UsageError(f"--workers {workers}: expected 1 or more")
     settings = settings_given(threshold, detection)
@@ -257,7 +256,7 @@ def _one(
     has_attribution: bool,
     has_figures: bool,
 ) -> ScoredRuns:
-    """One run, whose own files hold what is asked for beyond ``score_run``."""
+    """Return the scores of one run, with the attribution added to its files."""
     (run,) = runs
     one, metrics, report = run.scored.one, run.scored.metrics, run.report
     scores = scores_of([one], settings)
@@ -278,7 +277,7 @@ def _pool(
     has_attribution: bool,
     has_figures: bool,
 ) -> ScoredRuns:
-    """All runs together, into the folder asked for."""
+    """Return the scores of all runs together, written to ``output`` if it is not None."""
     ones = [run.scored.one for run in runs]
     scores = scores_of(ones, settings)
     tree = metrics_of(ones, scores)
@@ -293,7 +292,7 @@ def _pool(
 def _attribution(
     ones: Sequence[RunScored], tree: dict[str, Any], settings: ScoreSettings
 ) -> dict[str, Attribution]:
-    """What each cue was worth, also put into the metrics."""
+    """Return the effect of each cue on the scores, and add it to the metrics."""
     drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
     found = attribute(drives, settings=settings)
     tree["attribution"] = attribution_tree(found)

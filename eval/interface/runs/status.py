@@ -1,4 +1,4 @@
-"""How far batches of drives have come."""
+"""Report the progress of batches of drives."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from crosscue.replay.base import UsageError, visible
 
 @dataclass(frozen=True, slots=True, repr=False)
 class BatchStatus:
-    """How far the drives of batches have come; printed as ``crosscue status`` prints it.
+    """Progress of batches of drives; its repr is the output of ``crosscue status``.
 
     Attributes:
-        drives: Each with its run folder, its state, and why it failed.
-        pace: Of all folders together: drives an hour, and seconds left.
+        drives: Run folder, state and error of each drive.
+        pace: Drives per hour and seconds left, over all folders.
     """
 
     drives: tuple[DriveStatus, ...]
     pace: Pace
 
     def count(self, state: str) -> int:
-        """How many drives are in a state: done, running, failed, stale or waiting."""
+        """Return the number of drives in a state: done, running, failed, stale or waiting."""
         return sum(one.state == state for one in self.drives)
 
     @property
     def is_whole(self) -> bool:
-        """No drive has failed, and none was left by a worker that is gone."""
+        """True if no drive has failed or is stale."""
         return not any(self.count(state) for state in (DriveState.FAILED, DriveState.STALE))
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue status --json`` prints."""
+        """Return the JSON output of ``crosscue status``."""
         states = Counter(one.state.value for one in self.drives)
         return {
             **{state.value: states[state.value] for state in DriveState},
@@ -72,14 +72,14 @@ class BatchStatus:
         lines.append(f"drives    {total}: {', '.join(counted)}")
         if math.isfinite(self.pace.per_hour):
             digits = 0 if self.pace.per_hour >= 10.0 else 1
-            lines.append(f"rate      {self.pace.per_hour:,.{digits}f} drives an hour")
+            lines.append(f"rate      {self.pace.per_hour:,.{digits}f} drives per hour")
         if math.isfinite(self.pace.left_s):
             lines.append(f"time left {_duration(self.pace.left_s)}")
         return "\n".join(map(visible, lines))
 
 
 def _heard(one: DriveStatus) -> str:
-    """When a stale drive's worker was last heard of, and what to do."""
+    """Return the time since the last sign of a stale drive's worker, and what to do."""
     when = f"last heard of {_duration(one.silent_s)} ago; " if math.isfinite(one.silent_s) else ""
     return f"{when}replay again"
 
@@ -92,16 +92,17 @@ def _duration(seconds: float) -> str:
 
 
 def batch_status(*folders: Path | str) -> BatchStatus:
-    """How far the drives in folders of runs have come: done, running, failed, stale or waiting.
+    """Return the states of the drives in folders of runs.
 
-    Nothing is written, so it may be asked on any machine that sees the folders.
+    A state is done, running, failed, stale or waiting. Nothing is written, so the function works on
+    any machine that has access to the folders.
 
     Args:
-        folders: What ``replay`` of many drives writes to, of one batch or of several.
+        folders: Output folders of ``replay_drives``, of one batch or several.
 
     Raises:
-        UsageError: No folder, or one named twice.
-        RunError: A folder is missing, or no batch has written into it.
+        UsageError: There is no folder, or one is named twice.
+        RunError: A folder is missing, or no batch has been written to it.
     """
     places = [Path(folder) for folder in folders]
     if not places or len({place.resolve() for place in places}) < len(places):

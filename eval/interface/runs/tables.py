@@ -1,4 +1,4 @@
-"""Drives and runs as tables on disk: a drive decoded, runs merged."""
+"""Decode a drive into tables, and merge the tables of runs."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MergedRuns:
-    """Runs of many drives in one folder of tables.
+    """Merged tables of the runs of many drives.
 
     Attributes:
-        path: The folder.
-        drives: Names of the drives, each in the column ``drive`` of its rows.
-        failures: By name of a drive without a run, why.
-        rows: By table.
+        path: Folder of the tables.
+        drives: Names of the drives, as in the column ``drive`` of the tables.
+        failures: Errors by name of the drives without a run.
+        rows: Numbers of rows by table.
     """
 
     path: Path
@@ -35,7 +35,7 @@ class MergedRuns:
     rows: Mapping[str, int]
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue merge --json`` prints."""
+        """Return the JSON output of ``crosscue merge``."""
         return {
             "merged": str(self.path),
             "drives": list(self.drives),
@@ -60,20 +60,20 @@ def decode(
     overwrite: bool = False,
     on_rows: Callable[[int, int], None] = lambda done, of: None,
 ) -> Decoded:
-    """Write every stream of a drive as a Parquet file: topics, CAN messages, Mobileye tables.
+    """Write each topic, CAN message and Mobileye table of a drive as a Parquet file.
 
     Args:
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         output: Folder for the tables.
-        vehicle: DBC files, buses and mounting; None for the ``vehicle.toml`` beside the log, if
-            there is one.
+        vehicle: Vehicle file with DBC files, buses and mounting; None for the ``vehicle.toml`` next
+            to the log, if it exists.
         overwrite: Replace earlier tables.
-        on_rows: Called with the rows that are read, and those that the logs declare.
+        on_rows: Called with the number of rows read, and the number that the logs declare.
 
     Raises:
-        SchemaError: A DBC file cannot be understood.
-        EmptyResultError: No row for any table; the folder is as it was.
-        OutputError: The folder holds something else, or cannot be written.
+        SchemaError: A DBC file is not valid.
+        EmptyResultError: There is no row for any table; the folder is unchanged.
+        OutputError: The folder has other contents, or cannot be written.
     """
     from crosscue.eval.catalog.decoded_logs import decode_tables
 
@@ -86,9 +86,10 @@ def decode(
 def merge(
     folders: Sequence[Path | str], output: Path | str, *, overwrite: bool = False
 ) -> MergedRuns:
-    """Merge the runs of batches into one folder of tables, each row with its drive's name.
+    """Merge the runs of batches into one folder of tables, with the drive's name in each row.
 
-    A set union: the order does not matter, and a run that is in two batches counts once.
+    The result is a set union: the order does not matter, and a run that is in two batches counts
+    once.
 
     Args:
         folders: Run folders, or folders of them.
@@ -96,15 +97,15 @@ def merge(
         overwrite: Replace earlier tables.
 
     Raises:
-        RunError: No finished run, or one that is damaged.
-        UsageError: Two different runs have one name.
+        RunError: There is no finished run, or a run is damaged.
+        UsageError: Two different runs have the same name.
     """
     from crosscue.eval.batch.merge import gathered, merge_runs
 
     places = [Path(folder) for folder in folders]
     runs, failures = gathered(places)
     if not runs:
-        raise RunError(f"{places[0]}: no finished run in it; replay first")
+        raise RunError(f"{places[0]}: contains no finished run; replay first")
     with created(Path(output), overwrite=overwrite) as folder:
         merged = merge_runs(runs, folder, failures)
     return MergedRuns(merged.run.path, tuple(sorted(runs)), failures, merged.rows)

@@ -1,4 +1,4 @@
-"""Tags of runs: words that their users set, by which a catalog finds them."""
+"""Set, remove and list tags of runs, by which they can be queried."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class TaggedRuns:
     """Runs and their tags.
 
     Attributes:
-        tags: By run folder.
+        tags: Tags by run folder.
     """
 
     tags: Mapping[Path, Mapping[str, str]]
 
     def as_dict(self) -> dict[str, dict[str, str]]:
-        """What ``crosscue tag --json`` prints."""
+        """Return the JSON output of ``crosscue tag``."""
         return {str(path): dict(tags) for path, tags in self.tags.items()}
 
     def __repr__(self) -> str:
@@ -41,23 +41,23 @@ def tag_runs(
 ) -> TaggedRuns:
     """Set and remove tags of runs; without either, read them.
 
-    They are in ``tags.json`` of each run and stay when it is made again. Nothing else in the run
-    depends on them.
+    Tags are stored in ``tags.json`` of each run and are kept when the run is repeated. Nothing else
+    in the run depends on them.
 
     Args:
         runs: Run folders, folders of them, patterns, or ``@lists``.
-        tags: By key the value to set; or texts such as ``weather=rain``.
-        remove: Keys whose tag goes, where a run has it.
+        tags: Values to set by key, or texts such as ``weather=rain``.
+        remove: Keys of tags to remove, where a run has them.
 
     Raises:
-        UsageError: No key or value of a tag, or one key set twice or both set and removed.
-        RunError: No run, one that cannot be read, or one that is being written.
+        UsageError: A key or value is not valid, or a key is set twice or both set and removed.
+        RunError: There is no run, or a run cannot be read or is being written.
         OutputError: A run cannot be written.
     """
     new = stored.assignments(tags, remove)
     folders = [RunFolder(path) for path in runs_of([str(run) for run in runs])]
     for run in folders:
-        # All are checked before the first is changed.
+        # All runs are checked before the first is changed.
         run.drive_manifest()
         stored.read_tags(run.path)
     return TaggedRuns({run.path: _tagged(run, new, remove) for run in folders})

@@ -1,4 +1,4 @@
-"""Scores handed on to MLflow."""
+"""Log scores to MLflow."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from crosscue.eval.scoring.metric_values import metric_values
 
 
 class Scores(Protocol):
-    """What ``score_runs`` returns."""
+    """Result of ``score_runs``."""
 
     @property
     def runs(self) -> Sequence[Any]:
-        """Each run that was scored."""
+        """The scored runs."""
         ...
 
     @property
     def metrics(self) -> Mapping[str, Any]:
-        """Of all together."""
+        """Metrics of all runs together."""
         ...
 
     @property
     def report(self) -> Path | None:
-        """The page of all together."""
+        """Page of all runs together."""
         ...
 
     @property
     def is_many(self) -> bool:
-        """Several runs were to be scored."""
+        """True if several runs were to be scored."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class MlflowSink:
-    """An experiment that takes scores; ``open_mlflow`` makes one."""
+    """An MLflow experiment to log scores to, returned by ``open_mlflow``."""
 
     experiment: Experiment
 
     def log(self, found: Scores) -> tuple[str, ...]:
-        """Write each scored run as a run of the experiment, and one of all together.
+        """Log each scored run as a run of the experiment, and one more for all together.
 
-        Scores become metrics; the run's tags, its drive's identity and crosscue's version become
-        tags; report and ``metrics.json`` become artifacts. Scoring again adds runs.
+        Scores become metrics. The run's tags, its drive's identity and crosscue's version become
+        tags. The report and ``metrics.json`` become artifacts. Logging again adds runs.
 
         Raises:
-            OutputError: The store refuses, or can no longer be reached.
+            OutputError: The store refuses the data, or can no longer be reached.
         """
         runs = []
         for scored in found.runs:
@@ -96,14 +96,14 @@ LEFT_OUT = ("truth", "settings", "format", "account")
 
 
 def open_mlflow(uri: str, experiment: str = "crosscue") -> MlflowSink:
-    """Reach an MLflow server or store, to hand scores on to it.
+    """Connect to an MLflow server or store, to log scores to it.
 
     Args:
-        uri: Of the tracking server or store, such as ``http://localhost:5000``.
-        experiment: Its name; made where it does not exist.
+        uri: Address of the tracking server or store, such as ``http://localhost:5000``.
+        experiment: Name of the experiment; created if it does not exist.
 
     Raises:
-        UsageError: MLflow is not installed, or the store needs more of it than is.
+        UsageError: MLflow is not installed, or lacks a part that the store needs.
         OutputError: The store cannot be reached or used.
     """
     return MlflowSink(open_experiment(uri, experiment))

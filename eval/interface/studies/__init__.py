@@ -1,1 +1,1 @@
-"""The studies: of the town, of one drive in it, of intersections."""
+"""Functions that run the studies of the town, of single drives, of intersections and layouts."""

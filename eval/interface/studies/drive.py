@@ -1,4 +1,4 @@
-"""One simulated drive of a study, through its log."""
+"""Simulate one drive of a study, and replay it from its log."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ FLAGS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StudyDrive:
-    """A simulated drive, its log, and the replay of that; printed with the replay's errors.
+    """A simulated drive, its log and its replay; the repr includes the replay's errors.
 
     Attributes:
-        made: The drive as simulated, its files, its replay and score.
-        picture: The drive drawn.
-        recording: The replay as a Rerun recording, the true track with it.
+        made: The simulated drive, its files, its replay and its score.
+        picture: Drawing of the drive.
+        recording: Rerun recording of the replay, with the true track.
     """
 
     made: Replayed
@@ -36,11 +36,11 @@ class StudyDrive:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing of the log was dropped."""
+        """True if nothing of the log was dropped."""
         return self.made.is_whole
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue study drive --json`` prints."""
+        """Return the JSON output of ``crosscue study drive``."""
         return {
             "result": self.made.traced.result._asdict(),
             "log": str(self.made.files.log),
@@ -57,7 +57,7 @@ class StudyDrive:
         return (
             f"simulated  {result.travelled_m:.0f} m in {result.seconds:.0f} s, "
             f"{result.decisions} decisions, {result.detected} landmarks used\n"
-            f"\nthe replay of its log against the truth\n{pose_summary(self.made.score)}\n"
+            f"\nreplay of its log, compared with the truth\n{pose_summary(self.made.score)}\n"
             f"\npicture    {self.picture}\nlog        {self.made.files.log}"
             f"\nrecording  {self.recording}"
         )
@@ -73,22 +73,22 @@ def run_study_drive(
     detection_rate: float = 0.6,
     overwrite: bool = False,
 ) -> StudyDrive:
-    """Simulate one drive of a study, write its log, replay, score, draw and record it.
+    """Simulate one drive of a study, write its log, and replay, score, draw and record it.
 
-    The seed of any drive of a study is in its ``drives.parquet``.
+    A study's ``drives.parquet`` contains the seed of each drive.
 
     Args:
-        folder: Gets log, truth, picture and run.
-        seed: Everything random comes from it.
-        compass_2sigma_deg: Error of the compass; None for no compass.
+        folder: Output folder for log, truth, picture and run.
+        seed: Seed of all random numbers.
+        compass_2sigma_deg: 2-sigma error of the compass; None for no compass.
         strategy: ``straight to goal``, ``landmark to landmark`` or ``hybrid``.
         landmarks_per_km2: Density of landmarks.
         detection_rate: Probability that a landmark in view is recognised.
         overwrite: Replace an earlier drive.
 
     Raises:
-        UsageError: A value out of range.
-        OutputError: The folder holds a drive already, or cannot be written.
+        UsageError: A value is out of range.
+        OutputError: The folder already contains a drive, or cannot be written.
     """
     from crosscue.eval.recording import save
     from crosscue.eval.scoring.pose.score import truth_track

@@ -1,4 +1,4 @@
-"""The published experiment on simulated drives: distances, cues and beliefs beside the text's."""
+"""Repeat the published experiment on simulated drives, and compare with its results."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from crosscue.replay.base import RunError, json_tree, visible
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class IntersectionResult:
-    """The published experiment, simulated; printed as its tables beside the published numbers.
+    """Results of the simulated experiment; its repr is tables with the published numbers.
 
     Attributes:
-        drives: The outcome of each drive.
-        scored: Distances, cues and beliefs, and what each cue was worth.
-        files: The page, its tables as JSON, the metrics and a sheet of pictures.
+        drives: Outcome of each drive.
+        scored: Scores of distances, cues and beliefs, and of the ablation of each cue.
+        files: The page, its tables as JSON, the metrics and a contact sheet.
     """
 
     drives: tuple[Done[Outcome], ...]
@@ -33,11 +33,11 @@ class IntersectionResult:
 
     @property
     def exit_status(self) -> int:
-        """0 when all is whole; 3 when a drive failed or something was dropped."""
+        """0 if all drives are complete; 3 if a drive failed or something was dropped."""
         return exit_status_of(self.drives)
 
     def as_dict(self) -> object:
-        """What ``crosscue study intersections --json`` prints: the tables in its folder."""
+        """Return the JSON output of ``crosscue study intersections``: the tables in its folder."""
         return json_tree(self.files.tables.read_text(encoding="utf-8"))
 
     def __repr__(self) -> str:
@@ -54,22 +54,22 @@ def run_intersection_study(
     attribution: bool = True,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> IntersectionResult:
-    """Simulate every drive of a study, replay it from its pixels and score it.
+    """Simulate every drive of a study, replay it from its pictures, and score it.
 
-    An interrupted study goes on with the drives that are missing.
+    An interrupted study continues with the missing drives.
 
     Args:
-        study: ``IntersectionStudy()``, its fields changed as wanted.
+        study: ``IntersectionStudy()``, with any fields changed.
         output: Folder for drives, runs, tables and page.
-        workers: Drives side by side.
+        workers: Number of drives in parallel.
         ray: Address of a Ray cluster that shares ``output``.
-        attribution: Find what each cue was worth, by leaving it out.
+        attribution: Run an ablation of each cue.
         on_progress: As in ``replay_drives``.
 
     Raises:
-        UsageError: Too few workers.
+        UsageError: ``workers`` is below 1.
         VehicleError: The vehicle file cannot be read.
-        RunError: Every drive failed; with the first reason.
+        RunError: Every drive failed; the message contains the first reason.
         OutputError: A file cannot be written.
     """
     folder = Path(output)

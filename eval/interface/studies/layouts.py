@@ -1,4 +1,4 @@
-"""Random layouts, negatives among them: beliefs fitted on some and tested on the others."""
+"""Fit beliefs to random layouts, with and without intersections, and test them on others."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ SEEN_BY: Final = {
     "pixels": SPARSE_AND_EMBEDDED,
     "faults": (LABEL_IMAGES, DETECTORS),
 }
-"""From a perception to what cameras record and the detectors that look at it."""
-SEEN: Final = {"pixels": "seen by networks", "faults": "simulated detectors, no network"}
+"""Source of the recorded images, and detectors, by perception."""
+IN_WORDS: Final = {"pixels": "perceived by networks", "faults": "simulated detectors, no network"}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LayoutResult:
-    """Beliefs about layouts that had no part in their fit; printed as tables.
+    """Scores of beliefs on layouts that they were not fitted to; its repr is tables.
 
     Attributes:
-        perception: What found the cues.
-        scores: Of each belief, and of each with a cue or rule left out.
+        perception: Source of detections, ``pixels`` or ``faults``.
+        scores: Scores of each belief, and of its ablations of cues and rules.
         files: The page, and its tables as JSON.
-        failures: From drives that failed to why.
-        exit_status: 0 when all is whole; 3 when a drive failed or something was dropped.
+        failures: Reasons by name of the drives that failed.
+        exit_status: 0 if all drives are complete; 3 if a drive failed or something was dropped.
     """
 
     perception: Perception
@@ -49,13 +49,13 @@ class LayoutResult:
     exit_status: int
 
     def as_dict(self) -> object:
-        """What ``crosscue study layouts --json`` prints: the tables in its folder."""
+        """Return the JSON output of ``crosscue study layouts``: the tables in its folder."""
         return json_tree(self.files.tables.read_text(encoding="utf-8"))
 
     def __repr__(self) -> str:
         parts = [
             f"{self.scores.drives} simulated drives over {self.scores.layouts} layouts, "
-            f"{SEEN[self.perception]}",
+            f"{IN_WORDS[self.perception]}",
             *(f"  failed {name}: {why}" for name, why in self.failures.items()),
             *("\n" + table.as_text() for table in tables_of(self.scores)),
             f"\nwritten to {self.files.page}",
@@ -72,22 +72,22 @@ def run_layout_study(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     on_step: OnStep = lambda what, done, of: None,
 ) -> LayoutResult:
-    """Simulate every drive, find its cues as the study says, and judge beliefs by fold.
+    """Simulate every drive, find its cues, and score beliefs by cross-validation over layouts.
 
-    An interrupted study goes on with the drives that are missing; drives are kept, so that beliefs
-    are judged again in minutes.
+    An interrupted study continues with the missing drives. Drives are kept, so that beliefs can be
+    scored again in minutes.
 
     Args:
-        study: ``LayoutStudy()``, its fields changed as wanted.
+        study: ``LayoutStudy()``, with any fields changed.
         output: Folder for drives, runs, tables and page.
-        workers: Drives side by side.
-        ablation: Leave out each cue and each rule.
+        workers: Number of drives in parallel.
+        ablation: Run an ablation of each cue and each rule.
         on_progress: As in ``replay_drives``.
-        on_step: Called with what is being judged, how much of it is done, and of how much.
+        on_step: Called with the name of the current step, the amount done, and the total.
 
     Raises:
-        UsageError: Too few workers.
-        RunError: A fold has no drive that did not fail.
+        UsageError: ``workers`` is below 1.
+        RunError: All drives of a fold failed.
         OutputError: A file cannot be written.
     """
     folder = Path(output)
@@ -115,7 +115,7 @@ def run_layout_study(
     folds = {one.fold for one in drives}
     if len(folds) < study.folds:
         first = next(iter(failures.items()))
-        raise RunError(f"{folder}: a fold has no drive; the first that failed: {': '.join(first)}")
+        raise RunError(f"{folder}: all drives of a fold failed; the first: {': '.join(first)}")
     scores = score_study(drives, ablation=ablation, on_step=on_step)
     files = write_layout_study(folder, study, scores, failures)
     return LayoutResult(study.perception, scores, files, failures, exit_status_of(done))

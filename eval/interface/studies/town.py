@@ -1,4 +1,4 @@
-"""The Monte Carlo studies: how far a vehicle gets with little information."""
+"""Run the Monte Carlo studies of navigation with little information."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StudyResult:
-    """A finished study; printed as its tables beside the published ones.
+    """A finished study; its repr is tables with the published numbers.
 
     Attributes:
-        study: What was driven.
-        made: Its folder, its tables in words, and what to know when reading them.
+        study: Settings of the study.
+        made: Folder, tables as text, and notes on them.
     """
 
     study: RangeStudy | LandmarkStudy
@@ -34,16 +34,16 @@ class StudyResult:
 
     @property
     def folder(self) -> Path:
-        """Where drives, figures and page are."""
+        """Folder of drives, figures and page."""
         return self.made.folder
 
     @property
     def drives(self) -> pa.Table:
-        """Every drive is a row."""
+        """Table with one row per drive."""
         return RunFolder(self.folder).table("drives")
 
     def draw_drive(self, row: int) -> Path:
-        """Draw one drive again, by its row in ``drives``; a picture in the study's folder."""
+        """Draw the drive of a row of ``drives``; return the picture in the study's folder."""
         from crosscue.eval.studies.town import drive_figure
         from crosscue.localization.town.drive import drive_traced
 
@@ -60,7 +60,7 @@ class StudyResult:
         return self.folder / PAGE
 
     def as_dict(self) -> object:
-        """What ``crosscue study range --json`` prints: the summary in its folder."""
+        """Return the JSON output of ``crosscue study range``: the summary in its folder."""
         from crosscue.eval.studies.town.whole import SUMMARY
 
         return json_tree((self.folder / SUMMARY).read_text(encoding="utf-8"))
@@ -72,13 +72,13 @@ class StudyResult:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FieldResult:
-    """The field protocol, simulated; printed as its tables beside the published ones.
+    """Results of the simulated field protocol; its repr is tables with the published numbers.
 
     Attributes:
-        folder: Where runs, picture and page are.
-        runs: The outcome of each run.
-        tables: Results in words.
-        notes: What to know when reading them.
+        folder: Folder of runs, picture and page.
+        runs: Outcome of each run.
+        tables: Results as text.
+        notes: Notes on the results.
     """
 
     folder: Path
@@ -95,11 +95,11 @@ class FieldResult:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing of any run's log was dropped."""
+        """True if nothing of any run's log was dropped."""
         return all(one.is_whole for one in self.runs)
 
     def as_dict(self) -> list[dict[str, object]]:
-        """What ``crosscue study field --json`` prints: a record for each run."""
+        """Return the JSON output of ``crosscue study field``: a record for each run."""
         return [asdict(one) for one in self.runs]
 
     def __repr__(self) -> str:
@@ -116,18 +116,18 @@ def run_study(
     overwrite: bool = False,
     on_percent: Callable[[float, float], None] = lambda done, of: None,
 ) -> StudyResult:
-    """Drive a study and summarise it; an interrupted one goes on where it stopped.
+    """Run and summarise a study; an interrupted study continues where it stopped.
 
     Args:
-        study: ``RangeStudy()`` or ``LandmarkStudy()``, its fields changed as wanted.
+        study: ``RangeStudy()`` or ``LandmarkStudy()``, with any fields changed.
         output: Folder for drives, figures and page.
-        workers: Cores; all, if left out.
-        ray: Address of a Ray cluster to drive on.
+        workers: Number of cores; default: all.
+        ray: Address of a Ray cluster to run on.
         overwrite: Replace another study's results.
-        on_percent: Called with the percentage that is done, and 100.
+        on_percent: Called with the percentage done, and 100.
 
     Raises:
-        RunError: The folder holds another study's results.
+        RunError: The folder contains another study's results.
     """
     from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, finish_range
     from crosscue.eval.studies.town.work import default_workers
@@ -149,25 +149,25 @@ def run_field_study(
     overwrite: bool = False,
     on_percent: Callable[[float, float], None] = lambda done, of: None,
 ) -> FieldResult:
-    """Drive the field protocol through logs and the replay; an interrupted one goes on.
+    """Simulate the field protocol with logs and replays; an interrupted study continues.
 
     Args:
-        study: ``FieldStudy()``, its fields changed as wanted.
+        study: ``FieldStudy()``, with any fields changed.
         output: Folder for runs, picture and page.
-        workers: Cores; all, if left out.
+        workers: Number of cores; default: all.
         overwrite: Replace another study's results.
-        on_percent: Called with the percentage that is done, and 100.
+        on_percent: Called with the percentage done, and 100.
 
     Raises:
-        UsageError: A study without runs.
-        RunError: The folder holds another study's results.
+        UsageError: The study has no runs.
+        RunError: The folder contains another study's results.
     """
     from crosscue.eval.studies.town.field_study import NOTES, drive_field, finish_field
     from crosscue.eval.studies.town.replayed import through_log
     from crosscue.eval.studies.town.work import default_workers
 
     if not study.range_runs + study.landmark_runs:
-        raise UsageError("study field: no runs; give --range-runs or --landmark-runs")
+        raise UsageError("study field: no runs; set --range-runs or --landmark-runs")
     folder, runs = Path(output), []
     driven = drive_field(
         study, folder, workers or default_workers(), through_log, overwrite=overwrite
@@ -179,14 +179,14 @@ def run_field_study(
 
 
 def calibrate_study(study: RangeStudy, workers: int | None = None) -> float:
-    """The compass interval with which a study's vehicles are lost after the published mean.
+    """Find the compass interval with which the mean range equals the published one.
 
     Args:
-        study: Everything but the compass; seeds of their own are driven.
-        workers: Cores; all, if left out.
+        study: Settings of the study, apart from the compass; separate seeds are used.
+        workers: Number of cores; default: all.
 
     Returns:
-        Metres between two independent readings.
+        Distance between two independent readings, metres.
     """
     from crosscue.eval.studies.town.range_study import calibrate
     from crosscue.eval.studies.town.work import default_workers

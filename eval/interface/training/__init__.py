@@ -1,1 +1,1 @@
-"""Networks to train and to measure, and pictures to train them on."""
+"""Functions that render training pictures, and train and measure networks."""

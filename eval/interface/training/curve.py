@@ -1,4 +1,4 @@
-"""The curve of a training as a picture."""
+"""Draw the curve of a training."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from crosscue.replay.base import write_whole
 
 
 def draw_curve(curve: Path, picture: Path) -> None:
-    """Draw losses and average precisions over steps, as PNG.
+    """Draw losses and average precisions over training steps.
 
     Args:
-        curve: The training's curve file.
-        picture: To write.
+        curve: Curve file of the training, JSON.
+        picture: PNG file to write.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The picture cannot be written.
     """
     import matplotlib as mpl
 

@@ -1,4 +1,4 @@
-"""Pictures to train networks on."""
+"""Render annotated pictures for training."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from crosscue.datasets.scenes.drive import SOURCE
 from crosscue.datasets.scenes.export.coco import Objects
 from crosscue.datasets.scenes.export.training_frames import frames, joined
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
-from crosscue.eval.interface.training.inputs import check_place, learnt_layouts_of
+from crosscue.eval.interface.training.inputs import check_place, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TrainingFrames:
-    """Pictures with their annotations; printed in a line.
+    """Pictures with annotations; its repr is one line.
 
     Attributes:
-        coco: The annotations; the pictures are in ``images`` beside it.
-        pictures: How many.
-        objects: How many are annotated in them.
+        coco: Annotation file; the pictures are in the folder ``images`` next to it.
+        pictures: Number of pictures.
+        objects: Number of annotated objects.
     """
 
     coco: Path
@@ -29,7 +29,7 @@ class TrainingFrames:
     objects: int
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue train frames --json`` prints."""
+        """Return the JSON output of ``crosscue train frames``."""
         return {"coco": str(self.coco), "pictures": self.pictures, "objects": self.objects}
 
     def __repr__(self) -> str:
@@ -46,26 +46,26 @@ def render_training_frames(
     workers: int = 1,
     on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> TrainingFrames:
-    """Render pictures of simulated intersections with COCO annotations, to train networks on.
+    """Render pictures of simulated intersections with COCO annotations, for training.
 
     Args:
-        folder: Gets ``coco.json`` and ``images``.
-        layouts: Names and spans: L0, L17, L0-L99. A to H are scored, so nothing may learn from
-            them.
-        per_layout: Pictures of each.
-        seed: Of what differs from run to run.
-        width_px: Of a picture, a multiple of 16; it is 9/16 high.
-        workers: How many layouts are rendered side by side.
-        on_runs: Called with the number of runs that are rendered, and of how many.
+        folder: Output folder for ``coco.json`` and ``images``.
+        layouts: Names and ranges: L0, L17, L0-L99. A to H are refused, because crosscue is scored
+            on them.
+        per_layout: Number of pictures of each layout.
+        seed: Seed of everything that differs between runs.
+        width_px: Picture width, a multiple of 16; the height is 9/16 of it.
+        workers: Number of layouts to render in parallel.
+        on_runs: Called with the number of runs rendered, and their total.
 
     Raises:
-        UsageError: A value out of range, or a layout that is scored, or named twice.
-        OutputError: The folder has annotations already, or cannot be written.
+        UsageError: A value is out of range, or a layout is one of A to H or named twice.
+        OutputError: The folder already contains annotations, or cannot be written.
     """
     if per_layout < 1 or workers < 1 or seed < 0:
         raise UsageError("--per-layout, --workers: expected 1 or more; --seed: expected 0 or more")
     wanted = [
-        _settings(name, seed, width_px) for name in learnt_layouts_of(layouts, "train frames")
+        _settings(name, seed, width_px) for name in training_layouts_of(layouts, "train frames")
     ]
     target, images = Path(folder) / "coco.json", Path(folder) / "images"
     if target.exists():
@@ -81,6 +81,6 @@ def render_training_frames(
 
 
 def _settings(layout: str, seed: int, width_px: int) -> SceneSettings:
-    # Conditions come in ten kinds; layout and run count up together, so each kind comes as often.
+    # There are ten kinds of conditions, by number of the run; this uses each equally often.
     run = int(layout[1:]) % 10 + 1
     return SceneSettings(layout=layout, run=run, seed=seed, camera=camera_of_width(width_px))

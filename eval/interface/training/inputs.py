@@ -1,4 +1,4 @@
-"""What training begins with: names of layouts, and a place that can be written to."""
+"""Check the inputs of a training: names of layouts, and a writable output path."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from crosscue.datasets.scenes.layout import SCORED
 from crosscue.replay.base import UsageError, write_text
 
 MAX_LAYOUTS: Final = 100_000
-"""Layouts a command takes; far more than anybody has the time to render."""
+"""Max number of layouts of a command, far more than can be rendered in practice."""
 
 
 def layouts_of(texts: Sequence[str], who: str) -> list[str]:
-    """Layouts of names and spans: ``L0``, ``L0-L9``, ``A``, ``A-H``.
+    """Return the layouts that names and ranges stand for: ``L0``, ``L0-L9``, ``A``, ``A-H``.
 
     Args:
-        texts: As given.
-        who: The command or flag, for the error.
+        texts: Names and ranges.
+        who: Command or option, for the error message.
 
     Raises:
-        UsageError: Not a layout, an empty span, one named twice, or too many.
+        UsageError: A text is not a layout, a range is empty, a layout is named twice, or there are
+            too many.
     """
     names: list[str] = []
     for text in texts:
@@ -36,15 +37,17 @@ def layouts_of(texts: Sequence[str], who: str) -> list[str]:
     return names
 
 
-def learnt_layouts_of(texts: Sequence[str], who: str) -> list[str]:
-    """``layouts_of``, for learning from.
+def training_layouts_of(texts: Sequence[str], who: str) -> list[str]:
+    """Return the layouts of ``layouts_of``, none of which may be one of A to H.
 
     Raises:
-        UsageError: One is of those that are scored, too.
+        UsageError: As in ``layouts_of``, or a layout is one of those that crosscue is scored on.
     """
     names = layouts_of(texts, who)
     if scored := sorted({*names} & {*SCORED}):
-        raise UsageError(f"{who}: {scored[0]}: A to H are only for scoring; take L and a number")
+        raise UsageError(
+            f"{who}: {scored[0]}: expected L0, L1, and so on, because A to H are only for scoring"
+        )
     return names
 
 
@@ -59,15 +62,15 @@ def _span(text: str, who: str) -> Sequence[str]:
     else:
         raise UsageError(f"{who}: {text!r} is not a layout; expected L0, L0-L99, A or A-H")
     if not names:
-        raise UsageError(f"{who}: {text}: expected the lower one first")
+        raise UsageError(f"{who}: {text}: expected the lower layout first")
     return names
 
 
 def check_place(path: Path) -> None:
-    """Find out before hours of work whether a file can be written there.
+    """Check, before hours of work, that a file can be written to a path.
 
     Raises:
-        OutputError: It cannot.
+        OutputError: It cannot be written.
     """
     trial = path.with_name(f".{path.name}.{os.getpid()}.trial")
     write_text(trial, "")

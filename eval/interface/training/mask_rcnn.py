@@ -1,4 +1,4 @@
-"""Training and measuring Mask R-CNN networks."""
+"""Train and measure Mask R-CNN networks."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ if TYPE_CHECKING:
 CLASSES: Final = ("car", "stop sign", "traffic light")
 HELD_EVERY: Final = 10
 PROPOSALS: Final = 100
-"""The detector's own."""
+"""Number of region proposals that the detector uses."""
 MAX_WINDOW_PX: Final = 4096
-"""As wide as the widest picture."""
+"""Max side length of a training window."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaskRcnnTrainingSettings:
-    """What a Mask R-CNN is trained on, and for how long.
+    """Settings of a Mask R-CNN training.
 
     Attributes:
         data: COCO annotations to train on.
         images: Folder of their images.
-        val_data: Annotations to validate on; every tenth image of ``data``, if left out.
+        val_data: Annotations to validate on; default: every tenth image of ``data``.
         val_images: Folder of their images.
         init: Initial weights: ``compact``, ``resnet50``, ``resnet50-v2``, ``embedded``, or a
             checkpoint.
         classes: Names of the classes to train.
-        steps: Batches altogether.
-        batch: Images in a batch.
-        learning_rate: The highest one.
-        seed: Everything random comes from it.
-        width_px: Images are scaled to this width.
+        steps: Number of training steps.
+        batch: Images per step.
+        learning_rate: Max learning rate.
+        seed: Seed of all random numbers.
+        width_px: Width that images are scaled to.
         crop_top: Fraction of an image's height to skip at the top.
-        crop_bottom: Likewise at the bottom.
+        crop_bottom: Fraction of an image's height to skip at the bottom.
         window_px: Width and height of the training windows, multiples of 32.
         balance: 0 samples every object equally often, 1 every class.
         check_every: Steps between validations.
-        check_images: Images per validation during training; the last one takes all.
+        check_images: Images per validation during training; the last validation uses all.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         threads: CPU threads.
     """
@@ -77,18 +77,18 @@ class MaskRcnnTrainingSettings:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TrainedMaskRcnn:
-    """A Mask R-CNN that was trained; printed in a line.
+    """A trained Mask R-CNN; its repr is one line.
 
     Attributes:
         path: The checkpoint.
-        facts: What it says of itself: its plan, calibration, measured precision and recipe.
+        facts: Plan, calibration, measured precision and recipe that the checkpoint records.
     """
 
     path: Path
     facts: Facts
 
     def as_dict(self) -> dict[str, Any]:
-        """What ``crosscue train mask-rcnn --json`` prints: the facts."""
+        """Return the JSON output of ``crosscue train mask-rcnn``: the facts."""
         return self.facts.model_dump(mode="json")
 
     def __repr__(self) -> str:
@@ -98,11 +98,11 @@ class TrainedMaskRcnn:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class MeasuredMaskRcnn:
-    """What a Mask R-CNN reaches on labelled images; printed as tables.
+    """Accuracy of a Mask R-CNN on labelled images; its repr is tables.
 
     Attributes:
-        network: Its name.
-        pictures: How many it was measured on.
+        network: Name of the network.
+        pictures: Number of pictures it was measured on.
         by_proposals: Average precisions, and rates at the cues' scores, by number of proposals.
     """
 
@@ -111,7 +111,7 @@ class MeasuredMaskRcnn:
     by_proposals: dict[int, Measured]
 
     def as_dict(self) -> dict[str, Any]:
-        """What ``crosscue train mask-rcnn --measure --json`` prints."""
+        """Return the JSON output of ``crosscue train mask-rcnn --measure``."""
         measured = [measured_tree(count, reached) for count, reached in self.by_proposals.items()]
         return {"network": self.network, "pictures": self.pictures, "measured": measured}
 
@@ -130,26 +130,26 @@ def train_mask_rcnn(
     overwrite: bool = False,
     on_line: Callable[[str], None] = lambda text: None,
 ) -> TrainedMaskRcnn:
-    """Train a Mask R-CNN on COCO annotations: a compact one from nothing, or an existing one.
+    """Train a Mask R-CNN on COCO annotations, either a compact one from scratch or an existing one.
 
     The same settings and seed yield the same bytes on the same machine's CPU.
 
     Args:
-        settings: What to train on, and for how long.
-        output: Checkpoint to write, ``.safetensors``. Beside it lie the curve (JSON and PNG) and,
-            until the training ends, the state to resume from.
+        settings: Data and schedule of the training.
+        output: Checkpoint to write, ``.safetensors``. The curve (JSON and PNG) is written next to
+            it and, until the training ends, so is the state to resume from.
         resume: Continue an interrupted training from its state.
         overwrite: Replace existing results.
-        on_line: Called with a line of text on each set of images and after each validation.
+        on_line: Called with a line of text for each set of images and after each validation.
 
     Raises:
-        UsageError: A value out of range, or a state of another training.
+        UsageError: A value is out of range, or the state is of another training.
         OutputError: Results exist, or cannot be written.
         LogError: An image cannot be read.
-        SchemaError: The annotations are not a COCO file, or have nothing usable; the folder of
-            images is missing; or the state is damaged.
-        VehicleError: ``init`` is not a Mask R-CNN that fits, or the device is missing.
-        CrosscueError: The losses are not finite any more.
+        SchemaError: The annotations are not a COCO file or contain nothing usable, the folder of
+            images is missing, or the state is damaged.
+        VehicleError: ``init`` is not a suitable Mask R-CNN, or the device is missing.
+        CrosscueError: The loss is no longer finite.
     """
     path = Path(output)
     _check(settings, path)
@@ -185,25 +185,25 @@ def measure_mask_rcnn(
     threads: int = 1,
     on_measured: Callable[[int, int], None] = lambda done, of: None,
 ) -> MeasuredMaskRcnn:
-    """Measure how good a Mask R-CNN is on COCO annotations, without training it.
+    """Measure the accuracy of a Mask R-CNN on COCO annotations, without training it.
 
     Args:
         network: ``compact``, ``resnet50``, ``resnet50-v2``, ``embedded``, or a checkpoint.
         data: COCO annotations.
         images: Folder of their images.
-        subset: ``A:B:N`` measures on these images only: ``::4`` is every fourth.
+        subset: Slice ``A:B:N`` of the images to measure on: ``::4`` is every fourth.
         proposals: Numbers of region proposals to measure with, in turn.
         backend: Inference engine, ``torch`` or ``openvino``.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         threads: CPU threads.
-        on_measured: Called with how many of the numbers of proposals are done, and of how many.
+        on_measured: Called with the number of entries of ``proposals`` done, and their total.
 
     Raises:
-        UsageError: A value out of range, or a subset without images.
+        UsageError: A value is out of range, or the subset has no images.
         LogError: An image cannot be read.
-        SchemaError: The annotations are not a COCO file, or have nothing usable, or the folder of
+        SchemaError: The annotations are not a COCO file or contain nothing usable, or the folder of
             images is missing.
-        VehicleError: Not a Mask R-CNN, or the device is missing.
+        VehicleError: The network is not a Mask R-CNN, or the device is missing.
     """
     if not all(1 <= count <= 2000 for count in proposals):
         raise UsageError("--proposals: expected 1 to 2000")
@@ -219,7 +219,7 @@ def measure_mask_rcnn(
     labelled = replace(whole, pictures=whole.pictures[_slice(subset)])
     if not labelled.pictures:
         count = len(whole.pictures)
-        raise UsageError(f"--subset {subset}: none of {count} pictures; name others")
+        raise UsageError(f"--subset {subset}: selects none of {count} pictures; select others")
     measured: dict[int, Measured] = {}
     for count in proposals:
         settings = MaskRcnnSettings.model_validate(
@@ -231,7 +231,7 @@ def measure_mask_rcnn(
 
 
 def _set_text(one: LabelledSet) -> str:
-    """Its pictures, objects without a mask, and what was left out."""
+    """Return the numbers of pictures, of objects without a mask, and of what was left out."""
     text, bare = f"{len(one.pictures)} pictures", one.objects - one.masks
     if bare:
         text += f", {bare} of {one.objects} objects without a mask"
@@ -262,16 +262,16 @@ def _check(settings: MaskRcnnTrainingSettings, output: Path) -> None:
             f"--window {width_px} {height_px}: expected multiples of 32 from 64 to {MAX_WINDOW_PX}"
         )
     if not all(settings.classes) or len(set(settings.classes)) != len(settings.classes):
-        raise UsageError("--classes: one is empty or named twice; name each once")
+        raise UsageError("--classes: a name is empty or repeated; name each class once")
     if (settings.val_data is None) != (settings.val_images is None):
         raise UsageError("--val-data, --val-images: give both or neither")
 
 
 def _slice(text: str | None) -> slice:
-    """Of ``A:B:N``, any of which may be missing.
+    """Parse a slice ``A:B:N``, any number of which may be missing.
 
     Raises:
-        UsageError: It is not one.
+        UsageError: The text is not a slice.
     """
     match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
     if match is None:
@@ -339,7 +339,7 @@ def _job(settings: MaskRcnnTrainingSettings, output: Path) -> Job:
 
 
 def _made_of(settings: MaskRcnnTrainingSettings) -> dict[str, Any]:
-    """Annotations, pictures, initial weights, and settings: what decides the training."""
+    """Return the inputs that determine the training: data, initial weights and settings."""
     places = [settings.data, settings.images, settings.val_data, settings.val_images]
     if (start := Path(settings.init)).is_file():
         places.append(start)

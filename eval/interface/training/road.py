@@ -1,4 +1,4 @@
-"""Training and measuring road networks."""
+"""Train and measure road networks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rend
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.eval.interface.training.inputs import check_place, layouts_of, learnt_layouts_of
+from crosscue.eval.interface.training.inputs import check_place, layouts_of, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.made_of import made_of
 
@@ -30,29 +30,29 @@ SAVED_EVERY: Final = 100
 
 
 def _ignore(done: int, of: int) -> None:
-    """Called where no progress is wanted."""
+    """Ignore progress."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoadTrainingSettings:
-    """What a road network is trained on, and for how long.
+    """Settings of a road network's training.
 
-    Give either ``layouts`` to simulate, or ``data`` with pictures.
+    Set either ``layouts`` to simulate, or ``data`` with pictures.
 
     Attributes:
-        layouts: Simulated layouts to train on, names and spans: L400, L400-L519. A to H are for
-            ``test_layouts`` only.
-        val_layouts: Layouts to validate on, none of them trained on.
-        test_layouts: Further layouts to measure on at the end.
-        data: Folder with ``images/NAME.jpg`` and ``masks/NAME.png``, white where road is; every
-            tenth picture is held out.
-        init: Checkpoint with the initial weights; random ones, if left out.
-        per_layout: Pictures of each layout.
-        steps: Batches altogether.
-        stop_at: Stop after so many steps of the schedule.
-        batch: Pictures in a batch.
-        seed: Everything random comes from it.
-        width_px: Of the network's input, a multiple of 16; it is 9/16 high.
+        layouts: Simulated layouts to train on, names and ranges: L400, L400-L519. A to H are
+            allowed only as ``test_layouts``.
+        val_layouts: Layouts to validate on, different from ``layouts``.
+        test_layouts: Layouts to measure on at the end.
+        data: Folder with ``images/NAME.jpg`` and ``masks/NAME.png``, white where there is road;
+            every tenth picture is held out.
+        init: Checkpoint with the initial weights; default: random weights.
+        per_layout: Number of pictures of each layout.
+        steps: Number of training steps.
+        stop_at: Stop after this many steps of the schedule.
+        batch: Pictures per step.
+        seed: Seed of all random numbers.
+        width_px: Width of the network's input, a multiple of 16; the height is 9/16 of it.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
         threads: CPU threads; 0 for all.
     """
@@ -79,19 +79,19 @@ class RoadTrainingSettings:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TrainedRoad:
-    """A road network that was trained or measured; printed as its name and a line for each fact.
+    """A trained or measured road network; its repr is its name and one line per fact.
 
     Attributes:
-        checkpoint: Its file, or ``embedded``.
-        facts: Of a training the checkpoint's recipe, measurements included; of a measurement the
-            intersection over union, precision and recall, over so many pictures.
+        checkpoint: Checkpoint file, or ``embedded``.
+        facts: After a training, the checkpoint's recipe with measurements; after a measurement,
+            intersection over union, precision, recall, and number of pictures.
     """
 
     checkpoint: str
     facts: Reported
 
     def as_dict(self) -> Reported:
-        """What ``crosscue train road --json`` prints."""
+        """Return the JSON output of ``crosscue train road``."""
         return {"checkpoint": self.checkpoint, **self.facts}
 
     def __repr__(self) -> str:
@@ -114,19 +114,19 @@ def train_road(
     The same settings and seed yield the same bytes on the same machine's CPU.
 
     Args:
-        settings: What to train on, and for how long.
-        output: Checkpoint to write, ``.safetensors``. Until the training ends, its state lies
-            beside it, with the suffix ``.state``.
+        settings: Data and schedule of the training.
+        output: Checkpoint to write, ``.safetensors``. Until the training ends, its state is stored
+            next to it, with the suffix ``.state``.
         resume: Continue an interrupted training from its state.
         overwrite: Replace an existing checkpoint.
-        on_runs: Called with the number of simulated runs that are rendered, and of how many.
-        on_steps: Called with the number of steps done, and of how many.
+        on_runs: Called with the number of simulated runs rendered, and their total.
+        on_steps: Called with the number of steps done, and their total.
 
     Raises:
-        UsageError: A value out of range, a layout that is scored or named twice, or a state of
-            another training.
+        UsageError: A value is out of range, a layout to train on is one of A to H, a layout is
+            named twice, or the state is of another training.
         OutputError: The checkpoint exists, or cannot be written.
-        LogError: A picture or its mask is missing or does not decode.
+        LogError: A picture or its mask is missing or cannot be decoded.
         SchemaError: The state is damaged.
         VehicleError: ``init`` is not a road network, or the device is missing.
     """
@@ -161,7 +161,7 @@ def train_road(
         if resume and state.exists():
             training.resume(state, made)
         loss = _trained(training, learn, settings, state, made, on_steps)
-    scored = _scored(settings, settings.size_px, on_runs)
+    scored = _test_frames(settings, settings.size_px, on_runs)
     recipe: Reported = {
         "layouts": " ".join(settings.layouts),
         "pictures": len(learn),
@@ -192,21 +192,24 @@ def measure_road(
     device: str = "auto",
     on_runs: OnCount = _ignore,
 ) -> TrainedRoad:
-    """Measure how well a road network does, without training it.
+    """Measure the accuracy of a road network, without training it.
+
+    Set either ``test_layouts`` or ``data``.
 
     Args:
         network: ``embedded``, or a checkpoint.
-        test_layouts: Simulated layouts to measure on, names and spans; or
-        data: a folder with ``images`` and ``masks``, as for training.
-        per_layout: Pictures of each layout.
-        seed: Of what differs from run to run.
+        test_layouts: Simulated layouts to measure on, names and ranges.
+        data: Folder with ``images`` and ``masks``, as in ``RoadTrainingSettings``.
+        per_layout: Number of pictures of each layout.
+        seed: Seed of everything that differs between runs.
         device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
-        on_runs: Called with the number of simulated runs that are rendered, and of how many.
+        on_runs: Called with the number of simulated runs rendered, and their total.
 
     Raises:
-        UsageError: A value out of range, or not exactly one of layouts and data.
-        LogError: A picture or its mask is missing or does not decode.
-        VehicleError: Not a road network, or the device is missing.
+        UsageError: A value is out of range, or both or neither of ``test_layouts`` and ``data`` are
+            set.
+        LogError: A picture or its mask is missing or cannot be decoded.
+        VehicleError: The network is not a road network, or the device is missing.
     """
     settings = RoadTrainingSettings(
         test_layouts=test_layouts, data=data, per_layout=per_layout, seed=seed, device=device
@@ -222,7 +225,9 @@ def measure_road(
     chosen = chosen_device(device, "train road")
     checkpoint = load_road(embedded_path() if str(network) == "embedded" else Path(network))
     size = (checkpoint.facts.width_px, checkpoint.facts.height_px)
-    frames = _scored(settings, size, on_runs) if data is None else load_folder(Path(data), size)
+    frames = (
+        _test_frames(settings, size, on_runs) if data is None else load_folder(Path(data), size)
+    )
     measured = _measured(checkpoint.network.to(chosen), chosen, "measured", frames)
     return TrainedRoad(str(network), measured)
 
@@ -247,7 +252,7 @@ def _trained(
     made: dict[str, Any],
     on_steps: OnCount,
 ) -> float:
-    """Train, keeping the state to resume from; the last loss."""
+    """Train, save the state to resume from at intervals, and return the last loss."""
     loss = float("nan")
     for done, now in training.steps(learn.pixels, learn.road):
         loss = now
@@ -260,7 +265,7 @@ def _trained(
 
 
 def _made_of(settings: RoadTrainingSettings) -> dict[str, Any]:
-    """Pictures, initial weights, and settings: what decides the training."""
+    """Return the inputs that determine the training: pictures, initial weights and settings."""
     return made_of(
         [Path(path) for path in (settings.data, settings.init) if path is not None],
         {
@@ -278,7 +283,7 @@ def _made_of(settings: RoadTrainingSettings) -> dict[str, Any]:
 def _measured(
     network: RoadNetwork, device: torch.device, name: str, frames: RoadFrames | None
 ) -> Reported:
-    """How well the network does on frames it has not seen."""
+    """Return the network's accuracy on held-out frames."""
     if frames is None:
         return {}
     from crosscue.detectors.training.road import road_score
@@ -295,7 +300,7 @@ def _measured(
 def _frames(
     settings: RoadTrainingSettings, on_runs: OnCount
 ) -> tuple[RoadFrames, RoadFrames | None]:
-    """What to learn from and what to hold out."""
+    """Return the frames to train on, and the held-out frames."""
     size = settings.size_px
     if settings.data is not None:
         from crosscue.datasets.adapters.road_folder import load_folder
@@ -305,15 +310,15 @@ def _frames(
         out = [i for i in range(len(whole)) if i not in set(kept)]
         held = RoadFrames(whole.pixels[out], whole.road[out]) if out else None
         return RoadFrames(whole.pixels[kept], whole.road[kept]), held
-    layouts = learnt_layouts_of(settings.layouts, "--layouts")
+    layouts = training_layouts_of(settings.layouts, "--layouts")
     held_out = layouts_of(settings.val_layouts, "--val-layouts")
     if both := sorted({*layouts} & {*held_out}):
-        raise UsageError(f"--val-layouts {both[0]}: also trained on; hold out others")
+        raise UsageError(f"--val-layouts {both[0]}: also in --layouts; choose other layouts")
     learn = _rendered(layouts, size, settings, on_runs)
     return learn, _rendered(held_out, size, settings, on_runs) if held_out else None
 
 
-def _scored(settings: RoadTrainingSettings, size: Size, on_runs: OnCount) -> RoadFrames | None:
+def _test_frames(settings: RoadTrainingSettings, size: Size, on_runs: OnCount) -> RoadFrames | None:
     names = layouts_of(settings.test_layouts, "--test-layouts")
     return _rendered(names, size, settings, on_runs) if names else None
 
@@ -322,7 +327,7 @@ def _rendered(
     names: list[str], size: Size, settings: RoadTrainingSettings, on_runs: OnCount
 ) -> RoadFrames:
     camera, seed = Camera(width_px=2 * size[0], height_px=2 * size[1]), settings.seed
-    # Conditions come in ten kinds; each comes as often.
+    # There are ten kinds of conditions, by number of the run; this uses each equally often.
     runs = [
         SceneSettings(layout=name, run=number % 10 + 1, seed=seed, camera=camera)
         for number, name in enumerate(names)

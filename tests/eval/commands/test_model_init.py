@@ -287,7 +287,7 @@ def test_a_network_for_another_task_is_said_to_be_one(tmp_path: Path) -> None:
     onnx.helper.set_model_props(model, {"names": "{0: 'person'}", "task": "pose"})
     path.write_bytes(model.SerializeToString())
 
-    with pytest.raises(crosscue.UsageError, match="for 'pose'; expected one of detect, segment"):
+    with pytest.raises(crosscue.UsageError, match="expected one of detect, segment, found 'pose'"):
         crosscue.draft_card(path)
 
 
@@ -376,7 +376,7 @@ def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert run(["model", "init", str(path)]) == 2
 
     said = capsys.readouterr().err
-    assert "may be yolox (" in said
+    assert "several kinds fit: yolox (" in said
     assert "; yolov5 (" in said
     assert "choose one with --kind" in said
     assert run(["model", "init", str(path), "--kind", "yolox"]) == 0

@@ -125,13 +125,13 @@ def test_pictures_that_did_not_come_back_are_counted_and_others_or_doubles_refus
 
     tree["images"].append({**tree["images"][0], "id": 999})
     (tmp_path / "twice.json").write_text(json.dumps(tree))
-    with pytest.raises(SchemaError, match=r"2 times; expected each picture once"):
+    with pytest.raises(SchemaError, match=r"expected once, found 2 times"):
         crosscue.import_labels(tmp_path / "twice.json", exported.parent, tmp_path / "twice")
     tree["images"].pop()
 
     tree["images"][0]["file_name"] = "another.jpg"
     (tmp_path / "other.json").write_text(json.dumps(tree))
-    with pytest.raises(SchemaError, match=r"another.jpg: no such picture was exported"):
+    with pytest.raises(SchemaError, match=r"another.jpg: not in the export"):
         crosscue.import_labels(tmp_path / "other.json", exported.parent, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
@@ -142,9 +142,9 @@ def test_what_exists_is_not_replaced_unasked(worst: Path, exported: Path, tmp_pa
         crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
     crosscue.import_labels(exported, exported.parent, tmp_path / "labelled", add=True)
 
-    with pytest.raises(OutputError, match="holds an export"):
+    with pytest.raises(OutputError, match="contains an export"):
         crosscue.export(worst, exported.parent)
-    with pytest.raises(OutputError, match="not an export"):
+    with pytest.raises(OutputError, match="other than an export"):
         crosscue.export(worst, worst.parent, overwrite=True)
 
 

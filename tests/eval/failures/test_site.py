@@ -164,9 +164,9 @@ def test_a_folder_that_is_not_a_site_is_never_replaced(
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
 
-    with pytest.raises(OutputError, match="not a site"):
+    with pytest.raises(OutputError, match="other than a site"):
         crosscue.browse(folder / "run", tmp_path / "mine", overwrite=True)
-    with pytest.raises(OutputError, match="holds a site"):
+    with pytest.raises(OutputError, match="contains a site"):
         crosscue.browse(folder / "run", folder / "site")
     assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
 

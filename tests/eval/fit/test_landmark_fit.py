@@ -141,7 +141,7 @@ def test_pairs_from_a_table_fit_a_threshold_and_write_it(
         ("a,b\n", "expected columns query,known,same"),
         ("query,known,same\nx.png,y.png,maybe\n", "pairs.csv:2: same: expected 1 or 0"),
         ("query,known,same\nx.png,y.png,1\n", "x.png: No such file"),
-        ("query,known,same\n", "give more labelled pictures"),
+        ("query,known,same\n", "use more labelled pictures"),
     ],
 )
 def test_bad_tables_are_refused(

@@ -132,7 +132,7 @@ def test_the_command_writes_a_section_that_a_vehicle_file_takes(
     assert crosscue([*command, "-o", str(section)]) == 0
 
     reported = capsys.readouterr().out
-    assert f"{DRIVES} approaches to learn from" in reported
+    assert f"{DRIVES} annotated approaches" in reported
     assert "road_left -> left, near" in reported
     assert "stop_sign -> intersection, far: 16 places with it, 0 without, 16 positive" in reported
     text = "version = 1\n[fusion]\nkind = 'calibrated'\n" + section.read_text()

@@ -76,6 +76,6 @@ def test_without_a_vehicle_file_the_fit_becomes_one(tmp_path: Path) -> None:
 
 
 def test_settings_in_memory_are_no_file_to_write_into(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="needs the vehicle file"):
+    with pytest.raises(UsageError, match="expected a vehicle file"):
         check_output(Vehicle(version=1), tmp_path / "out.toml", overwrite=False)
     check_output(None, tmp_path / "out.toml", overwrite=False)

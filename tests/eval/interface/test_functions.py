@@ -40,7 +40,7 @@ def test_a_log_is_converted_in_part(drive: Path, tmp_path: Path) -> None:
 def test_several_logs_are_not_one_file(drive: Path, tmp_path: Path) -> None:
     with (
         crosscue.open(drive, drive) as log,
-        pytest.raises(crosscue.UsageError, match="2 logs; expected one"),
+        pytest.raises(crosscue.UsageError, match="expected one log, found 2"),
     ):
         crosscue.convert(log, tmp_path / "both.mcap")
 

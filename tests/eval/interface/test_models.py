@@ -64,5 +64,5 @@ def test_a_card_is_drafted_and_checked_without_files_of_names(tmp_path: Path) ->
     assert repr(checked) == f"{drafted.path}: fits its network"
     with pytest.raises(crosscue.UsageError, match="exists"):
         crosscue.draft_card(tmp_path / "net.onnx", class_names=["bright"])
-    with pytest.raises(crosscue.UsageError, match="not known here as yolox"):
+    with pytest.raises(crosscue.UsageError, match="not supported as yolox"):
         crosscue.draft_card(tmp_path / "net.onnx", tmp_path / "other.toml", kind="yolox")

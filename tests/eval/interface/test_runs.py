@@ -91,7 +91,7 @@ def test_other_settings_go_beside_it(run: crosscue.Run, drive: DriveFiles) -> No
     assert longer == pytest.approx(1.1, rel=1e-3)
     with pytest.raises(crosscue.OutputError, match="exists"):
         crosscue.estimate_run(run, vehicle, other.path)
-    with pytest.raises(crosscue.UsageError, match="beside the run"):
+    with pytest.raises(crosscue.UsageError, match="next to the run"):
         crosscue.estimate_run(run, vehicle, run.path / "inside")
 
 

@@ -223,7 +223,7 @@ def test_intrinsics_of_another_size_are_refused_and_doubtful_ones_are_named(
         ("support.detecting:nothing", "has no attribute 'nothing'"),
         ("support.detecting:too_few", "returned 0 results for"),
         (f"{BRIGHT},{BRIGHT}", "one is named twice"),
-        ("", "none named; there are:"),
+        ("", "none named; expected some of"),
     ],
 )
 def test_a_detector_that_cannot_be_is_reported_in_one_line(
