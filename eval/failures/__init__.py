@@ -1,1 +1,1 @@
-"""What went wrong in runs: found, ranked, grouped by cause, drawn, and exported for labelling."""
+"""Failures of runs: detection, ranking, grouping by cause, drawing, and export for labelling."""

@@ -1,4 +1,4 @@
-"""What went wrong over a whole approach: features missed, late or invented, and beliefs flipped."""
+"""Failures of complete approaches: missed, late or invented features, and flipped beliefs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .causes import Finding, approach_findings
 from .record import About, Failure, Kind
 
 SURE: Final = 1e-6
-"""No probability counts as closer to 0 or 1 than this: 20 bits."""
+"""Min distance of a probability from 0 and 1, which limits severities to 20 bits."""
 EVEN: Final = 0.5
 AGAINST: Final = "a cue speaks against it"
 NOTHING: Final = "no cue speaks against it"
 
 
 def bits(probability: float) -> float:
-    """How surprised a belief is when what it calls so probable happens."""
+    """Return the surprisal, in bits, of an event with this probability."""
     return -math.log2(min(max(probability, SURE), 1.0))
 
 
@@ -35,13 +35,13 @@ def of_approaches(
     abouts: Mapping[int, About],
     threshold: float,
 ) -> Iterator[Failure]:
-    """Failures of all approaches of a drive beside its truth.
+    """Yield the failures of all approaches of a drive, found by comparison with its truth.
 
     Args:
         judged: The approaches.
-        cues: Of the same drive.
-        abouts: By id.
-        threshold: A feature is believed above it.
+        cues: Cues of the same drive.
+        abouts: Descriptions of the approaches, by id.
+        threshold: Probability above which a feature counts as believed.
     """
     curves = {one.approach: one for one in judged.curves}
     positives = {one.cue: one.t_ns[one.count > 0] for one in cues}
@@ -56,13 +56,13 @@ def of_approaches(
 def flips_without_truth(
     belief: BeliefRows, positives: Mapping[str, NDArray[np.int64]], run: str, threshold: float
 ) -> list[Failure]:
-    """Flipped beliefs in a run's own approaches.
+    """Return the flipped beliefs in a run's own approaches.
 
     Args:
-        belief: Of the run.
-        positives: From cue to the times at which it was positive.
-        run: Its folder.
-        threshold: An answer counts as decided above it.
+        belief: Belief of the run.
+        positives: Times at which a cue was positive, by cue.
+        run: Folder of the run.
+        threshold: Probability above which an answer counts as decided.
     """
     found: list[Failure] = []
     for number, (first, last) in sorted(run_spans(belief).items()):
@@ -76,19 +76,19 @@ def flips_without_truth(
 
 
 def from_finding(found: Finding, curve: Curve | None, about: About, threshold: float) -> Failure:
-    """A feature that was missed, late or invented, at the moment that shows it best."""
+    """Return the failure of a missed, late or invented feature, at its most telling moment."""
     kinds: Mapping[str, Kind] = {"missing": "missed", "late": "late", "invented": "false"}
     kind = kinds[found.failing]
     values = None if curve is None else curve.features.get(found.feature)
     if curve is None or values is None:
-        # Nothing was said of it: even odds.
+        # Without any belief the odds are even.
         return _failure(about, kind, found.feature, (found.cause, found.reported), severity=1.0)
     if kind == "false":
         row = int(values.argmax())
         rows = np.flatnonzero(values > threshold)
         severity = bits(1.0 - float(values[row]))
     else:
-        # What was believed when it had to be.
+        # The belief at the last moment at which the feature had to be believed.
         far = np.flatnonzero(~(curve.distance_m < NEAR_M))
         row = int(far[-1]) if len(far) else 0
         rows = np.flatnonzero(values <= threshold)
@@ -107,13 +107,14 @@ def from_finding(found: Finding, curve: Curve | None, about: About, threshold: f
 def flips(
     curve: Curve, positives: Mapping[str, NDArray[np.int64]], about: About, threshold: float
 ) -> Iterator[Failure]:
-    """Beliefs that had passed the threshold for one answer and then went over to the other.
+    """Yield beliefs that had passed the threshold for one answer and then flipped to the other.
 
     Args:
-        curve: Of an approach.
-        positives: From cue to the times at which it was positive.
+        curve: Belief over an approach.
+        positives: Times at which a cue was positive, by cue.
         about: The approach.
-        threshold: An answer counts as decided above it; what no evidence has moved is undecided.
+        threshold: Probability above which an answer counts as decided; a belief without evidence
+            is undecided.
     """
     for name, values in curve.features.items():
         for decided, row, is_yes in _crossings(values, threshold):
@@ -121,12 +122,12 @@ def flips(
             loud = _against(name, is_yes, positives, int(curve.t_ns[decided]), int(curve.t_ns[row]))
             words = "there" if is_yes else "not there", "not there" if is_yes else "there"
             swing = f"{words[0]} ({values[decided]:.2f}), then {words[1]} ({values[row]:.2f})"
-            said = ", ".join(f"{cue.replace('_', ' ')} in {count}" for cue, count in loud)
+            counts = ", ".join(f"{cue.replace('_', ' ')} in {count}" for cue, count in loud)
             yield _failure(
                 about,
                 "flipped",
                 name,
-                (AGAINST, f"{swing}; {said} frames") if loud else (NOTHING, swing),
+                (AGAINST, f"{swing}; {counts} frames") if loud else (NOTHING, swing),
                 severity=bits(float(later.min())),
                 at=(int(curve.t_ns[row]), float(curve.distance_m[row])),
                 span_ns=(int(curve.t_ns[decided]), int(curve.t_ns[row])),
@@ -135,7 +136,7 @@ def flips(
 
 
 def _crossings(values: NDArray[np.float64], threshold: float) -> Iterator[tuple[int, int, bool]]:
-    """Last row of a decision, the row in which it is given up, and whether it was a yes."""
+    """Yield the last row of a decision, the row that reverses it, and whether it was a yes."""
     decided: tuple[int, bool] | None = None
     for row, value in enumerate(values.tolist()):
         if value == values[0]:
@@ -154,7 +155,7 @@ def _against(
     after_ns: int,
     until_ns: int,
 ) -> Sequence[tuple[str, int]]:
-    """Cues that claim the opposite in a span, with the number of frames."""
+    """Return the cues that indicate the opposite in a time span, with their numbers of frames."""
     found = []
     for cue, times in positives.items():
         if cue in CUES and CUES[cue].claim == (feature, not is_yes):

@@ -1,9 +1,9 @@
-"""Why an approach was missed, found late, or given a feature that is not there, in plain words.
+"""Causes of missed, late and invented features of an approach.
 
-Causes are read off the frames, not guessed from the weather: which cues could have shown a feature,
-in how many frames what they look for was there and to be seen, in how many they found it, and
-whether another cue or the order of things (eq. 18's gate) held the belief back. The conditions of a
-drive are reported beside the cause, since the source names its own by them.
+Causes are derived from the frames and not from the weather: the cues that could have shown a
+feature, the numbers of frames in which their object was present and visible and in which they found
+it, and whether another cue or the gate of eq. 18 held the belief back. The conditions of a drive
+are reported with the cause, because the dissertation explains its failures by them.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ Cause = Literal[
 ]
 
 MOSTLY: Final = 0.5
-"""Found in less than this fraction of the frames that show it: the detectors are the cause."""
+"""Max fraction of the frames showing an object in which it was found, to blame the detectors."""
 GOOD: Final = frozenset({"clear", "overcast"})
-"""Conditions that no failure is laid to."""
+"""Conditions that explain no failure."""
 
 
 @dataclass(frozen=True, slots=True)
 class CueEvidence:
-    """One cue in the frames of an approach that are at least ``NEAR_M`` before the intersection.
+    """Frame counts of one cue in an approach, at least ``NEAR_M`` before the intersection.
 
     Attributes:
-        cue: Name.
-        frames: In which it was looked for.
-        there: In which what it looks for was there, as far as truth knows.
-        seen: Of those, in which at least half of it could be seen.
-        found: In which it was positive.
-        found_seen: In which it was positive and what it looks for could be seen.
+        cue: Name of the cue.
+        frames: Frames in which the cue was evaluated.
+        there: Frames in which its object was present, where the truth knows.
+        seen: Frames of ``there`` in which at least half of the object was visible.
+        found: Frames in which the cue was positive.
+        found_seen: Frames of ``seen`` in which the cue was positive.
         first_m: True range at its first positive; None without any.
     """
 
@@ -62,19 +62,19 @@ class CueEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One feature of one approach that came late, never, or wrongly.
+    """One feature of an approach that was late, missing or invented.
 
     Attributes:
-        drive: Name.
-        approach: Its id in the truth.
-        intersection: Its name.
-        conditions: Tags that are not good weather.
-        feature: Which.
-        failing: How.
-        at_m: True range at which it was believed after all; None for never.
-        cause: By the rules of ``_cause``.
-        reported: The same in a short sentence with its numbers.
-        cues: What each cue that speaks of it did.
+        drive: Name of the drive.
+        approach: Id of the approach in the truth.
+        intersection: Name of the intersection.
+        conditions: Tags of the approach other than good weather.
+        feature: Name of the feature.
+        failing: Kind of failure.
+        at_m: True range at which the feature was believed; None for never.
+        cause: Cause by the rules of ``_cause``.
+        reported: The cause in a short sentence with its numbers.
+        cues: Counts of each cue that bears on the feature.
     """
 
     drive: str
@@ -90,7 +90,7 @@ class Finding:
 
 
 def by_cause(found: Sequence[Finding]) -> dict[str, Counter[str]]:
-    """From cause to the intersections at which it was one, with the number of drives."""
+    """Count drives by cause and intersection."""
     drives = {(one.cause, one.intersection, one.drive) for one in found}
     counts: dict[str, Counter[str]] = {}
     for cause, intersection, _ in sorted(drives):
@@ -99,7 +99,7 @@ def by_cause(found: Sequence[Finding]) -> dict[str, Counter[str]]:
 
 
 def approach_findings(result: ApproachResult, cues: Sequence[CueFrames]) -> list[Finding]:
-    """Those of one approach, from its drive's cues."""
+    """Return the findings of one approach, from the cues of its drive."""
     mine = {one.cue: _evidence(one, result.approach) for one in cues}
     found = []
     for feature, at_m in result.features_m.items():
@@ -112,7 +112,7 @@ def approach_findings(result: ApproachResult, cues: Sequence[CueFrames]) -> list
 def _evidence(judged: CueFrames, approach: int) -> CueEvidence:
     far = (judged.approach == approach) & (judged.distance_m >= NEAR_M)
     is_there = far & (judged.is_object == 1)
-    # Where truth does not report how much can be seen, it counts as seen.
+    # An object without a visible fraction in the truth counts as visible.
     is_seen = is_there & ~(judged.visible < SEEN)
     is_found = far & (judged.count > 0)
     return CueEvidence(
@@ -165,11 +165,11 @@ def _cause(
     for_it: Sequence[CueEvidence],
     against: Sequence[CueEvidence],
 ) -> tuple[Cause, str]:
-    """The first that holds; each rule needs what the ones before it have ruled out."""
+    """Return the first cause that applies; each rule assumes that the earlier ones do not."""
     there, seen = sum(one.there for one in for_it), sum(one.seen for one in for_it)
     found, denied = sum(one.found for one in for_it), sum(one.found for one in against)
     if there == 0:
-        return "nothing shows it", f"nothing that its cues look for is there up to {NEAR_M:.0f} m"
+        return "nothing shows it", f"no object of its cues is present up to {NEAR_M:.0f} m"
     if seen == 0:
         return "hidden", f"more than half hidden in all {there} frames that have it"
     if denied > found:
@@ -197,7 +197,7 @@ def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEviden
         failing="invented",
         at_m=loud[0].first_m if loud else None,
         cause="claimed wrongly",
-        reported=reported or "no cue of its own: only what others left over",
+        reported=reported or "no cue of its own, only the remainder of others",
         cues=tuple(for_it),
     )
 

@@ -1,4 +1,4 @@
-"""The belief around a failure: probabilities over time, and below them where cues were found."""
+"""Chart of the belief around a failure: probabilities over time, and the frames with cues."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LANES: Final = 8
 THRESHOLD: Final = 0.9
 STYLES: Final = {"intersection": "s0", "left": "s1", "right": "s2", "straight": "s3"}
 BREAK_S: Final = 1.0
-"""No line is drawn over a longer gap."""
+"""Max gap that a line is drawn across, seconds."""
 NOT_FEATURES: Final = frozenset(
     {"t_ns", "approach", "established", "not_believed", "segment", "log_t_ns"}
 )
@@ -31,14 +31,14 @@ NOT_FEATURES: Final = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunRows:
-    """What a run believed and found, for its charts; tables or None."""
+    """Tables of a run's belief and cues for its charts; None where missing."""
 
     belief: pa.Table | None
     cues: pa.Table | None
 
 
 def belief_around(rows: RunRows, failure: Failure) -> Markup | None:
-    """Probabilities from 6 s before the moment to 6 s after it; None for a run without belief."""
+    """Draw the probabilities within 6 s of a failure; return None for a run without belief."""
     if rows.belief is None:
         return None
     t_s = _seconds(rows.belief["t_ns"].to_numpy(), failure.t_ns)
@@ -87,7 +87,7 @@ def _seconds(t_ns: NDArray[np.int64], zero_ns: int) -> NDArray[np.float64]:
 def _lanes(
     cues: pa.Table | None, failure: Failure
 ) -> Sequence[tuple[str, list[tuple[float, float]]]]:
-    """The cues found around the failure, most often found first, as spans of seconds."""
+    """Return the time spans of the cues found around a failure, the most frequent cue first."""
     if cues is None:
         return []
     t_s = _seconds(cues["t_ns"].to_numpy(), failure.t_ns)

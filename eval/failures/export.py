@@ -1,4 +1,4 @@
-"""Failing frames for labelling: their pictures as recorded, and what detectors found in them."""
+"""Export of failing frames for labelling: recorded pictures and their detections."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, write_bytes
 
 ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}
-"""Codings that every tool reads; others are written as PNG, without loss."""
+"""Encodings that every tool reads; others are converted to PNG, which is lossless."""
 NO_PICTURE: Final = "frames whose picture cannot be read"
 OTHER: Final = "detections of labels that no cue is made of"
 
 
 @dataclass(slots=True)
 class ExportedRun:
-    """One run's frames.
+    """Exported frames of one run.
 
     Attributes:
-        name: Of its folder.
+        name: Name of the run folder.
         log: Path or URL of the log with the pictures.
-        labels: To choose from, with the cue that each counts as; empty for things like cars.
-        pictures: With detections as pre-labels; names are those of the files.
-        left_out: What was not exported, by reason.
+        labels: Available labels with the cue that each counts as; empty for objects such as cars.
+        pictures: Pictures with detections as pre-labels, named after their files.
+        left_out: Numbers of frames and detections not exported, by reason.
     """
 
     name: str
@@ -40,7 +40,7 @@ class ExportedRun:
     left_out: dict[str, int] = field(default_factory=dict)
 
     def as_index(self, folder: Path) -> dict[str, Any]:
-        """What ``crosscue_export.json`` in a folder says of it."""
+        """Return the run's entry in ``crosscue_export.json``."""
         log = str(self.log)
         if isinstance(self.log, Path):
             log = os.path.relpath(self.log.resolve(), folder.resolve())
@@ -64,15 +64,15 @@ def export_run(
     logs: Path | None = None,
     limits: Limits = DEFAULT_LIMITS,
 ) -> ExportedRun:
-    """Write the pictures of some frames, and collect what detectors found in them.
+    """Write the pictures of some frames and collect their detections.
 
     Args:
         path: The run.
-        times: Of the frames, as in the run's tables.
+        times: Times of the frames, as in the run's tables.
         images: Folder for the pictures.
-        classes: Labels to keep; None for those that the run's cues are made of.
-        logs: Where its logs have moved to, if they have.
-        limits: On what one chunk of a log may declare.
+        classes: Labels to keep; None for those that the run's cues use.
+        logs: Folder to which the logs have moved, if any.
+        limits: Limits on the declared size of a chunk of a log.
 
     Raises:
         RunError: The run or its log cannot be read.
@@ -80,7 +80,7 @@ def export_run(
     """
     run = open_run(path, logs, limits=limits)
     vehicle = run.drive_manifest().settings
-    # A car is a thing, and only how it stands or moves is a cue.
+    # A car is an object; only its orientation or motion is a cue.
     known = {
         label: "" if label in vehicle.cars.labels else cue
         for cue, labels in vehicle.cue_labels().items()
@@ -101,7 +101,7 @@ def export_run(
             content, ending, size = _content(picture)
         except CrosscueError:
             return
-        # In the log's time, which truth and labels have.
+        # Truth and labels use log time.
         at_ns = log_ns.get(t_ns, t_ns)
         name = f"{found.name}_{at_ns}ns{ending}"
         write_bytes(images / name, content)
@@ -117,7 +117,7 @@ def export_run(
 def _things(
     run: RunFolder, times: frozenset[int], found: ExportedRun
 ) -> Mapping[int, tuple[Thing, ...]]:
-    """Detections above their detector's threshold, by time."""
+    """Return the detections above their detector's threshold, by time."""
     detected = run.drive_manifest().detected
     things: dict[int, tuple[Thing, ...]] = {}
     for frame in stored_frames(run, detected.detectors) if detected is not None else ():
@@ -138,7 +138,7 @@ def _things(
 
 
 def _inside(box: Sequence[float], size_px: tuple[int, int]) -> list[float]:
-    """A box cut off at the picture's edges: tools refuse others."""
+    """Return a box clipped to the picture, because labelling tools refuse other boxes."""
     return [min(max(side, 0.0), float(size_px[k % 2])) for k, side in enumerate(box)]
 
 
@@ -148,7 +148,7 @@ def _log_times(run: RunFolder) -> Mapping[int, int]:
 
 
 def _content(picture: Encoded) -> tuple[bytes, str, tuple[int, int]]:
-    """A picture's file, its ending, and its size."""
+    """Return a picture's file content, file ending and size in pixels."""
     if picture.coding in ENDINGS:
         return bytes(picture.content), ENDINGS[picture.coding], size_of(picture)
     import cv2

@@ -1,4 +1,4 @@
-"""Everything that went wrong in one run: beside its truth, or, flipped beliefs, without any."""
+"""All failures of one run: compared with its truth, or, without truth, flipped beliefs only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .record import About, Failure
 def failures_beside_truth(
     run: RunFolder, scene: SceneJudged, threshold: float
 ) -> tuple[Failure, ...]:
-    """All failures of a judged run, in no order.
+    """Return all failures of a judged run, unordered.
 
     Raises:
         RunError: A table is missing or damaged.
@@ -40,7 +40,7 @@ def failures_beside_truth(
 
 
 def failures_without_truth(run: RunFolder, threshold: float) -> tuple[Failure, ...]:
-    """What a run without truth shows by itself: beliefs that it took back.
+    """Return the failures that show without truth: flipped beliefs.
 
     Raises:
         RunError: A table is missing or damaged.
@@ -69,7 +69,7 @@ def _of_frames(run: RunFolder, scene: SceneJudged, abouts: Mapping[int, About]) 
 
 
 def _detected(run: RunFolder, scene: SceneJudged) -> Detected:
-    """Detections in the frames that fail, by the log's time."""
+    """Return the detections in the failing frames, by log time."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -84,7 +84,7 @@ def _detected(run: RunFolder, scene: SceneJudged) -> Detected:
 
 
 def _placed(run: RunFolder, found: list[Failure]) -> tuple[Failure, ...]:
-    """With the times of the run's tables and of ``--at``; those of the truth are the log's."""
+    """Convert failures from log time, as in the truth, to the time of the run's tables."""
     if not found:
         return ()
     first_ns, last_ns = span_ns(run)

@@ -1,4 +1,4 @@
-"""What went wrong in consecutive frames: cues missed or found wrongly, ranges outside intervals."""
+"""Failures in consecutive frames: missed or false cues, and ranges outside their intervals."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from crosscue.eval.scoring.scene.ranges import RangeJudged, sds_off
 from .record import About, Failure, Kind
 
 APART_NS: Final = 2_000_000_000
-"""Failures of one cue closer than this are one."""
+"""Failures of one cue that are closer in time than this are merged."""
 NARROW: Final = 0.1
-"""An error below this fraction of the range is laid to the interval, a larger one to the range."""
+"""A smaller error, as a fraction of the range, is blamed on the interval, a larger on the range."""
 MOSTLY: Final = 0.5
 SDS_95: Final = 1.959964
 
 Detected = Mapping[int, Sequence[Mapping[str, Any]]]
-"""From a frame's time to rows of ``detections.parquet``."""
+"""Rows of ``detections.parquet`` by the time of their frame."""
 
 
 def missed_and_false(
@@ -35,21 +35,21 @@ def missed_and_false(
     about: Mapping[int, About],
     run: str,
 ) -> Iterator[Failure]:
-    """One cue's misses of what can be seen, and its positives where nothing is.
+    """Yield a cue's misses of visible objects, and its false positives.
 
     Args:
-        cue: In all frames of a drive.
+        cue: The cue in all frames of a drive.
         others: All cues of the drive.
-        labels: Of the detections that it is made of; none for road and Mobileye.
-        min_score: Score that they need; None for any.
-        detected: What detectors found at the times of failures.
+        labels: Labels of the detections that the cue uses; empty for road and Mobileye.
+        min_score: Min score of these detections; None for any.
+        detected: Detections at the times of failures.
         about: Approaches by id.
-        run: The run's folder.
+        run: Folder of the run.
     """
     is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
     for rows in _episodes(cue.t_ns, np.flatnonzero(is_missed), cue.approach):
         why = _why_missed(cue, rows, labels, min_score, detected)
-        # The nearest frame that is not yet at the intersection: there it should be easiest.
+        # The nearest frame before the intersection, where detection should be easiest.
         ahead = rows[~(cue.distance_m[rows] < NEAR_M)]
         row = int(ahead[-1] if len(ahead) else rows[-1])
         yield _failure("missed", cue.cue, why, cue, rows, row, about, run)
@@ -61,7 +61,7 @@ def missed_and_false(
 
 
 def failing_times(cues: Sequence[CueFrames]) -> NDArray[np.int64]:
-    """Frames in which a cue was missed or wrongly found: those whose detections are needed."""
+    """Return the times of frames with a missed or false cue, whose detections are needed."""
     wanted = [np.empty(0, np.int64)]
     for cue in cues:
         is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
@@ -72,7 +72,7 @@ def failing_times(cues: Sequence[CueFrames]) -> NDArray[np.int64]:
 def wrong_ranges(
     judged: Sequence[RangeJudged], about: Mapping[int, About], run: str
 ) -> Iterator[Failure]:
-    """Ranges that leave their own 95 % interval around the true one."""
+    """Yield spans in which the true range is outside the estimate's 95 % interval."""
     for one in judged:
         off = sds_off(one)
         for rows in _episodes(one.t_ns, np.flatnonzero(off > SDS_95), one.approach):
@@ -106,7 +106,7 @@ def wrong_ranges(
 def _episodes(
     t_ns: NDArray[np.int64], rows: NDArray[np.intp], approach: NDArray[np.int64]
 ) -> list[NDArray[np.intp]]:
-    """Rows close in time and of one approach, together."""
+    """Group rows that are close in time and belong to one approach."""
     breaks = (np.diff(t_ns[rows]) > APART_NS) | (np.diff(approach[rows]) != 0)
     return [part for part in np.split(rows, np.flatnonzero(breaks) + 1) if len(part)]
 
@@ -152,7 +152,7 @@ def _why_false(
 
 
 def _highest(rows: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> float:
-    """The best score of these labels; -1 without any."""
+    """Return the highest score among these labels; -1 without any."""
     return max((float(row["score"]) for row in rows if row["label"] in labels), default=-1.0)
 
 

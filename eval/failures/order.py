@@ -1,4 +1,4 @@
-"""Failures in order: by severity, by cause, and so that the first few are of many kinds."""
+"""Order of failures: by severity, by cause, and with many kinds among the first few."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from .record import Failure
 
 @dataclass(frozen=True, slots=True)
 class CauseGroup:
-    """Failures of one kind, about one thing, with one cause.
+    """Failures with the same kind, subject and cause.
 
     Attributes:
-        kind: What went wrong.
-        what: What it is about.
-        cause: Why.
-        failures: How many.
-        runs: In how many runs.
-        severity: Of the worst one.
+        kind: Kind of failure.
+        what: The feature, cue or range concerned.
+        cause: Cause of the failures.
+        failures: Number of failures.
+        runs: Number of runs with such a failure.
+        severity: Severity of the worst failure.
     """
 
     kind: str
@@ -31,7 +31,7 @@ class CauseGroup:
 
 
 def ranked(failures: Sequence[Failure]) -> tuple[Failure, ...]:
-    """The most severe first; the order of ``failures`` does not matter."""
+    """Return failures with the most severe first, independent of their input order."""
     return tuple(sorted(failures, key=_rank))
 
 
@@ -40,10 +40,10 @@ def _rank(one: Failure) -> tuple[object, ...]:
 
 
 def diverse(failures: Sequence[Failure], top: int) -> tuple[Failure, ...]:
-    """The worst failure of every group, then the second of every group, and so on.
+    """Return the worst failure of every group, then the second of every group, and so on.
 
-    Within a group every run has its turn before one comes again. So no group has two among the
-    first N before every group has one, and the first N are the beginning of the first N + 1.
+    Within a group, every run occurs before one occurs again. No group therefore has two among the
+    first N before every group has one, and the first N are a prefix of the first N + 1.
     """
     ordered = ranked(failures)
     in_run: Counter[tuple[object, ...]] = Counter()
@@ -60,7 +60,7 @@ def diverse(failures: Sequence[Failure], top: int) -> tuple[Failure, ...]:
 
 
 def cause_groups(failures: Sequence[Failure]) -> tuple[CauseGroup, ...]:
-    """Groups, the largest first."""
+    """Group failures by cause, the largest group first."""
     members: dict[tuple[str, str, str], list[Failure]] = {}
     for one in ranked(failures):
         members.setdefault(one.group, []).append(one)

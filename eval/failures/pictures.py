@@ -1,4 +1,4 @@
-"""Pictures of failing frames: boxes, masks, road and regions drawn, and a small copy of each."""
+"""Pictures of failing frames with boxes, masks, road and regions, and a thumbnail of each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ QUALITY: Final = 72
 SIDES: Final = ("left", "straight", "right")
 
 Keep = Callable[[int, bytes, bytes], None]
-"""Takes the time of a frame, its picture and the small copy, as JPEG."""
+"""Callback for the time of a frame, its picture and its thumbnail, both as JPEG."""
 
 
 def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
@@ -33,11 +33,11 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
 
     Args:
         run: The run.
-        times: Of the frames, as in the run's tables.
+        times: Times of the frames, as in the run's tables.
         keep: Called for each picture that could be read.
 
     Returns:
-        Why a picture is missing; empty where none is.
+        The reason why pictures are missing; empty if none is.
     """
     wanted = frozenset(times)
     try:
@@ -54,7 +54,7 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
             try:
                 canvas = draw_frame(picture, results, cues.get(t_ns, {}), regions, WIDTH_PX)
             except CrosscueError:
-                # One picture that cannot be decoded: its page says that it is missing.
+                # The page of a picture that cannot be decoded states that it is missing.
                 return
             keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))
 
@@ -73,7 +73,7 @@ def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, StoredFrame]:
 
 
 def _places(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, Place]:
-    """Where the run believes the intersection at these times; regions on the ground follow it."""
+    """Return the estimated place of the intersection by time, which fixes the ground regions."""
     if not run.file("range.parquet").exists():
         return {}
     length_m = run.drive_manifest().settings.fusion.length_m
@@ -92,7 +92,7 @@ def _places(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, Place]:
 
 
 def _cues(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, dict[str, int]]:
-    """Positive cues at these times."""
+    """Return the positive cues by time."""
     found: dict[int, dict[str, int]] = {}
     if run.file("cues.parquet").exists():
         for row in run.table("cues", ["t_ns", "cue", "count"]).to_pylist():

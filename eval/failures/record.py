@@ -1,4 +1,4 @@
-"""One thing that went wrong in a run, and the table of such things."""
+"""The record of one failure of a run, and tables of failures."""
 
 from __future__ import annotations
 
@@ -19,30 +19,31 @@ Level = Literal["approach", "frames"]
 KINDS: Final[tuple[Kind, ...]] = ("missed", "late", "false", "range", "flipped")
 FORMAT: Final = 1
 DISTANCES_M: Final = (0, 10, 20, 40, 80)
-"""Borders of the distances that failures are filtered by."""
+"""Bin edges of the distances by which failures are filtered."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One thing that went wrong.
+    """One failure.
 
     Attributes:
         run: Folder of the run.
-        kind: What went wrong.
-        level: Of a whole approach, or of consecutive frames of one cue or range.
-        what: The feature, cue or range that it is about: ``left``, ``stop_sign``, ``range to end``.
-        cause: In a few words, the same for all failures of one cause.
+        kind: Kind of failure.
+        level: Level: a complete approach, or consecutive frames of one cue or range.
+        what: The feature, cue or range concerned: ``left``, ``stop_sign``, ``range to end``.
+        cause: Cause in a few words, the same for all failures with this cause.
         reported: The cause with its numbers.
-        t_ns: The moment to look at, in the time of the run's tables.
-        at_s: The same in seconds from the run's first frame.
+        t_ns: The moment to inspect, in the time of the run's tables.
+        at_s: The same moment in seconds from the run's first frame.
         start_ns: First moment of the failure.
-        end_ns: Last moment.
-        frames: Frames or steps that show it.
-        approach: Id in the truth, or the run's number in a run without truth; None outside.
-        intersection: Its name; empty without.
+        end_ns: Last moment of the failure.
+        frames: Number of frames or steps that show the failure.
+        approach: Id of the approach in the truth, or its number in a run without truth; None
+            outside approaches.
+        intersection: Name of the intersection; empty if it has none.
         conditions: Tags of the approach.
-        distance_m: True distance to the intersection at that moment; None unknown.
-        severity: In bits; see ``docs/howto/failures.md``.
+        distance_m: True distance to the intersection at ``t_ns``; None if unknown.
+        severity: Severity in bits; see ``docs/howto/failures.md``.
     """
 
     run: str
@@ -64,21 +65,21 @@ class Failure:
 
     @property
     def group(self) -> tuple[str, str, str]:
-        """Failures of one kind, about one thing, with one cause belong together."""
+        """Kind, subject and cause, by which failures are grouped."""
         return self.kind, self.what, self.cause
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What all failures of one approach share.
+    """Attributes that all failures of one approach share.
 
     Attributes:
         run: Folder of the run.
-        approach: Its id.
-        intersection: Its name.
-        conditions: Its tags.
-        start_ns: When it begins.
-        end_ns: When the car enters.
+        approach: Id of the approach.
+        intersection: Name of the intersection.
+        conditions: Tags of the approach.
+        start_ns: Start of the approach.
+        end_ns: Time at which the vehicle enters the intersection.
     """
 
     run: str
@@ -90,7 +91,7 @@ class About:
 
 
 def distance_bin(distance_m: float | None) -> str:
-    """The bin that a distance is filtered by."""
+    """Return the name of the bin of a distance."""
     if distance_m is None:
         return "unknown"
     for near, far in pairwise(DISTANCES_M):
@@ -100,7 +101,7 @@ def distance_bin(distance_m: float | None) -> str:
 
 
 def failure_schema() -> pa.Schema:
-    """Columns of a table of failures."""
+    """Return the schema of a table of failures."""
     import pyarrow as pa
 
     return pa.schema(
@@ -126,19 +127,19 @@ def failure_schema() -> pa.Schema:
 
 
 def failure_table(failures: Sequence[Failure]) -> pa.Table:
-    """Failures as a table, in their order."""
+    """Return failures as a table, in the same order."""
     import pyarrow as pa
 
     return pa.Table.from_pylist([asdict(one) for one in failures], schema=failure_schema())
 
 
 def write_failures(failures: Sequence[Failure], path: Path) -> None:
-    """Write a table of failures: Parquet, or JSON where the name ends in ``.json``.
+    """Write a table of failures as Parquet, or as JSON if the name ends in ``.json``.
 
     Run folders are written relative to the table's folder, so that both can be moved together.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     import pyarrow.parquet as pq
 
@@ -158,10 +159,10 @@ def write_failures(failures: Sequence[Failure], path: Path) -> None:
 
 
 def read_failures(path: Path) -> tuple[Failure, ...]:
-    """Read such a table.
+    """Read a table that ``write_failures`` wrote.
 
     Raises:
-        AnnotationError: It is missing, damaged, or has other columns.
+        AnnotationError: The table is missing, damaged, or lacks columns.
     """
     if path.is_dir():
         raise _unreadable(path, "a folder")

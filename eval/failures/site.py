@@ -1,8 +1,8 @@
-"""A static site of failures: pages, pictures and charts that need no server and no build.
+"""A static site of failures: pages, pictures and charts that need neither a server nor a build.
 
-Lists are pages of a hundred; a script on the first page, which works without the others, filters
-and sorts all failures there. Without the script, pages by kind, cue, cause, condition and distance
-do. The same failures and runs give the same bytes.
+Lists have a hundred failures per page. A script on the first page filters and sorts all failures.
+Browsers without scripts use the lists by kind, cue, cause, condition and distance. The same
+failures and runs yield the same bytes.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ WEB_VIEWER: Final = "http://127.0.0.1:9090/?url=" + quote("rerun+http://127.0.0.
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A failure and its place in the site.
+    """A failure and its page in the site.
 
     Attributes:
-        number: From 1, by severity.
+        number: Rank by severity, from 1.
         failure: The failure.
-        picture: File name of its picture in ``p`` and ``t``.
+        picture: File name of its picture in ``p`` and of its thumbnail in ``t``.
     """
 
     number: int
@@ -55,7 +55,7 @@ class Entry:
         return f"{self.number:05d}.html"
 
     def facets(self, facet: str) -> tuple[str, ...]:
-        """The values by which it is found."""
+        """Return the values of a facet under which the failure is listed."""
         one = self.failure
         return {
             "kind": (one.kind,),
@@ -68,14 +68,14 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class RunWork:
-    """What is done for one run, here or in another process.
+    """Work on one run's failures, picklable so that it can run in another process.
 
     Attributes:
-        site: Folder.
-        total: Failures of the site.
-        logs: Where the runs' logs have moved to, if they have.
-        has_recordings: Each failure has a recording beside its page.
-        limits: On what one chunk of a log may declare.
+        site: Folder of the site.
+        total: Number of failures of the site.
+        logs: Folder to which the runs' logs have moved, if any.
+        has_recordings: True if each failure has a recording next to its page.
+        limits: Limits on the declared size of a chunk of a log.
     """
 
     site: Path
@@ -85,7 +85,7 @@ class RunWork:
     limits: Limits
 
     def __call__(self, entries: Sequence[Entry]) -> tuple[frozenset[str], str]:
-        """Write pictures and pages of one run's failures; pictures written, why some are not."""
+        """Write pictures and pages; return the pictures written and why others are missing."""
         run = open_run(Path(entries[0].failure.run), self.logs, limits=self.limits)
         names = {one.failure.t_ns: one.picture for one in entries}
         written: set[str] = set()
@@ -116,7 +116,7 @@ class RunWork:
 
 
 def entries_of(failures: Sequence[Failure]) -> tuple[Entry, ...]:
-    """Failures with their numbers and the names of their pictures, one for each frame."""
+    """Return failures with their ranks and picture names; failures of one frame share a picture."""
     runs = {run: number for number, run in enumerate(dict.fromkeys(f.run for f in failures), 1)}
     return tuple(
         Entry(number, one, f"{runs[one.run]:04d}-{one.t_ns}.jpg")
@@ -125,7 +125,7 @@ def entries_of(failures: Sequence[Failure]) -> tuple[Entry, ...]:
 
 
 def by_run(entries: Sequence[Entry]) -> tuple[tuple[Entry, ...], ...]:
-    """Those of each run together."""
+    """Group entries by run."""
     found: dict[str, list[Entry]] = {}
     for one in entries:
         found.setdefault(one.failure.run, []).append(one)
@@ -133,10 +133,10 @@ def by_run(entries: Sequence[Entry]) -> tuple[tuple[Entry, ...], ...]:
 
 
 def write_lists(site: Path, entries: Sequence[Entry], pictures: frozenset[str]) -> None:
-    """Write the pages of lists, the style, and what says that this folder is a site.
+    """Write the pages of lists, the style sheet, and the file that marks the folder as a site.
 
     Args:
-        site: Folder.
+        site: Folder of the site.
         entries: All failures.
         pictures: File names of the pictures that could be read.
 
@@ -168,7 +168,7 @@ def write_lists(site: Path, entries: Sequence[Entry], pictures: frozenset[str]) 
 def _pages(
     entries: Sequence[Entry], first: str, others: str
 ) -> Iterator[tuple[bool, str, Sequence[Entry], Sequence[str]]]:
-    """Whether it is the first page, its name, its entries, and the names of all pages."""
+    """Yield for each page: True if it is the first, its name and entries, and all pages' names."""
     count = max(-(-len(entries) // PER_PAGE), 1)
     names = [first, *(f"{others}-{number:04d}" for number in range(2, count + 1))]
     for k, name in enumerate(names):
@@ -176,7 +176,7 @@ def _pages(
 
 
 def _facets(entries: Sequence[Entry]) -> Mapping[str, Mapping[str, tuple[str, int]]]:
-    """By facet and value: the name of its page and how many failures, the most first."""
+    """Return the page name and number of failures by facet and value, the largest first."""
     found: dict[str, dict[str, tuple[str, int]]] = {}
     for facet in FACETS:
         counts: dict[str, int] = {}
@@ -186,14 +186,14 @@ def _facets(entries: Sequence[Entry]) -> Mapping[str, Mapping[str, tuple[str, in
         found[facet] = {}
         for value, count in sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])):
             plain = re.sub(r"[^a-z0-9]+", "-", value.lower()).strip("-")[:40]
-            # Two values may read alike once plain; their digests differ.
+            # Two values may have the same plain text; their digests differ.
             digest = hashlib.sha256(value.encode()).hexdigest()[:6]
             found[facet][value] = f"{facet}-{plain}-{digest}", count
     return found
 
 
 def _rows_json(entries: Sequence[Entry], pictures: frozenset[str]) -> str:
-    """What the script lists, as JSON that is safe inside a page."""
+    """Return the script's rows as JSON that is safe inside a page."""
     rows = [
         [
             one.failure.kind,

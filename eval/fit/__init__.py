@@ -1,1 +1,1 @@
-"""Parameters fitted from annotated drives."""
+"""Fitting of parameters to annotated drives."""

@@ -1,10 +1,10 @@
-"""What runs and their truth teach: annotated approaches, and annotated drives.
+"""Training data from runs and their truth: annotated approaches and annotated drives.
 
-For the fit of messages, a run's approach stands for the true one that it shares most time with,
-while the car drives up to it. One that meets no true approach leads to nothing: no intersection,
-no road to the left or right (whether it goes straight on is not known). For the fit of the belief
-over time, a drive is divided into the parts that lead up to each intersection of the truth, and
-those with none ahead. Both leave out frames in an intersection or outside the truth's time.
+For the fit of messages, a run's approach is matched to the true approach with the largest overlap
+in time before the intersection. An approach without a match leads to no intersection, and to no
+road to the left or right (a road straight ahead is unknown). For the fit of the belief over time, a
+drive is divided into one part before each intersection of the truth, and parts with no intersection
+ahead. Both exclude frames in an intersection or outside the truth's time.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 COVERED: Final = 0.9
-"""Of the time between two frames, at least so much must have odometry."""
+"""Min fraction of the time between two frames that odometry must cover."""
 NOTHING_THERE: Final = {"intersection": False, "left": False, "right": False}
 CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 
 
 @dataclass(slots=True)
 class Annotated:
-    """What runs and their truth teach.
+    """Annotated approaches of runs.
 
     Attributes:
-        approaches: To learn from.
-        used: Approaches of runs by what they were.
+        approaches: Approaches to fit to.
+        used: Number of the runs' approaches by kind.
     """
 
     approaches: list[AnnotatedApproach]
@@ -56,13 +56,13 @@ class Annotated:
 def check_arguments(
     command: str, runs: int, truth: int, output: Path | str | None, *, overwrite: bool
 ) -> Path | None:
-    """Refuse, before any run is read, what a fit to ``runs`` with ``truth`` files cannot use.
+    """Check the arguments of a fit before any run is read.
 
     Returns:
-        The output's path, if there is to be one.
+        The output's path, if any.
 
     Raises:
-        UsageError: Not a truth for each run.
+        UsageError: The numbers of runs and truth files differ.
         OutputError: The output exists.
     """
     if runs != truth:
@@ -76,10 +76,10 @@ def check_arguments(
 
 
 def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
-    """The factor graph that all runs share, and the first one's settings.
+    """Return the factor graph that all runs share, and the settings of the first run.
 
     Raises:
-        UsageError: They do not share one.
+        UsageError: The factor graphs differ.
         RunError: A manifest cannot be read.
     """
     vehicles = [run.drive_manifest().settings for run in runs]
@@ -94,21 +94,21 @@ def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
 
 
 def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) -> None:
-    """Add one run's approaches.
+    """Add the approaches of one run.
 
     Raises:
-        RunError: A table is missing or damaged, or nothing of the run is in the truth's time.
+        RunError: A table is missing or damaged, or the run is outside the truth's time.
     """
     run.refuse_set_back("fit messages")
     belief = run.table("belief", ["t_ns", "approach", "established"])
-    t_ns = _whole(belief["t_ns"])
-    number, established = _whole(belief["approach"]), np.asarray(belief["established"])
+    t_ns = _int64s(belief["t_ns"])
+    number, established = _int64s(belief["approach"]), np.asarray(belief["established"])
     if len(t_ns) and not ((t_ns >= truth.start_ns) & (t_ns < truth.end_ns)).any():
         raise RunError(
-            f"{run.path}: no approach between {truth.start_ns} and {truth.end_ns} ns, of which the "
-            "truth speaks; give the truth of this drive"
+            f"{run.path}: no approach between {truth.start_ns} and {truth.end_ns} ns, which the "
+            "truth covers; give the truth of this drive"
         )
-    way_m = _ways(run, t_ns, vehicle)
+    way_m = _distances(run, t_ns, vehicle)
     near = _near(run, t_ns, vehicle)
     counts = _counts_at(run.table("cues", ["t_ns", "cue", "count"]), t_ns)
     for one in np.unique(number).tolist():
@@ -135,7 +135,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
 def _meant(
     t_ns: Int64s, truth: Truth
 ) -> tuple[NDArray[np.bool_], dict[str, bool] | None, str, str]:
-    """Which frames count, true features, the intersection, and where the approach led."""
+    """Return the frames to use, the true features, the intersection, and the approach's kind."""
     shared = [((t_ns >= a.start_ns) & (t_ns < a.enter_ns)).sum() for a in truth.approaches]
     if shared and max(shared) > 0:
         one = truth.approaches[int(np.argmax(shared))]
@@ -153,39 +153,42 @@ def _meant(
     return inside, dict(NOTHING_THERE), "", "to nothing"
 
 
-def _whole(column: object) -> Int64s:
+def _int64s(column: object) -> Int64s:
     return np.asarray(column, np.int64)
 
 
-def _ways(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> Floats:
-    """Distance travelled, either way, up to each sorted time; estimated where unknown."""
+def _distances(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> Floats:
+    """Return the distance travelled in either direction up to each sorted time.
+
+    Gaps in the odometry count with the speed ``range_filter.unseen_mps``.
+    """
     odometer = odometer_of(run)
     gone, total, last_ns = np.empty(len(t_ns)), 0.0, None
     for i, now_ns in enumerate(t_ns.tolist()):
         way = odometer.until(now_ns)
         gap_ns = 0 if last_ns is None else now_ns - last_ns
         is_known = way.covered_ns >= COVERED * gap_ns
-        reckoned_m = vehicle.range_filter.unseen_mps * gap_ns * 1e-9
-        total += abs(way.distance_m) if is_known else reckoned_m
+        assumed_m = vehicle.range_filter.unseen_mps * gap_ns * 1e-9
+        total += abs(way.distance_m) if is_known else assumed_m
         gone[i], last_ns = total, now_ns
     return gone
 
 
 def _near(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> NDArray[np.bool_]:
-    """Frames in which the range that dissent goes by was within its reach."""
+    """Return the frames in which the range was within the reach of the rule for dissent."""
     table = run.table("range", ["t_ns", "reference", "range_m"])
-    at, reference = _whole(table["t_ns"]), np.array(table["reference"].to_pylist(), np.str_)
+    at, reference = _int64s(table["t_ns"]), np.array(table["reference"].to_pylist(), np.str_)
     range_m = np.asarray(table["range_m"], np.float64)
     best = np.full(len(t_ns), np.inf)
     is_wanted = reference == vehicle.fusion.reference
     for rows in (~is_wanted, is_wanted):
-        where, found = _places_in(t_ns, at[rows])
+        where, found = _indices_of(t_ns, at[rows])
         best[where] = range_m[rows][found]
     return np.asarray(best <= vehicle.fusion.dissent_within_m)
 
 
 class _Moves(NamedTuple):
-    """Between frames, shape (N,) each; of the first frame nothing."""
+    """Motion since the previous frame, shape (N,) each; zero for the first frame."""
 
     way_m: NDArray[np.float64]
     var_m2: NDArray[np.float64]
@@ -198,13 +201,13 @@ def annotated_drives(
     vehicle: Vehicle,
     tables: Mapping[str, pa.Table] | None = None,
 ) -> Iterator[AnnotatedDrive]:
-    """The parts of one run.
+    """Yield the parts of one run.
 
     Args:
-        run: With finished stages.
-        truth: Of the drive.
-        vehicle: Curves of ranges, and how fast they fade.
-        tables: ``cues`` and ``range``, estimated with other settings; the run's, if left out.
+        run: A run with finished stages.
+        truth: Truth of the drive.
+        vehicle: Range curves, and the distance over which ranges fade.
+        tables: Tables ``cues`` and ``range``, if estimated with other settings; default: the run's.
 
     Raises:
         RunError: A table is missing or damaged.
@@ -238,7 +241,7 @@ def annotated_drives(
 
 
 def _from_first(column: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same, without what lies before the part."""
+    """Return a column of differences with 0 for the first row of a part."""
     out = column.copy()
     out[0] = 0.0
     return out
@@ -247,7 +250,7 @@ def _from_first(column: NDArray[np.float64]) -> NDArray[np.float64]:
 def _parts(
     truth: Truth, t_ns: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.bool_], dict[str, bool], str]]:
-    """Frames of a part, what is true there, and the intersection's name."""
+    """Yield the frames of each part, its true features, and the intersection's name."""
     ahead = np.zeros(len(t_ns), np.bool_)
     for one in truth.approaches:
         kept = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
@@ -279,7 +282,7 @@ def _moves(run: RunFolder, t_ns: NDArray[np.int64]) -> _Moves:
 def _ranges(
     table: pa.Table, t_ns: NDArray[np.int64], way_m: NDArray[np.float64], vehicle: Vehicle
 ) -> list[tuple[MeasuredRange, ...]]:
-    """Of each frame, as the filter takes them."""
+    """Return the measured ranges of each frame, in the filter's form."""
     measured: dict[int, dict[Reference, tuple[float, float]]] = {}
     columns = [table[name].to_pylist() for name in ("t_ns", "reference", "measured_m", "var_m2")]
     for at, reference, range_m, var_m2 in zip(*columns, strict=True):
@@ -304,27 +307,27 @@ def _ranges(
 
 
 def _var_m2(reference: Reference, range_m: float, believed_m2: float, vehicle: Vehicle) -> float:
-    """Of one measurement: that of its curve, or of the belief where it has no curve."""
+    """Return the variance of a measurement: its curve's, or the belief's if it has no curve."""
     curve: RangeCurve | None = getattr(vehicle.ranges, CURVES[reference])
     own = believed_m2 if curve is None else curve.residual_sd_m**2
     return own + (vehicle.range_filter.sd_fraction * range_m) ** 2
 
 
 def _counts_at(table: pa.Table, t_ns: Int64s) -> dict[str, Int64s]:
-    """From each cue of a table ``cues`` to how many at sorted times, or ``NOT_LOOKED``."""
+    """Return the counts of each cue at sorted times, ``NOT_LOOKED`` where it was not evaluated."""
     at, count = np.asarray(table["t_ns"], np.int64), np.asarray(table["count"], np.int64)
     cue = np.array(table["cue"].to_pylist(), np.str_)
     out: dict[str, Int64s] = {}
     for name in np.unique(cue).tolist():
         column = np.full(len(t_ns), NOT_LOOKED, np.int64)
-        where, found = _places_in(t_ns, at[cue == name])
+        where, found = _indices_of(t_ns, at[cue == name])
         column[where] = count[cue == name][found]
         out[name] = column
     return out
 
 
-def _places_in(t_ns: Int64s, at: Int64s) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Where in the sorted ``t_ns`` the times of ``at`` stand, and which of them do."""
+def _indices_of(t_ns: Int64s, at: Int64s) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the indices in the sorted ``t_ns`` of the times ``at``, and which of them occur."""
     where = np.searchsorted(t_ns, at)
     found = np.zeros(len(at), np.bool_)
     inside = where < len(t_ns)

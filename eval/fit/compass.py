@@ -1,4 +1,4 @@
-"""Fit the compass of a vehicle file to a drive, with the GNSS course as the reference."""
+"""Fitting of a vehicle file's compass to a drive, with the GNSS course as the reference."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .log_signals import plan_of, read_signals
 
 
 def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
-    """Fit hard iron, soft iron and mounting as far as the drive shows them.
+    """Fit hard iron, soft iron and mounting, where the drive determines them.
 
     Raises:
-        EmptyResultError: No magnetometer.
-        VehicleError: Too few readings with a reference.
+        EmptyResultError: The logs have no magnetometer.
+        VehicleError: Too few readings have a reference.
     """
     planned = plan_of(logs, vehicle)
     magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
@@ -40,7 +40,7 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
 
 
 def section_of(fitted: CompassFit) -> dict[str, object]:
-    """The fit as a vehicle file's [compass] section."""
+    """Return the fit as a vehicle file's [compass] section."""
     compass = fitted.settings
     section: dict[str, object] = {
         "mounting_rotation": [list(row) for row in compass.mounting_rotation],
@@ -57,7 +57,7 @@ def section_of(fitted: CompassFit) -> dict[str, object]:
 
 
 def with_section(text: str, fitted: CompassFit) -> str:
-    """A vehicle file's text with its [compass] values replaced; comments stay."""
+    """Return a vehicle file's text with its [compass] values replaced and comments kept."""
     document = tomlkit.parse(text)
     section = document.setdefault("compass", tomlkit.table())
     for key, value in section_of(fitted).items():

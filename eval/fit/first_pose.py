@@ -1,4 +1,4 @@
-"""Where a drive begins and which way the car faces: from GNSS, a truth file, or three numbers."""
+"""The first pose of a drive, from GNSS, a truth file, or three numbers."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from .reference import GeodeticOrigin, Reference, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 
 READ_S: Final = START_S + 10.0
-"""Receivers and buses begin some seconds apart."""
+"""Time read from the start of a drive, seconds; receivers and buses start at different times."""
 MAX_HEADING_SD_RAD: Final = math.radians(30.0)
-"""A heading less certain than this is left to the compass, or to the map's own axes."""
+"""Max s.d. of a heading from GNSS; otherwise the compass or the map's axes determine it."""
 
 
 def with_start(
@@ -38,26 +38,27 @@ def with_start(
     gnss: GnssUse | None = None,
     start: str | None = None,
 ) -> Vehicle:
-    """The settings with a first pose, where one can be had.
+    """Return the settings with a first pose, if one can be determined.
 
     Args:
-        logs: Of the drive, open.
-        vehicle: A heading under ``[start]`` is kept, unless ``start`` says otherwise.
-        selection: Which part of the logs.
+        logs: Open logs of the drive.
+        vehicle: Settings; a heading under ``[start]`` is kept unless ``start`` replaces it.
+        selection: The part of the logs to use.
         gnss: Overrides ``gnss.use`` of the vehicle file.
         start: ``X,Y,HEADING`` in metres and degrees counter-clockwise from east, or a truth file.
 
     Raises:
-        UsageError: ``start`` or ``gnss`` is not understood.
-        SchemaError: The truth file holds no pose.
-        VehicleError: Its track does not cover the first seconds, or the car stands still in them.
+        UsageError: ``start`` or ``gnss`` is invalid.
+        SchemaError: The truth file has no pose.
+        VehicleError: The truth's track does not cover the first seconds, or the vehicle stands
+            still in them.
     """
     if gnss is not None:
         if gnss not in get_args(GnssUse):
             raise UsageError(f"--gnss {gnss}: expected one of {', '.join(get_args(GnssUse))}")
         vehicle = vehicle.model_copy(update={"gnss": vehicle.gnss.model_copy(update={"use": gnss})})
     vehicle = _started(logs, vehicle, selection, start)
-    # Refused here, before detectors have worked for an hour.
+    # Refused here, before the detectors run for an hour.
     fused_positions(vehicle)
     return vehicle
 
@@ -68,7 +69,7 @@ def _started(
     if start is not None and (numbers := _numbers(start)) is not None:
         return _changed(vehicle, numbers)
     if start is not None:
-        found = _laid(logs, vehicle, selection, Path(start))
+        found = _aligned(logs, vehicle, selection, Path(start))
         if found is None:
             raise VehicleError(
                 f"{start}: does not show the first pose: expected a track and wheel speeds in the "
@@ -77,23 +78,23 @@ def _started(
         return _changed(vehicle, found)
     if vehicle.gnss.use not in ("start", "fuse") or vehicle.start.heading_rad is not None:
         return vehicle
-    found = _laid(logs, vehicle, selection, None)
+    found = _aligned(logs, vehicle, selection, None)
     return vehicle if found is None else _changed(vehicle, found)
 
 
 def with_start_of(run: Vehicle, vehicle: Vehicle) -> Vehicle:
-    """Settings for estimating a run again: the first pose that it found stays, if none is given."""
+    """Return settings to estimate a run again, with its first pose unless ``vehicle`` has one."""
     if not run.start.source or vehicle.start.heading_rad is not None:
         return vehicle
     return vehicle.model_copy(update={"start": run.start})
 
 
 def without_found_start(vehicle: Vehicle) -> Vehicle:
-    """A run's settings as they were before it looked for the first pose."""
+    """Return a run's settings without the first pose that it determined."""
     start = vehicle.start
     if not start.source:
         return vehicle
-    # GNSS leaves x and y as the vehicle file has them; a truth file and a flag do not.
+    # GNSS keeps x and y of the vehicle file; a truth file and --start replace them.
     kept = {} if start.map_origin is None else {"x_m": start.x_m, "y_m": start.y_m}
     return vehicle.model_copy(update={"start": Start.model_validate(kept)})
 
@@ -104,10 +105,10 @@ def _changed(vehicle: Vehicle, start: dict[str, object]) -> Vehicle:
 
 
 def _numbers(text: str) -> dict[str, object] | None:
-    """The three numbers of ``X,Y,HEADING``; None for a path.
+    """Parse the three numbers of ``X,Y,HEADING``; return None for a path.
 
     Raises:
-        UsageError: There are other than three numbers, or they are not finite.
+        UsageError: There are not exactly three numbers, or one is not finite.
     """
     numbers = [_number(word) for word in text.split(",")]
     if len(numbers) != 3 and None in numbers:
@@ -131,10 +132,10 @@ def _number(word: str) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _laid(
+def _aligned(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, truth: Path | None
 ) -> dict[str, object] | None:
-    """The first seconds' odometry laid onto known positions; None where that shows no heading."""
+    """Return the pose that aligns the first seconds' odometry with known positions, or None."""
     planned = plan_of(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
@@ -150,7 +151,7 @@ def _laid(
     end_ns = begin_ns + round(READ_S * 1e9)
     if selection.end_ns is not None:
         end_ns = min(end_ns, selection.end_ns)
-    # The first stored row need not be the earliest, so nothing is cut off before it.
+    # The first stored row is not always the earliest, so the selection has no lower bound.
     part = replace(selection, end_ns=end_ns)
     found = read_signals(logs, planned, vehicle, part, wanted, warns=False)
     samples = found.get(Signal.POSITION)
@@ -172,7 +173,7 @@ def _laid(
 
 
 def _first(drive: KnownDrive, vehicle: Vehicle, reference: Reference) -> dict[str, object] | None:
-    """The pose at the first wheel speeds, which is where a run begins."""
+    """Return the pose at the first wheel speeds, where a run begins."""
     if len(drive.fixes) < 2:
         return None
     made = integrate(drive.wheels, odometry_settings(vehicle), drive.turn).increments
@@ -195,7 +196,7 @@ def _first(drive: KnownDrive, vehicle: Vehicle, reference: Reference) -> dict[st
 
 
 def _moved(origin: GeodeticOrigin, east_m: float, north_m: float) -> GeodeticOrigin:
-    """The geodetic place so far away."""
+    """Return the geodetic position displaced by the given metres."""
     latitude, longitude, altitude = origin
     turn = ecef_to_enu_matrix(math.radians(latitude), math.radians(longitude))
     at = geodetic_to_ecef(latitude, longitude, altitude) + np.array([east_m, north_m, 0.0]) @ turn

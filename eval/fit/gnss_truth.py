@@ -1,4 +1,4 @@
-"""A drive's own GNSS as a true track of stated quality."""
+"""Ground truth from a drive's own GNSS, with stated quality."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .log_signals import plan_of, read_signals
 
 POSE_FILE: Final = "gnss.tum"
 HELD_S: Final = 60.0
-"""A car that stands keeps its heading; so long, at most, is one carried on."""
+"""Max time for which a stationary vehicle keeps its last heading, seconds."""
 
 
 def write_gnss_truth(
@@ -29,12 +29,12 @@ def write_gnss_truth(
 ) -> Path:
     """Write ``truth.json`` and the antenna's track.
 
-    Rows without a heading (the car has not moved yet, or stood too long) are left out: a pose
-    without one cannot be scored.
+    Rows without a heading (the vehicle has not moved yet, or stood too long) are left out, because
+    a pose without a heading cannot be scored.
 
     Raises:
-        EmptyResultError: No GNSS position, or none with a heading.
-        OutputError: It cannot be written.
+        EmptyResultError: No GNSS position exists, or none has a heading.
+        OutputError: A file cannot be written.
     """
     planned = plan_of(logs, vehicle)
     source = planned.source_of(Signal.POSITION)
@@ -53,7 +53,7 @@ def write_gnss_truth(
     known = np.isfinite(heading)
     if not known.any():
         raise EmptyResultError(
-            f"{source.topic.name}: no position has a heading: the car never went "
+            f"{source.topic.name}: no position has a heading: the vehicle never reached "
             f"{gnss.min_speed_mps:g} m/s (gnss.min_speed_mps)"
         )
     t_ns = fixes.t_ns[known] - round(gnss.delay_s * 1e9)
@@ -78,23 +78,23 @@ def write_gnss_truth(
             heading_sd_rad=gnss.course_sd_rad,
             origin=Origin(latitude_deg=origin[0], longitude_deg=origin[1], altitude_m=origin[2]),
             source=f"GNSS of the log ({source.topic.name}), as received; {int((~known).sum())} of "
-            f"{len(known)} positions left out for want of a heading",
+            f"{len(known)} positions left out because they lack a heading",
         ),
         folder,
     )
 
 
 def _antenna(gnss: Gnss) -> tuple[Mounting, str]:
-    """Where it sits, and who says so."""
+    """Return the antenna's mounting and the source of this information."""
     if gnss.model_fields_set.isdisjoint(("x_m", "y_m")):
         place = Mounting(x_m=None, y_m=None, z_m=None, roll_rad=None, pitch_rad=None)
-        return place, "antenna's place unknown: [gnss] of the vehicle file does not state it"
+        return place, "antenna's position unknown: [gnss] of the vehicle file does not state it"
     place = Mounting(x_m=gnss.x_m, y_m=gnss.y_m, z_m=None, roll_rad=None, pitch_rad=None)
     return place, "[gnss] of the vehicle file"
 
 
 def _headings(t_ns: Int64s, xyz_m: Floats, course: Samples | None, min_speed_mps: float) -> Floats:
-    """The course at each position; a slow or standing car keeps its last."""
+    """Return the course at each position; a slow or stationary vehicle keeps its last course."""
     if course is not None and np.isfinite(course.values[:, 0]).any():
         found = course_at(
             t_ns, course.t_ns, course.values[:, 0], course.values[:, 1], min_speed_mps
@@ -109,7 +109,7 @@ def _headings(t_ns: Int64s, xyz_m: Floats, course: Samples | None, min_speed_mps
 
 
 def _between_positions(t_ns: Int64s, xyz_m: Floats, min_speed_mps: float) -> Floats:
-    """From the position a second before to the one a second after."""
+    """Return the course from the position a second before to the one a second after."""
     before = np.searchsorted(t_ns, t_ns - 1_000_000_000)
     after = np.minimum(np.searchsorted(t_ns, t_ns + 1_000_000_000), len(t_ns) - 1)
     way = xyz_m[after, :2] - xyz_m[before, :2]

@@ -1,4 +1,4 @@
-"""When and how large the pictures of a log's camera are, on the clock that runs use."""
+"""Times and size of the pictures of a log's camera, on the clock that runs use."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 
 def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) -> LogPictures:
-    """The pictures of the one camera of a log; warns of what was dropped.
+    """Return times and size of the pictures of a log's only camera; warn about dropped rows.
 
     Raises:
-        LogError: It cannot be read, or its first picture cannot.
-        VehicleError: No camera, or several.
+        LogError: The log or its first picture cannot be read.
+        VehicleError: The log has no camera, or several.
     """
     with open_log(path, limits) as log:
         camera = camera_of([(0, topic) for topic in log.topics], vehicle)
@@ -56,7 +56,7 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
 
 
 def _size_of(block: Block, pictures: Images, where: str) -> tuple[int, int]:
-    """Of the first picture, by which the annotations are checked."""
+    """Return the size of the first picture, which the annotations must match."""
     try:
         return size_of(encoded(pictures, 0))
     except LogError as error:
@@ -67,12 +67,13 @@ def _size_of(block: Block, pictures: Images, where: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class LogSpan:
-    """When a log's rows are, on its own clock.
+    """Time span of a log's rows, on its own clock.
 
     Attributes:
         start_ns: The first stamp.
-        end_ns: Just after the last one.
-        was_set_back: The clock ran backward, so the drive lasts longer than its stamps say.
+        end_ns: One nanosecond after the last stamp.
+        was_set_back: True if the clock was set back, so that the drive lasts longer than its
+            stamps suggest.
     """
 
     start_ns: int
@@ -81,10 +82,10 @@ class LogSpan:
 
 
 def log_span(path: Path, limits: Limits = DEFAULT_LIMITS) -> LogSpan:
-    """Log times of a log's first row and just after its last.
+    """Return the time span of a log's rows.
 
     Raises:
-        LogError: It cannot be read, or holds no row.
+        LogError: The log cannot be read, or has no row.
     """
     first, last, ledger = 2**63 - 1, -(2**63), Ledger(str(path))
     watches: defaultdict[str, StampWatch] = defaultdict(StampWatch)

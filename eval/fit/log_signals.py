@@ -1,4 +1,4 @@
-"""Whole signals of a drive, for fits that need all of it at once."""
+"""Complete signals of a drive, for fits that need all samples at once."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 
 def plan_of(logs: Sequence[Log], vehicle: Vehicle) -> Plan:
-    """Which topics of a drive's logs carry which signals.
+    """Return the plan that assigns topics of a drive's logs to signals.
 
     Raises:
-        VehicleError: A topic that the vehicle file names is not there, or several could be meant.
+        VehicleError: A topic that the vehicle file names does not exist, or is ambiguous.
     """
     return plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
 
@@ -32,9 +32,9 @@ def read_signals(
     *,
     warns: bool = True,
 ) -> dict[Signal, Samples]:
-    """The wanted signals of a drive, in order of time; those without a row are left out.
+    """Return the requested signals of a drive in order of time, without those that have no row.
 
-    Losses are reported as warnings, unless another pass over the log will report them.
+    Losses are reported as warnings if ``warns``; turn this off if another pass reports them.
     """
     sources = [source for signal in wanted if (source := planned.source_of(signal)) is not None]
     topics = frozenset(source.topic.name for source in sources)

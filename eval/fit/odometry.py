@@ -1,4 +1,4 @@
-"""Fit the odometry of a vehicle file to one half of a drive, and test it on the other."""
+"""Fitting of a vehicle file's odometry to one half of a drive, tested on the other half."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ OF_ONE_TURN: Final = {
     ),
     "wheels": ("right_wheel_scale", "track_width_m", "wheel_turn_rad_per_sqrt_m"),
 }
-"""What belongs to one source of turns alone."""
+"""Settings that belong to a single source of turns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Odometry alone against known positions, from the fitted start.
+    """Errors of odometry alone against known positions, from the fitted start.
 
     Attributes:
-        fitted_m: Root mean square over the fitted half.
-        held_out_m: Over the other half.
-        all_m: Over both.
-        end_m: At the last position.
-        fitted_nees: Mean squared error in units of its covariance; 2 is honest.
-        held_out_nees: The same of the other half.
-        all_nees: Of both.
+        fitted_m: Root mean square error over the fitted half.
+        held_out_m: Root mean square error over the other half.
+        all_m: Root mean square error over both halves.
+        end_m: Error at the last position.
+        fitted_nees: Mean NEES over the fitted half; 2 is consistent.
+        held_out_nees: Mean NEES over the other half.
+        all_nees: Mean NEES over both halves.
     """
 
     fitted_m: float
@@ -66,15 +66,16 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class SourceFit:
-    """The fit with one thing that turns the pose.
+    """The fit with one source of turns.
 
     Attributes:
-        fit: To the first half.
-        before: With the values that were given.
-        after: With the fitted ones.
-        camera_yaw_rad: How far the reference's body points to the left of the car; None where the
-            reference has no heading.
-        camera_yaw_sd_rad: Its s.d., with correlated differences counted as few.
+        fit: Fit to the first half.
+        before: Errors with the original values.
+        after: Errors with the fitted values.
+        camera_yaw_rad: Yaw of the reference's body relative to the vehicle, to the left; None if
+            the reference has no heading.
+        camera_yaw_sd_rad: Standard deviation of the yaw; correlation of differences is taken into
+            account.
     """
 
     fit: OdometryFit
@@ -86,19 +87,19 @@ class SourceFit:
 
 @dataclass(frozen=True, slots=True)
 class DriveFit:
-    """All that a drive shows of a car's odometry.
+    """Fit of a vehicle's odometry to a drive.
 
     Attributes:
-        log: Its name.
-        reference: Where the positions come from.
-        is_of_camera: Whether the reference is the camera's track.
-        start_ns: The fitted half.
-        middle_ns: Its end.
-        end_ns: The end of what was held out.
-        sources: By what turns the pose; that of the vehicle file first.
-        not_fitted: What could not be fitted, and why.
-        settings: With the values of all sources.
-        nees_band: The mean NEES of one drive is in here with 95 %, if the claims are right.
+        log: Name of the log.
+        reference: Source of the known positions.
+        is_of_camera: True if the reference is the camera's track.
+        start_ns: Start of the fitted half.
+        middle_ns: End of the fitted half and start of the held-out half.
+        end_ns: End of the held-out half.
+        sources: Fits by source of turns; that of the vehicle file first.
+        not_fitted: Reason why a source could not be fitted, by source.
+        settings: Settings with the values of all sources.
+        nees_band: 95 % interval of one drive's mean NEES for a consistent filter.
     """
 
     log: str
@@ -116,18 +117,18 @@ class DriveFit:
 def fit(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, truth: Path | None = None
 ) -> DriveFit:
-    """Fit to the first half of the drive, test on the second.
+    """Fit to the first half of the drive and test on the second.
 
     Args:
-        logs: Open.
-        vehicle: Where to begin.
-        selection: Which part of the logs.
+        logs: Open logs.
+        vehicle: Initial settings.
+        selection: The part of the logs to use.
         truth: Truth file with the positions; None for the log's GNSS.
 
     Raises:
-        EmptyResultError: No wheel speeds, or no positions.
+        EmptyResultError: The drive has no wheel speeds, or no positions.
         VehicleError: The drive is too short.
-        SchemaError: The truth file does not fit, or holds no pose.
+        SchemaError: The truth file is invalid, or has no pose.
     """
     planned = plan_of(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
@@ -236,7 +237,7 @@ def _rms(values: Floats) -> float:
 
 
 def _yaw(half: KnownDrive, fit: OdometryFit, reference: Reference) -> tuple[float, float]:
-    """The reference's heading less the car's, over the fitted half."""
+    """Return the mean yaw of the reference relative to the vehicle in the fitted half, and s.d."""
     assert reference.heading_rad is not None
     fixes = half.fixes
     rows = np.searchsorted(reference.fixes.t_ns, fixes.t_ns)
@@ -251,7 +252,7 @@ def _yaw(half: KnownDrive, fit: OdometryFit, reference: Reference) -> tuple[floa
 
 
 def _together(given: OdometrySettings, sources: Sequence[SourceFit]) -> OdometrySettings:
-    """Values of the first source, and of each other what belongs to its turns alone."""
+    """Return settings with the first source's shared values and each source's own values."""
     values = {name: getattr(sources[0].fit.settings, name) for name in SHARED}
     for source in sources:
         names = OF_ONE_TURN[source.fit.source]
@@ -260,7 +261,7 @@ def _together(given: OdometrySettings, sources: Sequence[SourceFit]) -> Odometry
 
 
 def section_of(found: DriveFit) -> dict[str, object]:
-    """The fit as a vehicle file's [odometry] section, with where it comes from."""
+    """Return the fit as a vehicle file's [odometry] section, with its provenance."""
     names = [*SHARED, *(name for one in found.sources for name in OF_ONE_TURN[one.fit.source])]
     values = {
         name: float(f"{value:.6g}")
@@ -297,13 +298,13 @@ def _provenance(found: DriveFit) -> dict[str, object]:
 
 
 def camera_yaw_of(found: DriveFit) -> float | None:
-    """The camera's mounting yaw, where the reference was its track."""
+    """Return the camera's mounting yaw, or None if the reference was not its track."""
     yaw_rad = found.sources[0].camera_yaw_rad
     return None if yaw_rad is None or not found.is_of_camera else round(yaw_rad, 5)
 
 
 def with_section(text: str, found: DriveFit) -> str:
-    """A vehicle file's text with its [odometry] values replaced; comments stay."""
+    """Return a vehicle file's text with its [odometry] values replaced and comments kept."""
     document = tomlkit.parse(text)
     section = document.setdefault("odometry", tomlkit.table())
     for key, value in section_of(found).items():

@@ -1,4 +1,4 @@
-"""Known positions of a drive: its GNSS, or a truth file."""
+"""Known positions of a drive, from its GNSS or a truth file."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 GeodeticOrigin: TypeAlias = tuple[float, float, float]
 """Latitude and longitude in degrees, altitude in metres."""
 SPACING_NS: Final = 1_000_000_000
-"""Positions nearer to each other say little more: their errors last."""
+"""Min spacing of positions; nearer ones add little, because their errors are correlated."""
 TRUTH_SD_M: Final = 0.3
-"""Where a truth file says nothing about its own quality; the fit finds out."""
+"""Initial s.d. of a truth file that states no quality; the fit estimates it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Positions of a point of the car, in a plane local frame.
+    """Positions of a point of the vehicle, in a plane local frame.
 
     Attributes:
-        name: Where they come from.
-        fixes: About a second apart.
-        lever_m: The point, ahead of and to the left of the rear axle.
-        heading_rad: Shape (N,): of the body whose track it is; None where it has none.
-        is_of_camera: Whether that body is the camera.
-        is_map: Whether the frame is the map of a truth file, in which runs are scored.
-        origin: Where the frame's zero lies.
+        name: Source of the positions.
+        fixes: Positions about a second apart.
+        lever_m: Position of the point, ahead of and to the left of the rear axle.
+        heading_rad: Heading of the tracked body, shape (N,); None if unknown.
+        is_of_camera: True if the tracked body is the camera.
+        is_map: True if the frame is the map of a truth file, in which runs are scored.
+        origin: Geodetic position of the frame's origin.
     """
 
     name: str
@@ -48,12 +48,12 @@ class Reference:
 
 
 def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> Reference:
-    """The receiver's positions, in a frame about the first of them.
+    """Return the receiver's positions in a frame centred on the first one.
 
     Args:
-        name: Of the topic.
-        samples: Of ``Signal.POSITION``.
-        vehicle: The antenna's place, and how good positions are that say nothing of it.
+        name: Name of the topic.
+        samples: Samples of ``Signal.POSITION``.
+        vehicle: The antenna's mounting, and the s.d. of positions without a covariance.
     """
     gnss = vehicle.gnss
     t_ns = samples.t_ns - round(gnss.delay_s * 1e9)
@@ -68,15 +68,15 @@ def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> Reference:
 
 
 def of_truth(path: Path, vehicle: Vehicle, spacing_ns: int = SPACING_NS) -> Reference:
-    """A truth file's track.
+    """Return the track of a truth file.
 
     Args:
         path: ``truth.json`` or its folder.
-        vehicle: Where the camera and the antenna sit, unless the truth says so.
-        spacing_ns: How far apart its poses are taken.
+        vehicle: Mounting of the camera and the antenna, unless the truth states it.
+        spacing_ns: Spacing of the poses used.
 
     Raises:
-        SchemaError: The file does not fit, or holds no pose.
+        SchemaError: The file is invalid, or has no pose.
     """
     truth, track = load_truth(path)
     rows = spaced(track.t_ns, spacing_ns)
@@ -99,10 +99,10 @@ def of_truth(path: Path, vehicle: Vehicle, spacing_ns: int = SPACING_NS) -> Refe
 
 
 def spaced(t_ns: Int64s, spacing_ns: int = SPACING_NS) -> Int64s:
-    """Indices of rows about so far apart, the first among them."""
+    """Return indices of rows that are about ``spacing_ns`` apart, including the first."""
     kept: list[int] = []
     for row, t in enumerate(t_ns.tolist()):
-        # A little early is on time: a row of a jittery clock.
+        # Rows slightly early are accepted, because clocks jitter.
         if not kept or t - int(t_ns[kept[-1]]) >= spacing_ns * 0.95:
             kept.append(row)
     return np.array(kept, np.int64)

@@ -1,4 +1,4 @@
-"""Does a truth file fit its log? And truth made from annotations of a log's pictures."""
+"""Checking a truth file against its log, and importing annotations of a log's pictures as truth."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ from .log_images import LogSpan, log_pictures, log_span
 
 FILE: Final = truth_file.FILE
 SLACK_NS: Final = 1_000_000_000
-"""Truth may begin or end so far outside its log: clocks and last pictures differ a little."""
+"""Max time by which truth may exceed its log, because clocks and last pictures differ slightly."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TruthFit:
-    """What a truth file that fits its log contains; printed as ``truth check`` prints it.
+    """Content of a truth file that fits its log; its ``repr`` is the output of ``truth check``.
 
     Attributes:
-        seconds: Its length.
-        approaches: How many.
-        cues: Statements about cues.
-        moments_with_frame: Of statements about a moment, those at which the log has a picture.
-        moments: Statements about a moment.
-        objects: Labelled objects.
-        ranges: Rows with true ranges.
-        poses: Of the track.
-        outside: Approaches and cues that reach beyond the log's stamps: only where its clock was
-            set back.
-        is_checked_by_hash: Whether the truth names the log's hash.
+        seconds: Duration of the truth.
+        approaches: Number of approaches.
+        cues: Number of statements about cues.
+        moments_with_frame: Number of ``moments`` at which the log has a picture.
+        moments: Number of statements about a single moment.
+        objects: Number of labelled objects.
+        ranges: Number of rows with true ranges.
+        poses: Number of poses of the track.
+        outside: Number of approaches and cues outside the log's stamps; above 0 only if the log's
+            clock was set back.
+        is_checked_by_hash: True if the truth names the log's hash.
     """
 
     seconds: float
@@ -76,7 +76,7 @@ class TruthFit:
     is_checked_by_hash: bool
 
     def as_dict(self) -> dict[str, object]:
-        """Its attributes."""
+        """Return the attributes as a dictionary."""
         return asdict(self)
 
     def __repr__(self) -> str:
@@ -100,16 +100,16 @@ class TruthFit:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class ImportedTruth:
-    """The result of an import; printed as ``truth import`` prints it.
+    """Result of an import; its ``repr`` is the output of ``truth import``.
 
     Attributes:
         truth: Path of the truth file.
-        objects: Path of the COCO file beside it.
-        pictures: Annotated ones.
-        things: Annotated things.
-        rule: How pictures found their frames.
-        cues: From cue to pictures in which it is there.
-        ignored: Shapes that were not taken, by kind.
+        objects: Path of the COCO file next to it.
+        pictures: Number of annotated pictures.
+        things: Number of annotated objects.
+        rule: Rule by which pictures were matched to frames.
+        cues: Number of pictures in which a cue is present, by cue.
+        ignored: Number of shapes that were not imported, by kind.
     """
 
     truth: Path
@@ -121,12 +121,12 @@ class ImportedTruth:
     ignored: Mapping[str, int]
 
     def as_dict(self) -> dict[str, object]:
-        """Its attributes."""
+        """Return the attributes as a dictionary."""
         return asdict(self) | {"truth": str(self.truth), "objects": str(self.objects)}
 
     def __repr__(self) -> str:
         lines = [f"pictures   {self.pictures} with {self.things} things, placed {self.rule}"]
-        lines += [f"           {cue}: there in {count}" for cue, count in self.cues.items()]
+        lines += [f"           {cue}: present in {count}" for cue, count in self.cues.items()]
         if not self.cues:
             lines.append("           no label is a cue; only objects were imported")
         lines += [f"not taken  {count} {kind}" for kind, count in self.ignored.items()]
@@ -146,12 +146,12 @@ def check_truth(
 
     Args:
         truth: The file, or the folder with ``truth.json``.
-        log: The log it belongs to.
-        vehicle: The vehicle file, where the log has several cameras.
-        limits: What the log is read with.
+        log: The log that it belongs to.
+        vehicle: The vehicle file, needed if the log has several cameras.
+        limits: Limits for reading the log.
 
     Raises:
-        SchemaError: Something does not fit; the first thing found is reported.
+        SchemaError: The truth does not fit the log; the first error found is reported.
         LogError: The log or the track cannot be read.
     """
     path, log_path, settings = Path(truth), Path(log), vehicle_given(vehicle)
@@ -179,7 +179,7 @@ def check_truth(
     matched = 0 if pictures is None else int(np.isin(moments, pictures.t_ns).sum())
     if len(moments) and not matched:
         raise SchemaError(
-            f"{path}: cues: at none of {len(moments)} moments has {log_path} a picture; the times "
+            f"{path}: cues: {log_path} has no picture at any of {len(moments)} moments; the times "
             "are of another log or clock"
         )
     ranges = 0 if drive.ranges is None else len(drive.ranges.t_ns)
@@ -198,10 +198,10 @@ def check_truth(
 
 
 def _check_times(truth: Truth, span: LogSpan, path: Path, log_path: Path) -> int:
-    """Refuse truth outside its log; how many of its parts reach beyond a log that was set back.
+    """Refuse truth outside its log; return the number of parts outside a log that was set back.
 
-    Truth may run on where its log's clock was set back. There, as in ``score``, the two have to
-    share a moment, and no more.
+    If the log's clock was set back, truth may exceed the log's stamps. As in ``score``, the two
+    then only have to overlap.
     """
     first, last = span.start_ns - SLACK_NS, span.end_ns + SLACK_NS
     where = f"{log_path} lasts from {span.start_ns} to {span.end_ns} ns; give the truth of this log"
@@ -218,7 +218,7 @@ def _check_times(truth: Truth, span: LogSpan, path: Path, log_path: Path) -> int
 
 
 def _parts(truth: Truth) -> Iterator[tuple[str, int, int]]:
-    """What each part of a truth is, its first and last moment."""
+    """Yield the description, first and last moment of each part of a truth."""
     for one in truth.approaches:
         yield f"approach {one.id}", one.start_ns, one.enter_ns
     for number, cue in enumerate(truth.cues):
@@ -263,14 +263,14 @@ def import_truth(
         annotations: COCO, FiftyOne or Label Studio (``.json``), CVAT 1.1 (``.xml``), or a folder of
             YOLO or FiftyOne.
         log: The log whose pictures were annotated.
-        output: The truth file, or its folder; labelled objects go beside it.
-        vehicle: Names the camera where the log has several, and cues of the user's own.
-        labels: From label to cue; an empty cue leaves the label out.
-        add: Keep everything but cues and objects of the truth file that is there.
-        overwrite: Replace a truth file that is there.
+        output: The truth file, or its folder; labelled objects are written next to it.
+        vehicle: Vehicle file that names the camera, if the log has several, and user-defined cues.
+        labels: Cue of each label; an empty cue leaves the label out.
+        add: Keep everything but cues and objects of an existing truth file.
+        overwrite: Replace an existing truth file.
         kind: One of ``coco``, ``cvat``, ``yolo``, ``fiftyone``, ``labelstudio``; recognised if left
             out.
-        limits: What the log is read with.
+        limits: Limits for reading the log.
 
     Raises:
         SchemaError: The annotations do not fit the log.
@@ -297,20 +297,20 @@ def import_part(
     add: bool = False,
     limits: Limits = DEFAULT_LIMITS,
 ) -> ImportedTruth:
-    """Write the annotated pictures of one log, as ``write_imported`` does.
+    """Write the annotated pictures of one log with ``write_imported``.
 
     Args:
-        annotations: As read.
-        cues: From label to cue.
+        annotations: The annotations.
+        cues: Cue of each label.
         log: The log.
         output: The truth file.
-        vehicle: Names the camera where the log has several.
-        add: Keep everything but cues and objects.
-        limits: What the log is read with.
+        vehicle: Settings that name the camera, if the log has several.
+        add: Keep everything but cues and objects of an existing truth file.
+        limits: Limits for reading the log.
 
     Raises:
         LogError: The log cannot be read.
-        SchemaError: The annotations do not fit it.
+        SchemaError: The annotations do not fit the log.
         OutputError: The files cannot be written.
     """
     pictures = log_pictures(log, vehicle, limits)
@@ -329,12 +329,12 @@ def write_imported(
     """Write the annotated pictures of one log as its truth and its labelled objects.
 
     Args:
-        annotations: As read.
-        cues: From label to cue; None for a label that is not one.
-        pictures: Of the log.
+        annotations: The annotations.
+        cues: Cue of each label; None for a label that is not a cue.
+        pictures: Times and size of the log's pictures.
         log_path: The log.
-        output: The truth file; objects go beside it.
-        add: Keep everything but cues and objects of the truth file that is there.
+        output: The truth file; objects are written next to it.
+        add: Keep everything but cues and objects of an existing truth file.
 
     Raises:
         SchemaError: The annotations do not fit the log.

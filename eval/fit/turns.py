@@ -1,4 +1,4 @@
-"""Samples of a log as the odometry takes them."""
+"""Conversion of a log's samples to the inputs of the odometry."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from crosscue.replay.signals.kinds import Samples, Signal
 
 
 def wheel_speeds(samples: Samples) -> WheelSpeeds:
-    """All four wheels, or the rear two where the front ones are not known."""
+    """Return the speeds of all four wheels, or of the rear two if the front ones are unknown."""
     speeds = samples.values
     has_front = not np.isnan(speeds[:, :2]).all()
     return WheelSpeeds(samples.t_ns, speeds if has_front else speeds[:, 2:])
 
 
 def turn_samples(signal: Signal | None, found: Mapping[Signal, Samples]) -> TurnSignal | None:
-    """What reports turns; None for the wheels' difference."""
+    """Return the samples of a source of turns; None for the difference of the wheel speeds."""
     if signal is None:
         return None
     kind: TurnKind = "yaw rate" if signal is Signal.YAW_RATE else "steering"

@@ -1,1 +1,1 @@
-"""Thresholds and calibrations of a detector, from labelled boxes."""
+"""Fitting of a detector's thresholds and calibrations to labelled boxes."""

@@ -1,4 +1,4 @@
-"""A model card's text with fitted thresholds and calibrations in it; comments stay."""
+"""Insertion of fitted thresholds and calibrations into a model card's text, comments kept."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ WRITTEN_BY: Final = "crosscue fit detector"
 
 
 def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, aim: str) -> str:
-    """The card's text with the fit.
+    """Return a model card's text with the fit.
 
     Args:
-        text: Of the card.
-        fits: Of every class; those left as they are change nothing.
-        pictures: Which, how many, by whom labelled.
-        measured: When.
-        aim: What was asked for, in words.
+        text: Text of the card.
+        fits: Fits of all classes; classes that were not fitted stay unchanged.
+        pictures: Description of the pictures: which, how many, labelled by whom.
+        measured: Date of the measurement.
+        aim: The requested aim, in words.
 
     Raises:
-        VehicleError: The card would not be one.
+        VehicleError: The result would not be a valid card.
     """
     document = tomlkit.parse(text)
     scores = document.setdefault("scores", tomlkit.table(is_super_table=True))
@@ -60,12 +60,12 @@ def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, 
         label in card.scores and card.scores[label].calibration is not None for label in reported
     )
     if is_calibrated != card.is_calibrated:
-        _put_first(document, "is_calibrated", is_calibrated)
+        _insert_first(document, "is_calibrated", is_calibrated)
     return tomlkit.dumps(document)
 
 
-def _put_first(document: Any, key: str, value: bool) -> None:
-    """A key of the whole card stands before its first section."""
+def _insert_first(document: Any, key: str, value: bool) -> None:
+    """Insert a top-level key of the card before its first section."""
     if key in document:
         document[key] = value
         return
@@ -114,14 +114,14 @@ def _checked(tree: object) -> ModelCard:
 
 
 def check_place(card: ModelCard, source: Path, output: Path, *, overwrite: bool) -> None:
-    """Refuse, before any work, a card that cannot be written there or would not find its weights.
+    """Check before any work that a card can be written to a path and will find its weights there.
 
     Raises:
-        UsageError: It exists, or its weights are elsewhere.
+        UsageError: The file exists, or the weights are in another folder.
     """
     if output.suffix != ".toml":
         raise UsageError(f"-o {output}: expected a card's name, which ends in .toml")
     if output.exists() and not overwrite and not output.samefile(source):
         raise UsageError(f"{output}: exists; give another name or --overwrite")
     if not card.files and output.resolve().parent != source.resolve().parent:
-        raise UsageError(f"{output}: a card lies beside its weights, in {source.parent}")
+        raise UsageError(f"{output}: a card must be in the folder of its weights, {source.parent}")

@@ -1,4 +1,4 @@
-"""One class of a detector: threshold and calibration on some pictures, and the result on others."""
+"""Fit of one class of a detector: threshold and calibration, tested on held-out pictures."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from .threshold import best_bound, fewest_detections, lower_bound, round_between
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
 CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
 MIN_LABELS: Final = 20
-"""A class with fewer labelled boxes is left as it is."""
+"""Min number of labelled boxes to fit a class."""
 MIN_EACH: Final = 10
-"""Without so many right and so many wrong detections, scores are not calibrated."""
+"""Min number of right and of wrong detections to calibrate scores."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,9 +29,9 @@ class Judged:
     """Detections of one class in some pictures.
 
     Attributes:
-        scores: Shape (N,).
-        is_right: Shape (N,).
-        labels: Boxes to be found.
+        scores: Scores of the detections, shape (N,).
+        is_right: True for detections that match a label, shape (N,).
+        labels: Number of labelled boxes.
     """
 
     scores: NDArray[np.float64]
@@ -41,17 +41,17 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """What the fit is worth on pictures that it has not seen.
+    """Result of the fit on held-out pictures.
 
     Attributes:
-        right: Detections above the threshold on a label.
-        of: All above the threshold.
-        labels: Boxes to be found.
-        interval: Of the precision, 95 %, as if detections were independent.
-        bound: Of it too, one-sided, with the confidence of the fit: what is shown of it.
+        right: Number of detections above the threshold that match a label.
+        of: Number of detections above the threshold.
+        labels: Number of labelled boxes.
+        interval: 95 % interval of the precision, for independent detections.
+        bound: One-sided lower bound of the precision, with the confidence of the fit.
         error_before: Expected calibration error of the network's scores.
-        error_after: Of the calibrated ones.
-        detections: That both are made of.
+        error_after: Expected calibration error of the calibrated scores.
+        detections: Number of detections behind both errors.
     """
 
     right: int
@@ -65,29 +65,29 @@ class HeldOut:
 
     @property
     def precision(self) -> float:
-        """NaN for none."""
+        """Precision; NaN without detections."""
         return self.right / self.of if self.of else math.nan
 
     @property
     def recall(self) -> float:
-        """NaN for none."""
+        """Recall; NaN without labels."""
         return self.right / self.labels if self.labels else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class ClassFit:
-    """One class.
+    """Fit of one class.
 
     Attributes:
-        name: As judged.
-        members: The detector's labels that it is made of.
-        labels: Boxes that were fitted to.
-        detections: Likewise.
-        right: Of these.
-        scores: What the card gets; None where the class is left as it is.
-        bound: Lower bound of the precision above the threshold; NaN without one.
-        held_out: The result on other pictures; None without a threshold.
-        notes: Why something was not fitted.
+        name: Name of the class.
+        members: The detector's labels that count as this class.
+        labels: Number of labelled boxes fitted to.
+        detections: Number of detections fitted to.
+        right: Number of these detections that match a label.
+        scores: Entry for the card; None if the class was not fitted.
+        bound: Lower bound of the precision above the threshold; NaN without a threshold.
+        held_out: Result on held-out pictures; None without a threshold.
+        notes: Reasons why something was not fitted.
     """
 
     name: str
@@ -113,17 +113,17 @@ def fit_class(
     """Fit one class.
 
     Args:
-        name: Of the class.
-        members: The detector's labels.
-        chosen_on: What it is fitted to.
-        held_out: What shows the result.
-        precision: Required.
-        confidence: Of its bound.
-        kind: Of calibration.
+        name: Name of the class.
+        members: The detector's labels of the class.
+        chosen_on: Detections to fit to.
+        held_out: Detections to test on.
+        precision: Required precision.
+        confidence: Confidence of the precision's lower bound.
+        kind: Kind of calibration.
     """
     n, right = len(chosen_on.scores), int(chosen_on.is_right.sum())
     if chosen_on.labels < MIN_LABELS:
-        why = f"{chosen_on.labels} labelled boxes, {MIN_LABELS} needed: left as it is"
+        why = f"{chosen_on.labels} labelled boxes, {MIN_LABELS} needed: not fitted"
         return ClassFit(name, members, chosen_on.labels, n, right, None, math.nan, None, (why,))
     notes = []
     calibration = _calibration(chosen_on, kind)
@@ -172,7 +172,7 @@ def _why_none(judged: Judged, precision: float, confidence: float) -> str:
     if len(judged.scores) < fewest:
         return f"no threshold: {len(judged.scores)} detections, at least {fewest} needed"
     best = best_bound(judged.scores, judged.is_right, precision, confidence)
-    return f"no threshold reaches {precision:g}: the best is surely above {best:.3f} only"
+    return f"no threshold reaches {precision:g}: the best lower bound is {best:.3f}"
 
 
 def _held_out(judged: Judged, by: ClassScores, confidence: float) -> HeldOut:

@@ -1,12 +1,13 @@
-"""The lowest score above which a detector is precise enough, with a bound that can be relied on.
+"""The lowest score above which a detector is precise enough, with a lower confidence bound.
 
-The bound is Clopper and Pearson's (Biometrika 26, 1934), one-sided. Since the threshold is chosen
-by looking at the same detections, each of ``TRIED`` candidates is held to a part of the allowed
-risk (Bonferroni), so that with the stated confidence no candidate that passes is less precise than
-asked for. Candidates are fixed by how many detections are above them, never by which are right.
+The bound is Clopper and Pearson's (Biometrika 26, 1934), one-sided. The threshold is chosen on the
+same detections. Each of ``TRIED`` candidates is therefore held to a part of the allowed risk
+(Bonferroni), so that with the stated confidence no candidate that passes is less precise than
+required. Candidates are determined by the number of detections above them, and never by which
+detections are right.
 
-The bound takes detections as independent. Those of neighbouring frames are not: a bound from one
-short drive says little of other drives.
+The bound assumes independent detections. Those of neighbouring frames are not independent, so a
+bound from one short drive means little for other drives.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ TRIED: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """A score, and what is known of detections above it.
+    """A score threshold and the detections above it.
 
     Attributes:
-        score: Detections with a higher score are counted.
-        next_score: The lowest of these.
-        right: Of these.
-        of: How many they are.
-        bound: With the confidence asked for, they are no less often right than this.
+        score: The threshold; detections with a higher score count.
+        next_score: The lowest score above the threshold.
+        right: Number of detections above the threshold that are right.
+        of: Number of detections above the threshold.
+        bound: Lower bound of their precision, with the required confidence.
     """
 
     score: float
@@ -41,12 +42,12 @@ class Threshold:
 
 
 def lower_bound(right: int, of: int, confidence: float) -> float:
-    """Clopper and Pearson's one-sided lower bound of a fraction.
+    """Return Clopper and Pearson's one-sided lower bound of a fraction.
 
     Args:
-        right: So many.
-        of: So many.
-        confidence: In (0, 1).
+        right: Number of successes.
+        of: Number of trials.
+        confidence: Confidence in (0, 1).
     """
     from scipy.stats import beta
 
@@ -54,7 +55,7 @@ def lower_bound(right: int, of: int, confidence: float) -> float:
 
 
 def fewest_detections(precision: float, confidence: float) -> int:
-    """So many have to be there for a threshold, even if all are right."""
+    """Return the min number of detections needed for a threshold if all of them are right."""
     risk = (1.0 - confidence) / TRIED
     return math.ceil(math.log(risk) / math.log(precision))
 
@@ -62,7 +63,7 @@ def fewest_detections(precision: float, confidence: float) -> int:
 def best_bound(
     scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> float:
-    """The highest bound that any candidate reaches; NaN without candidates."""
+    """Return the highest bound of any candidate; NaN without candidates."""
     found = _candidates(scores, is_right, precision, confidence)
     return max((one.bound for one in found), default=math.nan)
 
@@ -70,13 +71,13 @@ def best_bound(
 def threshold_for(
     scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> Threshold | None:
-    """The lowest candidate whose bound is high enough; None where none is.
+    """Return the lowest candidate whose bound is high enough, or None.
 
     Args:
-        scores: Shape (N,).
-        is_right: Shape (N,).
-        precision: Required, in (0, 1).
-        confidence: Of the bound, in (0, 1).
+        scores: Scores of the detections, shape (N,).
+        is_right: True for detections that match a label, shape (N,).
+        precision: Required precision, in (0, 1).
+        confidence: Confidence of the bound, in (0, 1).
     """
     found = _candidates(scores, is_right, precision, confidence)
     good = [one for one in found if one.bound >= precision]
@@ -86,7 +87,7 @@ def threshold_for(
 def _candidates(
     scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> list[Threshold]:
-    """Those with more and more detections above them, evenly in ratio."""
+    """Return candidates whose numbers of detections above them increase geometrically."""
     n, fewest = len(scores), fewest_detections(precision, confidence)
     if n < fewest:
         return []
@@ -96,7 +97,7 @@ def _candidates(
     each = 1.0 - (1.0 - confidence) / TRIED
     found = []
     for count in counts.tolist():
-        # Detections with equal scores are on the same side.
+        # Detections with equal scores are on the same side of a threshold.
         of = int(np.searchsorted(-falling, -falling[count - 1], side="right"))
         above = float(falling[of - 1])
         below = float(falling[of]) if of < n else max(above - 0.01, 0.0)
@@ -106,7 +107,7 @@ def _candidates(
 
 
 def round_between(low: float, high: float) -> float:
-    """The shortest number in [low, high), for a file that people read."""
+    """Return the shortest decimal number in [low, high), for files that people read."""
     for digits in range(2, 17):
         found = round(0.5 * (low + high), digits)
         if low <= found < high:

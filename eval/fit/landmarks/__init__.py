@@ -1,1 +1,1 @@
-"""Landmark databases and how well images match."""
+"""Building landmark databases and fitting the match threshold."""

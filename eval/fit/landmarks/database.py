@@ -1,4 +1,4 @@
-"""Building a landmark database: from a log with poses, or from pictures with coordinates."""
+"""Building a landmark database from a log with poses, or from pictures with coordinates."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_POINTS: Final = 20
-"""Pictures with fewer points (a blank wall, the dark) are not landmarks."""
+"""Min number of points of a landmark; pictures of a blank wall or at night have fewer."""
 MAX_GAP_NS: Final = 500_000_000
 MAX_COORDINATE_BYTES: Final = 256 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPoses:
-    """Where the camera was, N times.
+    """N positions of the camera.
 
     Attributes:
-        t_ns: Shape (N,), increasing.
-        xy_m: Shape (N, 2): of the camera.
-        heading_rad: Shape (N,): of the car.
-        cov_m2: Shape (N, 2, 2): of ``xy_m``; zero where the source claims no error.
+        t_ns: Times, shape (N,), increasing.
+        xy_m: Positions of the camera, shape (N, 2).
+        heading_rad: Headings of the vehicle, shape (N,).
+        cov_m2: Covariances of ``xy_m``, shape (N, 2, 2); zero if the source states no error.
     """
 
     t_ns: Int64s
@@ -62,15 +62,15 @@ class CameraPoses:
 
 @dataclass(slots=True)
 class AddCounts:
-    """What became of the pictures.
+    """Numbers of pictures by outcome.
 
     Attributes:
-        pictures: Met.
-        added: As landmarks.
-        too_near: Left out: less than the wanted distance from the last one.
-        without_pose: Left out: no pose at their time.
-        undecodable: Left out: do not decode.
-        blank: Left out: too little to see on them.
+        pictures: All pictures.
+        added: Pictures added as landmarks.
+        too_near: Pictures too near to the last landmark.
+        without_pose: Pictures without a pose at their time.
+        undecodable: Pictures that do not decode.
+        blank: Pictures with too few points.
     """
 
     pictures: int = 0
@@ -90,15 +90,15 @@ class Frame(NamedTuple):
 
 
 def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
-    """Poses of a run folder, or of a truth file (``truth.json`` or its folder).
+    """Read the poses of a run folder, or of a truth file (``truth.json`` or its folder).
 
     Args:
-        path: Where.
-        vehicle: For the camera's place, where a truth speaks of the rear axle.
+        path: The run folder or truth file.
+        vehicle: The camera's mounting, needed if a truth describes the rear axle.
 
     Raises:
-        RunError: A run that cannot be read.
-        AnnotationError: A truth that cannot be read.
+        RunError: The run cannot be read.
+        AnnotationError: The truth cannot be read.
     """
     if path.is_dir() and (path / "manifest.json").exists():
         return _run_poses(path)
@@ -132,10 +132,10 @@ def _turned(lever_m: tuple[float, float], heading: Floats) -> Floats:
 def camera_frames(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, ledgers: Sequence[Ledger]
 ) -> Iterator[Frame]:
-    """The camera's pictures of a drive, on the clock that a replay would choose.
+    """Yield the camera's pictures of a drive, on the clock that a replay would choose.
 
     Raises:
-        VehicleError: No camera, or several.
+        VehicleError: The logs have no camera, or several.
     """
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     camera = camera_of(topics, vehicle)
@@ -149,7 +149,7 @@ def camera_frames(
 
 
 def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> None:
-    """A camera's picture does not decode: only the camera's log has met its topic."""
+    """Drop a picture that does not decode, in the one ledger that has counted its topic."""
     ledger = next(one for one in ledgers if frame.topic in one.accounts)
     ledger.spoil(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
 
@@ -164,21 +164,21 @@ def add_from_log(
     source: str,
     ledgers: Sequence[Ledger],
 ) -> AddCounts:
-    """Add a landmark each ``every_m`` of the way.
+    """Add a landmark every ``every_m`` along the path.
 
-    The errors of a run's poses are shared by neighbouring landmarks; a later replay takes them as
-    independent. Where the run drifted, make ``every_m`` large, or give a truth.
+    Neighbouring landmarks share the errors of a run's poses, but a later replay assumes that they
+    are independent. If the run drifted, make ``every_m`` large, or use a truth.
 
     Args:
-        writer: Of the database.
-        matcher: Makes the features.
-        frames: In order of time.
-        poses: Of the same drive.
+        writer: Writer of the database.
+        matcher: Matcher that computes the features.
+        frames: Frames in order of time.
+        poses: Poses of the same drive.
         every_m: Straight distance between two landmarks.
-        sd_m: How far the car may be from the landmark when it matches best; added to the poses'
-            own covariance.
-        source: Name of the drive; landmarks are called ``source/time``.
-        ledgers: Of all logs; pictures that do not decode are dropped in the camera's.
+        sd_m: S.d. of the vehicle's distance from the landmark at the best match; added to the
+            covariance of the poses.
+        source: Name of the drive; landmarks are named ``source/time``.
+        ledgers: Ledgers of all logs; pictures that do not decode are dropped in the camera's.
     """
     counts = AddCounts()
     last: Floats | None = None
@@ -207,7 +207,7 @@ def add_from_log(
 
 
 def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place | None:
-    """The camera's place at a time, called ``source/time``; None where no pose is near."""
+    """Return the camera's place at a time, named ``source/time``; None if no pose is near."""
     after = int(np.searchsorted(poses.t_ns, t_ns))
     if after == len(poses.t_ns) or (after == 0 and poses.t_ns[0] != t_ns):
         return None
@@ -230,11 +230,11 @@ def add_from_images(
     """Add each picture that a table of coordinates names.
 
     The table is a CSV file with a header: ``image,x_m,y_m`` and ``sd_m`` or ``var_x_m2``,
-    ``cov_xy_m2``, ``var_y_m2``, and, if wanted, ``heading_rad`` (counter-clockwise from east).
+    ``cov_xy_m2``, ``var_y_m2``, and optionally ``heading_rad`` (counter-clockwise from east).
 
     Raises:
-        AnnotationError: The table cannot be understood; names the line.
-        LogError: A picture is missing or does not decode: here each was asked for by name.
+        AnnotationError: The table is invalid; the message names the line.
+        LogError: A picture is missing or does not decode.
     """
     counts = AddCounts()
     for name, place in read_coordinates(coordinates, source):
@@ -258,10 +258,10 @@ _COV_COLUMNS: Final = ("var_x_m2", "cov_xy_m2", "var_y_m2")
 
 
 def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
-    """Picture names and places of a table; see ``add_from_images``.
+    """Yield the picture names and places of a table, as described in ``add_from_images``.
 
     Raises:
-        AnnotationError: As there.
+        AnnotationError: The table is invalid; the message names the line.
     """
     try:
         content = read_at_most(path, MAX_COORDINATE_BYTES)
@@ -314,10 +314,10 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
 
 
 def near_of(text: str | None) -> tuple[Floats, float] | None:
-    """``x,y,r`` as a position and a radius in metres.
+    """Parse ``x,y,r`` as a position and a radius in metres.
 
     Raises:
-        UsageError: It is not that.
+        UsageError: The text does not have this form.
     """
     if text is None:
         return None

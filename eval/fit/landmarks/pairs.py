@@ -24,15 +24,15 @@ from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at
 MAX_PAIRS: Final = 1_000_000
 MAX_PAIR_BYTES: Final = 256 * MIB
 SAME_TURN_RAD: Final = math.pi / 4
-"""Pictures taken in directions further apart are not a pair of either kind when they are near."""
+"""Near pictures whose directions differ by more than this are not used as a pair."""
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
 
 
 def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
-    """Pairs named in a CSV file ``query,known,same``; picture names are relative to its folder.
+    """Score the pairs of a CSV file ``query,known,same``; picture names are relative to its folder.
 
     Raises:
-        AnnotationError: The table cannot be understood; names the line.
+        AnnotationError: The table is invalid; the message names the line.
         LogError: A picture cannot be read.
     """
 
@@ -86,19 +86,19 @@ def pairs_of_drive(
     max_per_frame: int,
     ledgers: Sequence[Ledger],
 ) -> ScoredPairs:
-    """Frames with known poses against landmarks: near ones show the same place, far ones do not.
+    """Score frames with known poses against landmarks; near ones are the same place, far ones not.
 
     Args:
-        frames: Of another drive than the landmarks', or the rates say too much.
-        poses: Of that drive.
+        frames: Frames of another drive than the landmarks' drive, else the rates are too good.
+        poses: Poses of that drive.
         database: The landmarks.
-        matcher: Scores.
-        every_m: Distance between frames that are taken.
-        near_m: Same place below, and looking the same way.
-        far_m: Another place above; what is between is not judged.
-        max_per_frame: Landmarks compared with one frame: all near ones first, then far ones drawn
-            with a fixed seed.
-        ledgers: Of all logs; pictures that do not decode are dropped in the camera's.
+        matcher: Matcher that computes the scores.
+        every_m: Distance between the frames used.
+        near_m: Max distance of the same place, if the directions also agree.
+        far_m: Min distance of different places; pairs in between are not used.
+        max_per_frame: Max number of landmarks compared with one frame: all near ones first, then
+            far ones drawn with a fixed seed.
+        ledgers: Ledgers of all logs; pictures that do not decode are dropped in the camera's.
     """
     marks = list(database)
     rng = np.random.default_rng(0)
@@ -143,7 +143,7 @@ def _columns(rows: list[tuple[float, bool, int]]) -> ScoredPairs:
 
 
 def with_min_score(text: str, min_score: float) -> str:
-    """A vehicle file's text with ``landmarks.min_score`` replaced; comments stay."""
+    """Return a vehicle file's text with ``landmarks.min_score`` replaced and comments kept."""
     document = tomlkit.parse(text)
     section = document.setdefault("landmarks", tomlkit.table())
     section["min_score"] = min_score

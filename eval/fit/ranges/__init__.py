@@ -1,1 +1,1 @@
-"""Height-to-range curves: pairs and their figure."""
+"""Fitting of height-to-range curves: training pairs and a figure."""

@@ -1,4 +1,4 @@
-"""Heights against ranges with the fitted curves, and residuals by distance (Fig. 22)."""
+"""Figure of heights against ranges with the fitted curves, and residuals by distance (Fig. 22)."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def draw(
     """Write the figure as PNG.
 
     Args:
-        path: Of the picture.
-        cue: What was measured.
-        pairs: Those fitted to.
-        fits: One for each family.
-        tested: The best curve's residuals on other pairs.
+        path: Path of the figure.
+        cue: The cue that was measured.
+        pairs: Pairs that the curves were fitted to.
+        fits: One fit for each family.
+        tested: The best curve with its residuals on other pairs.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -36,16 +36,16 @@ def draw(
     left.plot(pairs.height_px, pairs.range_m, ".", ms=2, color="#999999", label="pairs")
     height = np.linspace(pairs.height_px.min(), pairs.height_px.max(), 400)
     for fit, colour in zip(fits, COLOURS, strict=False):
-        said = f"{fit.curve.family}, s.d. {fit.curve.residual_sd_m:.2f} m"
-        left.plot(height, range_of(height, fit.curve), color=colour, lw=1.5, label=said)
+        label = f"{fit.curve.family}, s.d. {fit.curve.residual_sd_m:.2f} m"
+        left.plot(height, range_of(height, fit.curve), color=colour, lw=1.5, label=label)
     left.set(xlabel=f"height of the {what} [px]", ylabel="range to the rear axle [m]")
     left.set_ylim(0.0, 1.1 * float(pairs.range_m.max()))
     left.legend(fontsize=8)
     best = min(fits, key=lambda fit: fit.curve.residual_sd_m)
-    for of, said, colour in ((best, "fitted to", COLOURS[0]), (tested, "others", COLOURS[1])):
+    for of, label, colour in ((best, "fitted to", COLOURS[0]), (tested, "others", COLOURS[1])):
         if of is not None:
             middle = [(b.from_m + b.to_m) / 2 for b in of.bins]
-            right.plot(middle, [b.sd_m for b in of.bins], "o-", color=colour, label=said)
+            right.plot(middle, [b.sd_m for b in of.bins], "o-", color=colour, label=label)
     right.set(xlabel="range [m]", ylabel="r.m.s. residual [m]", title=best.curve.family)
     right.set_ylim(bottom=0.0)
     right.legend(fontsize=8)

@@ -1,4 +1,4 @@
-"""Pairs of an object's height in pixels and the true range it measures, to fit curves to."""
+"""Pairs of an object's height in pixels and its true range, to which curves are fitted."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from crosscue.replay.files.parquet import opened
 MAX_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
 REFERENCES: Final[Mapping[str, str]] = {"stop_sign": "start_m", "traffic_light": "end_m"}
-"""A stop sign measures the start of the intersection, a light its end."""
+"""Column of true ranges by cue: stop signs are at the intersection's start, lights at its end."""
 MIN_VISIBLE: Final = 0.9
-"""The height of an object that something hides says nothing about its range."""
+"""Min visible fraction of an object; the height of an occluded one does not show its range."""
 NEAREST_NS: Final = 20_000_000
-"""A detection belongs to the true range of a picture this near in time."""
+"""Max time difference between a detection and its true range."""
 
 
 class RangePairs(NamedTuple):
-    """N heights in pixels and true ranges of the rear axle in metres, along the path."""
+    """N heights in pixels, and true ranges of the rear axle along the path in metres."""
 
     height_px: Floats
     range_m: Floats
 
 
 def together(parts: Iterable[RangePairs]) -> RangePairs:
-    """Several as one."""
+    """Concatenate sets of pairs."""
     heights, ranges = zip(*parts, strict=True)
     return RangePairs(np.concatenate(heights), np.concatenate(ranges))
 
 
 def pairs_of_table(path: Path) -> RangePairs:
-    """From a CSV or Parquet file with the columns ``height_px`` and ``range_m``.
+    """Read pairs from a CSV or Parquet file with the columns ``height_px`` and ``range_m``.
 
     Raises:
-        AnnotationError: Not there, too large, or without these columns.
+        AnnotationError: The file does not exist, is too large, or lacks these columns.
     """
     try:
         columns = _parquet(path) if path.suffix == ".parquet" else _csv(path, RangePairs._fields)
@@ -70,7 +70,7 @@ def pairs_of_table(path: Path) -> RangePairs:
 
 
 def pairs_of_truth(truth: Path, cue: str) -> RangePairs:
-    """From a drive's annotated objects, those that nothing hides and no edge cuts.
+    """Return pairs from a drive's annotated objects that are neither occluded nor truncated.
 
     Args:
         truth: ``truth.json``, or its folder.
@@ -97,13 +97,13 @@ def pairs_of_truth(truth: Path, cue: str) -> RangePairs:
 
 
 def pairs_of_run(run: Path, truth: Path, cue: str, score: float) -> RangePairs:
-    """From what detectors found in a run.
+    """Return pairs from the detections of a run.
 
     Args:
         run: A run folder with ``detections.parquet``.
-        truth: Of its drive.
+        truth: Truth of its drive.
         cue: ``stop_sign`` or ``traffic_light``.
-        score: Detections must have more.
+        score: Threshold that the scores of detections must exceed.
 
     Raises:
         UnreadableRunError: The run has no detections.
@@ -134,7 +134,7 @@ def _paired(rows: list[tuple[int, float]], t_ns: Int64s, range_m: Floats) -> Ran
 
 
 def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
-    """Times and ranges of a drive's pictures, sorted."""
+    """Return the times and true ranges of a drive's pictures, sorted by time."""
     name = load(truth).ranges
     if name is None:
         raise SchemaError(f"{truth}: has no ranges; name a file with them as ranges")
@@ -173,7 +173,7 @@ def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
     if set(names) - set(reader.fieldnames or ()):
         raise KeyError(names)
     rows = list(reader)
-    # Nanoseconds since 1970 are kept to 256 ns, which is near enough to find a picture by.
+    # As float64, nanoseconds since 1970 are exact to 256 ns, enough to identify a picture.
     return tuple(np.array([float(row[name] or "nan") for row in rows]) for name in names)
 
 

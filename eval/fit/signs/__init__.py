@@ -1,1 +1,1 @@
-"""Threshold of the sign detector: drives, labels, scores."""
+"""Fitting of the sign detector's threshold to labelled pictures and drives."""

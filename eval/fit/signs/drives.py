@@ -1,4 +1,4 @@
-"""The pictures of a drive with the signs that its truth has in them."""
+"""Pictures of a drive, labelled with the signs of its truth."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ MAX_BYTES: Final = 512 * MIB
 
 
 def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[Labelled]:
-    """All annotated pictures of a drive's folder, in the order of the log.
+    """Yield all annotated pictures of a drive's folder, in the order of the log.
 
     Raises:
-        AnnotationError: The folder is not a drive's, or has no annotated objects with times.
+        AnnotationError: The folder is not a drive, or has no annotated objects with times.
         LogError: The log cannot be read, or has no camera.
     """
     drives = drives_of([str(folder)])
@@ -51,11 +51,11 @@ def _boxes(path: Path) -> dict[int, Boxes]:
         text = content.decode("utf-8")
     except OSError as error:
         raise AnnotationError(
-            f"{path}: {error.strerror}; labels of a drive's signs stand there"
+            f"{path}: {error.strerror}; expected labels of the drive's signs"
         ) from None
     except UnicodeDecodeError:
         raise AnnotationError(
-            f"{path}: is not text; labels of a drive's signs stand there"
+            f"{path}: is not text; expected labels of the drive's signs"
         ) from None
     found: dict[int, Boxes] = {}
     for image, boxes in coco_boxes(text, path):

@@ -16,7 +16,7 @@ MAX_BYTES: Final = 64 * MIB
 _WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
 
 Boxes = dict[str, list[tuple[float, float, float, float]]]
-"""From label to boxes (x0, y0, x1, y1) in pixels."""
+"""Boxes (x0, y0, x1, y1) in pixels by label."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +24,9 @@ class Labelled:
     """One picture and its true signs.
 
     Attributes:
-        name: What a person may look for.
-        picture: Its bytes, or where they are.
-        boxes: Its signs.
+        name: Readable name, for messages.
+        picture: Content of the picture, or its path.
+        boxes: Boxes of its signs.
     """
 
     name: str
@@ -35,10 +35,10 @@ class Labelled:
 
 
 def read_labels(path: Path) -> list[Labelled]:
-    """Read a CSV file, where an empty label says that the picture has no sign, or COCO (.json).
+    """Read a COCO file (.json) or a CSV file; an empty CSV label marks a picture without signs.
 
     Raises:
-        AnnotationError: Not there, not such a file, or a box that is not one; with the line.
+        AnnotationError: The file does not exist or is invalid; the message names the line.
     """
     text = _text(path)
     return _of_coco(text, path) if path.suffix == ".json" else _of_csv(text, path)
@@ -57,7 +57,7 @@ def _text(path: Path) -> str:
 
 
 def _of_coco(text: str, path: Path) -> list[Labelled]:
-    """Pictures are beside the file or in a folder ``images`` beside it."""
+    """Read a COCO file whose pictures are next to it or in a folder ``images`` next to it."""
     found = []
     for image, boxes in coco_boxes(text, path):
         try:
@@ -70,10 +70,10 @@ def _of_coco(text: str, path: Path) -> list[Labelled]:
 
 
 def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
-    """The images of a COCO file with their boxes, by id.
+    """Return the images of a COCO file with their boxes, by id.
 
     Raises:
-        AnnotationError: It is not one, holds no image, or a box is not one.
+        AnnotationError: The file is not COCO, has no image, or has an invalid box.
     """
     try:
         tree = json_tree(text)
@@ -86,7 +86,7 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
             box = (x, y, x + wide, y + high)
             if not all(map(math.isfinite, box)) or wide <= 0.0 or high <= 0.0:
                 raise AnnotationError(
-                    f"{path}: annotation {one['id']}: box {box}: expected a real one"
+                    f"{path}: annotation {one['id']}: box {box}: expected positive width and height"
                 )
             found[one["image_id"]][1].setdefault(names[one["category_id"]], []).append(box)
     except (ValueError, KeyError, TypeError) as error:

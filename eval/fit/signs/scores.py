@@ -1,4 +1,4 @@
-"""How good a sign detector is on labelled pictures: of files, or of drives with truth."""
+"""Scoring of a sign detector on labelled pictures, from files or from drives with truth."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from crosscue.replay.base import DEFAULT_LIMITS, Floats, Limits, LogError, Usage
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What of labelled pictures is asked, and what is right.
+    """Rules by which detections are scored.
 
     Attributes:
-        labels: The signs to find.
-        min_overlap: With the true box (intersection over union).
-        min_height_px: True signs that are lower do not count.
+        labels: Labels of the signs to find.
+        min_overlap: Min intersection over union with the true box.
+        min_height_px: Min height of a true sign; smaller ones do not count.
     """
 
     labels: Sequence[str]
@@ -33,26 +33,26 @@ class Rules:
 
     @property
     def of_judge(self) -> tuple[float, float]:
-        """As ``judge`` takes them."""
+        """Arguments of ``judge``."""
         return self.min_overlap, self.min_height_px
 
 
 def judged_pictures(
     path: Path, detector: Detector, rules: Rules, every: slice, limits: Limits = DEFAULT_LIMITS
 ) -> Judged:
-    """What a detector finds in some of a file's or drive's pictures, and what of it is right.
+    """Return a detector's detections in pictures of a file or drive, judged by the labels.
 
     Args:
-        path: Of a file with labels, or a drive's folder.
-        detector: For signs.
-        rules: Of judging.
-        every: Which pictures.
-        limits: For reading a drive's log.
+        path: A file with labels, or a drive's folder.
+        detector: Detector of signs.
+        rules: Rules of scoring.
+        every: Slice of the pictures to use.
+        limits: Limits for reading a drive's log.
 
     Raises:
-        UsageError: No such file, or a box outside its picture.
+        UsageError: The file does not exist, or a box is outside its picture.
         LogError: A picture or a drive's log cannot be read.
-        SchemaError: A drive has no truth, or it does not fit.
+        SchemaError: A drive has no truth, or its truth is invalid.
     """
     chosen = islice(_labelled(path, limits), every.start, every.stop, every.step)
     return together([_judged(one, detector, rules) for one in chosen])

@@ -1,4 +1,4 @@
-"""The sign threshold for a required precision: chosen on some pictures, measured on others."""
+"""Choice of the sign threshold for a required precision, measured on other pictures."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Limits, UsageError
 
 Progress = Callable[[Iterable[Judged], Callable[[], tuple[int, int]]], Iterable[Judged]]
-"""Passes parts on while it shows how far the work is; the second argument returns parts done, and
-of how many."""
+"""Function that passes parts through and shows progress; the second argument returns the number of
+parts done and the total."""
 
 LOWEST: Final = 0.05
 
@@ -34,12 +34,12 @@ class SignRates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignFit:
-    """A threshold, and what pictures say of any.
+    """A threshold and the judged detections behind it.
 
     Attributes:
-        threshold: For ``min_score``; None where none is precise enough.
-        chosen_on: What the pictures say that chose it, a part for each file or drive.
-        others: The same of the pictures that measure it.
+        threshold: Value for ``min_score``; None if no threshold is precise enough.
+        chosen_on: Detections on which it was chosen, a part for each file or drive.
+        others: Detections on which it is measured, in the same form.
     """
 
     threshold: float | None
@@ -47,7 +47,7 @@ class SignFit:
     others: Sequence[Judged]
 
     def rates(self, threshold: float, *, on_others: bool = True) -> SignRates:
-        """Precision and recall at any threshold, on the pictures that did not choose."""
+        """Return precision and recall at any threshold, by default on the held-out pictures."""
         parts = self.others if on_others else self.chosen_on
         counts = [rates_at(part, threshold) for part in parts]
         return SignRates(
@@ -56,7 +56,7 @@ class SignFit:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue fit signs --json`` prints."""
+        """Return the object that ``crosscue fit signs --json`` prints."""
         tree: dict[str, object] = {"min_score": self.threshold}
         of = self.threshold
         for name, on_others in (("chosen_on", False), ("other_frames", True)):
@@ -96,29 +96,30 @@ def fit_signs(
 ) -> SignFit:
     """Choose the sign detector's threshold for a required precision.
 
-    Every second picture chooses, the others measure, unless ``test`` names other pictures.
+    The threshold is chosen on every second picture and measured on the others, unless ``test``
+    names other pictures.
 
     Args:
         labels: CSV files ``picture,label,x0,y0,x1,y1``, COCO files, or folders of drives.
         label: The labels to choose one threshold for.
         test: Other files or drives to measure on.
         test_every: Measure on every Nth picture only.
-        kinds: Drawings to look for.
-        precision: Required, above 0 and up to 1.
-        threshold: Measure this one instead of choosing.
-        overlap: With the true box, to be right.
-        min_height_px: Lower true signs count neither as found nor as missed.
-        crop_top: Fraction of the picture that is not searched.
-        crop_bottom: Likewise.
-        enlarge: The first level of the pyramid, for small signs.
-        levels: Of the pyramid.
-        points: Kept at a level.
-        limits: What drives' logs are read with.
-        progress: Passes the parts on while it shows how far the work is.
+        kinds: Drawings to search for.
+        precision: Required precision, above 0 and up to 1.
+        threshold: Measure this threshold instead of choosing one.
+        overlap: Min intersection over union of a right detection with the true box.
+        min_height_px: Min height of a true sign; smaller ones count neither as found nor as missed.
+        crop_top: Fraction of the picture that is not searched, at the top.
+        crop_bottom: Fraction that is not searched, at the bottom.
+        enlarge: Enlargement of the first level of the pyramid, for small signs.
+        levels: Number of levels of the pyramid.
+        points: Number of points kept at a level.
+        limits: Limits for reading drives' logs.
+        progress: Function that passes the parts through and shows progress.
 
     Raises:
-        UsageError: A value out of range.
-        EmptyResultError: Pictures without such a sign.
+        UsageError: A value is out of range.
+        EmptyResultError: The pictures contain no such sign.
     """
     _check(precision, overlap, test_every, threshold, kinds)
     detector = build(
@@ -142,7 +143,7 @@ def fit_signs(
     chosen_on, others = parts[: len(labels)], parts[len(labels) :]
     if not sum(part.signs for part in chosen_on):
         raise EmptyResultError(
-            f"{labels[0]}: no {' or '.join(label)} in the pictures that choose; add some"
+            f"{labels[0]}: no {' or '.join(label)} in the pictures to choose on; add some"
         )
     if threshold is None:
         threshold = _shown(threshold_for(together(chosen_on), precision))
@@ -165,7 +166,7 @@ def _check(
 
 
 def _shown(score: float | None) -> float | None:
-    """With as many digits as are printed, rounded down: rates are those of that number."""
+    """Round a score down to the printed digits, so that rates belong to the printed number."""
     return None if score is None else math.floor(score * 1e6) / 1e6
 
 

@@ -209,7 +209,7 @@ def test_a_class_with_few_labels_is_left_as_it_is_and_said(drive: Path, tmp_path
     found = crosscue.fit_detector(drive / "run", tmp_path, output)
 
     assert not found.has_threshold
-    assert "20 needed: left as it is" in repr(found)
+    assert "20 needed: not fitted" in repr(found)
     assert not output.exists()
 
 
