@@ -115,9 +115,7 @@ class DriveList:
             UsageError: The list is a single drive.
         """
         if not self.is_many:
-            raise UsageError(
-                f"--shard {shard}: expected many drives, found one (--each makes it many)"
-            )
+            raise UsageError(f"--shard {shard}: expected many drives, found one; add --each")
         mine = tuple(one for one in self.drives if shard.holds(one.identity))
         return replace(self, drives=mine, shard=shard, of=len(self.drives))
 

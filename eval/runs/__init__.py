@@ -1,1 +1,1 @@
-"""A run on disk: its folder, tables and manifest."""
+"""Runs on disk: folder, tables, manifest and account."""

@@ -1,12 +1,13 @@
-"""One account per run: what became of every row, frame and reading, over all stages.
+"""The account of a run: every row, frame and reading of all stages, by outcome.
 
-For every topic of every log, and for every stream that a stage takes in::
+For every topic of every log, and for every input stream of a stage::
 
     in = used + skipped (by reason) + dropped (by reason)
 
-The manifest holds it under ``account``: *reading* has the topics of each log; *detecting* the
-camera's frames; *estimating* what the filters take. ``score`` adds *scoring* to ``metrics.json``.
-What was used is counted by who used it, so the identity can fail; that is a bug in crosscue.
+The manifest contains it as ``account``: *reading* covers the topics of each log, *detecting* the
+camera's frames, and *estimating* the inputs of the filters. ``score`` adds *scoring* to
+``metrics.json``. Used rows are counted independently by their consumer, so the identity can fail;
+that is a bug in crosscue.
 """
 
 from __future__ import annotations
@@ -32,25 +33,25 @@ from .record import Record
 REASONS_SHOWN: Final = 20
 DETAILS_SHOWN: Final = 5
 UNATTRIBUTED: Final = ""
-"""The topic of what no topic can be named for."""
+"""Name for rows whose topic is unknown."""
 _ROWS: Final = {
     "reading": "rows", "detecting": "frames", "estimating": "readings", "scoring": "judgements",
 }  # fmt: skip
 
 
 class Counts(Record):
-    """What became of one stream of a stage: in = used + skipped + dropped."""
+    """Counts of one stream of a stage: in = used + skipped + dropped."""
 
     entered: int = Field(validation_alias="in", serialization_alias="in")
     used: int
     skipped: dict[str, int]
-    """By reason."""
+    """Number of skipped rows by reason."""
     dropped: dict[str, int]
-    """By reason."""
+    """Number of dropped rows by reason."""
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Reasons for which a number that cannot be known was dropped."""
+        """Reasons for which an unknown number of rows was dropped."""
         return ()
 
 
@@ -58,11 +59,11 @@ class Line(Counts):
     """One stream of a stage of one drive."""
 
     dropped_unknown: tuple[str, ...] = ()
-    """Reasons for which a number that cannot be known was dropped."""
+    """Reasons for which an unknown number of rows was dropped."""
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """The same."""
+        """The same as ``dropped_unknown``."""
         return self.dropped_unknown
 
 
@@ -70,9 +71,9 @@ class TopicLine(Line):
     """One topic of a log."""
 
     declared: int | None
-    """What the log itself says it holds."""
+    """Number of rows that the log itself declares; None if it declares none."""
     found: int
-    """Rows met in its bytes."""
+    """Number of rows found in its bytes."""
 
 
 class SummedLine(Counts):
@@ -83,14 +84,14 @@ class SummedLine(Counts):
 
 
 class LogAccount(Record):
-    """What became of every row of one log."""
+    """Account of every row of one log."""
 
     log: str
     integrity: str
     is_whole: bool
     notices: tuple[str, ...]
     topics: dict[str, TopicLine]
-    """The empty name holds what no topic can be named for."""
+    """Account by topic; the empty name is for rows whose topic is unknown."""
 
 
 class Account(Record):
@@ -98,14 +99,14 @@ class Account(Record):
 
     reading: tuple[LogAccount, ...]
     detecting: dict[str, Line]
-    """By camera."""
+    """Frames by camera."""
     estimating: dict[str, Line]
-    """By stream."""
+    """Inputs of the filters by stream."""
     is_whole: bool
-    """Nothing was dropped in any stage."""
+    """True if no row was dropped in any stage."""
 
     def lines(self) -> Iterator[tuple[str, str, Counts]]:
-        """Stage, name and counts of everything, in order."""
+        """Yield stage, name and counts of every stream, in order."""
         for log in self.reading:
             yield from _named("reading", log.topics)
         yield from _named("detecting", self.detecting)
@@ -113,7 +114,7 @@ class Account(Record):
 
 
 class ScoredAccount(Account):
-    """The account of one run that was laid beside its truth."""
+    """The account of one run that was scored."""
 
     scoring: dict[str, Line]
 
@@ -124,10 +125,10 @@ class ScoredAccount(Account):
 
 
 class SummedAccount(Record):
-    """The accounts of many runs added up."""
+    """Sums of the accounts of many runs."""
 
     reading: dict[str, SummedLine]
-    """By topic."""
+    """Sums by topic."""
     detecting: dict[str, SummedLine]
     estimating: dict[str, SummedLine]
     scoring: dict[str, SummedLine]
@@ -160,7 +161,7 @@ def line(
     dropped: Mapping[str, int] | None = None,
     unknown: Iterable[str] = (),
 ) -> Line:
-    """One stream of a stage; reasons that nothing was left out for are left out."""
+    """Return the line of one stream of a stage, without reasons whose count is zero."""
     return Line(
         entered=entered,
         used=used,
@@ -175,15 +176,15 @@ def account(
     detecting: Mapping[str, Line] | None = None,
     estimating: Mapping[str, Line] | None = None,
 ) -> Account:
-    """The account of a run, checked.
+    """Return the account of a run after checking it.
 
     Args:
         reading: ``account_of`` each log.
-        detecting: By camera.
-        estimating: By stream.
+        detecting: Frames by camera.
+        estimating: Inputs of the filters by stream.
 
     Raises:
-        AccountError: It does not add up.
+        AccountError: The account does not balance.
     """
     stages = {**(detecting or {}), **(estimating or {})}.values()
     topics = [one for log in reading for one in log.topics.values()]
@@ -199,17 +200,17 @@ def account(
 
 
 def detecting_of(camera: str, ledger: Ledger, frames: int) -> dict[str, Line]:
-    """The camera's frames: ``frames`` is what detectors were given, by their own count."""
+    """Return the line of the camera; ``frames`` is the detectors' own count of frames."""
     topic = ledger.topic(camera)
     unknown = sorted(set(topic.dropped_unknown))
     return {camera: line(topic.in_file, frames, topic.skipped, topic.dropped, unknown)}
 
 
 def check(of: HasLines) -> None:
-    """Hold every line to in = used + skipped + dropped.
+    """Check that in = used + skipped + dropped in every line.
 
     Raises:
-        AccountError: One does not add up, or a count is below zero.
+        AccountError: A line does not balance, or a count is negative.
     """
     for stage, name, one in of.lines():
         parts = [one.used, *one.skipped.values(), *one.dropped.values()]
@@ -222,7 +223,7 @@ def check(of: HasLines) -> None:
 
 
 def account_of(ledger: Ledger) -> LogAccount:
-    """One log's account."""
+    """Return the account of one log."""
     return LogAccount(
         log=ledger.log,
         integrity=ledger.integrity,
@@ -245,10 +246,10 @@ def _topic_line(of: Counted) -> TopicLine:
 
 
 def reading_of(ledgers: Iterable[Ledger]) -> list[LogAccount]:
-    """The part on reading, each log's ledger checked.
+    """Return the accounts of reading after checking each log's ledger.
 
     Raises:
-        AccountError: One does not add up.
+        AccountError: A ledger does not balance.
     """
     found = []
     for ledger in ledgers:
@@ -260,7 +261,7 @@ def reading_of(ledgers: Iterable[Ledger]) -> list[LogAccount]:
 def joined_accounts(
     ours: Sequence[LogAccount], earlier: Sequence[LogAccount], topic: str
 ) -> list[LogAccount]:
-    """Accounts of one stage with that of ``topic`` taken from an earlier one, which read it."""
+    """Return a stage's accounts, with ``topic`` taken from the earlier stage that read it."""
     logs = {one.log: one for one in earlier}
     return [_joined(one, logs.get(one.log), topic) for one in ours]
 
@@ -281,10 +282,10 @@ def _joined(ours: LogAccount, before: LogAccount | None, topic: str) -> LogAccou
 
 
 def summed(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
-    """The accounts of many runs added up, topic by topic.
+    """Return the sums of the accounts of many runs, topic by topic.
 
     Raises:
-        AccountError: One does not add up.
+        AccountError: An account does not balance.
     """
     whole = True
     totals: dict[tuple[str, str], SummedLine] = {}
@@ -323,7 +324,7 @@ def _plus(total: SummedLine | None, counts: Counts) -> SummedLine:
 
 
 def account_lines(of: HasLines) -> list[str]:
-    """The account for a person: a line for each stage, then what was left out and why."""
+    """Return the account as text: a line for each stage, then a line for each reason."""
     head, reasons = [], []
     for stage, noun in _ROWS.items():
         mine = [one for at, _, one in of.lines() if at == stage]
@@ -340,22 +341,22 @@ def account_lines(of: HasLines) -> list[str]:
             (False, f"dropped an unknown number of {stage} {name or 'unknown topics'}: {why}")
             for why in one.unknown
         ]
-    said = [text for _, text in sorted(reasons, key=lambda reason: reason[0])]
-    if len(said) > REASONS_SHOWN:
-        said[REASONS_SHOWN:] = [f"and {len(said) - REASONS_SHOWN} reasons more: manifest.json"]
+    shown = [text for _, text in sorted(reasons, key=lambda reason: reason[0])]
+    if len(shown) > REASONS_SHOWN:
+        shown[REASONS_SHOWN:] = [f"and {len(shown) - REASONS_SHOWN} more reasons: manifest.json"]
     if _has_damaged_logs(of):
-        said.append("to write what can be read: crosscue convert LOG -o OUT.mcap --salvage")
+        shown.append("to write what can be read: crosscue convert LOG -o OUT.mcap --salvage")
     titles = ["account", *[""] * (len(head) - 1)]
     return [f"{title:9}{text}" for title, text in zip(titles, head, strict=True)] + [
-        f"  {text}" for text in said
+        f"  {text}" for text in shown
     ]
 
 
 def details_of(ledgers: Iterable[Ledger]) -> list[str]:
-    """Where and why the first rows were dropped."""
+    """Return location and reason of the first dropped rows."""
     found = [one for ledger in ledgers for one in ledger.drops() if one.detail]
-    said = [f"dropped  {one.topic or 'rows'}: {one.reason}: {one.detail}" for one in found]
-    return said[:DETAILS_SHOWN]
+    shown = [f"dropped  {one.topic or 'rows'}: {one.reason}: {one.detail}" for one in found]
+    return shown[:DETAILS_SHOWN]
 
 
 def _in_words(of: Sequence[Counts], noun: str) -> str:
@@ -367,7 +368,10 @@ def _in_words(of: Sequence[Counts], noun: str) -> str:
 
 
 def _has_damaged_logs(of: HasLines) -> bool:
-    """Were rows dropped in reading? Those that differ from a seal, or do not decode, were not."""
+    """Return whether rows were dropped because a log is damaged.
+
+    Rows that differ from a seal or do not decode do not count.
+    """
     reasons: dict[str, set[str]] = {"reading": set(), "detecting": set()}
     for stage, _, one in of.lines():
         if stage in reasons:

@@ -1,4 +1,4 @@
-"""What became of the candidates of cues and ranges, as the manifest and the summary report it."""
+"""Counts of the candidates of cues and ranges by outcome, for the manifest and the summary."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from .record import Record
 
 
 class CandidateRow(Record):
-    """Of one cue or range: ``seen`` = ``used`` + all ``skipped``."""
+    """Candidates of one cue or range: ``seen`` = ``used`` + all ``skipped``."""
 
     unit: Literal["detections", "frames"]
-    """Detections with one of the cue's labels, or frames with road in its region."""
+    """Unit of the counts: detections with the cue's labels, or frames with road in its region."""
     setting: str | None
-    """Where the threshold is set in the vehicle file; None where it has none."""
+    """Setting of the threshold in the vehicle file; None if it has none."""
     threshold: float | None
-    """Only a higher score, or fraction of road, counts."""
+    """Score, or fraction of road, that a candidate must exceed."""
     seen: int
     used: int
     skipped: dict[str, int]
-    """By reason."""
+    """Number of skipped candidates by reason."""
     max_score: float | None
-    """The highest score, or fraction of road, met."""
+    """Highest score, or fraction of road, of all candidates."""
 
 
 def candidate_rows(found: Mapping[str, Candidates]) -> dict[str, CandidateRow]:
-    """As the manifest holds them."""
+    """Return candidates as rows of the manifest."""
     return {
         cue: CandidateRow(
             unit=one.unit,
@@ -46,10 +46,10 @@ def candidate_rows(found: Mapping[str, Candidates]) -> dict[str, CandidateRow]:
 def candidate_lines(
     cues: Mapping[str, CandidateRow], ranged: Mapping[str, CandidateRow]
 ) -> list[str]:
-    """A sentence for each cue and range that something was skipped for; alike ones together.
+    """Return a sentence for each cue and range with skipped candidates; equal ones are merged.
 
-    A road cue gets one only where it never was: a region that is not road is nothing that was
-    skipped.
+    A road cue gets a sentence only if it was never positive, because a region without road is not a
+    skipped candidate.
     """
     reported: dict[str, list[str]] = {}
     for cue, one in cues.items():
@@ -60,7 +60,7 @@ def candidate_lines(
 
 
 def not_looked_lines(cues: Mapping[str, str]) -> list[str]:
-    """A sentence for each reason for which cues were not looked for."""
+    """Return a sentence for each reason why cues were not evaluated."""
     same: dict[str, list[str]] = {}
     for cue, why in cues.items():
         same.setdefault(why, []).append(cue)
@@ -86,7 +86,7 @@ def _text_of(one: CandidateRow) -> str:
 
 
 def _range_text(cue: str, one: CandidateRow) -> list[str]:
-    """Scores belong to the cue and are reported there."""
+    """Return the sentences of a range; scores are reported with its cue."""
     skipped = {why: number for why, number in one.skipped.items() if why != BELOW_SCORE}
     things = f"{cue.replace('_', ' ')}s"
     lines = []
@@ -94,7 +94,7 @@ def _range_text(cue: str, one: CandidateRow) -> list[str]:
     if unmeasured:
         lines.append(
             f"range: {unmeasured:,} {things} measured, no curve: [ranges.{cue}] is not given; "
-            "crosscue fit ranges, or for ranges from motion give camera.focal_px and leave out "
+            "crosscue fit ranges, or for ranges from motion set camera.focal_px and leave out "
             "ranges.kind"
         )
     if skipped:

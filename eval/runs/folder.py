@@ -1,7 +1,7 @@
-"""The run folder: where stages meet on disk.
+"""The run folder, in which the stages exchange their results.
 
-Files get their final name only when whole. One lock file names the process at work. The records of
-the manifest, the account and what became of candidates are imported from here as well.
+A file gets its final name only when it is complete. A lock file names the process that is writing.
+The records of the manifest, the account and the candidates can be imported from here as well.
 """
 
 from __future__ import annotations
@@ -138,14 +138,14 @@ __all__ = [
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 INPUT: Final = "input.json"
-"""What a run is made of, written before anything else: a run cut short has no manifest."""
+"""Inputs of a run, written first, because an interrupted run has no manifest."""
 FAILURE: Final = "failure.log"
-"""Why the last attempt at a run failed; a finished run takes its place."""
+"""Error of the last attempt at a run; removed when the run finishes."""
 MAX_MANIFEST_BYTES: Final = 256 << 20
 TAGS: Final = "tags.json"
-"""What its users call a run; it stays when the run is made again. See ``tags``."""
+"""The user's tags of a run, see ``tags``; they are kept when the run is made again."""
 STAGED: Final = ".new"
-"""Folder inside a run that holds what is to replace it, until that is whole."""
+"""Folder inside a run with the files that will replace it when they are complete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,10 +153,10 @@ class RunFolder(TableFolder):
     """A run's folder; make one with ``create`` or ``open_run``.
 
     Attributes:
-        logs: A folder that its logs have moved to, or None where they are as the manifest says.
-        without_images: Is it to be shown without the pictures in its logs?
-        limits: What its logs are read with.
-        home: Where it will lie, if it is still being made elsewhere; see ``staged``.
+        logs: Folder to which the logs have moved; None if they are where the manifest states.
+        without_images: True to show the run without the pictures in its logs.
+        limits: Limits for reading the logs.
+        home: Final location of a run that is being written elsewhere, see ``staged``.
     """
 
     logs: Path | None = None
@@ -165,10 +165,10 @@ class RunFolder(TableFolder):
     home: Path | None = None
 
     def manifest(self) -> Manifest:
-        """The manifest as read.
+        """Read the manifest.
 
         Raises:
-            RunError: Not there, damaged, or of another version of crosscue.
+            RunError: The manifest is missing, damaged, or of another version of crosscue.
         """
         path = self.file(MANIFEST)
         try:
@@ -189,39 +189,41 @@ class RunFolder(TableFolder):
             ) from None
 
     def drive_manifest(self) -> DriveManifest:
-        """The manifest of a run of one drive.
+        """Read the manifest of a run of one drive.
 
         Raises:
-            RunError: It holds many drives, or tables of ``crosscue decode``; else as ``manifest``.
+            RunError: The folder holds many drives or tables of ``crosscue decode``, or as for
+                ``manifest``.
         """
         found = self.manifest()
         if isinstance(found, MergedManifest):
             raise RunError(
-                f"{self.path}: holds the tables of many drives; give one of the runs beside it"
+                f"{self.path}: holds the tables of many drives; give one of the runs next to it"
             )
         if isinstance(found, DecodeManifest):
             raise RunError(f"{self.path}: holds tables of crosscue decode; give a run of replay")
         return found
 
     def refuse_set_back(self, what: str) -> None:
-        """Refuse a run whose times do not fit the truth's, for ``what`` compares them.
+        """Refuse a run whose times are not those of the truth, because ``what`` compares them.
 
         Raises:
-            RunError: A clock was set back during the drive; else as ``drive_manifest``.
+            RunError: A clock was set back during the drive, or as for ``drive_manifest``.
         """
         if self.drive_manifest().timeline.was_set_back:
             raise RunError(
                 f"{self.path}: a clock was set back during the drive, so its times are not the "
-                f"truth's; {what} takes drives without: replay each side alone with --from and --to"
+                f"truth's, as {what} needs; replay each side alone with --from and --to"
             )
 
 
 def create(path: Path, *, overwrite: bool) -> RunFolder:
-    """An empty run folder.
+    """Create an empty run folder.
 
     Raises:
-        RunError: It exists and is not empty, or is not a folder, and ``overwrite`` is not given.
-        OutputError: It cannot be made.
+        RunError: The path is a file, or a folder that is not empty; the files of an earlier run
+            are accepted with ``overwrite``.
+        OutputError: The folder cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -240,11 +242,11 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
 
 @contextmanager
 def created(path: Path, *, overwrite: bool) -> Iterator[RunFolder]:
-    """As ``create``; a folder that was not there before goes again if it stays empty.
+    """Create a run folder as ``create`` does, and remove a new one again if it stays empty.
 
     Raises:
-        RunError: As ``create``.
-        OutputError: As ``create``.
+        RunError: As for ``create``.
+        OutputError: As for ``create``.
     """
     is_new = not path.exists()
     run = create(path, overwrite=overwrite)
@@ -252,23 +254,24 @@ def created(path: Path, *, overwrite: bool) -> Iterator[RunFolder]:
         yield run
     except BaseException:
         if is_new:
-            # Not where a run cut short has left files.
+            # The folder is kept if an interrupted run has left files.
             with suppress(OSError):
                 path.rmdir()
         raise
 
 
 def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
-    """Delete an earlier run's files; the lock and its tags stay. Call it while holding the lock.
+    """Delete an earlier run's files except the lock and the tags; call it while holding the lock.
 
-    The manifest goes first: a folder that has one is a whole run, even if this is cut short.
+    The manifest is deleted first, so that a folder with a manifest is a complete run even if this
+    is interrupted.
 
     Args:
         run: The folder.
-        content: Of ``input.json``, which says from now on what is being made here.
+        content: New content of ``input.json``, which describes the run that follows.
 
     Raises:
-        OutputError: One cannot be deleted.
+        OutputError: A file cannot be deleted.
     """
     try:
         run.file(MANIFEST).unlink(missing_ok=True)
@@ -290,15 +293,15 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
 def staged(
     run: RunFolder, *, keep: bool = False, until: Manifest | None = None
 ) -> Iterator[RunFolder]:
-    """A place to write what replaces a finished run; that is touched only once this is whole.
+    """Yield a folder for files that replace a finished run once they are complete.
 
-    Without a finished run there is nothing to protect, and the place is the run itself. Call it
+    Without a finished run there is nothing to protect, and the folder is the run itself. Call it
     while holding the lock.
 
     Args:
         run: The run.
-        keep: Begin with its files, and leave those that nothing replaces.
-        until: What the manifest says while files are replaced; without it none exists so long.
+        keep: Start with the run's files, and keep those that are not replaced.
+        until: Manifest while files are being replaced; None for no manifest during that time.
 
     Raises:
         OutputError: The folder cannot be written.
@@ -325,7 +328,7 @@ def staged(
 
 
 def _link_files(run: RunFolder, new: RunFolder) -> None:
-    """The run's files under a second name each: a file is never changed, only replaced."""
+    """Hard-link the run's files, which is safe because files are replaced and never modified."""
     for entry in run.path.iterdir():
         if entry.name == LOCK or not entry.is_file():
             continue
@@ -336,7 +339,7 @@ def _link_files(run: RunFolder, new: RunFolder) -> None:
 
 
 def _swap(run: RunFolder, new: RunFolder, keep: bool, until: Manifest | None) -> None:
-    """Put the new files in place of the old ones; the manifest goes first and comes last."""
+    """Replace the old files by the new ones; remove the manifest first and write it last."""
     if until is None:
         run.file(MANIFEST).unlink()
     else:
@@ -360,16 +363,16 @@ def open_run(
     without_images: bool = False,
     limits: Limits = DEFAULT_LIMITS,
 ) -> RunFolder:
-    """An existing run folder, its manifest checked.
+    """Open an existing run folder and check its manifest.
 
     Args:
         path: The folder.
-        logs: Where its logs have moved to, if they have.
-        without_images: Show it without the pictures in its logs.
-        limits: What its logs are read with.
+        logs: Folder to which its logs have moved, if any.
+        without_images: Show the run without the pictures in its logs.
+        limits: Limits for reading its logs.
 
     Raises:
-        RunError: As ``RunFolder.manifest``; ``logs`` is not a folder.
+        RunError: As for ``RunFolder.manifest``, or ``logs`` is not a folder.
     """
     if logs is not None and not logs.is_dir():
         raise UnreadableRunError(f"{logs}: not a folder; give the one that the logs have moved to")
@@ -388,13 +391,13 @@ def _looks_like_run(entries: list[Path]) -> bool:
 
 @contextmanager
 def locked(run: RunFolder) -> Iterator[None]:
-    """Hold the folder for this process.
+    """Lock the folder for this process.
 
-    The kernel keeps the lock and drops it when its holder dies, however that happens; the file's
-    text says who holds it, which is all there is where a network file system has no such locks.
+    The kernel releases the lock when its holder dies for any reason. The file's text names the
+    holder, which is the only protection on network file systems without locks.
 
     Raises:
-        RunError: Another living process holds it; it is named.
+        RunError: Another living process holds the lock; the message names it.
         OutputError: The folder cannot be written.
     """
     path = run.file(LOCK)
@@ -407,13 +410,13 @@ def locked(run: RunFolder) -> Iterator[None]:
         shutil.rmtree(run.file(STAGED), ignore_errors=True)
         yield
     finally:
-        # Gone from the folder before it is free, so that nobody waits for a file without a name.
+        # Delete the file before releasing it, so that no process waits for a deleted file.
         path.unlink(missing_ok=True)
         os.close(handle)
 
 
 def _lock_file(path: Path) -> int:
-    """The folder's lock file, open, locked, and with our name in it."""
+    """Return the folder's lock file, opened, locked and signed by this process."""
     while True:
         handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
         try:
@@ -429,7 +432,7 @@ def _lock_file(path: Path) -> int:
 
 
 def _sign(handle: int, path: Path) -> None:
-    """Write into the lock who holds it; a lock that cannot be written is taken away."""
+    """Write the holder into the lock file; delete the file if that fails."""
     try:
         os.ftruncate(handle, 0)
         os.pwrite(handle, signature().encode(), 0)
@@ -440,17 +443,17 @@ def _sign(handle: int, path: Path) -> None:
 
 
 def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool | None) -> None:
-    """Refuse when the kernel knows of a holder, or, where it cannot, the lock's text names one.
+    """Refuse a lock held by another process.
 
     Args:
-        path: The lock.
-        text: What it says.
-        is_ours: Did the kernel give it to us? None where it keeps no locks.
+        path: The lock file.
+        text: Its content, which names the holder if the file system has no locks.
+        is_ours: True if the kernel granted the lock; None if the file system has no locks.
     """
     try:
         pid, host, started = text.decode().split(" ", 2)
     except ValueError:
-        # Nobody is named: taken this moment, or its holder died before writing.
+        # No holder is named: it has just locked the file, or died before signing.
         pid = host = started = ""
     if host not in ("", socket.gethostname()):
         raise RunError(f"{path}: held by process {pid} on {host}; delete the file if that is over")
@@ -462,12 +465,12 @@ def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool | None) -> None:
 
 
 def signature() -> str:
-    """This process: its number, its host, and when it began."""
+    """Return the id, host and start time of this process."""
     return f"{os.getpid()} {socket.gethostname()} {_started(os.getpid())}"
 
 
 def is_alive(signed: str) -> bool | None:
-    """Does the process of a signature still run? None where it is another machine's."""
+    """Return whether the process of a signature is still running; None for another machine's."""
     pid, host, started = [*signed.split(" ", 2), "", "", ""][:3]
     if host != socket.gethostname():
         return None
@@ -475,7 +478,7 @@ def is_alive(signed: str) -> bool | None:
 
 
 def _started(pid: int) -> str:
-    """When a process began, boot included: its number alone is used again. Empty if it is gone."""
+    """Return boot id and start time of a process, because ids are reused; empty if it has ended."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         ticks = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
@@ -485,11 +488,11 @@ def _started(pid: int) -> str:
 
 
 def write_manifest(run: RunFolder, content: Manifest) -> None:
-    """Write the manifest, last of all: a folder that has one is a finished run."""
+    """Write the manifest; call it last, because a folder with a manifest is a finished run."""
     write_text(run.file(MANIFEST), strict_json(content.as_json()) + "\n")
 
 
 def write_input(run: RunFolder, content: Mapping[str, object]) -> None:
-    """Write what the run is made of."""
+    """Write the inputs of a run to ``input.json``."""
     whole = {"format_version": FORMAT_VERSION, **content}
     write_text(run.file(INPUT), strict_json(whole) + "\n")

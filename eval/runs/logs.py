@@ -1,11 +1,11 @@
-"""A run's logs: what its manifest says of them, how they are found again, and whether they changed.
+"""The logs of a run: their rows in the manifest, finding them again, and detecting changes.
 
-Paths in a run are relative to its folder; tables and accounts name a log by its file name alone, so
-that they are the same bytes wherever run and logs lie. A log is opened again only if it is the one
-that the run was made of, by its identity.
+Paths in a run are relative to its folder. Tables and accounts name a log by its file name alone, so
+that they are the same bytes wherever run and logs are stored. A log is opened again only if its
+identity is that of the log from which the run was made.
 
-As a run begins, ``input.json`` keeps what decides it: the identity of its logs and every setting.
-``--resume`` continues a run only if both are the same; anything else would be destroyed.
+At the start of a run, ``input.json`` records what determines it: the identity of its logs and every
+setting. ``--resume`` continues a run only if both are the same, because it would destroy any other.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 DEPTH: Final = 8
-"""Of folders looked through for logs that have moved."""
+"""Max depth of folders searched for logs that have moved."""
 
 
 def log_names(logs: Sequence[Log]) -> list[str]:
-    """What the logs of a drive are called in its tables: file names, told apart where equal."""
+    """Return the names of a drive's logs in its tables: file names, made unique where equal."""
     names = [place_name(origin(log)) for log in logs]
     count = Counter(names)
     return [
@@ -57,16 +57,16 @@ def log_names(logs: Sequence[Log]) -> list[str]:
 
 
 def place_name(place: Path | str) -> str:
-    """The last part of a path or URL."""
+    """Return the last part of a path or URL."""
     if isinstance(place, str) and is_remote(place):
         return place.rstrip("/").rpartition("/")[2]
     return Path(place).name or Path(place).resolve().name
 
 
 def log_rows(logs: Sequence[Log], run: RunFolder) -> tuple[LogRow, ...]:
-    """Name, place, format, identity, cameras and hashes of every log, for the manifest.
+    """Return the row of every log for the manifest.
 
-    A log that is read by ranges is known by its identity alone: a hash would fetch all of it.
+    A log that is read by ranges has an identity but no hash, because hashing would fetch all of it.
     """
     return tuple(
         LogRow(
@@ -83,28 +83,28 @@ def log_rows(logs: Sequence[Log], run: RunFolder) -> tuple[LogRow, ...]:
 
 
 def is_simulated(log: Log) -> bool:
-    """Whether ``simulate`` made a log, by the file that it writes beside one."""
+    """Return whether ``simulate`` made a log, by the file that it writes next to it."""
     place = origin(log)
     return isinstance(place, Path) and (place.resolve().parent / SIMULATED).is_file()
 
 
 def relative(place: Path, run: RunFolder) -> str:
-    """A path as a run's manifest holds it: from the run's folder."""
+    """Return a path relative to the run's folder, as in the manifest."""
     whole = place.absolute()
     return os.path.relpath(whole.parent.resolve() / whole.name, (run.home or run.path).resolve())
 
 
-def place_of(run: RunFolder, said: LogRow) -> Path | str:
-    """Where a log of a run lies now: a URL, or a path whose content is what the run was made of.
+def place_of(run: RunFolder, row: LogRow) -> Path | str:
+    """Return the present location of a run's log, a URL or a path, after checking its identity.
 
     Args:
-        run: The run; its ``logs`` folder is where its logs have moved to, if anybody said so.
-        said: The log's row in the manifest.
+        run: The run; its ``logs`` folder is searched if it is set.
+        row: The log's row in the manifest.
 
     Raises:
-        RunError: It is gone, or another log is there.
+        RunError: The log does not exist, or its content has changed.
     """
-    where, wanted = said.path, said.identity
+    where, wanted = row.path, row.identity
     if is_remote(where):
         places: list[Path | str] = [where]
     elif run.logs is None:
@@ -125,8 +125,8 @@ def place_of(run: RunFolder, said: LogRow) -> Path | str:
     if others:
         place, found = others[0]
         raise UnreadableRunError(
-            f"{run.path}: its log {place} has changed since: {found} there, {wanted} wanted; "
-            "--logs DIR says where that is, or replay again"
+            f"{run.path}: its log {place} has changed since: expected {wanted}, found {found}; "
+            "say where the original is with --logs DIR, or replay again"
         )
     gone = f"{places[0]} is gone" if run.logs is None else f"{wanted} is not in {run.logs}"
     raise UnreadableRunError(
@@ -135,7 +135,7 @@ def place_of(run: RunFolder, said: LogRow) -> Path | str:
 
 
 def _moved(folder: Path, where: Path) -> Iterator[Path]:
-    """Places below ``folder`` where a log of this name may have gone, the likeliest first."""
+    """Yield possible paths of a moved log below ``folder``, the most likely first."""
     parts = [part for part in where.parts if part != ".."]
     for count in range(len(parts), 0, -1):
         yield folder.joinpath(*parts[-count:])
@@ -146,14 +146,14 @@ def _moved(folder: Path, where: Path) -> Iterator[Path]:
             yield Path(place, where.name)
 
 
-def reopened(run: RunFolder, said: LogRow) -> Log:
-    """A log of a run, open.
+def reopened(run: RunFolder, row: LogRow) -> Log:
+    """Open a log of a run.
 
     Raises:
-        RunError: As ``place_of``.
-        LogError: It cannot be opened.
+        RunError: As for ``place_of``.
+        LogError: The log cannot be opened.
     """
-    return open_log(place_of(run, said), run.limits)
+    return open_log(place_of(run, row), run.limits)
 
 
 def input_of(
@@ -164,15 +164,15 @@ def input_of(
     draw: int,
     landmarks: Path | None,
 ) -> dict[str, object]:
-    """The content of ``input.json``.
+    """Return the content of ``input.json``.
 
     Args:
-        logs: All logs of the drive, open.
-        vehicle: What the vehicle file says.
-        selection: Which part of the logs.
+        logs: All open logs of the drive.
+        vehicle: Settings of the vehicle file.
+        selection: The part of the logs.
         choices: Detectors, in order.
-        draw: How many pictures are drawn.
-        landmarks: The database that frames are compared with.
+        draw: Number of pictures drawn.
+        landmarks: The database with which frames are compared.
     """
     settings = {
         "vehicle": vehicle.model_dump(mode="json"),
@@ -190,11 +190,11 @@ def input_of(
 
 
 def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
-    """Let ``--resume`` go on with a run of this very input, or with an empty folder.
+    """Refuse to resume a run of any other input; an empty folder is accepted.
 
     Raises:
-        UsageError: The folder holds another run, or one of which nothing is known.
-        RunError: It holds a run of another version of crosscue.
+        UsageError: The folder holds another run, or a run of unknown input.
+        RunError: The folder holds a run of another version of crosscue.
     """
     there = _read(run)
     if there is None:
@@ -221,12 +221,12 @@ def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
 
 
 def files_named_in(settings: object) -> dict[str, str]:
-    """Files that settings name, such as DBC files and model cards, with size and time of each.
+    """Return the files that settings name, such as DBC files and model cards, with size and time.
 
-    A name alone would not show that a file was edited.
+    The name alone would not show that a file was edited.
     """
     if isinstance(settings, str):
-        # Longer texts are not names, and some systems fail on them.
+        # Longer texts are not file names, and some systems fail on them.
         is_file = "/" in settings and len(settings) < 4096 and Path(settings).is_file()
         return {settings: version_of(settings)} if is_file else {}
     if isinstance(settings, Mapping):
@@ -237,7 +237,7 @@ def files_named_in(settings: object) -> dict[str, str]:
 
 
 def _read(run: RunFolder) -> Mapping[str, Any] | None:
-    """What the folder's run is made of; None where nothing believable says so."""
+    """Return the content of ``input.json``; None if it is missing or damaged."""
     try:
         content = read_at_most(run.file(INPUT), DEFAULT_LIMITS.record_bytes)
         found = json_tree(content or b"")
@@ -248,7 +248,7 @@ def _read(run: RunFolder) -> Mapping[str, Any] | None:
 
 
 def settings_changed(run: RunFolder, vehicle: Vehicle) -> dict[str, Any] | None:
-    """``input.json`` with other vehicle settings, after which ``estimate`` estimates again."""
+    """Return ``input.json`` with the settings of a repeated estimate; None if it is missing."""
     there = _read(run)
     if there is None:
         return None

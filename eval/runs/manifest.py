@@ -1,7 +1,7 @@
-"""The manifest of a run: what it was made of, how, and what became of every row.
+"""The manifest of a run: its inputs, settings, results, and the account of every row.
 
-One record for each stage that can finish a run folder. ``RunFolder.manifest`` reads one,
-``write_manifest`` writes one; ``crosscue run schema`` prints the JSON Schema.
+Each stage that can finish a run folder has a record. ``RunFolder.manifest`` reads a manifest,
+``write_manifest`` writes it, and ``crosscue run schema`` prints the JSON Schema.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from .record import Record
 
 FORMAT_VERSION: Final = 5
 LINE: Final = 100
-"""Characters of a field that are printed."""
+"""Max characters of a printed field."""
 OWN_FRAME: Final = "no start heading and no compass: the map's x axis points where the car did"
-"""The notice of a run whose poses are in a frame of its own, turned against any other."""
+"""Notice of a run whose poses are in its own frame, rotated against any other."""
 
 
 def _vehicle(given: object) -> object:
-    """Settings from JSON, by the rules of the vehicle file: its defaults are tuples."""
+    """Return settings from JSON, validated by the rules of the vehicle file."""
     if not isinstance(given, dict):
         return given
     try:
@@ -48,7 +48,7 @@ def _vehicle(given: object) -> object:
 
 @lru_cache(maxsize=64)
 def _vehicle_of(text: str) -> Vehicle:
-    """Most runs of a fleet share their settings, and checking them takes longer than all else."""
+    """Parse settings, cached because most runs of a fleet share them and validation is slow."""
     return Vehicle.model_validate(tuples(json_tree(text)))
 
 
@@ -56,7 +56,7 @@ Settings = Annotated[Vehicle, BeforeValidator(_vehicle)]
 
 
 def _first_of(error: ValidationError, skip: int = 0) -> tuple[str, str]:
-    """Where the first thing lies that does not fit, and why it does not."""
+    """Return the location of the first invalid value, and the reason."""
     first = error.errors(include_url=False)[0]
     return ".".join(str(part) for part in first["loc"][skip:]), first["msg"].lower()
 
@@ -67,19 +67,19 @@ class LogRow(Record):
     name: str
     """File name, made unique within the run."""
     path: str
-    """From the run's folder, or a URL."""
+    """Path relative to the run's folder, or a URL."""
     format: str
     identity: Identity
     cameras: tuple[str, ...]
     """Topics with pictures."""
     sha256: dict[str, str]
-    """By file; empty for a log that was read by ranges."""
+    """Hash by file; empty for a log that was read by ranges."""
     is_simulated: bool = False
-    """Whether ``simulated.json`` lay beside it."""
+    """True if ``simulated.json`` was next to the log."""
 
 
 class Part(Record):
-    """The part of the logs that was asked for; None where everything was."""
+    """The selected part of the logs; None selects everything."""
 
     start_ns: int | None
     end_ns: int | None
@@ -87,13 +87,13 @@ class Part(Record):
 
     @property
     def selection(self) -> Selection:
-        """As a log takes it."""
+        """Selection in the form that logs accept."""
         topics = None if self.topics is None else frozenset(self.topics)
         return Selection(topics, self.start_ns, self.end_ns)
 
 
 def part_of(selection: Selection) -> Part:
-    """A selection as the manifest holds it."""
+    """Return a selection in the form of the manifest."""
     topics = None if selection.topics is None else tuple(sorted(selection.topics))
     return Part(start_ns=selection.start_ns, end_ns=selection.end_ns, topics=topics)
 
@@ -111,61 +111,61 @@ class ClockRow(Record):
 
     used: Clock
     why: str
-    """Judged over the whole log."""
+    """Reason for the choice, judged over the complete log."""
     rows: int
     rate_hz: float | None
 
 
 class DetectorRow(Record):
-    """One detector as it ran."""
+    """One detector that ran."""
 
     name: str
     identity: str
-    """Of weights, settings and code: the same identity finds the same."""
+    """Hash of weights, settings and code; equal identities yield equal detections."""
     kind: str
     role: str | None
-    """None where it found nothing to report its role by."""
+    """Role of the detector; None if it found nothing that shows its role."""
     labels: tuple[str, ...] | None
-    """All class names that it can report: none for road, None where it does not say."""
+    """All class names that it can report: empty for road, None if it does not state them."""
     settings: dict[str, Any]
     min_scores: dict[str, float] = Field(default_factory=dict)
-    """From label to the score above which a detection is a cue, as far as the detector says."""
+    """Score above which a detection is a cue, by label, where the detector states it."""
     calibrated: tuple[str, ...] = ()
     """Labels whose scores a fitted calibration has turned into probabilities."""
     with_mask: tuple[str, ...] = ()
-    """Labels of what it found with a mask."""
+    """Labels of detections with a mask."""
     boxes_only: tuple[str, ...] = ()
-    """Labels of what it found, never with a mask."""
+    """Labels of detections that never had a mask."""
 
 
 class DetectCounts(Record):
-    """Frames and what was found in them."""
+    """Numbers of frames, detections and cues."""
 
     frames: int
     decoded: int
     ran: dict[str, int]
-    """Frames by detector."""
+    """Number of frames by detector."""
     from_cache: dict[str, int]
     objects: dict[str, int]
-    """By detector and label."""
+    """Number of detections by detector and label."""
     cues: dict[str, int]
-    """Frames in which each cue was positive."""
+    """Number of frames in which each cue was positive."""
 
 
 class DetectTimings(Record):
-    """Wall time."""
+    """Wall time of the detect stage."""
 
     seconds: float
 
 
 class EstimateCounts(Record):
-    """What became of what the pose was estimated from, by the counters of its parts."""
+    """Numbers of the pose filter's inputs by outcome."""
 
     odometry: dict[str, int]
     track: dict[str, int]
     landmarks: dict[str, int]
     gnss: dict[str, int] = Field(default_factory=dict)
-    """Of positions weighed in; empty unless ``gnss.use`` is ``fuse``."""
+    """Number of GNSS positions by outcome; empty unless ``gnss.use`` is ``fuse``."""
 
 
 class LandmarksUsed(Record):
@@ -182,11 +182,11 @@ class PoseSummary(Record):
     rows: int
     travelled_m: float
     major_axis_m: float | None
-    """Of the 2-sigma ellipse at the end; None without any pose."""
+    """Major axis of the 2-sigma ellipse at the end; None without any pose."""
 
 
 class ApproachRow(Record):
-    """One approach as the run itself saw it; no truth is asked."""
+    """One approach as the run itself found it, without truth."""
 
     number: int
     start_ns: int
@@ -196,7 +196,7 @@ class ApproachRow(Record):
     reference: str | None
     probabilities: dict[str, float]
     not_seen: tuple[str, ...] = ()
-    """Features that no cue has said anything about: their probability is the prior."""
+    """Features without an observation by any cue; their probability is the prior."""
 
 
 class SceneSummary(Record):
@@ -208,15 +208,15 @@ class SceneSummary(Record):
     without_odometry: int
     approaches: tuple[ApproachRow, ...]
     candidates: dict[str, CandidateRow]
-    """By cue, what became of everything that could have been it."""
+    """Candidates of each cue by outcome."""
     not_looked_for: dict[str, str]
-    """Cues that have no row in the whole run, and why."""
+    """Reason why a cue has no row in the run, by cue."""
     ranged: dict[str, CandidateRow]
-    """By cue, what became of its detections on the way to a range."""
+    """Candidates of each cue's range by outcome."""
 
 
 class EstimateTimings(Record):
-    """Wall time."""
+    """Wall time of the estimate stage."""
 
     seconds: float
     detect_seconds: float
@@ -225,10 +225,10 @@ class EstimateTimings(Record):
 class _Versioned(Record):
     format_version: Literal[5] = FORMAT_VERSION
     versions: dict[str, str]
-    """Of crosscue, Python and the libraries that results depend on."""
+    """Versions of crosscue, Python and the libraries that results depend on."""
 
     def __repr__(self) -> str:
-        """One line per field, for a notebook; long values are cut."""
+        """Return one line per field, for a notebook; long values are truncated."""
         fields = {name: repr(getattr(self, name)) for name in type(self).model_fields}
         width = max(map(len, fields))
         lines = [
@@ -239,13 +239,13 @@ class _Versioned(Record):
 
 
 class _Drive(_Versioned):
-    """What both stages of a drive say."""
+    """Fields common to both stages of a drive."""
 
     logs: tuple[LogRow, ...]
     selection: Part
     settings: Settings
     clocks: tuple[dict[str, ClockRow], ...]
-    """By topic, for each log that was read."""
+    """Clocks by topic, for each log that was read."""
     time: TimeSegments
     account: Account
     notices: tuple[str, ...]
@@ -257,40 +257,40 @@ class _Drive(_Versioned):
 
 
 class DetectManifest(_Drive):
-    """A run whose detect stage has finished, or the part on it of a whole run."""
+    """A run whose detect stage has finished, or the detect part of a complete run."""
 
     stage: Literal["detect"] = "detect"
     camera: str
-    """Its topic."""
+    """Topic of the camera."""
     camera_log: int
-    """Which of ``logs``, from 0."""
+    """Index in ``logs`` of the camera's log, from 0."""
     detectors: tuple[DetectorRow, ...]
     counts: DetectCounts
     timings: DetectTimings
 
     @property
     def detected(self) -> DetectManifest | None:
-        """The part on the detect stage: all of it."""
+        """The detect part, which is this manifest itself."""
         return self
 
 
 class EstimateManifest(_Drive):
-    """A whole run of one drive."""
+    """A complete run of one drive."""
 
     stage: Literal["estimate"] = "estimate"
     sources: dict[str, str | None]
-    """From a signal to the log and topic that it came from."""
+    """Log and topic of each signal."""
     counts: EstimateCounts
     landmarks: LandmarksUsed | None
     pose: PoseSummary
     scene: SceneSummary | None
     detect: DetectManifest | None
-    """None where no detector ran."""
+    """The detect part; None if no detector ran."""
     timings: EstimateTimings
 
     @property
     def detected(self) -> DetectManifest | None:
-        """The part on the detect stage; None where none ran."""
+        """The detect part; None if no detector ran."""
         return self.detect
 
 
@@ -309,7 +309,7 @@ class MergedDrive(Record):
     settings_sha256: str
     is_whole: bool
     rows: dict[str, int]
-    """By table."""
+    """Number of rows by table."""
     seconds: float
     tables_sha256: str
     tags: dict[str, str] = Field(default_factory=dict)
@@ -323,22 +323,22 @@ class MergedManifest(Record):
     tables: tuple[str, ...]
     drives: tuple[MergedDrive, ...]
     failures: dict[str, str]
-    """By drive, why there is no run of it."""
+    """Reason why a drive has no run, by drive."""
     account: SummedAccount
     notices: dict[str, int]
-    """In how many drives each was met."""
+    """Number of drives with each notice."""
     versions: dict[str, tuple[str, ...]]
-    """All that were used."""
+    """All versions used of each library."""
 
 
 class DecodeManifest(_Versioned):
-    """Every stream of a drive as a table; no run."""
+    """Tables of every stream of a drive, written by ``crosscue decode``; not a run."""
 
     stage: Literal["decode"] = "decode"
     tables: dict[str, str]
-    """From a topic to its file."""
+    """File of each topic."""
     rows: dict[str, int]
-    """By file."""
+    """Number of rows by file."""
     settings: Settings
     account: Account
     time: TimeSegments
@@ -355,11 +355,11 @@ class OtherVersionError(ValueError):
 
 
 def parse_manifest(content: bytes) -> Manifest:
-    """A manifest from the text of ``manifest.json``.
+    """Parse the text of ``manifest.json``.
 
     Raises:
-        OtherVersionError: Of another version; the message says which.
-        ValueError: No manifest: not JSON, or a value that does not fit, which is named.
+        OtherVersionError: The manifest has another version, which the message states.
+        ValueError: The text is not JSON, or a value is invalid; the message names the value.
     """
     tree = json_tree(content)
     version = tree.get("format_version") if isinstance(tree, Mapping) else None
@@ -373,5 +373,5 @@ def parse_manifest(content: bytes) -> Manifest:
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON Schema of ``manifest.json``."""
+    """Return the JSON Schema of ``manifest.json``."""
     return _ANY.json_schema(mode="serialization")

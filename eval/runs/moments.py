@@ -1,4 +1,4 @@
-"""Moments of a run as people write them, and a run as if it had lasted only some time."""
+"""Moments of a run as users write them, and views of a run limited to a time span."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 __all__ = ["TableFolder", "approach_spans", "moment_ns", "part_of", "seconds_into", "span_ns"]
 
 TABLES: Final = ("frames", "pose")
-"""The first that has rows begins the run."""
+"""Tables that define a run's time span; the first that has rows is used."""
 
 
 def span_ns(run: TableFolder) -> tuple[int, int]:
-    """First and last time of the run's frames; of its poses where it has no camera.
+    """Return the first and last time of the run's frames, or of its poses without a camera.
 
     Raises:
-        RunError: It has neither.
+        RunError: The run has neither.
     """
     import pyarrow.compute as pc
 
@@ -38,10 +38,10 @@ def span_ns(run: TableFolder) -> tuple[int, int]:
 
 
 def moment_ns(run: TableFolder, text: str) -> int:
-    """The moment that ``12.3`` (seconds from the first frame) or ``17...ns`` means.
+    """Parse a moment: ``12.3`` (seconds from the first frame) or ``17...ns``.
 
     Raises:
-        UsageError: It is neither, or is outside the run.
+        UsageError: The text has neither form, or the moment is outside the run.
     """
     first, last = span_ns(run)
     if re.fullmatch(r"[0-9]{1,19}ns", text):
@@ -65,7 +65,7 @@ def moment_ns(run: TableFolder, text: str) -> int:
 
 
 def approach_spans(run: TableFolder) -> dict[int, tuple[int, int]]:
-    """First and last time of each approach of a run, by its number.
+    """Return the first and last time of each approach of a run, by its number.
 
     Raises:
         RunError: The table is damaged.
@@ -80,13 +80,13 @@ def approach_spans(run: TableFolder) -> dict[int, tuple[int, int]]:
 
 
 def seconds_into(first_ns: int, t_ns: int) -> float:
-    """A moment as it is written behind ``--at``, to a millisecond."""
+    """Return a moment in the seconds of ``--at``, rounded to a millisecond."""
     return round((t_ns - first_ns) * 1e-9, 3)
 
 
 @dataclass(frozen=True, slots=True)
 class PartOfRun(RunFolder):
-    """A run whose tables have only the rows of some time.
+    """A run whose tables contain only the rows of a time span.
 
     Attributes:
         start_ns: First moment.
@@ -97,7 +97,7 @@ class PartOfRun(RunFolder):
     end_ns: int = 2**63 - 1
 
     def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
-        """Rows of ``NAME.parquet`` in that time."""
+        """Return the rows of ``NAME.parquet`` in the time span."""
         whole = RunFolder.table(self, name, _with_time(columns))
         inside = whole.filter(self._is_inside(whole)) if "t_ns" in whole.column_names else whole
         return inside if columns is None else inside.select(columns)
@@ -105,7 +105,7 @@ class PartOfRun(RunFolder):
     def batches(
         self, name: str, columns: list[str] | None = None, rows: int = 16_384
     ) -> Iterator[pa.RecordBatch]:
-        """The same, a batch at a time."""
+        """Yield the rows of ``NAME.parquet`` in the time span, a batch at a time."""
         for batch in RunFolder.batches(self, name, _with_time(columns), rows):
             inside = batch.filter(self._is_inside(batch)) if "t_ns" in batch.schema.names else batch
             yield inside if columns is None else inside.select(columns)
@@ -118,10 +118,10 @@ class PartOfRun(RunFolder):
 
 
 def _with_time(columns: list[str] | None) -> list[str] | None:
-    """Each table of a run has its time; who leaves it out still gets the rows of that time."""
+    """Return the columns with ``t_ns``, which is needed to select the rows."""
     return columns if columns is None else list(dict.fromkeys([*columns, "t_ns"]))
 
 
 def part_of(run: RunFolder, start_ns: int, end_ns: int) -> RunFolder:
-    """The run with the rows of its tables from one moment to another, both included."""
+    """Return a view of the run from one moment to another, both included."""
     return PartOfRun(run.path, run.logs, run.without_images, run.limits, run.home, start_ns, end_ns)

@@ -1,4 +1,4 @@
-"""What the records of a run are made of."""
+"""Base class of the records of a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Record(BaseModel):
-    """Checked where it is made and where it is read; unknown keys are refused."""
+    """A record that is validated when it is created and read; unknown keys are refused."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -19,5 +19,5 @@ class Record(BaseModel):
     )
 
     def as_json(self) -> dict[str, Any]:
-        """As plain values that JSON can hold, under their names there."""
+        """Return the record as plain JSON values, with the JSON names of its fields."""
         return self.model_dump(mode="json", by_alias=True)

@@ -1,4 +1,4 @@
-"""A hash of what a run was made with, by which runs of the same drive are told apart."""
+"""Hash of a run's settings, by which runs of the same drive are distinguished."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from crosscue.replay.base import json_tree
 
 
 def settings_sha256(settings: object, detectors: object, selection: object) -> str:
-    """Of JSON values: the settings, the detectors, and the part of the logs.
+    """Return the hash of the settings, the detectors and the selection, all as JSON values.
 
-    Files count by their names alone: the same drive replayed in another place is the same run.
+    Only the names of files are hashed, without their folders, so that a drive replayed elsewhere
+    yields the same hash.
     """
     return _sha256_of(json.dumps([settings, detectors, selection], sort_keys=True))
 
 
 @lru_cache(maxsize=256)
 def _sha256_of(made_with: str) -> str:
-    """Of many runs few differ in what they were made with."""
+    """Return the SHA-256 of a text, cached because most runs share their settings."""
     plain = _without_places(json_tree(made_with))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""The pictures of a run, read again from its log, on the clock that the run's tables have."""
+"""Pictures of a run, read again from its log, on the clock of the run's tables."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .logs import place_of
 
 AROUND_NS: Final = 2_000_000_000
-"""A picture's own clock and the log's may differ by this much."""
+"""Max difference between a picture's own clock and the log's."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredCamera:
-    """Where a run's pictures lie.
+    """Source of a run's pictures.
 
     Attributes:
-        log: Path or URL.
-        topic: In it.
-        clock: Whose times the run's tables have.
-        selection: What part of the log the run examined.
-        time: The log's clock against the times of the run's tables.
-        limits: What the log is read with.
+        log: Path or URL of the log.
+        topic: Topic of the camera.
+        clock: Clock of the run's tables.
+        selection: The part of the log that the run examined.
+        time: The log's clock relative to the times of the run's tables.
+        limits: Limits for reading the log.
     """
 
     log: Path | str
@@ -58,10 +58,10 @@ class StoredCamera:
 
 
 def camera_of(run: RunFolder) -> StoredCamera | None:
-    """The camera; None where the run's logs have none, or several and no line says which.
+    """Return the camera of a run; None if its logs have none, or several without a choice.
 
     Raises:
-        RunError: The manifest cannot be read; its log is gone, or another is in its place.
+        RunError: The manifest cannot be read, or the log is missing or has changed.
         LogError: The log cannot be opened.
     """
     if run.without_images:
@@ -98,7 +98,7 @@ def _clock(detected: DetectManifest | None, topic: str) -> Clock:
 
 
 def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
-    """The picture taken at exactly this time of the run's tables; None where none exists.
+    """Return the picture with exactly this time in the run's tables, or None.
 
     Raises:
         LogError: The log cannot be opened.
@@ -111,7 +111,7 @@ def picture_at(camera: StoredCamera, t_ns: int) -> Encoded | None:
 def pictures_at(
     camera: StoredCamera, times: Collection[int], on_picture: Callable[[int, Encoded], None]
 ) -> None:
-    """Give the pictures taken at exactly these times of the run's tables to ``on_picture``.
+    """Pass the pictures with exactly these times in the run's tables to ``on_picture``.
 
     Raises:
         LogError: The log cannot be opened.
@@ -132,12 +132,12 @@ def read_pictures(
     on_pictures: Callable[[Block], None],
     span_ns: tuple[int, int] | None = None,
 ) -> None:
-    """Give every block of pictures to ``on_pictures``, and warn of what was dropped.
+    """Pass every block of pictures to ``on_pictures``, and warn about dropped rows.
 
     Args:
-        camera: Where they are.
+        camera: Source of the pictures.
         on_pictures: Called with blocks of ``Images`` with times as in the run's tables.
-        span_ns: Those of this time, and some before and behind it; None for all.
+        span_ns: Time span to read, with some pictures before and after it; None for all.
 
     Raises:
         LogError: The log cannot be opened.
@@ -153,7 +153,7 @@ def read_pictures(
         shift_at=camera.time.shift_at if len(camera.time.epochs) > 1 else None,
     )
     selection = camera.selection
-    # Rows are told apart by counting where stamps alone do not do.
+    # Rows whose stamps are ambiguous are identified by counting.
     if span_ns is not None and camera.topic.name not in camera.time.topics:
         begin, end = span_ns[0] - AROUND_NS, span_ns[1] + AROUND_NS
         selection = Selection(selection.topics, begin, end)

@@ -1,7 +1,7 @@
-"""Tags of a run: words that its users set on it, such as ``weather=rain``.
+"""Tags of a run: labels that users set on it, such as ``weather=rain``.
 
-They are in a file of their own, so that what a run is made of and what it found stay the same bytes
-whatever it is called.
+They are stored in a separate file, so that tagging does not change the bytes of a run's inputs and
+results.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class _Tags(Record):
 
 
 def parse_tags(content: bytes) -> dict[str, str]:
-    """From the content of ``tags.json``.
+    """Parse the content of ``tags.json``.
 
     Raises:
-        ValueError: It is something else; one line.
+        ValueError: The content is invalid; the message has one line.
     """
     try:
         return dict(sorted(_Tags.model_validate_json(content).tags.items()))
@@ -44,10 +44,10 @@ def parse_tags(content: bytes) -> dict[str, str]:
 
 
 def read_tags(run: Path) -> dict[str, str]:
-    """The tags of a run folder; none without a file of them.
+    """Read the tags of a run folder; empty without a tags file.
 
     Raises:
-        UnreadableRunError: They cannot be read.
+        UnreadableRunError: The file cannot be read.
     """
     path = run / TAGS
     try:
@@ -61,10 +61,10 @@ def read_tags(run: Path) -> dict[str, str]:
 
 
 def write_tags(run: Path, tags: Mapping[str, str]) -> None:
-    """Replace the tags of a run folder; without any, its file goes.
+    """Replace the tags of a run folder; delete its tags file without any.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: The file cannot be written.
     """
     if tags:
         content = _Tags(tags=dict(sorted(tags.items())))
@@ -74,14 +74,14 @@ def write_tags(run: Path, tags: Mapping[str, str]) -> None:
 
 
 def assignments(tags: Mapping[str, str] | Sequence[str], remove: Sequence[str]) -> dict[str, str]:
-    """Tags to set, by key, checked.
+    """Return the tags to set, by key, after checking them.
 
     Args:
-        tags: By key; or texts such as ``weather=rain``.
-        remove: Keys that are to go.
+        tags: Values by key, or texts such as ``weather=rain``.
+        remove: Keys to remove.
 
     Raises:
-        UsageError: No key or value, a key set twice, or set and removed.
+        UsageError: A key or value is invalid, or a key is set twice, or both set and removed.
     """
     texts = [f"{key}={value}" for key, value in tags.items()] if isinstance(tags, Mapping) else tags
     found: dict[str, str] = {}
@@ -91,7 +91,7 @@ def assignments(tags: Mapping[str, str] | Sequence[str], remove: Sequence[str]) 
         found[key] = value
     for key in remove:
         if re.fullmatch(KEY, key) is None:
-            raise UsageError(f"{key}: no key of a tag; expected one such as weather")
+            raise UsageError(f"{key}: not a valid key of a tag; expected one such as weather")
     return found
 
 

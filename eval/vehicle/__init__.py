@@ -1,1 +1,1 @@
-"""What a log shows of the car that made it: camera mounting, signals that agree."""
+"""Checks of a vehicle file against a log: camera mounting and agreement of signals."""

@@ -1,4 +1,4 @@
-"""Seconds of a drive read as the vehicle file says, and what contradicts what in them."""
+"""Check of a vehicle file: reads some seconds of a drive with it and reports contradictions."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 WHEELS: Final = ("front left", "front right", "rear left", "rear right")
 INTRINSICS_OFF: Final = 0.02
-"""Focal lengths that differ by more are those of different pictures."""
+"""Max relative difference of two focal lengths of the same pictures."""
 WHEEL_OFF: Final = 0.1
 UNCONFIRMED: Final = "too few bends here for course or wheels to confirm its sign"
 
 
 @dataclass(frozen=True, slots=True)
 class SignalRow:
-    """One signal as the vehicle file has it read.
+    """One signal, read as the vehicle file specifies.
 
     Attributes:
-        signal: What it is.
-        source: Topic, and the names in the database.
-        count: Readings in the seconds examined.
-        rate_hz: By the median time between them.
+        signal: Name of the signal.
+        source: Topic, and the signal names in the database.
+        count: Number of readings in the seconds examined.
+        rate_hz: Rate, from the median time between readings.
         low: Smallest reading, in ``unit``.
-        high: Largest one.
-        unit: Of both.
-        agrees: What it agrees with, in words.
-        wrong: What contradicts it.
+        high: Largest reading, in ``unit``.
+        unit: Unit of ``low`` and ``high``.
+        agrees: Signals that it agrees with, in words.
+        wrong: Contradictions.
     """
 
     signal: str
@@ -81,9 +81,9 @@ class Shown:
     """One picture of the camera.
 
     Attributes:
-        topic: The camera.
-        t_ns: When it was taken.
-        pixels: Shape (H, W, 3), uint8, blue first.
+        topic: Topic of the camera.
+        t_ns: Time of the picture.
+        pixels: Shape (H, W, 3), uint8, in BGR order.
     """
 
     topic: str
@@ -93,13 +93,13 @@ class Shown:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """What was found.
+    """Result of a check.
 
     Attributes:
-        signals: A row for each that is read.
-        missing: From a signal that is not read to why.
-        contradictions: Sentences, the gravest first.
-        picture: From the middle of the seconds examined; None without a camera.
+        signals: A row for each signal that is read.
+        missing: Reason why a signal is not read, by signal.
+        contradictions: Sentences, the most serious first.
+        picture: Picture from the middle of the seconds examined; None without a camera.
     """
 
     signals: tuple[SignalRow, ...]
@@ -109,12 +109,12 @@ class Checked:
 
 
 def check(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checked:
-    """Read a part of a drive and hold its signals against each other.
+    """Read a part of a drive and compare its signals with each other.
 
     Args:
         logs: Open logs of one drive.
         vehicle: The vehicle file.
-        selection: The part; its topics do not count.
+        selection: The part to read; its topics are ignored.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
@@ -142,7 +142,7 @@ def check(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checke
 def _samples(
     logs: Sequence[Log], vehicle: Vehicle, planned: Plan, selection: Selection
 ) -> dict[Signal, Samples]:
-    """All readings, by signal, in order of time."""
+    """Return all readings in order of time, by signal."""
     ledgers = [Ledger(name_of(log)) for log in logs]
     extractors = [Extractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
     wanted = [
@@ -199,8 +199,8 @@ def _judged(
     if speed is not None and track is not None:
         verdicts[Signal.WHEEL_SPEEDS] = judge_speed(speed, track.speed, grid, True)
     rows = [*_rows(samples, planned, vehicle, verdicts)]
-    said = [f"{row.signal}: {text}" for row in rows for text in row.wrong]
-    return rows, [*said, *_of_wheels(wheels)]
+    contradictions = [f"{row.signal}: {text}" for row in rows for text in row.wrong]
+    return rows, [*contradictions, *_of_wheels(wheels)]
 
 
 def _rows(
@@ -229,7 +229,7 @@ def _rows(
             float(known.min() * scale) if len(known) else math.nan,
             float(known.max() * scale) if len(known) else math.nan,
             unit,
-            # Rate and range have columns of their own.
+            # Rate and range have their own columns.
             ", ".join(verdict.facts[2:]),
             wrong,
         )
@@ -246,7 +246,7 @@ _UNITS: Final = {
 
 
 def _named(signal: Signal, vehicle: Vehicle) -> tuple[str, ...]:
-    """Names of CAN signals that the vehicle file has for it."""
+    """Return the names of the CAN signals that the vehicle file assigns to a signal."""
     can = vehicle.can
     if signal is Signal.WHEEL_SPEEDS and can.wheel_speeds is not None:
         of = can.wheel_speeds
@@ -269,14 +269,14 @@ def _series(samples: Mapping[Signal, Samples], planned: Plan, signal: Signal) ->
 
 
 def _as_usual(steering: Series, vehicle: Vehicle) -> Series:
-    """The angle as that of a car with a usual ratio and its wheel straight ahead at zero."""
+    """Return the steering angle converted to a typical steering ratio and without its offset."""
     odometry = vehicle.odometry
     scale = 15.0 / odometry.steering_ratio
     return replace(steering, values=(steering.values - odometry.steering_offset_rad) * scale)
 
 
 def _wheels(samples: Mapping[Signal, Samples]) -> dict[str, Series]:
-    """Speeds of the wheels that are read, and their mean at the rear."""
+    """Return the speed of each wheel that is read, and the mean of the rear wheels."""
     found = samples.get(Signal.WHEEL_SPEEDS)
     if found is None:
         return {}
@@ -292,13 +292,13 @@ def _wheels(samples: Mapping[Signal, Samples]) -> dict[str, Series]:
 
 
 def _differ(wheels: Mapping[str, Series]) -> bool:
-    """Are left and right two signals? Odometry topics have one speed for both."""
+    """Return whether left and right are separate signals; odometry topics have a single speed."""
     left, right = wheels["rear left"], wheels["rear right"]
     return len(left) != len(right) or bool((left.values != right.values).any())
 
 
 def _of_wheels(wheels: Mapping[str, Series]) -> Iterator[str]:
-    """Wheels that disagree with the others."""
+    """Yield contradictions of wheels that disagree with the others."""
     means = {
         name: float(np.abs(one.values).mean()) for name, one in wheels.items() if name in WHEELS
     }
@@ -324,7 +324,7 @@ def _track(samples: Mapping[Signal, Samples], planned: Plan) -> Track | None:
 def _picture(
     log: Log, number: int, topic: Topic, vehicle: Vehicle, selection: Selection
 ) -> Shown | None:
-    """The picture in the middle of the part; the first that decodes, where the part has no end."""
+    """Return the picture in the middle of the part, or the first that decodes if it has no end."""
     ledger = Ledger(name_of(log))
     shown: Shown | None = None
     middle_ns = None
@@ -345,7 +345,7 @@ def _picture(
 
 
 def _of_camera(shown: Shown | None, log: Log, camera: Camera) -> Iterator[str]:
-    """Intrinsics that do not fit the pictures, or what the log itself publishes."""
+    """Yield contradictions between the intrinsics and the pictures or the published values."""
     if shown is None:
         yield "camera: not one picture in the seconds examined"
         return

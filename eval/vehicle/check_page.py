@@ -1,4 +1,4 @@
-"""What a check of a vehicle file found, as a page or a picture."""
+"""Report of a vehicle file's check as a page or a picture."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ WIDTH_PX: Final = 1280
 
 
 def check_output(path: Path, overwrite: bool) -> None:
-    """Refuse a file that cannot be written, before anything is read.
+    """Check before any reading that the report can be written.
 
     Raises:
-        UsageError: Its ending is that of no page or picture.
-        OutputError: It exists.
+        UsageError: The file ending is not that of a page or picture.
+        OutputError: The file exists.
     """
     if path.suffix.lower() not in PAGES + PICTURES:
         endings = ", ".join(PAGES + PICTURES)
@@ -40,18 +40,18 @@ def check_output(path: Path, overwrite: bool) -> None:
 def write_check(
     path: Path, found: Checked, vehicle: Vehicle, logs: Sequence[str], part: str
 ) -> None:
-    """Write the page, or the picture alone, by the file's ending.
+    """Write the page, or only the picture, depending on the file's ending.
 
     Args:
         path: The file.
-        found: What the check found.
-        vehicle: What was checked.
+        found: Result of the check.
+        vehicle: The settings that were checked.
         logs: Names of the logs.
-        part: Which seconds were examined, in words.
+        part: The seconds examined, in words.
 
     Raises:
-        UsageError: A picture is wanted of a log without one.
-        OutputError: It cannot be written.
+        UsageError: A picture is requested, but the log has none.
+        OutputError: The file cannot be written.
     """
     drawn = None if found.picture is None else draw_ground(found.picture.pixels, vehicle)
     if path.suffix.lower() in PICTURES:
@@ -86,7 +86,7 @@ def _encoded(pixels: Bytes, ending: str) -> bytes:
 
 
 def _in_words(vehicle: Vehicle) -> str:
-    """What the lines in the picture are."""
+    """Return the legend of the lines in the picture."""
     if vehicle.camera.focal_px is None:
         return "No horizon and no grid: camera.focal_px is not in the vehicle file."
     grid = (
@@ -95,9 +95,9 @@ def _in_words(vehicle: Vehicle) -> str:
         "below the horizon; the lines along the road are 5 m apart."
     )
     if vehicle.regions.kind == "picture":
-        return f"{grid} Green: the regions in which road is looked for."
+        return f"{grid} Green: the regions in which road is detected."
     return (
-        f"{grid} Green: the regions in which road would be looked for if an intersection began "
+        f"{grid} Green: the regions in which road would be detected if an intersection began "
         f"{ASSUMED.start_m:g} m ahead and ended at {ASSUMED.end_m:g} m."
     )
 

@@ -1,7 +1,7 @@
-"""What a vehicle file says of the camera, drawn on a picture: horizon, metres on the road, regions.
+"""Drawing of a vehicle file's camera settings on a picture: horizon, ground grid and regions.
 
-The road is taken for level. Regions on the ground follow the believed intersection, which is not
-known here: they are drawn for one assumed ahead.
+The road is assumed to be level. Regions on the ground depend on the estimated intersection, which
+is unknown here, so they are drawn for an assumed intersection ahead.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 AHEAD_M: Final = (5, 10, 15, 20, 30, 50, 80)
 ASIDE_M: Final = (-15, -10, -5, 0, 5, 10, 15)
 NEAREST_M: Final = 0.5
-"""Ahead of the camera; lines on the road begin there."""
+"""Distance ahead of the camera at which the grid begins."""
 ASSUMED: Final = Place(30.0, 50.0, 0.0)
-"""From the rear axle to the start and the end of the intersection that regions are drawn for."""
+"""Assumed intersection for which regions are drawn."""
 YELLOW, WHITE, GREEN, BLACK = (0, 230, 255), (255, 255, 255), (80, 230, 80), (0, 0, 0)
 
 
 def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8]:
-    """A copy with the horizon, a grid in metres on the road, and the regions.
+    """Return a copy with the horizon, a grid in metres on the road, and the regions.
 
     Args:
-        pixels: Shape (H, W, 3), uint8, blue first.
-        vehicle: Its camera and regions.
+        pixels: Shape (H, W, 3), uint8, in BGR order.
+        vehicle: Settings of the camera and regions.
     """
     canvas = pixels.copy()
     size_px = (pixels.shape[1], pixels.shape[0])
@@ -61,7 +61,7 @@ def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8
 
 
 def _grid(camera: Camera) -> Iterator[tuple[NDArray[np.float64], str]]:
-    """Lines across the road with their labels, from the left; then those along it."""
+    """Yield labelled lines across the road, from left to right, then lines along it."""
     for ahead in AHEAD_M:
         if ahead - camera.x_m > NEAREST_M:
             across = np.array([[ahead, max(ASIDE_M)], [ahead, min(ASIDE_M)]], np.float64)
@@ -98,7 +98,7 @@ def _line(
     scale: float,
 ) -> None:
     high, wide = canvas.shape[:2]
-    # A polygon may reach far beyond the picture; OpenCV wants numbers that fit.
+    # A polygon may extend far beyond the picture, but OpenCV's coordinates are limited.
     clipped = np.clip(points, -4.0 * max(high, wide), 4.0 * max(high, wide))
     places = np.rint(clipped * 16).astype(np.int32).reshape(-1, 1, 2)
     thick = max(1, round(2 * scale))

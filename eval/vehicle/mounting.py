@@ -1,4 +1,4 @@
-"""Pitch and yaw of a camera, by the direction in which it moves while the car drives straight."""
+"""Estimation of a camera's pitch and yaw from its direction of motion on a straight road."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 DEGREE: Final = np.pi / 180.0
 WIDTH_PX: Final = 960
 APART_M: Final = 1.5
-"""Between two pictures: enough for nearby things to move, too little for them to leave."""
+"""Distance between two pictures: near objects move visibly, but stay in the picture."""
 MOVING_MPS: Final = 2.0
 STRAIGHT_RAD_PER_M: Final = 0.2 * DEGREE
-"""A bend of a larger radius than 290 m counts as straight."""
+"""Max curvature of a straight road, a radius of 290 m."""
 PAIRS: Final = 200
 MIN_PAIRS: Final = 10
 LOOKED_AT_NS: Final = 60_000_000_000
 
 
 class Estimate(NamedTuple):
-    """Of the mounting, from pairs of pictures.
+    """Estimate of the mounting from pairs of pictures.
 
     Attributes:
-        pitch_rad: How far the axis points below the direction of travel; None without enough pairs.
-        yaw_rad: How far it points to the left of it.
-        pairs: How many pairs of pictures were used.
-        why_not: Why there is no estimate; empty where there is one.
+        pitch_rad: Angle of the optical axis below the direction of travel; None without enough
+            pairs.
+        yaw_rad: Angle of the optical axis to the left of the direction of travel; likewise.
+        pairs: Number of pairs of pictures used.
+        why_not: Reason why the estimate is missing; empty if it is not.
     """
 
     pitch_rad: Measured | None
@@ -56,13 +57,13 @@ class Estimate(NamedTuple):
 def estimate_mounting(
     log: Log, camera: str, intrinsics: Intrinsics | None, speed: Series | None
 ) -> Estimate:
-    """Pitch and yaw of a log's camera, each the median over pairs of pictures.
+    """Return pitch and yaw of a log's camera, each the median over pairs of pictures.
 
     Args:
-        log: Open.
-        camera: Its topic.
-        intrinsics: Of the camera; needed for an estimate.
-        speed: Of the car, m/s; needed likewise.
+        log: The open log.
+        camera: Topic of the camera.
+        intrinsics: Intrinsics of the camera; without them there is no estimate.
+        speed: Speed of the vehicle, m/s; without it there is no estimate.
     """
     if intrinsics is None or speed is None or len(speed) < 2:
         lacks = "focal_px" if intrinsics is None else "the car's speed"
@@ -109,7 +110,7 @@ def _measured(angles_rad: Floats) -> Measured:
 def _pairs(
     log: Log, number: int, intrinsics: Intrinsics, speed: Series
 ) -> Iterator[tuple[Bytes, Bytes, float, float, tuple[float, float]]]:
-    """Pictures about ``APART_M`` apart with the way between them, and the optics at their size."""
+    """Yield pairs of pictures about ``APART_M`` apart, with distance, focal length and centre."""
     way_m = _way_m(speed)
     waiting: deque[tuple[float, Bytes]] = deque()
     first_ns: int | None = None
@@ -138,7 +139,7 @@ def _way_m(speed: Series) -> Floats:
 
 
 def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, float]]:
-    """Pictures in order of time, small and grey, with their scale; damaged ones are left out."""
+    """Yield undamaged pictures in order of time, small and grey, with their scale."""
     import cv2
 
     view = View(is_grey=True, min_width_px=WIDTH_PX)

@@ -1,1 +1,1 @@
-"""Tables of a run: how they are written, and read back."""
+"""Writing and reading the tables of a run."""

@@ -1,4 +1,4 @@
-"""The two columns that every table of a run carries: ``segment`` and ``log_t_ns``."""
+"""The two columns that every table of a run has: ``segment`` and ``log_t_ns``."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 def labelled(schema: pa.Schema) -> pa.Schema:
-    """A table's columns with those two appended."""
+    """Return a table's schema with the two columns appended."""
     import pyarrow as pa
 
     return schema.append(pa.field("segment", pa.int32())).append(pa.field("log_t_ns", pa.int64()))
 
 
 def with_labels(table: pa.Table, timeline: Timeline, clock: LogClock) -> pa.Table:
-    """A table in memory with those two."""
+    """Return a table in memory with the two columns appended."""
     import pyarrow as pa
 
     times = table["t_ns"].to_numpy()
@@ -38,13 +38,13 @@ class LabelledSink(TableSink):
     def __init__(
         self, run: TableFolder, name: str, schema: pa.Schema, timeline: Timeline, clock: LogClock
     ) -> None:
-        """Begin ``NAME.parquet``; ``clock`` is that of the log whose rows these are."""
+        """Create ``NAME.parquet``; ``clock`` is that of the log that the rows come from."""
         super().__init__(run, name, labelled(schema))
         self._timeline = timeline
         self._clock = clock
 
     def write(self, columns: Mapping[str, object]) -> None:
-        """Append rows given as columns without those two.
+        """Append rows, as columns without the two.
 
         Raises:
             OutputError: The disk is full.

@@ -1,8 +1,8 @@
-"""Tables of a run in the time of its logs, as truth is: for scoring.
+"""Conversion of a run's tables to the time of its logs, which truth uses, for scoring.
 
-A drive whose clock was never set back has one time, and nothing changes. After a set-back some
-moments of the log's clock come twice; which of the two a truth means cannot be known, so rows of
-either are left out and counted.
+A drive whose clock was never set back has a single time, and nothing changes. After a set-back,
+some moments of the log's clock occur twice. It is unknown which of the two a truth means, so the
+rows of both are left out and counted.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 LABELS: Final = frozenset({"segment", "log_t_ns"})
-"""Columns that every table has besides its own."""
+"""Columns that every table has in addition to its own."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A stretch of the log's clock in which nothing was measured, or that comes twice.
+    """A span of the log's clock without measurements, or one that occurs twice.
 
     Attributes:
-        start_ns: Log time of the last wheel speeds before it; of what comes twice the first.
-        end_ns: Of the first wheel speeds after it; of what comes twice the last.
-        text: What it is, with its length.
+        start_ns: Log time of the last wheel speeds before a gap, or the start of a repeated span.
+        end_ns: Log time of the first wheel speeds after a gap, or the end of a repeated span.
+        text: Description with its length.
     """
 
     start_ns: int
@@ -41,12 +41,12 @@ class Gap:
 
     @property
     def middle_ns(self) -> int:
-        """Halfway."""
+        """Middle of the span."""
         return (self.start_ns + self.end_ns) // 2
 
 
 def gaps_of(timeline: Timeline) -> tuple[Gap, ...]:
-    """The gaps of a drive on its log's clock, in order: what charts over time shade."""
+    """Return the gaps of a drive on its log's clock, in order, for charts over time."""
     ordered = sorted(timeline.segments, key=lambda one: one.log_start_ns)
     found = []
     for one, other in pairwise(ordered):
@@ -58,13 +58,13 @@ def gaps_of(timeline: Timeline) -> tuple[Gap, ...]:
 
 
 def broken_at(gaps: Sequence[Gap], t_ns: Int64s) -> Int64s:
-    """Rows, sorted by time, before which a line is interrupted; shape (K,)."""
+    """Return the sorted indices of the rows before which a line is interrupted, shape (K,)."""
     rows = np.searchsorted(t_ns, [one.middle_ns for one in gaps]).astype(np.int64)
     return np.unique(rows[(rows > 0) & (rows < len(t_ns))])
 
 
 def ambiguous(timeline: Timeline, log_ns: Int64s, numbers: Int64s) -> NDArray[np.bool_]:
-    """Which rows have a log time that another segment has, too, shape (N,)."""
+    """Return a mask of the rows whose log time also occurs in another segment, shape (N,)."""
     found = np.zeros(len(log_ns), np.bool_)
     for one in timeline.segments:
         inside = (log_ns >= one.log_start_ns) & (log_ns <= one.log_end_ns)
@@ -73,7 +73,7 @@ def ambiguous(timeline: Timeline, log_ns: Int64s, numbers: Int64s) -> NDArray[np
 
 
 def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
-    """A run's table with ``t_ns`` as recorded, in order, without rows whose time comes twice."""
+    """Return a run's table with recorded ``t_ns``, sorted, without rows whose time occurs twice."""
     if not timeline.was_set_back or not table.num_rows:
         return table
     import pyarrow as pa
@@ -85,7 +85,7 @@ def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
 
 
 def comes_twice(timeline: Timeline, log_ns: Int64s) -> NDArray[np.bool_]:
-    """Which moments of the log's clock are in more than one segment, shape (N,)."""
+    """Return a mask of the log times that are in more than one segment, shape (N,)."""
     inside = np.zeros(len(log_ns), np.int64)
     for one in timeline.segments if timeline.was_set_back else ():
         inside += (log_ns >= one.log_start_ns) & (log_ns <= one.log_end_ns)

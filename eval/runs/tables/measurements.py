@@ -1,9 +1,9 @@
-"""What the pose filter was given, as a table: the smoother's input, written beside the pose.
+"""Table of the pose filter's inputs, which are also the smoother's.
 
-``measurements.parquet`` has one row a measurement and nulls where a column does not apply:
-``start`` (the first belief), ``odometry`` (from ``start_ns`` to ``t_ns``), ``gap`` (likewise: what
-was assumed between two time segments), ``heading`` (those that counted), ``landmark`` and
-``position`` (those weighed in: of the camera, and of the antenna by GNSS).
+``measurements.parquet`` has one row per measurement, with nulls where a column does not apply:
+``start`` (the first belief), ``odometry`` (from ``start_ns`` to ``t_ns``), ``gap`` (likewise, the
+motion assumed between two time segments), ``heading`` (accepted headings), ``landmark`` and
+``position`` (accepted positions of the camera, and of the antenna by GNSS).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ NUMBERS: Final = (
 
 
 def schema() -> pa.Schema:
-    """Columns of ``measurements.parquet``."""
+    """Return the schema of ``measurements.parquet``."""
     import pyarrow as pa
 
     return pa.schema(
@@ -56,7 +56,7 @@ def schema() -> pa.Schema:
 
 
 def start_rows(belief: PoseBelief) -> dict[str, object]:
-    """The first belief as a row."""
+    """Return the first belief as a row."""
     x, y, heading, speed = belief.mean.tolist()
     cov = belief.cov.tolist()
     return _rows(
@@ -77,14 +77,14 @@ def start_rows(belief: PoseBelief) -> dict[str, object]:
 
 
 def odometry_rows(made: Increments) -> dict[str, object]:
-    """Increments as rows."""
+    """Return increments of odometry as rows."""
     names = NUMBERS[:6]
     columns: dict[str, object] = {name: getattr(made, name) for name in names}
     return _rows("odometry", made.stop_ns, columns | {"start_ns": made.start_ns})
 
 
 def gap_rows(start_ns: int, crossed: Crossed) -> dict[str, object]:
-    """A gap as a row."""
+    """Return a gap as a row."""
     _, _, _, speed_mps = crossed.belief.mean.tolist()
     return _rows(
         "gap",
@@ -102,7 +102,7 @@ def gap_rows(start_ns: int, crossed: Crossed) -> dict[str, object]:
 
 
 def heading_rows(used: HeadingColumns) -> dict[str, object]:
-    """Headings that counted as rows."""
+    """Return accepted headings as rows."""
     good = used.outcome == ACCEPTED
     columns: dict[str, object] = {
         "heading_rad": used.heading_rad[good],
@@ -112,7 +112,7 @@ def heading_rows(used: HeadingColumns) -> dict[str, object]:
 
 
 def landmark_rows(sightings: list[Sighting]) -> dict[str, object]:
-    """Landmarks weighed in as rows."""
+    """Return accepted landmarks as rows."""
     good = [s for s in sightings if s.outcome == ACCEPTED]
     columns: dict[str, object] = {
         "x_m": [s.xy_m[0] for s in good],
@@ -126,7 +126,7 @@ def landmark_rows(sightings: list[Sighting]) -> dict[str, object]:
 
 
 def position_rows(used: list[tuple[int, float, float, float, float, float]]) -> dict[str, object]:
-    """GNSS positions weighed in as rows: time, x, y, xx, xy, yy."""
+    """Return accepted GNSS positions (time, x, y, xx, xy, yy) as rows."""
     names = ("x_m", "y_m", "xx_m2", "xy_m2", "yy_m2")
     columns = {name: [one[i] for one in used] for i, name in enumerate(names, start=1)}
     return _rows("position", np.array([one[0] for one in used], np.int64), columns)

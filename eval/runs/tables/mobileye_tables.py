@@ -1,7 +1,7 @@
-"""What a Mobileye said during a drive, kept with the run: written once, read at any setting.
+"""Tables of a Mobileye's decoded rows, written once with the run and read with any settings.
 
 ``mobileye_obstacles.parquet`` and ``mobileye_lanes.parquet`` hold the decoded rows in the rear
-axle's frame (x ahead, y left), so that cues past the intersection need no log.
+axle's frame (x ahead, y left), so that cues beyond the intersection need no log.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ TABLES: Final[Mapping[Signal, tuple[str, tuple[str, ...]]]] = {
 
 
 def schema(signal: Signal) -> pa.Schema:
-    """Columns of one of the two tables."""
+    """Return the schema of one of the two tables."""
     import pyarrow as pa
 
     return pa.schema([("t_ns", pa.int64()), *((name, pa.float64()) for name in TABLES[signal][1])])
 
 
 class MobileyeSink:
-    """Writes both tables, a window at a time; a context manager."""
+    """Writer of both tables, a window at a time; a context manager."""
 
     def __init__(self, run: TableFolder, timeline: Timeline, clock: LogClock) -> None:
         self._stack: Final = ExitStack()
@@ -57,7 +57,7 @@ class MobileyeSink:
         }
 
     def write(self, samples: Mapping[Signal, Samples]) -> None:
-        """Append what a window holds of the device."""
+        """Append the device's samples of a window."""
         for signal in MOBILEYE_SIGNALS:
             found = samples.get(signal)
             if found is not None and len(found.t_ns):
@@ -79,7 +79,7 @@ class MobileyeSink:
 
 
 class StoredMobileye:
-    """Both tables read forwards in time; memory holds a batch of each."""
+    """Reader of both tables, forward in time; memory holds a batch of each."""
 
     def __init__(self, run: TableFolder, past: Past) -> None:
         self._past: Final = past
@@ -87,7 +87,7 @@ class StoredMobileye:
         self._readers: Final = {signal: _Reader(signal, _parts(run, signal)) for signal in TABLES}
 
     def at(self, t_ns: int) -> MobileyeState:
-        """What was known at ``t_ns``; call it with times that do not go back."""
+        """Return the device's state at ``t_ns``; call it with times that do not decrease."""
         keep_ns = round((self._past.max_age_s + 1.0) * 1e9)
         obstacles, lanes = (
             self._readers[signal].around(t_ns, keep_ns) for signal in MOBILEYE_SIGNALS
@@ -95,7 +95,7 @@ class StoredMobileye:
         return state_at(self._fresh(obstacles), self._fresh(lanes), t_ns, self._past)
 
     def forget_before(self, t_ns: int) -> None:
-        """Nothing reported before ``t_ns`` counts any more."""
+        """Ignore everything reported before ``t_ns``."""
         self._since_ns = t_ns
 
     def _fresh(self, held: Samples | None) -> Samples | None:
@@ -104,7 +104,7 @@ class StoredMobileye:
         return held.take(held.t_ns >= self._since_ns)
 
     def cues(self, t_ns: int) -> PastCues:
-        """The cues past the intersection at ``t_ns``, once a range is known."""
+        """Return the cues beyond the intersection at ``t_ns``, evaluated once a range is known."""
         past = self._past
 
         def counts(best: RangeBelief | None, reference: Reference | None) -> Mapping[str, int]:
@@ -123,7 +123,7 @@ class _Reader:
     held: Samples | None = None
 
     def around(self, t_ns: int, keep_ns: int) -> Samples | None:
-        """Samples from some way before ``t_ns`` to beyond it."""
+        """Return samples from ``keep_ns`` before ``t_ns``, or earlier, to after it."""
         while self.held is None or self.held.t_ns[-1] <= t_ns:
             fresh = next(self.parts, None)
             if fresh is None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 GROUP_ROWS: Final = 8192
-"""Rows of a table held back before they are written."""
+"""Rows of a table buffered before they are written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,20 +25,20 @@ class TableFolder:
     """A folder of tables.
 
     Attributes:
-        path: Where it is.
+        path: Path of the folder.
     """
 
     path: Path
 
     def file(self, name: str) -> Path:
-        """Path of one of its files."""
+        """Return the path of one of its files."""
         return self.path / name
 
     def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
-        """Rows of ``NAME.parquet``, its page checksums verified.
+        """Read ``NAME.parquet`` and verify its page checksums.
 
         Raises:
-            RunError: Not there or damaged.
+            RunError: The file is missing or damaged.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -55,10 +55,10 @@ class TableFolder:
             ) from None
 
     def schema(self, name: str) -> pa.Schema:
-        """Columns of ``NAME.parquet``.
+        """Read the schema of ``NAME.parquet``.
 
         Raises:
-            RunError: Not there or damaged.
+            RunError: The file is missing or damaged.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -77,10 +77,10 @@ class TableFolder:
     def batches(
         self, name: str, columns: list[str] | None = None, rows: int = 16_384
     ) -> Iterator[pa.RecordBatch]:
-        """Rows of ``NAME.parquet`` a batch at a time, its page checksums verified.
+        """Read ``NAME.parquet`` a batch at a time and verify its page checksums.
 
         Raises:
-            RunError: Not there or damaged.
+            RunError: The file is missing or damaged.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -101,13 +101,13 @@ class TableFolder:
 
 
 class TableSink:
-    """A Parquet file written a batch at a time and named when whole; a context manager.
+    """A Parquet file written a batch at a time and renamed when complete; a context manager.
 
-    Small batches are held back until they make a row group worth its header.
+    Small batches are buffered until they form a row group of reasonable size.
     """
 
     def __init__(self, run: TableFolder, name: str, schema: pa.Schema) -> None:
-        """Begin ``NAME.parquet``."""
+        """Create ``NAME.parquet``."""
         import pyarrow.parquet as pq
 
         self._path: Final = run.file(f"{name}.parquet")
@@ -128,7 +128,7 @@ class TableSink:
             raise cannot_write(self._path, error) from None
 
     def write(self, columns: Mapping[str, object]) -> None:
-        """Append rows given as columns.
+        """Append rows, as columns.
 
         Raises:
             OutputError: The disk is full.
@@ -162,7 +162,7 @@ class TableSink:
         trace: TracebackType | None,
     ) -> None:
         if kind is not None:
-            # The disk may be full: what matters is that nothing half stays and the cause is kept.
+            # The disk may be full; remove the incomplete file and report the original error.
             with suppress(OSError, ValueError):
                 self._writer.close()
             self._give_up()
@@ -177,7 +177,7 @@ class TableSink:
             raise cannot_write(self._path, error) from None
 
     def _give_up(self) -> None:
-        """Leave nothing half."""
+        """Remove the incomplete file."""
         with suppress(OSError):
             self._file.close()
         self._partial.drop()

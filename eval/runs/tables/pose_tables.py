@@ -1,4 +1,4 @@
-"""Columns of ``pose.parquet``, and what a run sums up of them."""
+"""Columns of ``pose.parquet``, and their summary for a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2"
 
 @dataclass(slots=True)
 class PoseTally:
-    """Grows with every batch of poses."""
+    """Running summary of all poses of a run."""
 
     rows: int = 0
     travelled_m: float = 0.0
@@ -26,11 +26,11 @@ class PoseTally:
 
     @property
     def seconds(self) -> float:
-        """From the first row to the last."""
+        """Time from the first row to the last."""
         return 0.0 if self.first_ns is None else (self.last_ns - self.first_ns) * 1e-9
 
     def add(self, poses: PoseColumns) -> None:
-        """Take in a batch, not empty."""
+        """Add a non-empty batch of poses."""
         self.rows += len(poses)
         self.travelled_m = float(poses.travelled_m[-1])
         self.major_axis_m = float(poses.major_axis_m[-1])
@@ -40,7 +40,7 @@ class PoseTally:
 
 
 def pose_schema() -> pa.Schema:
-    """Columns of ``pose.parquet``."""
+    """Return the schema of ``pose.parquet``."""
     import pyarrow as pa
 
     numbers = [
@@ -62,7 +62,7 @@ def pose_schema() -> pa.Schema:
 
 
 def pose_rows(poses: PoseColumns, landmarks: Sequence[str | None]) -> dict[str, object]:
-    """Rows of ``pose.parquet``, with the landmark weighed in at each."""
+    """Return rows of ``pose.parquet``, with the landmark that corrected each pose."""
     rows: dict[str, object] = {
         "t_ns": poses.t_ns,
         "x_m": poses.x_m,

@@ -1,4 +1,4 @@
-"""``skipped.parquet``: what was left out of the logs, and why."""
+"""The table ``skipped.parquet``: skipped and dropped rows of the logs, with reasons."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def skipped_schema() -> pa.Schema:
-    """Columns of ``skipped.parquet``."""
+    """Return the schema of ``skipped.parquet``."""
     import pyarrow as pa
 
     return pa.schema(
@@ -36,7 +36,7 @@ def skipped_schema() -> pa.Schema:
 
 
 def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
-    """Single skips and drops of one log."""
+    """Return the single skips and drops of one log."""
     return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
 
 
@@ -47,21 +47,21 @@ def write_skipped(
     kept: pa.Table | None = None,
     timeline: Timeline = ONE_SEGMENT,
 ) -> None:
-    """Write ``skipped.parquet``; its counts are those of the account, reason by reason.
+    """Write ``skipped.parquet``, whose counts match the account for each reason.
 
     Args:
         run: The run.
-        ledgers: Of all logs.
-        reading: The account's part on them, as it goes into the manifest.
-        kept: Rows of an earlier stage; those of topics that it alone has read stay.
-        timeline: The drive's time segments; stamps here are as recorded.
+        ledgers: Ledgers of all logs.
+        reading: Accounts of the logs, as written to the manifest.
+        kept: Rows of an earlier stage; those of topics that only it has read are kept.
+        timeline: The drive's time segments; stamps in this table are as recorded.
     """
     rows = [row for ledger in ledgers for row in _skipped_rows(ledger)]
     earlier = [] if kept is None else kept.to_pylist()
     with TableSink(run, "skipped", labelled(skipped_schema())) as sink:
         for log in reading:
             for topic, account in log.topics.items():
-                # What both stages have met is in the rows of each, a camera's in the first's.
+                # Rows of unknown topics are this stage's; others the earlier stage's if it has any.
                 for rest in (rows, earlier) if topic == UNATTRIBUTED else (earlier, rows):
                     mine = [r for r in rest if (r["log"], r["topic"]) == (log.log, topic)]
                     if mine:
@@ -78,7 +78,7 @@ def write_skipped(
 def _in_bulk(
     single: Sequence[Mapping[str, Any]], log: str, topic: str, account: TopicLine
 ) -> list[dict[str, Any]]:
-    """A row for each reason of which the single rows report less than the account."""
+    """Return a row for each reason that the account counts more often than the single rows."""
     rows = []
     for known_counts, is_dropped in ((account.skipped, False), (account.dropped, True)):
         listed: Counter[str] = Counter()

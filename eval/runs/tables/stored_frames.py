@@ -1,4 +1,4 @@
-"""Frames of a run with what detectors found in them, read back from its tables one by one."""
+"""Frames of a run with their detections, read one by one from its tables."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class StoredFrame:
     """One frame of the camera.
 
     Attributes:
-        seen: What was found, by role.
+        seen: Detections by role.
         size_px: Width and height of the picture.
-        heights_px: One array a detections object of ``seen.objects``: rows that each mask spans.
+        heights_px: Number of rows that each mask spans, one array per item of ``seen.objects``.
     """
 
     seen: Seen
@@ -35,14 +35,14 @@ class StoredFrame:
 
     @property
     def found(self) -> tuple[Found, ...]:
-        """What each detector found, road as far as its mask was read."""
+        """Results of each detector; road only if its mask was read."""
         road = (self.seen.road,) if isinstance(self.seen.road, RoadMask) else ()
         return (*self.seen.objects, *self.seen.signs, *road)
 
 
 @dataclass(slots=True)
 class _Rows:
-    """A table read forwards, as rows that belong to one frame after another."""
+    """Forward reader of a table that returns the rows of one frame after another."""
 
     batches: Iterator[Any]
     names: Sequence[str]
@@ -51,7 +51,7 @@ class _Rows:
     _next: int = 0
 
     def of(self, frame: int) -> list[tuple[Any, ...]]:
-        """Rows of a frame; call with frames in order."""
+        """Return the rows of a frame; call it with frames in order."""
         rows: list[tuple[Any, ...]] = []
         while self._fill():
             start = bisect_left(self._frames, frame, self._next)
@@ -92,14 +92,14 @@ MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 def stored_frames(
     run: TableFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
 ) -> Iterator[StoredFrame]:
-    """All frames of a run in the order they were examined; memory holds one batch of rows.
+    """Yield all frames of a run in the order of detection; memory holds one batch of rows.
 
-    What another detector found with a better score is in ``seen.doubles``.
+    Detections for which another detector has a better score are in ``seen.doubles``.
 
     Args:
-        run: With the tables of the detect stage.
-        detectors: The manifest's list: name and role of each.
-        with_road_masks: Give road pixels instead of their fractions of the regions.
+        run: A run with the tables of the detect stage.
+        detectors: The manifest's list of detectors, with name and role.
+        with_road_masks: Return road masks instead of road fractions of the regions.
 
     Raises:
         RunError: A table is missing or damaged.

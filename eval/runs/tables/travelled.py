@@ -1,8 +1,8 @@
-"""How far the car went between two times, from the odometry a run has stored.
+"""Distance travelled between two times, from the odometry stored in a run.
 
-A run keeps the odometry its pose filter was given (``measurements.parquet``); estimators that work
-at camera rate take their increments from there, so they never read the log again. Where a short gap
-was crossed at the last speed, the way says so: it was assumed, not measured.
+A run stores the odometry of its pose filter (``measurements.parquet``). Estimators that work at
+camera rate read their increments from there, so they never read the log again. Motion across a
+short gap is assumed from the last speed, and is reported as assumed.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ COLUMNS: Final = ("start_ns", "t_ns", "distance_m", "turn_rad", "distance_var_m2
 
 
 class Way(NamedTuple):
-    """What the odometry says of a stretch of time.
+    """Motion over a span of time.
 
     Attributes:
-        distance_m: Signed: forwards is positive.
-        var_m2: Its variance.
-        turn_rad: Counter-clockwise.
-        covered_ns: How much of the stretch odometry covers, or what was assumed across a gap.
-        assumed_ns: How much of that was assumed.
-        assumed_m: The part of the way that was assumed, without sign.
+        distance_m: Signed distance, positive forward.
+        var_m2: Variance of the distance.
+        turn_rad: Change of heading, counter-clockwise.
+        covered_ns: Time covered by odometry or by assumed motion.
+        assumed_ns: Part of that time for which the motion was assumed.
+        assumed_m: Assumed part of the distance, unsigned.
     """
 
     distance_m: float
@@ -55,11 +55,11 @@ _Part = tuple[Int64s, Int64s, Floats, Floats, Floats, NDArray[np.bool_]]
 
 @dataclass(slots=True)
 class Odometer:
-    """Reads a run's odometry once, forwards in time; memory holds one batch.
+    """Forward reader of a run's odometry; memory holds one batch.
 
     Attributes:
-        parts: Batches of columns in ``COLUMNS``' order and whether a row is a gap, by time.
-        at_ns: How far it has been read.
+        parts: Batches of columns in the order of ``COLUMNS``, and flags of gaps, sorted by time.
+        at_ns: Time up to which the odometry has been read.
     """
 
     parts: Iterator[_Part]
@@ -68,9 +68,9 @@ class Odometer:
     _next: int = 0
 
     def until(self, t_ns: int) -> Way:
-        """The way since the last call; the first call's begins with the odometry itself.
+        """Return the motion since the last call, or since the start of the odometry.
 
-        A time before the last call's moves nothing and returns nothing.
+        A time before that of the last call has no effect and returns no motion.
         """
         if self.at_ns is not None and t_ns <= self.at_ns:
             return Way(0.0, 0.0, 0.0, 0)
@@ -95,7 +95,7 @@ class Odometer:
         return Way(distance, var, turn, covered, assumed, assumed_m)
 
     def skip_to(self, t_ns: int) -> None:
-        """Leave out all odometry before ``t_ns``, and all of a gap that it is in."""
+        """Skip all odometry before ``t_ns``, and the complete gap if ``t_ns`` is in one."""
         self.until(t_ns)
         row = self._peek()
         if row is not None and row.is_gap and row.start_ns < t_ns:
@@ -113,7 +113,7 @@ class Odometer:
 
 
 def odometer_of(run: TableFolder) -> Odometer:
-    """The odometry of a run.
+    """Open the odometry of a run.
 
     Raises:
         RunError: The table is missing or damaged.

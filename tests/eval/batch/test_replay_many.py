@@ -104,7 +104,7 @@ def test_workers_for_a_single_drive_are_refused(
 
     assert run(["replay", log, "-o", str(tmp_path / "run"), "--workers", "2"]) == 2
 
-    assert "--each makes it many" in capsys.readouterr().err
+    assert "add --each" in capsys.readouterr().err
 
 
 def test_a_drive_folder_brings_its_vehicle_file(drives: Path, tmp_path: Path) -> None:

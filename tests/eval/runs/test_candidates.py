@@ -44,7 +44,7 @@ def test_a_range_without_a_curve_says_so() -> None:
 
     assert candidate_lines({}, ranged) == [
         "range: 80 traffic lights measured, no curve: [ranges.traffic_light] is not given; "
-        "crosscue fit ranges, or for ranges from motion give camera.focal_px and leave out "
+        "crosscue fit ranges, or for ranges from motion set camera.focal_px and leave out "
         "ranges.kind",
         "range: 0 traffic lights used; 5 no height",
     ]

@@ -101,7 +101,7 @@ def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
         (["weather=a\nb"], "expected KEY=VALUE"),
         (["weather=rain", "weather=dry"], "weather: set twice"),
         (["weather=rain", "--remove", "weather"], "set twice, or set and removed"),
-        (["--remove", "a b"], "a b: no key of a tag"),
+        (["--remove", "a b"], "a b: not a valid key of a tag"),
     ],
 )
 def test_wrong_tags_change_nothing(
