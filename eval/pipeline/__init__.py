@@ -1,1 +1,1 @@
-"""The stages of one drive: detect, estimate, and the tables between them."""
+"""The stages that process one drive: detect and estimate."""

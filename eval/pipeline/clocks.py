@@ -1,4 +1,4 @@
-"""Which clock each topic was read by: chosen by a log's first seconds, judged over all of it."""
+"""Clocks of topics: chosen from a log's first seconds, and judged over the complete log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from crosscue.replay.clocks.reports import ClockReport
 def clock_rows(
     used: Mapping[str, Clock], reports: Mapping[str, ClockReport]
 ) -> dict[str, ClockRow]:
-    """Clock used and the whole pass's report for each topic."""
+    """Return the clock used and the report over the complete log, by topic."""
     return {
         name: ClockRow(
             used=used.get(name, Clock.LOG),
@@ -25,7 +25,7 @@ def clock_rows(
 
 
 def clock_changes(used: Mapping[str, Clock], reports: Mapping[str, ClockReport]) -> Iterator[str]:
-    """Topics whose clock would have been chosen otherwise in hindsight."""
+    """Yield notices of topics for which the complete log suggests another clock."""
     for name, report in reports.items():
         if name in used and used[name] is not report.used:
             yield f"{name}: used the {used[name].value}, but over the whole log: {report.why}"

@@ -1,4 +1,4 @@
-"""From a drive's camera to detections, fractions of road and cues in a run folder."""
+"""The detect stage: from a drive's camera to detections, road and cues in a run folder."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ if TYPE_CHECKING:
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
-    """The vehicle file's own detectors by name."""
+    """Return the detectors that the vehicle file defines, by name."""
     return {
         name: Choice(
             name,
@@ -98,9 +98,9 @@ def detect_drive(
     draw: int = 0,
     on_frames: OnFrames = no_progress,
 ) -> DetectOutcome:
-    """Run detectors over the one camera of a drive, into an empty run folder.
+    """Run detectors over the only camera of a drive, into an empty run folder.
 
-    The folder is locked while this works, and cleared first; otherwise as ``detect_into``.
+    The folder is locked meanwhile, and cleared first. See ``detect_into`` for the arguments.
     """
     with locked(run), staged(run) as new, nothing_left(new):
         clear(new, input_of(logs, vehicle, selection, choices, draw, None))
@@ -119,22 +119,23 @@ def detect_into(
     on_frames: OnFrames = no_progress,
     timeline: Timeline | None = None,
 ) -> DetectOutcome:
-    """Run detectors over the one camera of a drive, into a run folder that is locked.
+    """Run detectors over the only camera of a drive, into a locked run folder.
 
     Args:
-        logs: All logs of the drive, open.
-        vehicle: What the vehicle file says.
-        run: Where to.
-        selection: Which part of the logs.
+        logs: All open logs of the drive.
+        vehicle: Settings of the vehicle file.
+        run: The run folder.
+        selection: The part of the logs to use.
         choices: Detectors, in order.
-        cache: File with results of earlier runs, or None for none.
-        draw: How many pictures to write at most, with detections drawn, spread over the drive.
-        on_frames: Called with how many frames are done, and of how many where the log declares it.
-        timeline: The drive's time segments, if they have been found already.
+        cache: File with results of earlier runs, or None.
+        draw: Max number of pictures to write with detections drawn, spread over the drive.
+        on_frames: Called with the number of frames done, and the total if the log declares it.
+        timeline: The drive's time segments, if already known.
 
     Raises:
-        VehicleError: No camera or several; a card, weights or settings that do not fit.
-        EmptyResultError: Not one frame in the requested part.
+        VehicleError: The drive has no camera or several, or a card, weights or settings are
+            invalid.
+        EmptyResultError: The selected part contains no frame.
         OutputError: The disk is full.
     """
     began = time.monotonic()
@@ -233,7 +234,7 @@ def detect_into(
 
 
 def _declared(topic: Topic, selection: Selection) -> int | None:
-    """How many frames the log declares in the requested part; None for a span of time."""
+    """Return the number of frames that the log declares; None if a time span is selected."""
     is_whole = selection.start_ns is None and selection.end_ns is None
     return topic.declared if is_whole else None
 
@@ -247,7 +248,7 @@ def _no_frames(topic: Topic, ledger: Ledger) -> str:
 def _detector_rows(
     named: Sequence[Named], choices: Sequence[Choice], tables: _Tables
 ) -> tuple[DetectorRow, ...]:
-    """The manifest's part on detectors, in order."""
+    """Return the manifest's rows of the detectors, in order."""
     return tuple(
         DetectorRow(
             name=one.name,
@@ -266,12 +267,12 @@ def _detector_rows(
 
 
 def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]:
-    """Embedded networks on a log that ``simulate`` has not made."""
+    """Return warnings about embedded networks on a log that was not simulated."""
     if all(map(is_simulated, logs)):
         return []
     return [
         f"warning: {choice.name}: the embedded network knows simulated scenes only, and this log "
-        f"is not simulated (no {SIMULATED} beside it); its results mean nothing here; "
+        f"is not simulated (no {SIMULATED} next to it); its results mean nothing here; "
         "choose a model with crosscue model list"
         for choice in choices
         if knows_simulated_only(choice)
@@ -279,7 +280,7 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
 
 
 def _without_cues(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
-    """Detectors of objects of which none is counted by a cue."""
+    """Return warnings about detectors whose labels no cue uses."""
     if vehicle.counts_any_label:
         return []
     counted = {label for labels in vehicle.cue_labels().values() for label in labels}
@@ -294,7 +295,7 @@ def _without_cues(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
 
 
 def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
-    """Detectors that lack a fitted threshold for a label, and the vehicle file says none."""
+    """Return notices about labels without a threshold, fitted or set in the vehicle file."""
     cues, cars = vehicle.cues, vehicle.cars
     open_labels = {
         label
@@ -319,20 +320,20 @@ def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
 
 
 def _without_masks(boxes_only: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]:
-    """Which rules used boxes where the source uses masks, by detector.
+    """Return notices about rules that used boxes where the dissertation uses masks, by detector.
 
     Args:
-        boxes_only: Labels that a detector reported, never with a mask.
-        vehicle: With what the cues count.
+        boxes_only: Labels that a detector reported only without masks, by detector.
+        vehicle: Settings with the labels of the cues.
     """
     cues, cars = vehicle.cues, vehicle.cars
     heights = {*cues.stop_sign_labels, *cues.traffic_light_labels}
-    said = {
+    affected = {
         name: [
             *(["heights of signs and lights are those of boxes"] if labels & heights else []),
             *(
                 [
-                    "cross traffic is judged by boxes (eq. 15 takes masks), and its cars do not "
+                    "cross traffic is judged by boxes (eq. 15 uses masks), and its cars do not "
                     "count as parked, since only a mask shows where one faces (eq. 16)"
                 ]
                 if labels & {*cars.labels}
@@ -341,7 +342,7 @@ def _without_masks(boxes_only: Mapping[str, Set[str]], vehicle: Vehicle) -> list
         ]
         for name, labels in boxes_only.items()
     }
-    return [f"{name}: no masks: {'; '.join(rules)}" for name, rules in said.items() if rules]
+    return [f"{name}: no masks: {'; '.join(rules)}" for name, rules in affected.items() if rules]
 
 
 def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
@@ -352,7 +353,7 @@ def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[
 
 @dataclass(slots=True)
 class _Tables:
-    """The three tables of a run, filled frame by frame."""
+    """The three tables of a run, written frame by frame."""
 
     run: RunFolder
     camera: str
@@ -366,7 +367,7 @@ class _Tables:
     notices: list[str] = field(default_factory=list)
     objects: dict[str, int] = field(default_factory=dict)
     masked: dict[str, set[str]] = field(default_factory=dict)
-    """By detector: labels of objects that it reported with a mask."""
+    """Labels of objects reported with a mask, by detector."""
     _boxed: dict[str, set[str]] = field(default_factory=dict)
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, LabelledSink] = field(default_factory=dict)
@@ -378,11 +379,11 @@ class _Tables:
     _meanings: dict[str, str] = field(default_factory=dict)
     _min_scores: list[dict[str, float]] = field(default_factory=list)
     _labels: frozenset[str] | None = None
-    """What the detectors that give boxes can report; known from the first frame on."""
+    """Labels that the detectors of boxes can report; known from the first frame."""
 
     @property
     def boxes_only(self) -> dict[str, set[str]]:
-        """By detector: labels of objects that it reported, never with a mask."""
+        """Labels of objects reported only without masks, by detector."""
         return {name: labels - self.masked.get(name, set()) for name, labels in self._boxed.items()}
 
     def __enter__(self) -> _Tables:
@@ -403,7 +404,7 @@ class _Tables:
                 self._write(name)
 
     def add(self, result: FrameResult) -> None:
-        """Rows of one frame."""
+        """Add the rows of one frame."""
         if self._size not in (None, result.size_px):
             self.notices.append(
                 f"{self.camera}: pictures of {self._size} became {result.size_px} px at "
@@ -445,7 +446,7 @@ class _Tables:
         if isinstance(road, RoadMask):
             fractions = cues.road
             if fractions is None or self.vehicle.regions.kind == "ground":
-                # Where the intersection is becomes known later; the mask is kept for that.
+                # The mask is stored, because the intersection's position is estimated later.
                 fractions = road_fractions(road, self.vehicle.regions)
             self._held["road"].append(
                 {
@@ -478,7 +479,10 @@ class _Tables:
             self.cue_frames[cue] = self.cue_frames.get(cue, 0) + (count > 0)
 
     def _once(self, found: Sequence[Found]) -> tuple[list[Found], dict[int, Int64s]]:
-        """Results without another detector's objects; and whose they are, by detector."""
+        """Return results without duplicates, and by detector who keeps each of its detections.
+
+        The latter is the index of the other detector, or ``KEPT`` for a detector's own.
+        """
         numbers = [k for k, one in enumerate(found) if isinstance(one, Detections)]
         boxes = [one for one in found if isinstance(one, Detections)]
         calibrated = [is_calibrated(self.detectors[k].detector) for k in numbers]
@@ -536,7 +540,7 @@ class _Tables:
 
 
 def _height_px(found: Detections, i: int) -> float:
-    """Rows that the mask spans, or the box's height where there is no mask."""
+    """Return the number of rows that the mask spans, or the height of a box without mask."""
     if not found.masks[i]:
         return float(found.boxes_px[i, 3] - found.boxes_px[i, 1])
     rows = np.flatnonzero(found.mask(i).any(axis=1))
@@ -544,7 +548,7 @@ def _height_px(found: Detections, i: int) -> float:
 
 
 def schemas() -> dict[str, pa.Schema]:
-    """Columns of the tables that this stage writes."""
+    """Return the schemas of the tables that this stage writes."""
     import pyarrow as pa
 
     number, text = pa.float64(), pa.string()

@@ -1,4 +1,4 @@
-"""A drive's time segments, found once and used by all of its stages."""
+"""Time segments of a drive, found once and used by all of its stages."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def drive_timeline(
     """Read a drive's stamps once and find its segments.
 
     Args:
-        logs: All logs of the drive, open.
-        vehicle: What the vehicle file says.
-        selection: Which part of the logs will be read.
-        camera: Its stamps are examined, too.
-        known: What an earlier stage found; its shifts are kept.
+        logs: All open logs of the drive.
+        vehicle: Settings of the vehicle file.
+        selection: The part of the logs that will be read.
+        camera: Camera whose stamps are examined as well.
+        known: Segments found by an earlier stage; their shifts are kept.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
@@ -50,10 +50,10 @@ def drive_timeline(
 def camera_timeline(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, camera: tuple[int, Topic]
 ) -> Timeline:
-    """As ``drive_timeline``, for a stage that needs the camera alone.
+    """Return the segments as ``drive_timeline`` does, for a stage that needs only the camera.
 
-    Where the vehicle file does not fit the odometry, only the camera's own clock is examined: the
-    stage that needs the odometry says what is wrong.
+    If the vehicle file does not fit the odometry, only the camera's own clock is examined. The
+    stage that needs the odometry reports the error.
     """
     try:
         return drive_timeline(logs, vehicle, selection, camera)
@@ -64,13 +64,13 @@ def camera_timeline(
 
 
 def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
-    """Say that a run's frames carry other segments than its odometry has.
+    """Refuse a run whose frames have other segments than its odometry.
 
-    The vehicle file that detected may not have fitted the odometry, or have named other wheel
-    speeds.
+    The vehicle file used for detection may not have fitted the odometry, or may have named other
+    wheel speeds.
 
     Raises:
-        UsageError: Some frame's number differs.
+        UsageError: The segment of a frame differs.
     """
     for batch in run.batches("frames", ["t_ns", "segment"]):
         t_ns, there = (batch[name].to_numpy() for name in ("t_ns", "segment"))
@@ -80,12 +80,12 @@ def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
             raise UsageError(
                 f"{run.path}: its frame at {t_ns[at]} ns is in segment {there[at]}, the odometry "
                 f"then in {wanted[at]}: its frames were detected with a vehicle file of other "
-                "odometry; estimate keeps their segments: run crosscue replay again"
+                "odometry, and estimate keeps their segments; run crosscue replay again"
             )
 
 
 def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Timeline:
-    """As ``drive_timeline``, over every topic: for who writes all of them."""
+    """Return the segments as ``drive_timeline`` does, from the stamps of all topics."""
     planned, wheels = plan_for_time(logs, vehicle, selection)
     return scan(logs, planned, vehicle, [selection] * len(logs), wheels)
 
@@ -93,9 +93,9 @@ def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) 
 def plan_for_time(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection
 ) -> tuple[Plan, list[Extractor]]:
-    """Where the wheel speeds come from, and what reads them, for each log.
+    """Return the plan for the wheel speeds, and an extractor for each log.
 
-    Without wheel speeds to choose, nothing is planned: set-backs are found all the same.
+    Without wheel speeds nothing is planned; clock set-backs are still found.
     """
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     try:
@@ -118,7 +118,7 @@ def _no_wheels(planned: Plan, vehicle: Vehicle, logs: int) -> list[Extractor]:
 
 
 def selections_of(logs: Sequence[Log], planned: Plan, selection: Selection) -> list[Selection]:
-    """What is read of each log: the topics that are used."""
+    """Return the selection of each log, narrowed to the topics that are used."""
     return [_narrowed(selection, planned.topics_of(i)) for i in range(len(logs))]
 
 
@@ -128,7 +128,7 @@ def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
 
 
 def time_segments(timeline: Timeline) -> TimeSegments:
-    """The manifest's part on time."""
+    """Return a timeline in the form of the manifest."""
     return TimeSegments(
         segments=timeline.segments,
         clocks=timeline.clocks,

@@ -1,4 +1,4 @@
-"""An empty result: one line that says what the log has instead."""
+"""Errors for empty results, with one line on what the log contains instead."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ ROLES: Final[Mapping[Signal, str]] = {
 
 
 def empty_result(what: str, logs: Sequence[Log], selection: Selection) -> CrosscueError:
-    """The error to raise; the logs are read once more to say what they do hold.
+    """Return the error to raise; the logs are read again to report what they contain.
 
-    It is a ``LogError`` where damage has left not one row in them.
+    It is a ``LogError`` if no row is left because of damage.
 
     Args:
-        what: What found no rows, and where it looked.
-        logs: Open.
-        selection: What was asked for.
+        what: Description of what found no rows, and where.
+        logs: Open logs.
+        selection: The requested part of the logs.
     """
     rows: Counter[str] = Counter({topic.name: 0 for log in logs for topic in log.topics})
     first_ns: int | None = None
@@ -78,7 +78,7 @@ def _or(time_ns: int | None, word: str) -> str:
 
 
 def silent_roles(planned: Plan, received: Mapping[Signal, int]) -> dict[Signal, str]:
-    """Roles that a topic was planned for and that found no row, each in words."""
+    """Return a sentence for each role whose planned topic had no row."""
     found = {}
     for signal, name in ROLES.items():
         source = planned.source_of(signal)
@@ -89,9 +89,9 @@ def silent_roles(planned: Plan, received: Mapping[Signal, int]) -> dict[Signal, 
 
 @contextmanager
 def nothing_left(run: RunFolder) -> Iterator[None]:
-    """Take a run's files away again when the result is empty, so that it does not look finished.
+    """Remove a run's files if the result is empty, so that the run does not look finished.
 
-    Detections that are whole stay where only the settings of the estimate are refused.
+    Complete detections are kept if only the settings of the estimate are refused.
     """
     try:
         yield

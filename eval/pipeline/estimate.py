@@ -1,7 +1,6 @@
-"""The second stage: pose from the logs' signals, and the scene from what detectors found before.
+"""The estimate stage: the pose from the logs' signals, and the scene from stored detections.
 
-No picture is opened here, unless landmarks are to be looked for: a detector's results come from
-the run's own tables.
+No picture is opened unless landmarks are searched for: detections are read from the run's tables.
 """
 
 from __future__ import annotations
@@ -82,24 +81,24 @@ def estimate_into(
     reported: Sequence[LogRow] | None = None,
     timeline: Timeline | None = None,
 ) -> Outcome:
-    """Write pose, cues, ranges, beliefs and the manifest into a run folder that is locked.
+    """Write pose, cues, ranges, beliefs and the manifest into a locked run folder.
 
     Args:
-        logs: All logs of the drive, open.
-        vehicle: What the vehicle file says.
-        run: With the detect stage's tables, or without any.
-        selection: Which part of the logs.
-        on_time: Called with the seconds done, and those there are.
-        landmarks: Camera frames are compared with these, where given.
-        detected: The detect stage, if it ran just now.
-        earlier: The manifest's part on the detect stage, if it ran earlier.
-        reported: ``log_rows(logs, run)``, if they have been hashed already.
-        timeline: The drive's time segments, if they have been found already.
+        logs: All open logs of the drive.
+        vehicle: Settings of the vehicle file.
+        run: The run folder, with or without tables of the detect stage.
+        selection: The part of the logs to use.
+        on_time: Called with the seconds done, and the total.
+        landmarks: Database with which camera frames are compared, or None.
+        detected: Outcome of the detect stage, if it ran just now.
+        earlier: Manifest of the detect stage, if it ran earlier.
+        reported: ``log_rows(logs, run)``, if already computed.
+        timeline: The drive's time segments, if already known.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: The requested part holds nothing to estimate from.
-        UsageError: The frames of the detect stage are labelled with other segments.
+        EmptyResultError: The selected part contains nothing to estimate from.
+        UsageError: The frames of the detect stage have other time segments.
         OutputError: The disk is full.
     """
     began = time.monotonic()
@@ -191,7 +190,7 @@ def _notices(
     found: DetectManifest | None,
     landmarks: LandmarkDatabase | None,
 ) -> tuple[str, ...]:
-    """What a person should know of the run, the gaps first."""
+    """Return the notices of the run, gaps first."""
     return (
         *gaps_text(reading.timeline.segments),
         *_missing(reading.planned),
@@ -209,7 +208,7 @@ def _notices(
 
 
 def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUsed:
-    """The manifest's part on landmarks."""
+    """Return the manifest's record of the landmark database."""
     return LandmarksUsed(
         database=relative(landmarks.path, run),
         landmarks=len(landmarks),
@@ -218,14 +217,14 @@ def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUse
 
 
 def _of_detecting(found: DetectManifest | None) -> list[str]:
-    """What the detect stage had to say, but for the gaps: those are reported for the whole run."""
+    """Return the notices of the detect stage except gaps, which are reported for the run."""
     if found is None:
         return []
     return [one for one in found.notices if one not in found.time.notices]
 
 
 def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
-    """From the first row to the last, gaps left out."""
+    """Return the time from the first row to the last, without gaps."""
     later = timeline.segments[1:]
     pairs = zip(timeline.segments, later, strict=False)
     gaps_ns = sum(b.start_ns - a.end_ns for a, b in pairs if b.breaks_odometry)
@@ -235,12 +234,12 @@ def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
 def _hashed(
     logs: Sequence[Log], run: RunFolder, found: DetectManifest | None
 ) -> tuple[LogRow, ...]:
-    """Paths and hashes of the logs; the detect stage of this very run has taken them already."""
+    """Return the rows of the logs, from the detect stage of this run if it has hashed them."""
     return log_rows(logs, run) if found is None else found.logs
 
 
 def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
-    """Make the run what the detect stage left: cut short, it must not pass for a whole one."""
+    """Restore the detect stage's manifest, so that an interrupted run does not look complete."""
     if found is None:
         run.file(MANIFEST).unlink(missing_ok=True)
     else:
@@ -248,7 +247,7 @@ def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
 
 
 class _Reading:
-    """A drive's logs, planned and with their clocks chosen."""
+    """A drive's logs with their plan and chosen clocks."""
 
     def __init__(
         self,
@@ -287,7 +286,7 @@ class _Reading:
         return [TimedLog(log, self.timeline.clock(i)) for i, log in enumerate(self.logs)]
 
     def clock_of(self, signal: Signal) -> LogClock:
-        """The clock of the log that a signal comes from."""
+        """Return the clock of the log that a signal comes from."""
         source = self.planned.source_of(signal)
         return self.timeline.clock(0 if source is None else source.log)
 
@@ -346,7 +345,7 @@ def _scene(
 
 
 def scene_summary(scene: SceneOutcome) -> SceneSummary:
-    """As the manifest holds it."""
+    """Return the scene in the form of the manifest."""
     return SceneSummary(
         frames=scene.frames,
         positive=dict(scene.positive),
@@ -360,7 +359,7 @@ def scene_summary(scene: SceneOutcome) -> SceneSummary:
 
 
 def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
-    """What the detect stage reported of the camera; the other topics are read again."""
+    """Return the detect stage's skipped rows of the camera; other topics are read again."""
     import pyarrow.compute as pc
 
     table = run.table("skipped")
@@ -369,7 +368,7 @@ def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
 
 
 def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
-    """From a signal to the log and topic that gave it."""
+    """Return the log and topic of each signal."""
     names = log_names(logs)
     found = {signal: planned.source_of(signal) for signal in Signal}
     return {
@@ -379,7 +378,7 @@ def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
 
 
 def _missing(planned: Plan) -> list[str]:
-    """What the run had to do without, in plain words."""
+    """Return notices about missing signals."""
     names = {
         Signal.WHEEL_SPEEDS: "no wheel speeds, so no pose",
         Signal.MAGNETIC_FIELD: "no compass, so the heading drifts",
@@ -395,14 +394,14 @@ def _missing(planned: Plan) -> list[str]:
 def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | None) -> list[str]:
     if landmarks is None or camera is not None:
         return []
-    return ["landmarks were given, but the logs have no camera: none is looked for"]
+    return ["landmarks were given, but the logs have no camera: none is searched for"]
 
 
 def _no_mobileye(found: DetectManifest | None, planned: Plan) -> list[str]:
     reason = planned.missing.get(Signal.MOBILEYE_OBSTACLES)
     if found is None or reason is None:
         return []
-    return [f"no Mobileye, so no lane lines or vehicles past the intersection: {reason}"]
+    return [f"no Mobileye, so no lane lines or vehicles beyond the intersection: {reason}"]
 
 
 def _no_scene(found: DetectManifest | None, reading: _Reading) -> list[str]:

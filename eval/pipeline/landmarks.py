@@ -1,4 +1,4 @@
-"""The camera's part of a replay: frames kept until the pose track comes by, then examined."""
+"""Landmarks in a replay: frames are kept until the pose track reaches their time, then matched."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNDECODABLE: Final = "picture does not decode"
 
 
 def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
-    """The vehicle file's [landmarks] section and the camera's place, as the search takes them."""
+    """Return the search settings from the [landmarks] section and the camera's mounting."""
     section, camera = vehicle.landmarks, vehicle.camera
     return LandmarkSettings(
         min_score=section.min_score,
@@ -38,28 +38,28 @@ def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
 
 
 def matcher_for(vehicle: Vehicle, name: str | None = None) -> Matcher:
-    """The matcher that the vehicle file, or a flag, names.
+    """Return the matcher named by the vehicle file or an option.
 
     Raises:
-        UsageError: No such matcher.
+        UsageError: The matcher does not exist.
     """
     camera = CameraGeometry(vehicle.camera.focal_px, vehicle.camera.center_px)
     return make_matcher(name or vehicle.landmarks.matcher, camera)
 
 
 def open_for(path: Path, matcher: Matcher) -> LandmarkDatabase:
-    """A database whose features ``matcher`` can compare.
+    """Open a database whose features ``matcher`` can compare.
 
     Raises:
-        LogError: It cannot be read.
-        UsageError: It holds another matcher's features.
+        LogError: The database cannot be read.
+        UsageError: The database holds another matcher's features.
     """
     database = LandmarkDatabase(path)
     if database.kind != matcher.kind:
         database.close()
         raise UsageError(
             f"{path}: holds features of matcher {database.kind!r}, not {matcher.kind!r}; set "
-            "landmarks.matcher in the vehicle file, or give another database"
+            "landmarks.matcher in the vehicle file, or choose another database"
         )
     return database
 
@@ -73,13 +73,13 @@ class _Frame:
 
 @dataclass(slots=True)
 class LandmarkStage:
-    """``Looks`` of a pose track: the camera's frames against a landmark database.
+    """``Looks`` of a pose track that matches camera frames with a landmark database.
 
     Attributes:
-        search: Owns database, matcher and counts.
-        ledger: The camera's log; pictures that do not decode are dropped in it.
-        interval_ns: Frames closer to the one before are not kept.
-        names: From a time to the landmark weighed in then, for the rows of the pose track.
+        search: Search with database, matcher and counts.
+        ledger: Ledger of the camera's log; pictures that do not decode are dropped in it.
+        interval_ns: Min interval between frames that are kept.
+        names: Accepted landmark by time, for the rows of the pose track.
     """
 
     search: LandmarkSearch
@@ -90,7 +90,7 @@ class LandmarkStage:
     _kept_ns: int | None = None
 
     def see(self, block: Block) -> None:
-        """Keep a block's frames, still encoded."""
+        """Keep the frames of a block, still encoded."""
         if not isinstance(block.rows, Images):
             return
         for row, t_ns in enumerate(block.log_ns.tolist()):
@@ -102,11 +102,11 @@ class LandmarkStage:
             insort(self._frames, _Frame(t_ns, block.topic, picture_of(block.rows, row)))
 
     def times_ns(self) -> Sequence[int]:
-        """Of the frames that wait."""
+        """Times of the waiting frames."""
         return [frame.t_ns for frame in self._frames]
 
     def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """Look at the frame of the belief's time."""
+        """Match the frame at the belief's time; return the corrected belief, or None."""
         self.let_go(belief.t_ns)
         frame = self._frames.pop(0)
         found = self.search.look(belief, travelled_m, partial(self._describe, frame))
@@ -116,26 +116,26 @@ class LandmarkStage:
         return found
 
     def cross_gap(self) -> None:
-        """What was in view before a gap in time says nothing about where the car is after it."""
+        """Forget matches before a gap in time, which do not show the position after it."""
         self.search.cross_gap()
 
     def take_sightings(self) -> list[Sighting]:
-        """The sightings since the last call."""
+        """Return the sightings since the last call."""
         return self.search.take_sightings()
 
     def take_names(self, t_ns: Int64s) -> list[str | None]:
-        """The landmark weighed in at each row's time, or None."""
+        """Return the accepted landmark, or None, at each row's time."""
         return [self.names.pop(t, None) for t in t_ns.tolist()]
 
     def let_go(self, before_ns: int) -> None:
-        """Drop frames that no odometry will reach any more."""
+        """Drop frames that are too old to be reached by odometry."""
         late = bisect_left(self._frames, before_ns, key=lambda frame: frame.t_ns)
         self.search.counts.frames += late
         self.search.counts.late += late
         del self._frames[:late]
 
     def counts(self) -> dict[str, int]:
-        """What became of every frame, for the manifest."""
+        """Return the numbers of frames by outcome, for the manifest."""
         return self.search.counts.as_dict()
 
     def _describe(self, frame: _Frame) -> Features | None:
@@ -147,6 +147,6 @@ class LandmarkStage:
 
 
 def looking(database: LandmarkDatabase, vehicle: Vehicle, ledger: Ledger) -> LandmarkStage:
-    """A stage that looks for the landmarks of ``database`` as the vehicle file says."""
+    """Return a stage that searches for the landmarks of a database, set up by the vehicle file."""
     search = LandmarkSearch(database, matcher_for(vehicle), landmark_settings(vehicle))
     return LandmarkStage(search, ledger, round(vehicle.landmarks.interval_s * 1e9))

@@ -1,4 +1,4 @@
-"""What stages report: how far into a drive they are, and in the end what they did."""
+"""Outcomes of the stages, with their text and JSON output."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Segment
 
 @dataclass(frozen=True, slots=True, repr=False)
 class DetectOutcome:
-    """What a detection run did; printed as ``crosscue detect`` prints it.
+    """Outcome of the detect stage; its ``repr`` is the output of ``crosscue detect``.
 
     Attributes:
-        run: Its folder.
-        ledger: The camera log's account.
-        counts: Frames, by detector what ran and what came from the cache.
-        objects: Detections by detector and label.
-        cues: Frames in which each cue was positive.
-        notices: Plain sentences.
+        run: The run folder.
+        ledger: Ledger of the camera's log.
+        counts: Number of frames, and for each detector of frames run and read from the cache.
+        objects: Number of detections by detector and label.
+        cues: Number of frames in which each cue was positive.
+        notices: Notices for the user.
         seconds: Wall time.
-        account: What became of every row and frame.
-        has_gaps: The drive has more than one time segment.
+        account: Account of every row and frame.
+        has_gaps: True if the drive has more than one time segment.
     """
 
     run: RunFolder
@@ -52,7 +52,7 @@ class DetectOutcome:
         return 0 if self.account.is_whole and not self.has_gaps else 3
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue detect --json`` prints."""
+        """Return the object that ``crosscue detect --json`` prints."""
         return {
             "run": str(self.run.path),
             "account": self.account.as_json(),
@@ -71,22 +71,22 @@ class DetectOutcome:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Outcome:
-    """What a replay, or its second stage alone, did; printed as ``crosscue replay`` prints it.
+    """Outcome of a replay or an estimate; its ``repr`` is the output of ``crosscue replay``.
 
     Attributes:
-        run: Its folder.
-        ledgers: One account for each log.
-        rows: Pose rows written.
-        travelled_m: Along the estimated track.
-        major_axis_m: At the end; NaN without any pose.
-        notices: Plain sentences for the person who ran it.
-        seconds: Wall time, detection included where it ran.
-        drive_seconds: Log time from first to last pose row.
-        landmark_counts: What became of camera frames; empty where no landmarks were given.
-        account: What became of every row, frame and reading.
-        detected: What the detect stage did, where it ran just now.
-        scene: Cues, ranges and beliefs, where detectors have run.
-        segments: Time segments of the drive.
+        run: The run folder.
+        ledgers: Ledger of each log.
+        rows: Number of pose rows written.
+        travelled_m: Length of the estimated track.
+        major_axis_m: Major axis of the 2-sigma ellipse at the end; NaN without any pose.
+        notices: Notices for the user.
+        seconds: Wall time, including detection if it ran.
+        drive_seconds: Log time from the first to the last pose row, without gaps.
+        landmark_counts: Number of camera frames by outcome; empty without landmarks.
+        account: Account of every row, frame and reading.
+        detected: Outcome of the detect stage, if it ran just now.
+        scene: Cues, ranges and beliefs, if detectors have run.
+        segments: Number of time segments of the drive.
     """
 
     run: RunFolder
@@ -109,7 +109,7 @@ class Outcome:
         return 0 if self.account.is_whole and len(self.segments) == 1 else 3
 
     def as_dict(self) -> dict[str, object]:
-        """What ``crosscue replay --json`` prints."""
+        """Return the object that ``crosscue replay --json`` prints."""
         return {
             "run": str(self.run.path),
             "account": self.account.as_json(),
@@ -137,7 +137,7 @@ class Outcome:
 
 
 def _detect_text(outcome: DetectOutcome) -> str:
-    """What happened, for a person."""
+    """Return the text output of the detect stage."""
     counts, ledger = outcome.counts, outcome.ledger
     lines = [f"run      {outcome.run.path}", f"log      {ledger.log}"]
     lines.append(f"frames   {counts.frames:,} in {outcome.seconds:.2f} s")
@@ -151,7 +151,7 @@ def _detect_text(outcome: DetectOutcome) -> str:
 
 
 def _outcome_text(outcome: Outcome) -> str:
-    """What happened, for a person, in 80 columns."""
+    """Return the text output of a replay, at most 80 columns wide."""
     lines = [f"run      {outcome.run.path}"]
     for log in outcome.account.reading:
         lines.append(f"log      {log.log}")
@@ -198,7 +198,7 @@ def _detected(outcome: Outcome) -> list[str]:
 
 
 def _scene_lines(scene: SceneOutcome) -> list[str]:
-    """Cues and approaches, for a person."""
+    """Return the output lines on cues and approaches."""
     seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
     lines = [f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
     rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
@@ -211,14 +211,14 @@ def _scene_lines(scene: SceneOutcome) -> list[str]:
 
 
 def _approach(one: ApproachSummary) -> str:
-    said = ", ".join(
+    features = ", ".join(
         f"{feature} not seen" if feature in one.not_seen else f"{feature} {p:.2f}"
         for feature, p in one.probabilities.items()
     )
     where = "not detected"
     if one.detected_m is not None:
         where = f"detected {one.detected_m:.1f} m before its {one.reference}"
-    return f"{one.number}: {where}; at the end {said}"
+    return f"{one.number}: {where}; at the end {features}"
 
 
 def _landmarks(counts: dict[str, int]) -> str:

@@ -1,4 +1,4 @@
-"""The pose part of the one loop: windows of signals in, rows of the pose track out."""
+"""The pose part of the estimate stage: from windows of signals to rows of the pose track."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 REJECTED_SHARE: Final = 0.1
-"""An honest filter refuses one reading in a thousand; above this something is wrong."""
+"""Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand."""
 FRAMES_WAIT_NS: Final = 10_000_000_000
-"""Frames without odometry are kept this long."""
+"""Time for which frames without odometry are kept."""
 FOREVER_NS: Final = int(np.iinfo(np.int64).max)
 OWN_FRAME_SD_RAD: Final = 1e-3
-"""Where the car itself lays the map's axes, its first heading is right by definition."""
+"""S.d. of the first heading if it defines the map's axes and is therefore exact."""
 
 
 def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
-    """Which signal turns the pose; None leaves it to the wheels' difference."""
+    """Return the signal for the turns of the pose; None for the difference of wheel speeds."""
     wish = vehicle.odometry.heading_from
     offers = {"yaw_rate": Signal.YAW_RATE, "steering": Signal.STEERING}
     if wish == "auto":
@@ -61,14 +61,14 @@ def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
 
 
 def odometry_settings(vehicle: Vehicle) -> OdometrySettings:
-    """The vehicle file's odometry section as the integrator takes it."""
+    """Return the integrator's settings from the vehicle file."""
     left_out = {"heading_from", "accel_var_m2ps3", "fitted", "scale_sd"}
     fields = vehicle.odometry.model_dump(exclude=left_out)
     return OdometrySettings(**fields)
 
 
 def track_settings(vehicle: Vehicle) -> TrackSettings:
-    """The vehicle file's filter settings."""
+    """Return the pose filter's settings from the vehicle file."""
     return TrackSettings(
         heading_interval_m=vehicle.compass.interval_m,
         heading_interval_s=vehicle.compass.interval_s,
@@ -78,49 +78,49 @@ def track_settings(vehicle: Vehicle) -> TrackSettings:
 
 
 def gap_settings(vehicle: Vehicle) -> GapSettings:
-    """What the vehicle file says a car can do in a gap."""
+    """Return the limits of motion in a gap from the vehicle file."""
     fields = vehicle.time.model_dump(exclude={"max_silence_s", "unknown_gap_s"})
     return GapSettings(**fields)
 
 
 def fused_positions(vehicle: Vehicle) -> PositionLooks | None:
-    """What weighs GNSS positions in, where the vehicle file asks for it.
+    """Return the updater for GNSS positions, or None if the vehicle file does not request it.
 
     Raises:
-        VehicleError: Where the map's zero lies is not known.
+        VehicleError: The geodetic position of the map's origin is unknown.
     """
     gnss = vehicle.gnss
     if gnss.use != "fuse":
         return None
     if vehicle.start.map_origin is None:
         raise VehicleError(
-            "gnss.use = 'fuse': where the map's zero lies is not known; expected GNSS in the first "
-            "seconds, with the car moving, or start.map_origin in the vehicle file"
+            "gnss.use = 'fuse': the map's origin is unknown; expected GNSS in the first "
+            "seconds, with the vehicle moving, or start.map_origin in the vehicle file"
         )
     return PositionLooks((gnss.x_m, gnss.y_m), gnss.interval_s, gnss.gate_nis, gnss.delay_s)
 
 
 class LandmarkLooks(Looks, Protocol):
-    """What looks for landmarks beside the pose track; ``landmarks.LandmarkStage`` does."""
+    """Search for landmarks along the pose track, such as ``landmarks.LandmarkStage``."""
 
     def take_sightings(self) -> list[Sighting]:
-        """The sightings since the last call."""
+        """Return the sightings since the last call."""
         ...
 
     def take_names(self, t_ns: Int64s) -> list[str | None]:
-        """The landmark weighed in at each row's time, or None."""
+        """Return the accepted landmark, or None, at each row's time."""
         ...
 
     def cross_gap(self) -> None:
-        """Forget what was in view before a gap in time."""
+        """Forget matches before a gap in time."""
         ...
 
     def let_go(self, before_ns: int) -> None:
-        """Drop what no odometry will reach any more."""
+        """Drop frames that are too old to be reached by odometry."""
         ...
 
     def counts(self) -> dict[str, int]:
-        """What became of every frame, for the manifest."""
+        """Return the numbers of frames by outcome, for the manifest."""
         ...
 
 
@@ -128,40 +128,40 @@ class NoLandmarks(NoLooks):
     """A replay without a landmark database."""
 
     def take_sightings(self) -> list[Sighting]:
-        """None."""
+        """Return an empty list."""
         return []
 
     def take_names(self, t_ns: Int64s) -> list[str | None]:
-        """None at any time."""
+        """Return None for every row."""
         return [None] * len(t_ns)
 
     def cross_gap(self) -> None:
-        """Nothing is remembered."""
+        """Do nothing."""
 
     def let_go(self, before_ns: int) -> None:
-        """Nothing is held."""
+        """Do nothing, because no frames are kept."""
 
     def counts(self) -> dict[str, int]:
-        """Nothing to count."""
+        """Return no counts."""
         return {}
 
 
 @dataclass(slots=True)
 class PoseStage:
-    """Carries belief and pending rows from window to window, and the belief across gaps.
+    """Pose filter over the windows of a drive and across its gaps.
 
     Attributes:
-        vehicle: The vehicle file.
-        turn: What turns the pose, from ``turn_signal_of``.
-        notices: Plain sentences about the start, for the manifest.
-        odometry_counts: What became of wheel rows.
-        track_counts: What became of headings and intervals.
-        landmarks: What looks for landmarks meanwhile.
-        positions: What weighs GNSS positions in, from ``fused_positions``.
-        received: Samples that arrived, by signal.
-        started_with: Headings that the first belief was made of.
-        turn_early: Turn samples that came before the first wheel speeds.
-        timeline: Where the drive has gaps.
+        vehicle: Settings of the vehicle file.
+        turn: Signal for the turns of the pose, from ``turn_signal_of``.
+        notices: Notices about the start, for the manifest.
+        odometry_counts: Numbers of wheel rows by outcome.
+        track_counts: Numbers of headings and intervals by outcome.
+        landmarks: Search for landmarks.
+        positions: Updater for GNSS positions, from ``fused_positions``.
+        received: Numbers of samples received, by signal.
+        started_with: Number of headings used for the first belief.
+        turn_early: Number of turn samples before the first wheel speeds.
+        timeline: Time segments of the drive.
     """
 
     vehicle: Vehicle
@@ -183,7 +183,7 @@ class PoseStage:
     _segment: int = 0
 
     def __call__(self, window: Window) -> Iterator[PoseColumns]:
-        """Rows that this window completes."""
+        """Yield the rows that a window completes."""
         self.received.update({signal: len(of.t_ns) for signal, of in window.samples.items()})
         while (following := self._following(window.end_ns)) is not None:
             if following.begins_ns > window.start_ns:
@@ -194,7 +194,7 @@ class PoseStage:
         yield from self._advance(window, window.end_ns)
 
     def _following(self, until_ns: int) -> Segment | None:
-        """The next segment, if it begins before ``until_ns``."""
+        """Return the next segment if it begins before ``until_ns``."""
         segments = self.timeline.segments
         if self._segment + 1 >= len(segments):
             return None
@@ -205,7 +205,7 @@ class PoseStage:
         return following
 
     def finish(self) -> Iterator[PoseColumns]:
-        """Rows that waited for more odometry."""
+        """Yield the rows that waited for more odometry."""
         yield from self._close()
         self._let_go(FOREVER_NS)
 
@@ -215,19 +215,19 @@ class PoseStage:
             self.positions.let_go(before_ns)
 
     def _close(self) -> Iterator[PoseColumns]:
-        """Rows that waited for odometry that does not come."""
+        """Yield the waiting rows at the end of a segment, where no more odometry follows."""
         if self._state is not None and self._last_ns is not None:
             yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
 
     def _end_segment(self, following: Segment) -> Iterator[PoseColumns]:
-        """Close a segment; what follows is another drive that begins about here."""
+        """Close a segment; the following one is processed like a new drive with a known start."""
         yield from self._close()
         self._pending = Pending()
         if self._state is not None:
             self._gap = following
 
     def _cross(self, segment: Segment, until_ns: int) -> None:
-        """Carry the belief over the gap before ``segment``, to its first wheel speed."""
+        """Predict the belief across the gap before ``segment``, to its first wheel speed."""
         assert self._state is not None
         restarts = segment.cause is Cause.SET_BACK
         before_ns = self._state.belief.t_ns
@@ -240,26 +240,26 @@ class PoseStage:
         self._gap = None
 
     def take_measured(self) -> list[dict[str, object]]:
-        """What the filter was given since the last call, as rows of ``measurements.parquet``."""
+        """Return the filter's inputs since the last call, as rows of ``measurements.parquet``."""
         taken, self._measured = self._measured, []
         return taken
 
     def doubts(self) -> list[str]:
-        """What the counts say against the settings, in plain words."""
+        """Return notices about counts that contradict the settings."""
         if self._state is None:
-            return ["not one wheel speed in the part that was asked for, so no pose"]
+            return ["no wheel speed in the selected part, so no pose"]
         counts = self.track_counts
         judged = counts.headings_accepted + counts.headings_rejected
         if not judged or counts.headings_rejected <= REJECTED_SHARE * judged:
             return []
         return [
             f"{counts.headings_rejected} of {judged} compass readings were rejected by the gate: "
-            "compass or odometry err more than the vehicle file says; fit the compass, or raise "
+            "compass or odometry err more than the vehicle file states; fit the compass, or raise "
             "heading_sd_rad and the odometry's noise"
         ]
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """What became of every odometry row and heading, for the manifest."""
+        """Return the numbers of odometry rows and headings by outcome, for the manifest."""
         return {
             "odometry": asdict(self.odometry_counts),
             "track": asdict(self.track_counts),
@@ -269,7 +269,7 @@ class PoseStage:
 
     @property
     def waiting(self) -> int:
-        """Headings that wait for wheel speeds."""
+        """Number of headings waiting for wheel speeds."""
         return 0 if self._state is None else len(self._state.waiting)
 
     def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
@@ -327,10 +327,7 @@ class PoseStage:
             yield made.poses
 
     def _start(self, t_ns: int, speed_mps: float, headings: Headings) -> Headings:
-        """Fix the first belief, where the car was first measured to go at a speed.
-
-        The headings used for it are not used again.
-        """
+        """Set the first belief at the first wheel speed; return the headings not used for it."""
         start = self.vehicle.start
         heading_rad, sd_rad = start.heading_rad, start.heading_sd_rad
         if heading_rad is not None and start.source:
@@ -373,7 +370,7 @@ class PoseStage:
         return TurnSignal(found.t_ns, found.values, kind)
 
     def _fixes(self, window: Window) -> Fixes:
-        """A window's GNSS positions, in the map frame."""
+        """Return a window's GNSS positions in the map frame."""
         found, origin = window.samples.get(Signal.POSITION), self.vehicle.start.map_origin
         if found is None or origin is None:
             return NO_FIXES
@@ -395,7 +392,7 @@ class PoseStage:
 
 
 def _split(window: Window, at_ns: int) -> tuple[Window, Window]:
-    """A window's part before a time, and the rest."""
+    """Split a window at a time."""
     before: dict[Signal, Samples] = {}
     after: dict[Signal, Samples] = {}
     for signal, samples in window.samples.items():
@@ -408,7 +405,7 @@ def _split(window: Window, at_ns: int) -> tuple[Window, Window]:
 
 
 def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
-    """The vehicle file's compass section as the compass takes it."""
+    """Return the compass settings from the vehicle file."""
     section = vehicle.compass
     return compass.CompassSettings(
         mounting_rotation=section.mounting_rotation,
@@ -429,11 +426,11 @@ def _wheels(found: Samples | None) -> WheelSpeeds:
 
 
 def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str, Line]:
-    """What the filters took of the readings that reached them.
+    """Return the account of the filters' inputs.
 
     Args:
-        stage: After its last window.
-        frames: Frames detected and frames that cues and belief were estimated for, if any were.
+        stage: The stage after its last window.
+        frames: Numbers of frames detected, and of frames used for cues and belief; or None.
     """
     wheels, track, got = stage.odometry_counts, stage.track_counts, stage.received
     rejected = {

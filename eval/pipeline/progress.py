@@ -1,4 +1,4 @@
-"""Progress that stages report: frames that are done, and seconds of log."""
+"""Progress callbacks of the stages: frames done, and seconds of the drive done."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Callable
 from crosscue.replay.time.segments import Timeline
 
 OnTime = Callable[[float, float], None]
-"""Called with the seconds of a drive that are done, and those there are."""
+"""Callback for the seconds of a drive that are done, and the total."""
 
 
 def unwatched_time(_done_s: float, _of_s: float) -> None:
-    """Nobody wants to know."""
+    """Ignore the progress."""
 
 
 def report_time(on_time: OnTime, timeline: Timeline, t_ns: int) -> None:
-    """Call ``on_time`` for a drive that has been worked through up to ``t_ns``."""
+    """Call ``on_time`` for a drive that has been processed up to ``t_ns``."""
     first, last = timeline.segments[0], timeline.segments[-1]
     if last.end_ns > first.start_ns:
         # The last window ends after the last wheel speed.
@@ -25,8 +25,8 @@ def report_time(on_time: OnTime, timeline: Timeline, t_ns: int) -> None:
 
 
 OnFrames = Callable[[int, int | None], None]
-"""Called with how many frames are done, and of how many where that is known."""
+"""Callback for the number of frames done, and the total if known."""
 
 
 def no_progress(_done: int, _of: int | None) -> None:
-    """Nobody looks."""
+    """Ignore the progress."""

@@ -1,4 +1,4 @@
-"""A drive's logs into a run folder by its two stages, or by the second once more."""
+"""Replay of a drive's logs into a run folder by both stages, or by the second stage again."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ from .estimate import begin_again, estimate_into
 from .progress import OnFrames, OnTime, no_progress, unwatched_time
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
-"""What the second stage reads of the first."""
+"""Tables of the first stage that the second stage reads."""
 
 
 @dataclass(frozen=True, slots=True)
 class Detecting:
-    """What the detect stage is to do.
+    """Options of the detect stage.
 
     Attributes:
         choices: Detectors, in order.
-        cache: File with results of earlier runs, or None for none.
-        draw: How many pictures to write with detections drawn.
-        resume: Keep detections of an earlier start that would come out the same.
-        on_frames: Called with how many frames are done, and of how many where that is known.
+        cache: File with results of earlier runs, or None.
+        draw: Number of pictures to write with detections drawn.
+        resume: Keep detections of an earlier start that would be the same.
+        on_frames: Called with the number of frames done, and the total if known.
     """
 
     choices: tuple[Choice, ...]
@@ -74,20 +74,20 @@ def replay_drive(
     *,
     overwrite: bool = False,
 ) -> Outcome:
-    """Replay one drive into an empty or to be overwritten run folder.
+    """Replay one drive into a run folder.
 
     Args:
-        logs: All logs of the drive, open.
-        vehicle: What the vehicle file says.
-        run: Where to; locked while this works, cleared first unless its detections are kept.
-        selection: Which part of the logs.
-        on_time: Called with the seconds done, and those there are.
-        landmarks: Camera frames are compared with these, where given.
-        detecting: Detectors to run over the camera; without any, the run has pose alone.
-        overwrite: Replace a run of other logs or settings, though ``detecting`` says to resume.
+        logs: All open logs of the drive.
+        vehicle: Settings of the vehicle file.
+        run: The run folder; locked meanwhile, and cleared first unless its detections are kept.
+        selection: The part of the logs to use.
+        on_time: Called with the seconds done, and the total.
+        landmarks: Database with which camera frames are compared, or None.
+        detecting: Detectors to run over the camera; without any, the run has only the pose.
+        overwrite: Replace a run of other logs or settings even if ``detecting.resume`` is set.
 
     Raises:
-        UsageError: It is to be resumed, and the folder holds a run of other logs or settings.
+        UsageError: The folder to be resumed holds a run of other logs or settings.
         VehicleError: The vehicle file does not fit the logs.
         EmptyResultError: The result is empty; the folder is unchanged.
         OutputError: The disk is full.
@@ -126,7 +126,7 @@ def _camera(
     detecting: Detecting,
     landmarks: LandmarkDatabase | None,
 ) -> tuple[int, Topic] | None:
-    """The camera, where anything will look at it."""
+    """Return the camera if detectors or landmarks need it."""
     if not detecting.choices and landmarks is None:
         return None
     return camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
@@ -163,7 +163,7 @@ def _kept(
     selection: Selection,
     detecting: Detecting,
 ) -> DetectManifest | None:
-    """The detect stage of an earlier start, where its tables are what it would give again."""
+    """Return the detect stage of an earlier start if its tables would be the same again."""
     try:
         earlier = run.drive_manifest().detected
     except RunError:
@@ -198,34 +198,34 @@ def estimate_run(
 ) -> Outcome:
     """Estimate again into the same run folder; no picture is opened.
 
-    The run stays as it was until the new one is whole.
+    The run stays unchanged until the new one is complete.
 
     Args:
         run: A finished run, or one whose detect stage has finished.
-        vehicle: Other settings; those of the run, if left out.
-        on_time: Called with the seconds done, and those there are.
+        vehicle: Settings; default: those of the run.
+        on_time: Called with the seconds done, and the total.
 
     Raises:
-        RunError: Its logs are gone or have changed, or it was made with landmarks.
+        RunError: The run's logs are missing or have changed, or it was made with landmarks.
         VehicleError: The settings do not fit the logs.
-        UsageError: They split the drive otherwise than detections are labelled.
+        UsageError: The settings split the drive into other segments than those of the detections.
     """
     manifest = run.drive_manifest()
     if isinstance(manifest, EstimateManifest) and manifest.landmarks is not None:
         raise RunError(
-            f"{run.path}: landmarks are looked for in pictures, which estimate does not open; run "
-            "crosscue replay --landmarks again"
+            f"{run.path}: landmarks are searched for in pictures, which estimate does not open; "
+            "run crosscue replay --landmarks again"
         )
     if vehicle is not None:
         _refuse_other_time(run, manifest, vehicle)
     with ExitStack() as stack:
-        logs = [stack.enter_context(_reopened(run, said)) for said in manifest.logs]
+        logs = [stack.enter_context(_reopened(run, row)) for row in manifest.logs]
         stack.enter_context(locked(run))
         settings = vehicle or manifest.settings
         changed = None if vehicle is None else settings_changed(run, vehicle)
         new = stack.enter_context(staged(run, keep=True, until=manifest.detected))
         if changed is not None:
-            # In this order a run cut short between them does not pass for a whole one.
+            # In this order, an interrupted run does not look complete.
             begin_again(new, manifest.detected)
             write_input(new, changed)
         outcome = estimate_into(
@@ -241,29 +241,30 @@ def estimate_run(
 
 
 def _refuse_other_time(run: RunFolder, manifest: DriveManifest, vehicle: Vehicle) -> None:
-    """Frames and detections carry segments by the ``[time]`` they were detected with."""
+    """Refuse other ``[time]`` settings than those with which the frames were detected."""
     wanted = vehicle.time.model_dump()
     there = wanted if manifest.detected is None else manifest.detected.settings.time.model_dump()
     for name, value in wanted.items():
         if there[name] != value:
             raise UsageError(
                 f"{run.path}: its frames are split into segments by time.{name} = "
-                f"{there[name]:g}, not {value:g}; estimate keeps that: run crosscue replay again"
+                f"{there[name]:g}, not {value:g}, which estimate keeps; run crosscue replay again"
             )
 
 
-def _reopened(run: RunFolder, said: LogRow) -> Log:
-    log = reopened(run, said)
-    if said.sha256 and not _is_older(log.path, run) and sha256_of(log.path) != said.sha256:
+def _reopened(run: RunFolder, row: LogRow) -> Log:
+    log = reopened(run, row)
+    if row.sha256 and not _is_older(log.path, run) and sha256_of(log.path) != row.sha256:
         log.close()
         raise RunError(f"{run.path}: its log {log.path} has changed since; replay again")
     return log
 
 
 def _is_older(log: Path, run: RunFolder) -> bool:
-    """Has nobody touched the log since the run hashed it? Then there is no need to read it all.
+    """Return whether a log is unchanged since the run hashed it, so that it need not be read again.
 
-    The time of its entry counts, too: a file put in its place may bring an older time of its own.
+    The change time of the inode counts, too, because a replaced file may have an older modification
+    time.
     """
     files = [log] if log.is_file() else [entry for entry in log.rglob("*") if entry.is_file()]
     hashed_ns = run.file(MANIFEST).stat().st_mtime_ns

@@ -1,1 +1,1 @@
-"""The stage that makes ranges, beliefs and cues of what was detected."""
+"""The scene part of the estimate stage: cues, ranges and beliefs from stored detections."""

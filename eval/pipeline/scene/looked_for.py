@@ -1,4 +1,4 @@
-"""Cues that nothing looked for in a run, and why: a cue without rows is not one that found none."""
+"""Cues that a run did not evaluate, and why; they differ from cues that were never positive."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ NEVER: Final = "no frame in which they could be computed"
 
 
 def needing_masks(detectors: Sequence[DetectorRow], car_labels: Sequence[str]) -> frozenset[str]:
-    """Cues that only masks show, if every car of the run is a box without one.
+    """Return the cues that need masks, if no car of the run has one.
 
-    Their absence would otherwise count as evidence that a road is not there.
+    Their absence would otherwise count as evidence that a road does not exist.
 
     Args:
-        detectors: As the manifest has them.
-        car_labels: Which labels are cars.
+        detectors: The manifest's rows of the detectors.
+        car_labels: Labels of cars.
     """
     cars = {*car_labels}
     has_boxes = any(cars & {*one.boxes_only} for one in detectors)
@@ -43,14 +43,14 @@ def not_looked_for(
     not_followed: Mapping[str, int] = MappingProxyType({}),
     without: Set[str] = frozenset(),
 ) -> dict[str, str]:
-    """From each cue, a user's own among them, that has no row to the reason.
+    """Return the reason why a cue has no rows, by cue, including user-defined cues.
 
     Args:
         looked: Cues that have rows.
-        detectors: As the manifest has them.
-        cue_labels: All cues, with the labels they are made of.
-        not_followed: Frames in which cars could not be followed, by reason.
-        without: Cues that ``needing_masks`` names.
+        detectors: The manifest's rows of the detectors.
+        cue_labels: All cues with the labels that they use.
+        not_followed: Number of frames in which cars could not be followed, by reason.
+        without: Cues that ``needing_masks`` returned.
     """
     roles = {one.role for one in detectors}
     finders = [one for one in detectors if one.role in (Role.OBJECTS, Role.SIGNS)]

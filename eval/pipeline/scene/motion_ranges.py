@@ -1,17 +1,18 @@
 """Ranges to an intersection from the motion of its lights and signs, one object for each reference.
 
-Which object reports the range:
+The object that defines a range is chosen as follows:
 
-* **Traffic lights** stand on both sides of the crossing. Of those that face the car, one that no
-  other is clearly (two standard deviations) further than marks the **end**. One of a nearer group,
-  which may well be seen from behind, marks the **start**. A light that is known not to face the car
-  never marks the end, and one of which that is unknown never the start. Where only one group was
-  seen, the run says so. Lights stand set back from the crossing (``Ranges.light_setback_m``).
-* **Stop signs** mark the **start**: one that no other is clearly nearer than. They come before
-  lights.
+* **Traffic lights** are on both sides of the intersection. Among those facing the vehicle, the
+  farthest marks the **end**: no other may be clearly (two standard deviations) farther. A light of
+  a nearer group, which may be seen from behind, marks the **start**. A light known not to face the
+  vehicle never marks the end, and a light of unknown facing never marks the start. If only one
+  group was seen, the run reports it. Lights are set back from the intersection
+  (``Ranges.light_setback_m``).
+* **Stop signs** mark the **start**: one such that no other is clearly nearer. They take precedence
+  over lights.
 
-The choice stays while that holds, groups are never averaged, and every range is that object's own
-posterior. Lights whose facing is unknown count as facing where no other does.
+The choice is kept while these conditions hold. Groups are never averaged, and every range is the
+posterior of a single object. Lights of unknown facing count as facing if no other light does.
 """
 
 from __future__ import annotations
@@ -41,29 +42,32 @@ from crosscue.replay.vehicle.vehicle import TRAFFIC_LIGHT, Vehicle
 from .usable import MEASURED, Usable, source_of, usable
 
 CLEARLY: Final = 2.0
-"""Standard deviations of the difference of two ranges."""
+"""Min difference of two clearly different ranges, in standard deviations."""
 WIDEST_M: Final = 60.0
-"""Lights further behind the nearest than this are another intersection's."""
+"""Max distance of a light behind the nearest one at the same intersection."""
 NARROWEST_M: Final = 8.0
-"""Groups nearer to each other than a street of two lanes with its kerbs is wide are one."""
+"""Min distance between two groups, the width of a two-lane street with its kerbs."""
 PERSISTS: Final = 10
-"""An object seen so often competes with any; less often, with those seen up to twice as often."""
+"""Observations after which an object competes with any other.
+
+Below, it competes only with objects observed at most twice as often.
+"""
 ONE_GROUP: Final = "frames with only one group of lights"
 ONLY_AWAY: Final = "frames with only lights that do not face the ego vehicle"
 
 
 class RangedObject(NamedTuple):
-    """One tracked object in one frame, as ``ranged_objects.parquet`` has it.
+    """One tracked object in one frame, a row of ``ranged_objects.parquet``.
 
     Attributes:
-        cue: What it is.
-        object: Its number; of one cue and one stretch without a restart.
-        facing: For lights, from the lenses seen lit so far.
-        reference: What it marks in this frame; None for nothing.
-        range_m: From the rear axle to the object.
-        var_m2: Its variance.
-        height_m: Its estimated height.
-        box_px: x0, y0, x1, y1.
+        cue: Cue of the object.
+        object: Number of the object, unique for a cue between restarts.
+        facing: Facing of a light, from the lit lenses observed so far.
+        reference: Reference that it marks in this frame; None if none.
+        range_m: Range from the rear axle to the object.
+        var_m2: Variance of the range.
+        height_m: Estimated height of the object.
+        box_px: Box x0, y0, x1, y1.
     """
 
     cue: str
@@ -78,13 +82,13 @@ class RangedObject(NamedTuple):
 
 @dataclass(slots=True)
 class MotionRanges:
-    """All kinds of objects whose range comes from motion; the vehicle file says which.
+    """Ranges from motion, for all kinds of objects that the vehicle file selects.
 
     Attributes:
         vehicle: Settings.
-        counts: Objects followed, boxes of one object, changes of choice, and frames with only one
-            group.
-        objects: All that were seen in the newest frame.
+        counts: Numbers of objects followed, duplicate boxes, changes of choice, and frames with
+            only one group.
+        objects: Objects observed in the newest frame.
     """
 
     vehicle: Vehicle
@@ -100,17 +104,17 @@ class MotionRanges:
         heights_px: Sequence[NDArray[np.float64]],
         without: frozenset[str] = frozenset(),
     ) -> tuple[RangePosterior, ...]:
-        """The next frame: at most one range for each reference.
+        """Process the next frame; return at most one range for each reference.
 
         Args:
-            evidence: Of that frame; only the car's motion is read.
-            seconds: Time since the frame before.
-            found: Of the detectors of objects.
-            heights_px: For each, the rows that every mask spans.
+            evidence: Evidence of the frame; only the vehicle's motion is used.
+            seconds: Time since the previous frame.
+            found: Detections of each detector of objects.
+            heights_px: Number of rows that each mask spans, by detector.
             without: Cues to leave out.
         """
         turned_rad = evidence.turned_rad or 0.0
-        # What slip_per_sqrt_m stands for is scale_sd of the whole way, which the tracks know.
+        # The variance of slip_per_sqrt_m is not used: the tracks have scale_sd of the distance.
         slip_m2 = self.vehicle.odometry.slip_per_sqrt_m**2 * abs(evidence.travelled_m or 0.0)
         var_m2 = max(evidence.travelled_var_m2 - slip_m2, 0.0)
         motion = Motion(evidence.travelled_m, var_m2, turned_rad, seconds)
@@ -131,7 +135,7 @@ class MotionRanges:
         return tuple(ranges.values())
 
     def restart(self) -> None:
-        """Know nothing of what was before."""
+        """Forget all objects."""
         self._chains.clear()
         self.objects = ()
 
@@ -149,7 +153,7 @@ class MotionRanges:
 
 @dataclass(slots=True)
 class _Chain:
-    """One kind of objects, and which of them report the ranges."""
+    """Tracks of one kind of object, and the choice of those that define ranges."""
 
     vehicle: Vehicle
     cue: str
@@ -171,7 +175,7 @@ class _Chain:
         return self._posteriors({Reference.END: end, Reference.START: start})
 
     def objects(self) -> list[RangedObject]:
-        """All seen in the newest frame, by number."""
+        """Return the objects observed in the newest frame, by number."""
         marks = {choice.chosen: reference for reference, choice in self.choices.items()}
         return [
             RangedObject(
@@ -189,7 +193,7 @@ class _Chain:
         ]
 
     def _posteriors(self, chosen: dict[Reference, Track | None]) -> list[RangePosterior]:
-        """Of the chosen that were seen in this frame."""
+        """Return the ranges of the chosen objects that were observed in this frame."""
         camera, ranges = self.vehicle.camera, self.vehicle.ranges
         found = []
         for reference, one in chosen.items():
@@ -213,13 +217,16 @@ class _Chain:
 
 
 def _may_end(tracks: Sequence[Track]) -> list[Track]:
-    """Lights that face the car, or may; those that do come first."""
+    """Return the lights facing the vehicle, or, if none does, those of unknown facing."""
     facing = [one for one in tracks if one.facing is Facing.EGO]
     return facing or [one for one in tracks if one.facing is Facing.UNKNOWN]
 
 
 def _may_start(tracks: Sequence[Track], end: Track | None) -> list[Track]:
-    """Lights of a group that is clearly nearer than the end, once it is known where they face."""
+    """Return the lights that may mark the start.
+
+    These are lights facing away or, if the end is known, of known facing and clearly nearer.
+    """
     if end is None:
         return [one for one in tracks if one.facing is Facing.AWAY]
     return [
@@ -233,7 +240,7 @@ def _may_start(tracks: Sequence[Track], end: Track | None) -> list[Track]:
 
 @dataclass(slots=True)
 class _Held:
-    """The range of a choice that is no longer seen."""
+    """Predicted range of a chosen object that is no longer observed."""
 
     range_m: float
     var_m2: float
@@ -242,7 +249,7 @@ class _Held:
 
 @dataclass(slots=True)
 class _Choice:
-    """Which object marks one reference; it stays while no other is clearly better."""
+    """Choice of the object that marks a reference; it is kept while no other is clearly better."""
 
     vehicle: Vehicle
     reference: Reference
@@ -251,7 +258,7 @@ class _Choice:
     _held: _Held | None = None
 
     def go_on(self, motion: Motion) -> None:
-        """Carry what is held to the next frame."""
+        """Predict the held range to the next frame."""
         if self._held is not None:
             self._held.range_m -= motion.way_m or 0.0
             self._held.var_m2 += motion.var_m2
@@ -259,7 +266,7 @@ class _Choice:
                 self._held = None
 
     def __call__(self, tracks: Sequence[Track]) -> Track | None:
-        """Choose among those that may mark it."""
+        """Choose among the tracks that may mark the reference."""
         best = self._best(tracks)
         if best is None:
             return None
@@ -302,5 +309,5 @@ class _Choice:
 
 
 def _is_apart(one: Track, other: Track) -> bool:
-    """Are they clearly at different ranges?"""
+    """Return whether two tracks are clearly at different ranges."""
     return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(difference_var_m2(one, other))

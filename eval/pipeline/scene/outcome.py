@@ -1,4 +1,4 @@
-"""What the scene stage did, approach by approach and cue by cue."""
+"""Outcome of the scene part, by approach and by cue."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from crosscue.detectors.cues.candidates import Candidates
 
 @dataclass(slots=True)
 class ApproachSummary:
-    """One approach as the run itself saw it; no truth is asked.
+    """One approach as the run itself found it, without truth.
 
     Attributes:
-        number: From 1 in the order of the drive.
-        start_ns: First step.
-        end_ns: Last step.
-        detected_ns: When the intersection was first held present with a range known.
-        detected_m: The range then.
-        reference: What that range goes to.
-        probabilities: At the last step.
-        not_seen: Features that no cue has said anything about: a probability that is the prior.
+        number: Number from 1, in the order of the drive.
+        start_ns: Time of the first step.
+        end_ns: Time of the last step.
+        detected_ns: Time at which the intersection was first established with a known range.
+        detected_m: Range at that time.
+        reference: Reference of that range.
+        probabilities: Probabilities at the last step.
+        not_seen: Features without an observation by any cue, whose probability is the prior.
     """
 
     number: int
@@ -35,17 +35,17 @@ class ApproachSummary:
 
 @dataclass(frozen=True, slots=True)
 class SceneOutcome:
-    """What the scene part did.
+    """Outcome of the scene part.
 
     Attributes:
-        frames: Looked at.
-        positive: Frames in which each cue was positive.
-        approaches: In order.
-        counts: What became of the evidence, as ``Approaches`` counts it.
-        without_odometry: Frames before which the odometry has a hole.
-        candidates: By cue, what became of everything that could have been it.
-        ranged: By cue, what became of its detections on the way to a range.
-        not_looked_for: Cues without any row, and why.
+        frames: Number of frames processed.
+        positive: Number of frames in which each cue was positive.
+        approaches: Approaches in order.
+        counts: Counts of the evidence, from ``Approaches``.
+        without_odometry: Number of frames preceded by a hole in the odometry.
+        candidates: Candidates of each cue by outcome.
+        ranged: Candidates of each cue's range by outcome.
+        not_looked_for: Reason why a cue has no row, by cue.
     """
 
     frames: int

@@ -1,4 +1,4 @@
-"""Distances to an intersection from the signs and lights of one frame."""
+"""Ranges to an intersection from the heights of signs and lights in one frame."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
 @dataclass(frozen=True, slots=True)
 class SignRanges:
-    """A stop sign measures the start of the intersection, a traffic light its end.
+    """Ranges from heights: stop signs measure the intersection's start, traffic lights its end.
 
     Attributes:
-        vehicle: Labels, scores and curves; of objects whose range comes from motion none is made
-            here, but candidates are counted.
-        by_cue: What became of all candidates so far, by the cue that they belong to.
+        vehicle: Labels, scores and curves. Objects whose range comes from motion only have their
+            candidates counted here.
+        by_cue: Numbers of all candidates so far by outcome, by cue.
     """
 
     vehicle: Vehicle
@@ -33,11 +33,11 @@ class SignRanges:
     def __call__(
         self, found: Sequence[Detections], heights_px: Sequence[NDArray[np.float64]]
     ) -> tuple[SignRange, ...]:
-        """Ranges of one frame.
+        """Return the ranges of one frame.
 
         Args:
-            found: Of the detectors of objects.
-            heights_px: For each, the rows that every mask spans.
+            found: Detections of each detector of objects.
+            heights_px: Number of rows that each mask spans, by detector.
         """
         return tuple(
             one for row in range(len(MEASURED)) for one in self._of_cue(found, heights_px, row)
@@ -46,7 +46,7 @@ class SignRanges:
     def _of_cue(
         self, found: Sequence[Detections], heights_px: Sequence[NDArray[np.float64]], row: int
     ) -> list[SignRange]:
-        """Of one row of ``MEASURED``."""
+        """Return the ranges of one row of ``MEASURED``."""
         cue, reference = MEASURED[row]
         labels = self.vehicle.labels_of(cue)
         curve: RangeCurve | None = getattr(self.vehicle.ranges, cue.name)

@@ -1,8 +1,8 @@
-"""The scene part of the one loop: stored frames in; cues, ranges and beliefs out, frame by frame.
+"""The scene part of the estimate stage: cues, ranges and beliefs from stored frames.
 
-Everything comes from the run's own tables (frames, detections, road, measurements), so no picture
-is opened and no log read: settings of cues, ranges and belief can be changed and tried in seconds,
-and each cue left out to see what it was worth.
+All inputs are the run's own tables (frames, detections, road, measurements), so no picture is
+opened and no log is read. Settings of cues, ranges and belief can therefore be tried in seconds,
+and each cue can be left out to measure its contribution.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ if TYPE_CHECKING:
 
 ROWS_HELD: Final = 8192
 COVERED: Final = 0.9
-"""Odometry over less of the time between two frames does not say how far the car went."""
+"""Min fraction of the time between two frames that odometry must cover to measure the distance."""
 FEATURES: Final = ("intersection", "left", "right", "straight")
-"""Columns of ``belief.parquet``, unless the vehicle file's graph has others."""
+"""Feature columns of ``belief.parquet``, unless the vehicle file's graph has others."""
 
 Sink = Callable[[str, dict[str, list[Any]]], None]
-"""Takes a batch of a table: its name and columns."""
+"""Callback for a batch of a table: its name and columns."""
 
 
 def nothing_past(_t_ns: int) -> PastCues | None:
-    """No Mobileye: no cue past the intersection is looked for."""
+    """Return None, because without a Mobileye no cue beyond the intersection is evaluated."""
     return None
 
 
@@ -68,15 +68,15 @@ def estimate_scene(
     """Run cues, range filter and belief over a run's stored frames.
 
     Args:
-        run: With the tables of the detect stage and ``measurements.parquet``.
+        run: A run with the tables of the detect stage and ``measurements.parquet``.
         vehicle: Settings.
-        detected: The manifest's part on the detect stage.
-        sink: Given the rows of ``cues``, ``range`` and ``belief``.
-        past: From a time to the Mobileye's cues past the intersection then.
-        without: Cues to leave out as if nothing had looked for them, with the ranges they give.
-        on_time: Called with the seconds done, and those there are.
-        timeline: Where the drive has gaps; beyond a long one everything starts over.
-        on_restart: Called with the drive time from which on a new start counts.
+        detected: Manifest of the detect stage.
+        sink: Called with the rows of ``cues``, ``range`` and ``belief``.
+        past: Function from a time to the Mobileye's cues beyond the intersection.
+        without: Cues to leave out, together with their ranges, as if they had not been evaluated.
+        on_time: Called with the seconds done, and the total.
+        timeline: Time segments of the drive; after a long gap everything starts over.
+        on_restart: Called with the drive time of each new start.
 
     Raises:
         RunError: A table is missing or damaged.
@@ -122,14 +122,14 @@ def estimate_scene(
 
 @dataclass(slots=True)
 class Restarts:
-    """Follows the segments along the frames."""
+    """Detection of long gaps between frames."""
 
     vehicle: Vehicle
     timeline: Timeline
     _number: int = 0
 
     def before(self, t_ns: int) -> int | None:
-        """Where the new segment begins if a frame at ``t_ns`` is the first after a long gap."""
+        """Return the new segment's start if a frame at ``t_ns`` is the first after a long gap."""
         segments, found = self.timeline.segments, None
         limit_ns = round(self.vehicle.time.restart_after_s * 1e9)
         while self._number + 1 < len(segments):
@@ -144,11 +144,11 @@ class Restarts:
 
 @dataclass(slots=True)
 class EgoMotion:
-    """Reads the odometry along the frames.
+    """Motion of the ego vehicle between frames.
 
     Attributes:
-        odometer: Of the run.
-        without_odometry: Frames since whose predecessor the way was not measured.
+        odometer: Odometry of the run.
+        without_odometry: Number of frames whose distance from the previous frame was not measured.
     """
 
     odometer: Odometer
@@ -156,7 +156,7 @@ class EgoMotion:
     _last_ns: int | None = None
 
     def __call__(self, t_ns: int) -> tuple[FrameEvidence, Motion]:
-        """Since the frame before: evidence that holds nothing else, and what trackers take."""
+        """Return the motion since the previous frame, as evidence and in the trackers' form."""
         way = self.odometer.until(t_ns)
         gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
         is_covered = way.covered_ns >= COVERED * gap_ns
@@ -176,7 +176,7 @@ class EgoMotion:
         return evidence, Motion(travelled_m, way.var_m2, turned_rad or 0.0, max(gap_ns, 0) * 1e-9)
 
     def restart(self, t_ns: int) -> None:
-        """Know nothing of what was before ``t_ns``."""
+        """Ignore the odometry before ``t_ns``."""
         self.odometer.skip_to(t_ns)
         self._last_ns = None
 
@@ -234,15 +234,15 @@ class _Scene:
         self._sum_up(step)
 
     def _place(self, ego: Motion) -> Place | None:
-        """Where the intersection is in this frame, from what was believed in the one before."""
+        """Return the intersection's place in this frame, predicted from the previous frame."""
         if ego.way_m is None:
             return None
         return place_of(self._ranges, ego.way_m, self.vehicle.fusion.length_m)
 
     def _is_new(self, seen: Seen) -> bool:
-        """False where a camera repeats a picture, which shows as detections equal to the last bit.
+        """Return False for a repeated picture, recognized by bit-identical detections.
 
-        Only beliefs that depend on successive frames ask.
+        Only beliefs that depend on successive frames need this.
         """
         if self.vehicle.fusion.kind not in ("persistent", "temporal"):
             return True
@@ -280,12 +280,12 @@ class _Scene:
 
 
 def place_of(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place | None:
-    """Where an intersection is after ``way_m`` more; None without any range.
+    """Return an intersection's place after ``way_m`` of travel; None without any range.
 
     Args:
-        ranges: At most one for each reference.
-        way_m: Gone since they held.
-        length_m: From its start to its end, where only one is known.
+        ranges: At most one range for each reference.
+        way_m: Distance travelled since the time of the ranges.
+        length_m: Length of the intersection, used if only one reference is known.
     """
     if not ranges:
         return None
@@ -301,7 +301,7 @@ def place_of(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place
 
 
 def _is_repeated(before: Seen, now: Seen) -> bool:
-    """Is everything that was found the same, and was anything found?"""
+    """Return whether both frames have the same results and at least one detection."""
     if len(before.boxes) != len(now.boxes) or not any(map(len, now.boxes)):
         return False
     return all(
@@ -325,7 +325,7 @@ def _leaving_out(past: PastCues, without: frozenset[str]) -> PastCues:
 
 @dataclass(slots=True)
 class _Rows:
-    """Rows of the three tables, handed to the sink some thousand at a time."""
+    """Rows of the tables, passed to the sink in batches of some thousand."""
 
     sink: Sink
     features: Sequence[str]
@@ -403,19 +403,19 @@ RANGE_COLUMNS: Final = ("t_ns", "approach", "reference", "range_m", "var_m2", "m
 
 
 def features_of(vehicle: Vehicle) -> tuple[str, ...]:
-    """Names of the features that are believed in, a user's own among them."""
+    """Return the names of the features of the belief, including user-defined ones."""
     return tuple(feature.name for feature in graph_of(vehicle.fusion).features)
 
 
 def gives_reasons(vehicle: Vehicle) -> bool:
-    """Does ``belief.parquet`` say which cues were seen and not believed, and why?"""
+    """Return whether ``belief.parquet`` has reasons for cues that were observed but not used."""
     return vehicle.fusion.kind == "persistent"
 
 
 def schemas(
     features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
 ) -> dict[str, pa.Schema]:
-    """Columns of the tables that this stage writes."""
+    """Return the schemas of the tables that this stage writes."""
     import pyarrow as pa
 
     number, integer, text = pa.float64(), pa.int64(), pa.string()

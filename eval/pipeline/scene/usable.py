@@ -1,4 +1,4 @@
-"""Which detections may say how far an intersection is, and why the others may not."""
+"""Selection of the detections that can measure the range to an intersection."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, Vehicle
 
 BORDER_PX: Final = 2.0
-"""A sign that reaches the picture's edge is cut, so its height says nothing about its distance."""
+"""Margin at the picture's edge; the height of a sign within it is truncated."""
 
 Source = Literal["curve", "motion"]
 NO_HEIGHT: Final = "no height"
 CUT: Final = "cut by the picture's edge"
 MEASURED: Final = ((STOP_SIGN, Reference.START), (TRAFFIC_LIGHT, Reference.END))
-"""Cues whose detections measure a distance, and to where: the source's."""
+"""Cues of the dissertation whose detections measure a range, with its reference."""
 
 
 def source_of(vehicle: Vehicle, cue: str) -> Source | None:
-    """Where ranges to a cue's objects come from; None if there is neither curve nor camera."""
+    """Return the source of ranges to a cue's objects; None without a curve and a camera."""
     chosen = vehicle.ranges.kind
     if chosen != "motion" and getattr(vehicle.ranges, cue) is not None:
         return "curve"
@@ -38,7 +38,7 @@ def why_not(
     are_sure: NDArray[np.bool_],
     source: Source | None,
 ) -> str | None:
-    """Why a detection has no range; None where it has one, or belongs to a track that has."""
+    """Return why a detection has no range; None if it or its track has one."""
     if not are_sure[i]:
         return BELOW_SCORE
     if heights_px[i] <= 0.0:
@@ -51,12 +51,12 @@ def why_not(
 
 
 class Usable(NamedTuple):
-    """N detections that may give a range.
+    """N detections that may yield a range.
 
     Attributes:
-        boxes_px: Shape (N, 4).
-        heights_px: Shape (N,).
-        lenses: N lenses of lights, empty where nobody looked.
+        boxes_px: Boxes, shape (N, 4).
+        heights_px: Heights, shape (N,).
+        lenses: N lenses of lights; empty where they were not examined.
     """
 
     boxes_px: NDArray[np.float64]
@@ -70,7 +70,7 @@ def usable(
     found: Sequence[Detections],
     heights_px: Sequence[NDArray[np.float64]],
 ) -> Usable:
-    """Detections of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
+    """Return the usable detections of one row of ``MEASURED``; ``SignRanges`` counts the rest."""
     cue, _ = MEASURED[row]
     labels = vehicle.labels_of(cue)
     _, score = vehicle.threshold_of(cue)

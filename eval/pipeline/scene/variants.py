@@ -1,4 +1,4 @@
-"""A run's scene once more with other settings or without a cue, in memory: what was it worth?"""
+"""Repetition of a run's scene in memory with other settings or without a cue."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 def scene_tables(
     run: RunFolder, vehicle: Vehicle | None = None, without: frozenset[str] = frozenset()
 ) -> dict[str, pa.Table]:
-    """Tables ``cues``, ``range`` and ``belief`` as the run would have them.
+    """Return the tables ``cues``, ``range`` and ``belief`` of a repeated run.
 
     Args:
-        run: With a finished detect stage and a pose.
-        vehicle: Other settings; the run's, if left out.
-        without: Cues to leave out as if nothing had looked for them.
+        run: A run with a finished detect stage and a pose.
+        vehicle: Settings; default: those of the run.
+        without: Cues to leave out, as if they had not been evaluated.
 
     Raises:
         RunError: No detector has examined the run's camera.

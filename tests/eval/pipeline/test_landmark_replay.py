@@ -179,7 +179,7 @@ def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
     assert cli.run([*command, "--landmarks", str(town.database)]) == 0
 
     notices = RunFolder(run).drive_manifest().notices
-    assert "landmarks were given, but the logs have no camera: none is looked for" in notices
+    assert "landmarks were given, but the logs have no camera: none is searched for" in notices
 
 
 def refused(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
