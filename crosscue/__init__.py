@@ -1,10 +1,10 @@
-"""Replay a recorded drive, score every cue and the pose, and see it in Rerun.
+"""Replay a recorded drive, score every cue and the pose, and view it in Rerun.
 
-What ``__all__`` lists is the public interface: stable, and in the changelog when it changes. Each
-name is imported when it is first used, so ``import crosscue`` costs nothing.
+``__all__`` lists the public interface, whose changes are recorded in the changelog. Each name is
+imported when it is first used, so ``import crosscue`` is fast.
 
 The six packages ``replay``, ``detectors``, ``fusion``, ``localization``, ``datasets`` and ``eval``
-lie at the top of the repository and are linked here, so that only ``crosscue`` is ever installed.
+are at the top of the repository and are linked here, so that only ``crosscue`` is installed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _LINKED: Final = ("replay", "detectors", "fusion", "localization", "datasets", "
 
 
 def _broken_links(folder: Path) -> list[str]:
-    """Names of linked packages that are not folders here."""
+    """Return the names of linked packages that are not folders here."""
     return [name for name in _LINKED if not (folder / name).is_dir()]
 
 
@@ -208,7 +208,7 @@ _EXPORTS: Final = {
     "LayoutResult": "eval.interface.studies.layouts",
     "LayoutStudy": "eval.studies.layouts.settings",
 }
-"""From a public name to its module."""
+"""Module of each public name."""
 
 __all__ = [*_EXPORTS]
 

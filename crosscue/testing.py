@@ -7,7 +7,7 @@ Call them from a test of your own package::
     def test_it_keeps_the_contract():
         check_detector(my_package.build)
 
-Each raises ``AssertionError`` with what was expected and what was found.
+Each raises ``AssertionError`` with the expected and the actual result.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 __all__ = ["check_cue", "check_dataset", "check_detector", "check_reader"]
 
 Rows: TypeAlias = dict[str, list[tuple[int, object]]]
-"""By topic, log time and content of each row, in stored order."""
+"""Log time and content of each row in stored order, by topic."""
 
 
 def check_reader(
@@ -50,19 +50,20 @@ def check_reader(
     *,
     is_in_order: bool = True,
 ) -> None:
-    """Check that a reader keeps the contract on a small, whole log of several rows.
+    """Check that a reader keeps the contract on a small, undamaged log of several rows.
 
-    Every row is accounted for, reading twice returns the same, times of a topic are in order, a
-    span is half open, and a topic can be read alone. With ``damage_one_row``, the log is damaged
-    afterwards, and exactly that row is lost, with a reason.
+    Every row is accounted for, reading twice returns the same rows, the times of a topic are in
+    order, a time span is half open, and a topic can be read alone. With ``damage_one_row``, the log
+    is damaged afterwards, and exactly that row must be lost, with a reason.
 
     Args:
-        log: Of the reader's format; opened as ``crosscue.open`` does.
-        damage_one_row: Damages exactly one row of the log, whose path it is called with.
-        is_in_order: Rows of a topic are stored in order of time; packets of a video may not be.
+        log: A log of the reader's format, opened with ``crosscue.open``.
+        damage_one_row: Function that damages exactly one row of the log at the given path.
+        is_in_order: True if the rows of a topic are stored in order of time; packets of a video
+            may not be.
 
     Raises:
-        AssertionError: The contract is broken; the message says where.
+        AssertionError: The contract is broken; the message states where.
     """
     whole, ledger = _read(log)
     _expect(sum(map(len, whole.values())) > 2, f"{log}: expected three rows or more, for a test")
@@ -85,17 +86,17 @@ def check_reader(
 def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) -> None:
     """Check that a detector keeps the contract on black, white and noisy frames.
 
-    It returns one result for each frame, in order, with the frame's time and size; boxes are in the
-    picture and scores in 0 to 1; every label is one of its ``labels``, where it has any; frames
-    stay as they were; the same frames give the same result, one by one or together; and its
+    It returns one result for each frame, in order, with the frame's time and size. Boxes are inside
+    the picture, scores are from 0 to 1, and every label is one of its ``labels`` if it has any.
+    Frames stay unchanged. The same frames yield the same result, one by one or in a batch. Its
     identity is the same when it is built again.
 
     Args:
-        build: Makes the detector, with its default settings.
-        tolerance: How far boxes in pixels and scores may differ between one frame and a batch.
+        build: Function that builds the detector with its default settings.
+        tolerance: Max difference of boxes in pixels and of scores between one frame and a batch.
 
     Raises:
-        AssertionError: The contract is broken; the message says where.
+        AssertionError: The contract is broken; the message states where.
     """
     from crosscue.detectors.base import reportable
 
@@ -107,24 +108,24 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
     before = [frame.pixels.copy() for frame in frames]
     together = detect(frames)
     for frame, pixels in zip(frames, before, strict=True):
-        _expect(np.array_equal(frame.pixels, pixels), "it has changed a frame's pixels")
+        _expect(np.array_equal(frame.pixels, pixels), "it changed a frame's pixels")
     _expect(len(together) == len(frames), f"{len(frames)} frames, {len(together)} results")
     for frame, found in zip(frames, together, strict=True):
         _check_found(frame, found)
         _check_labels(found, labels)
         (alone,) = detect([frame])
-        _expect(_is_same(alone, found, tolerance), f"frame {frame.t_ns}: alone it gives another")
+        _expect(_is_same(alone, found, tolerance), f"frame {frame.t_ns}: its result differs alone")
     _expect(len(detect([])) == 0, "no frames: expected no results")
 
 
 def check_cue(cue: CueSpec) -> None:
-    """Check that a cue keeps the contract: its claim, its rule, and its answer to empty input.
+    """Check that a cue keeps the contract: its claim, its rule, and its result for empty input.
 
     Args:
-        cue: Its row of the table.
+        cue: The cue's row of the table.
 
     Raises:
-        AssertionError: The contract is broken; the message says where.
+        AssertionError: The contract is broken; the message states where.
     """
     from crosscue.detectors.cues.rules import rule_of
     from crosscue.replay.vehicle.vehicle import Vehicle
@@ -146,7 +147,10 @@ def check_cue(cue: CueSpec) -> None:
             count is None or (isinstance(count, int) and count >= 0),
             f"{cue.name}: {what}: got {count!r}, expected a count or None",
         )
-        _expect(rule(observed, settings, cue) == count, f"{cue.name}: {what}: another answer")
+        _expect(
+            rule(observed, settings, cue) == count,
+            f"{cue.name}: {what}: called again, its result differs",
+        )
         _expect(not (what == "nothing" and count), f"{cue.name}: counts {count} where nothing is")
 
 
@@ -155,16 +159,15 @@ def check_dataset(
 ) -> None:
     """Check that a data set keeps the contract of a reader, and that its truth fits its log.
 
-    A true track states whose track it is and that body's mounting (null where unknown), with the
-    source.
+    A true track states the tracked body and its mounting (null if unknown), with the source.
 
     Args:
-        log: A small, whole drive of the data set.
-        folder: An empty folder, for its truth.
+        log: A small, undamaged drive of the data set.
+        folder: An empty folder for its truth.
         damage_one_row: As for ``check_reader``.
 
     Raises:
-        AssertionError: The contract is broken; the message says where.
+        AssertionError: The contract is broken; the message states where.
     """
     from crosscue.datasets.truth.truth import load, write_carried
 
@@ -187,7 +190,7 @@ def check_dataset(
 
 
 def _expect(is_kept: bool, text: str) -> None:
-    """Not ``assert``, which ``python -O`` leaves out."""
+    """Raise unless a condition holds; ``python -O`` would skip an ``assert``."""
     if not is_kept:
         raise AssertionError(text)
 
@@ -339,7 +342,7 @@ def _is_same(one: Found, other: Found, tolerance: float) -> bool:
 
 
 def _observations(observed_by: str) -> dict[str, Any]:
-    """What a rule may be given: nothing at all, and, of boxes, some of other kinds."""
+    """Return inputs of a rule: nothing at all, and boxes of other kinds."""
     from crosscue.detectors.base import Detections
 
     if observed_by in ("objects", "signs"):

@@ -76,7 +76,7 @@ def flips_without_truth(
 
 
 def from_finding(found: Finding, curve: Curve | None, about: About, threshold: float) -> Failure:
-    """Return the failure of a missed, late or invented feature, at its most telling moment."""
+    """Return the failure of a missed, late or invented feature at its clearest moment."""
     kinds: Mapping[str, Kind] = {"missing": "missed", "late": "late", "invented": "false"}
     kind = kinds[found.failing]
     values = None if curve is None else curve.features.get(found.feature)

@@ -1,7 +1,7 @@
-"""A run as a Rerun recording, laid out without a click.
+"""Rerun recordings of runs, with a ready-made layout.
 
-Everything is on one timeline, the log's time; columns are sent in bulk, pictures pass through as
-stored. ``save`` is all there is to call.
+Everything is on one timeline, the drive time. Columns are sent in bulk, and pictures are passed
+through as stored. ``save`` is the only entry point.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ def save(
     true_ranges: TrueRanges | None = None,
     part: Part = WHOLE,
 ) -> None:
-    """Write the recording of a run, whole or not at all; what the run lacks is left out.
+    """Write the recording of a run atomically; views without data are left out.
 
     Args:
-        run: A finished run, or one that has only detected.
-        path: Where to.
+        run: A finished run, or one whose detect stage has finished.
+        path: The output file.
         truth: The true track, drawn into the map.
-        true_ranges: Drawn beside the estimated ones.
-        part: What of the run, and which views.
+        true_ranges: The true ranges, drawn with the estimated ones.
+        part: The time span and the views to record.
 
     Raises:
-        UsageError: The run has nothing for any of the views.
+        UsageError: The run has no data for any of the views.
         RunError: The run's tables are damaged, or the log with its pictures is not found.
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     import rerun as rr
 
@@ -129,7 +129,7 @@ def _log_all(
 def _within(
     part: Part, truth: TruthTrack | None, ranges: TrueRanges | None
 ) -> tuple[TruthTrack | None, TrueRanges | None]:
-    """The truth in the part's time."""
+    """Return the truth in the part's time span."""
     if part.is_whole:
         return truth, ranges
     if truth is not None:
@@ -148,7 +148,7 @@ def _within(
 
 
 def _read_part(stored: StoredCamera, part: Part, on_pictures: Callable[[Block], None]) -> None:
-    """Every picture of the part's time."""
+    """Read every picture in the part's time span."""
 
     def inside(block: Block) -> None:
         rows = (block.log_ns >= part.start_ns) & (block.log_ns <= part.end_ns)
@@ -185,7 +185,7 @@ def _log_marks(
 
 
 def _pose(run: RunFolder) -> dict[str, Floats] | None:
-    """Columns of the pose, or None where none exists."""
+    """Return the columns of the pose, or None if the run has none."""
     if not run.file("pose.parquet").exists():
         return None
     table = run.table("pose")

@@ -1,7 +1,7 @@
-"""What lies ahead of the car, seen from above in its own frame: up is ahead, metres.
+"""Top view of the area ahead of the vehicle, in its own frame in metres; up is ahead.
 
-The intersection stands across the way at its estimated range, its 2-sigma band around it; lanes and
-vehicles are the Mobileye's, as it had reported them by then.
+The intersection is drawn across the road at its estimated range, with its 2-sigma band. Lanes and
+vehicles are the Mobileye's latest reports at that time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def log_ahead(
     scene: SceneRows,
     truth: TrueRanges | None,
 ) -> None:
-    """Everything ahead of the car, frame by frame."""
+    """Log everything ahead of the vehicle, frame by frame."""
     _log_ground(recording, vehicle)
     _log_intersection(recording, time, scene)
     _log_mobileye(recording, time, StoredMobileye(run, vehicle.past), scene)
@@ -51,7 +51,7 @@ def log_ahead(
 
 
 def above(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From the car's frame to the view's, where x goes right and y down; shape (N, 2)."""
+    """Convert from the vehicle's frame to the view's (x right, y down), shape (N, 2)."""
     return np.stack([-y_m, -x_m], axis=-1)
 
 
@@ -116,7 +116,7 @@ def _log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TrueRanges
             if -BEHIND_M < range_m < 2.0 * FAR_M:
                 across = np.array([-ASIDE_M, ASIDE_M])
                 shapes.add(above(np.full(2, range_m), across), TRUTH)
-    # The truth ends at the intersection: nothing is to stay behind there.
+    # The truth ends at the intersection; clear the bar there.
     if len(truth.t_ns):
         shapes.begin(int(truth.t_ns[-1]) + 1)
     shapes.send(recording, time)

@@ -1,7 +1,7 @@
-"""What is anchored to the road, drawn over the pictures: regions on the ground, cars' own motion.
+"""Overlays anchored to the road: regions on the ground and the motion of cars.
 
-Both need odometry and the believed place of the intersection, so they are computed once more along
-the frames, as the scene stage did.
+Both need odometry and the estimated place of the intersection. They are therefore computed again
+frame by frame, as in the scene stage.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ PAST: Final = (60, 190, 70)
 ARROW_S: Final = 1.0
 NEAREST_M: Final = 1.0
 NOSE: Final = 0.04
-"""Length of a parked car's arrow, in fractions of the picture's width."""
+"""Length of a parked car's arrow as a fraction of the picture's width."""
 
 
 @dataclass(slots=True)
 class Anchored:
-    """Follows cars and regions along the frames; draws into the marks of the same frame.
+    """Tracking of cars and regions over the frames, drawn into the marks of the same frame.
 
     Attributes:
-        run: With odometry and ranges.
-        manifest: Of the run.
-        marks: Where to draw.
+        run: A run with odometry and ranges.
+        manifest: Manifest of the run.
+        marks: Marks to draw into.
     """
 
     run: RunFolder
@@ -64,7 +64,7 @@ class Anchored:
         self._ranges = _ranges_of(self.run)
 
     def add(self, frame: StoredFrame) -> None:
-        """Draw one frame, which the marks have begun."""
+        """Draw one frame that the marks have already begun."""
         seen, vehicle = frame.seen, self.manifest.settings
         fresh_ns = self._restarts.before(seen.t_ns)
         if fresh_ns is not None:
@@ -116,7 +116,7 @@ class Anchored:
 
 
 def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """Where the middle of a car would move within a second, did the camera stand; in the image."""
+    """Return a car's displacement in the image within a second, with the camera at rest."""
     center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
     now_px = np.array(car.center_px) - center
     then_m = max(car.distance_m + ARROW_S * car.ahead_mps, NEAREST_M)
@@ -128,14 +128,14 @@ def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> NDArray[
 def _part_inside(
     tail_px: NDArray[np.float64], way_px: NDArray[np.float64], size_px: tuple[int, int]
 ) -> float:
-    """How much of an arrow fits the image: the viewer makes room for the whole of it."""
+    """Return the fraction of an arrow that is inside the image, to which the viewer adapts."""
     room_px = np.where(way_px > 0.0, np.subtract(size_px, tail_px), tail_px)
     moves = np.abs(way_px) > 0.0
     return max(float(np.min(room_px[moves] / np.abs(way_px[moves]), initial=1.0)), 0.0)
 
 
 def _ranges_of(run: RunFolder) -> dict[int, list[RangeRow]]:
-    """Ranges by time of frame."""
+    """Return the ranges by time of their frame."""
     found: dict[int, list[RangeRow]] = {}
     if run.file("range.parquet").exists():
         table = run.table("range").select(["t_ns", "reference", "range_m", "var_m2"])

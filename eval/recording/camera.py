@@ -1,4 +1,4 @@
-"""The camera's pictures: JPEG and PNG pass through as the log stores them, others become JPEG."""
+"""Recording of camera pictures: JPEG and PNG are passed through, others converted to JPEG."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from crosscue.replay.base import Block, Images, LogError
 from .columns import DriveTime
 
 PASSED_THROUGH: Final = ("jpeg", "png")
-"""Codings that the viewer decodes itself."""
+"""Encodings that the viewer decodes itself."""
 ENTITY: Final = "camera/picture"
 BATCH_BYTES: Final = 4 << 20
 QUALITY: Final = 90
@@ -25,7 +25,7 @@ def log_pictures(
     read_pictures: Callable[[Callable[[Block], None]], None],
     time: DriveTime,
 ) -> int:
-    """Send all pictures; returns how many could not be decoded, which are left out.
+    """Send all pictures that can be decoded; return the number of others.
 
     Raises:
         LogError: The log cannot be opened.
@@ -42,7 +42,7 @@ class _Sink:
     left_out: int = 0
 
     def add(self, block: Block) -> None:
-        """Send a block's pictures some megabytes at a time."""
+        """Send a block's pictures, a few megabytes at a time."""
         images = block.rows
         assert isinstance(images, Images)
         held: list[tuple[int, bytes, str]] = []
@@ -71,12 +71,12 @@ class _Sink:
                 media_type=[kind for _, _, kind in held],
             ),
         )
-        # Without it pictures are taken in faster than the disk takes them, and memory grows.
+        # Without flushing, pictures arrive faster than the disk writes them, and memory grows.
         self.recording.flush()
 
 
 def shown(picture: Encoded) -> bytes | None:
-    """A picture as JPEG, or None where it cannot be decoded."""
+    """Return a picture as JPEG, or None if it cannot be decoded."""
     import cv2
 
     try:

@@ -1,4 +1,4 @@
-"""Colours that mean the same in every view of a recording, on light and on dark ground."""
+"""Colours with the same meaning in every view of a recording, for light and dark backgrounds."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ OTHERS: Final[tuple[Colour, ...]] = ((200, 120, 255), (250, 220, 90), (90, 220, 
 
 
 def of_feature(name: str, number: int) -> Colour:
-    """A user's own features take the other colours in turn."""
+    """Return the colour of a feature; user-defined ones get the remaining colours in turn."""
     return FEATURE_COLOURS.get(name, OTHERS[number % len(OTHERS)])

@@ -1,4 +1,4 @@
-"""Rows of frames gathered into columns and sent some hundred frames at a time."""
+"""Collection of frames' rows into columns that are sent some hundred frames at a time."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ Colour: TypeAlias = tuple[int, int, int]
 
 @dataclass(slots=True)
 class Shapes:
-    """Things drawn in frames: every frame has any number of them, also none.
+    """Shapes drawn in frames, any number in each frame, including none.
 
     Attributes:
-        entity: Where they go.
-        to_columns: From geometry (a list of arrays), colours and labels to Rerun's columns.
-        geometry: One array for each thing.
+        entity: Path of the Rerun entity.
+        to_columns: Function from geometry (a list of arrays), colours and labels to Rerun's
+            columns.
+        geometry: One array for each shape.
     """
 
     entity: str
@@ -34,19 +35,19 @@ class Shapes:
     counts: list[int] = field(default_factory=list)
 
     def begin(self, t_ns: int) -> None:
-        """A frame; what is added next belongs to it."""
+        """Start a frame; shapes added next belong to it."""
         self.times.append(t_ns)
         self.counts.append(0)
 
     def add(self, geometry: NDArray[np.float64], colour: Colour, label: str = "") -> None:
-        """One thing of the frame begun last."""
+        """Add a shape to the current frame."""
         self.geometry.append(geometry)
         self.colours.append(colour)
         self.labels.append(label)
         self.counts[-1] += 1
 
     def send(self, recording: rr.RecordingStream, time: DriveTime) -> None:
-        """Send what has been gathered, and forget it."""
+        """Send and discard the collected frames."""
         if not self.times:
             return
         columns = self.to_columns(self.geometry, self.colours, self.labels)
@@ -60,7 +61,7 @@ class Shapes:
 def boxes(
     geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
-    """Geometry: x0, y0, x1, y1."""
+    """Return the columns of boxes; geometry: x0, y0, x1, y1."""
     corners = np.asarray(geometry, np.float32).reshape(-1, 4)
     return rr.Boxes2D.columns(
         centers=(corners[:, :2] + corners[:, 2:]) / 2,
@@ -73,7 +74,7 @@ def boxes(
 def strips(
     geometry: list[NDArray[np.float64]], colours: list[Colour], _labels: list[str]
 ) -> rr.ComponentColumnList:
-    """Geometry: shape (N, 2)."""
+    """Return the columns of line strips; geometry: shape (N, 2)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
     return rr.LineStrips2D.columns(strips=lines, colors=packed(colours))
 
@@ -81,7 +82,7 @@ def strips(
 def labelled_strips(
     geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
-    """The same with a label each."""
+    """Return the columns of line strips with labels; geometry: shape (N, 2)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
     return rr.LineStrips2D.columns(strips=lines, colors=packed(colours), labels=labels)
 
@@ -89,7 +90,7 @@ def labelled_strips(
 def strips_above(
     geometry: list[NDArray[np.float64]], colours: list[Colour], _labels: list[str]
 ) -> rr.ComponentColumnList:
-    """In space; geometry: shape (N, 3)."""
+    """Return the columns of line strips in space; geometry: shape (N, 3)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
     return rr.LineStrips3D.columns(strips=lines, colors=packed(colours))
 
@@ -97,7 +98,7 @@ def strips_above(
 def arrows(
     geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
-    """Geometry: x, y of the tail, then of the way to the tip."""
+    """Return the columns of arrows; geometry: x, y of the tail, then of the vector to the tip."""
     both = np.asarray(geometry, np.float32).reshape(-1, 4)
     return rr.Arrows2D.columns(
         origins=both[:, :2], vectors=both[:, 2:], colors=packed(colours), labels=labels
@@ -107,34 +108,34 @@ def arrows(
 def points(
     geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
-    """Geometry: x, y."""
+    """Return the columns of points; geometry: x, y."""
     places = np.asarray(geometry, np.float32).reshape(-1, 2)
     return rr.Points2D.columns(positions=places, colors=packed(colours), labels=labels)
 
 
 def packed(colours: Sequence[Colour]) -> NDArray[np.uint32]:
-    """As Rerun keeps colours: red first, opaque."""
+    """Return colours as Rerun's packed RGBA, opaque."""
     rgb = np.asarray(colours, np.uint32).reshape(-1, 3)
     return (rgb @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 0xFF).astype(np.uint32)
 
 
 TIMELINE: Final = "drive"
-"""Not ``log_time``: under that name the viewer keeps the wall clock of the logging itself."""
+"""Name of the timeline; the viewer reserves ``log_time`` for the wall clock of logging."""
 YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class DriveTime:
-    """How a drive's times are shown.
+    """Display of a drive's times.
 
     Attributes:
-        is_date: As dates; else as durations, for logs on a clock that begins with the machine.
+        is_date: True to show dates; False to show durations, for clocks that start at boot.
     """
 
     is_date: bool
 
     def column(self, t_ns: NDArray[np.int64] | Sequence[int]) -> list[rr.TimeColumn]:
-        """The index of ``send_columns`` for rows at these times."""
+        """Return the index for ``send_columns`` of rows at these times."""
         times = np.asarray(t_ns, np.int64)
         if self.is_date:
             return [rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))]
@@ -142,5 +143,5 @@ class DriveTime:
 
 
 def time_of(first_ns: int) -> DriveTime:
-    """For a drive that begins then."""
+    """Return the display of times for a drive that starts at ``first_ns``."""
     return DriveTime(first_ns > YEAR_2000_NS)

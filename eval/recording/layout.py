@@ -1,4 +1,4 @@
-"""How the viewer lays a recording out, without a click."""
+"""Layout of a recording in the viewer."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ FAR_M: Final = 110.0
 BEHIND_M: Final = 12.0
 ASIDE_M: Final = 24.0
 MARKED_NS: Final = 100_000_000
-"""On either side of the moment that is marked on the time line."""
+"""Time marked on either side of a moment on the time line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """What there is to show.
+    """Data available to the views.
 
     Attributes:
-        camera: Its topic, or None.
+        camera: Topic of the camera, or None.
         pose: Columns of the pose, or None.
-        has_truth: The true track is drawn.
-        has_scene: There are ranges, beliefs or cues.
-        longest_m: The largest range, with its band.
-        part: What of the run is recorded, and in which views.
+        has_truth: True if the true track is drawn.
+        has_scene: True if there are ranges, beliefs or cues.
+        longest_m: The largest range, including its band.
+        part: The time span and the views recorded.
     """
 
     camera: str | None
@@ -46,10 +46,10 @@ class Shown:
 
 
 def blueprint(shown: Shown) -> rrb.Blueprint:
-    """The layout: a scene's, a pose's alone, or the views that were asked for.
+    """Return the layout: for a scene, for a pose alone, or of the requested views.
 
     Raises:
-        UsageError: The run has nothing for any of these.
+        UsageError: The run has no data for any of the requested views.
     """
     whole = _scene(shown) if shown.has_scene else _pose_alone(shown)
     return rrb.Blueprint(
@@ -61,7 +61,7 @@ def blueprint(shown: Shown) -> rrb.Blueprint:
 
 
 def _time_panel(moment_ns: int | None) -> rrb.TimePanel:
-    """Plays from the beginning: no blueprint of Rerun 0.41 says where the cursor stands."""
+    """Return the time panel; playback starts at the beginning, as Rerun 0.41 has no start time."""
     marked = None
     if moment_ns is not None:
         marked = AbsoluteTimeRange(min=moment_ns - MARKED_NS, max=moment_ns + MARKED_NS)
@@ -75,7 +75,7 @@ def _time_panel(moment_ns: int | None) -> rrb.TimePanel:
 
 
 def _only(shown: Shown) -> rrb.Container:
-    """The views that were asked for and that the run has something for, side by side."""
+    """Return the requested views for which the run has data, side by side."""
     there: dict[str, rrb.View | rrb.Container] = {"notes": _notes()}
     if shown.camera is not None:
         there["cameras"] = _camera(shown.camera)
@@ -91,7 +91,7 @@ def _only(shown: Shown) -> rrb.Container:
     views = [there[name] for name in VIEWS if name in there and shown.part.shows(name)]
     if not views:
         raise UsageError(
-            f"--only {','.join(sorted(shown.part.only))}: the run has nothing to show there; "
+            f"--only {','.join(sorted(shown.part.only))}: the run has no data for these views; "
             f"it has {','.join(name for name in VIEWS if name in there)}"
         )
     return rrb.Grid(*views)
@@ -128,7 +128,7 @@ def _ranges(longest_m: float) -> rrb.View:
         origin="/".join(RANGE),
         name="Range (m): start red, end yellow, 2-sigma bands thin, truth green",
         axis_x=rrb.TimeAxis(view_range=_whole()),
-        # A legend of eight lines would cover them.
+        # A legend of eight lines would cover the curves.
         axis_y=rrb.ScalarAxis(range=(0.0, longest_m)),
         plot_legend=rrb.PlotLegend(visible=False),
     )
@@ -180,7 +180,7 @@ def _pose_series() -> Sequence[rrb.View]:
 
 
 def _whole() -> rrb.TimeRange:
-    """Without it the viewer shows a minute around the cursor, not the drive."""
+    """Return the range of the complete drive; by default the viewer shows only a minute."""
     return rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
 
 
@@ -194,7 +194,7 @@ def _plan(shown: Shown, pose: Mapping[str, NDArray[np.float64]]) -> rrb.View:
 
 
 def _from_above(pose: Mapping[str, NDArray[np.float64]]) -> rrb.EyeControls3D:
-    """North up, the whole track in sight."""
+    """Return a camera above the map, north up, with the complete track in view."""
     x, y = pose["x_m"], pose["y_m"]
     middle = (float(x.min() + x.max()) / 2, float(y.min() + y.max()) / 2)
     height_m = 1.15 * max(float(np.ptp(x)), float(np.ptp(y)), 20.0)

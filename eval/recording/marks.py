@@ -1,7 +1,7 @@
-"""What detectors found, drawn over the pictures: boxes, outlines, road, regions, moving cars.
+"""Overlays of detections: boxes, outlines, road, regions and moving cars.
 
-Outlines are strips of a few points, and road is hatched every few rows: a small part of the bytes
-of a mask, and one still sees the picture below.
+Outlines are strips of a few points, and road is hatched every few rows. This takes a small fraction
+of a mask's bytes and keeps the picture visible.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ CROSSING: Final = (255, 130, 30)
 PARKED: Final = (190, 130, 255)
 HATCH_ROWS: Final = 4
 ARROW_STEPS: Final = 4.0
-"""An arrow's length in steps from one frame to the next."""
+"""Length of an arrow as a multiple of the step from one frame to the next."""
 LABELLED: Final = 0.03
-"""Narrower things, in fractions of the picture's width, show their label only when pointed at."""
+"""Min width of an object with a permanent label, as a fraction of the picture's width."""
 SIDES: Final = ("left", "straight", "right")
 
 
 @dataclass(slots=True)
 class Marks:
-    """Draws frame by frame; keeps the cars of the frame before.
+    """Overlays of successive frames; keeps the cars of the previous frame.
 
     Attributes:
-        vehicle: For labels, thresholds and regions.
+        vehicle: Settings with labels, thresholds and regions.
     """
 
     vehicle: Vehicle
@@ -82,19 +82,19 @@ class Marks:
         if isinstance(seen.road, RoadMask):
             for line in road_lines(seen.road):
                 self.road.add(line, ROAD)
-        # What is anchored to the road or followed over frames is drawn by ``anchored``.
+        # Overlays anchored to the road or tracked over frames are drawn by ``anchored``.
         if self.vehicle.regions.kind != "ground":
             self._regions(seen.road, frame.size_px)
         if seen.objects and self.vehicle.cars.kind != "tracks":
             self._cars(seen.objects)
 
     def all(self) -> Iterator[Shapes]:
-        """Everything that is drawn."""
+        """Yield all shapes."""
         yield from (self.objects, self.far, self.outlines, self.signs)
         yield from (self.road, self.regions, self.cars)
 
     def send(self, recording: rr.RecordingStream, time: DriveTime) -> None:
-        """Send the frames gathered so far."""
+        """Send the frames collected so far."""
         for shapes in self.all():
             shapes.send(recording, time)
 
@@ -107,7 +107,7 @@ class Marks:
                 self.outlines.add(line, colour)
 
     def _colour(self, found: Detections, row: int) -> Colour:
-        """Grey for what is too unsure to be a cue."""
+        """Return the colour of a detection; grey if its score is too low for a cue."""
         cues, cars = self.vehicle.cues, self.vehicle.cars
         label = found.labels[row]
         for labels, min_score, colour in (
@@ -123,7 +123,7 @@ class Marks:
         return OWN if is_own else UNSURE
 
     def _regions(self, road: RoadMask | RoadFractions | None, size_px: tuple[int, int]) -> None:
-        """Polygons, green where there is road; none where no detector looks for road."""
+        """Draw the regions, green if they contain road; nothing without a detector of road."""
         if road is None:
             return
         fractions = (
@@ -162,26 +162,26 @@ class Marks:
 
 
 def _report_text(found: Detections) -> Iterator[tuple[NDArray[np.float64], str, int]]:
-    """Box, text and row of each detection."""
+    """Yield box, text and row of each detection."""
     for row, (label, score) in enumerate(zip(found.labels, found.scores.tolist(), strict=True)):
         yield found.boxes_px[row], f"{label} {score:.2f}", row
 
 
 def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
-    """Outline of the road and a line along every few rows of it, in the picture's pixels."""
+    """Return the road's outline and a line along every few rows of it, in pixels."""
     width, height = road.mask_size_px
     scale = np.array(road.size_px, np.float64) / (width, height)
     is_road = road.pixels()
     padded = np.zeros((-(-height // HATCH_ROWS), width + 2), np.int8)
     padded[:, 1:-1] = is_road[::HATCH_ROWS]
-    # Runs begin and end in turn along a row, so each two neighbours of a row are one run's ends.
+    # Starts and ends of runs alternate along a row, so successive pairs are the ends of one run.
     rows, columns = np.nonzero(np.diff(padded, axis=1))
     hatch = np.stack([columns, HATCH_ROWS * rows + 0.5], axis=1).reshape(-1, 2, 2)
     return [line * scale for line in (*rle.borders(is_road, (0, 0)), *hatch)]
 
 
 def log_styles(recording: rr.RecordingStream) -> None:
-    """Widths in points of the screen; labels where there is room for them."""
+    """Log line widths in screen points, and labels where there is enough room."""
     boxes_style = rr.Boxes2D.from_fields(radii=[_points(1.0)], show_labels=True)
     recording.log("camera/objects", boxes_style, static=True)
     recording.log("camera/sign_windows", boxes_style, static=True)
@@ -194,5 +194,5 @@ def log_styles(recording: rr.RecordingStream) -> None:
 
 
 def _points(width: float) -> float:
-    """Rerun takes negative radii for points of the screen."""
+    """Return a radius in screen points, which Rerun encodes as a negative number."""
     return -width

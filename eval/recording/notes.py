@@ -1,4 +1,4 @@
-"""A page of text beside the pictures: which logs, what was dropped, what the colours say."""
+"""Page of text with the logs, dropped rows and the meaning of colours."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLOURS: Final = (
 
 
 def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
-    """What a person should know before looking."""
+    """Return the page of notes on a run."""
     manifest = run.drive_manifest()
     logs = [f"- {inert(log.name)}" for log in manifest.logs]
     notices = [f"- {inert(sentence)}" for sentence in (*manifest.notices, *more)]
@@ -51,5 +51,5 @@ def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
 
 
 def inert(text: str) -> str:
-    """Text that Markdown shows as it is: no link, no picture to fetch, no mark-up."""
+    """Escape text so that Markdown shows it literally, without links, pictures or markup."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", visible(text))

@@ -1,4 +1,4 @@
-"""What of a run is recorded: some time of it, some of its views."""
+"""The part of a run that is recorded: a time span and views."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ LAST_NS: Final = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What to record.
+    """The part to record.
 
     Attributes:
-        start_ns: First moment, as in the run's tables.
+        start_ns: First moment, in the time of the run's tables.
         end_ns: Last moment.
-        moment_ns: Marked on the time line; None for none.
-        only: Of ``VIEWS``; empty for all.
+        moment_ns: Moment marked on the time line, or None.
+        only: Views to record, from ``VIEWS``; empty for all.
     """
 
     start_ns: int = 0
@@ -28,10 +28,10 @@ class Part:
     only: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        """Refuse views that there are not.
+        """Check the names of the views.
 
         Raises:
-            UsageError: With their names.
+            UsageError: A view does not exist; the message lists those that do.
         """
         strange = sorted(self.only.difference(VIEWS))
         if strange:
@@ -39,11 +39,11 @@ class Part:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing is cut off."""
+        """True if the part covers the complete time of the run."""
         return self.start_ns == 0 and self.end_ns == LAST_NS
 
     def shows(self, view: str) -> bool:
-        """Is a view wanted?"""
+        """Return whether a view is selected."""
         return not self.only or view in self.only
 
 

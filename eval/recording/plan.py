@@ -1,4 +1,4 @@
-"""The map seen from above: x east, y north, metres."""
+"""The map view from above: x east, y north, in metres."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ELLIPSES_PER_S: Final = 5.0
 HALF_ROAD_M: Final = 8.0
 CAR_M: Final = 8.0
 CAR_SHARE: Final = 0.02
-"""The car's arrow is at least this fraction of the track's extent, to be seen on a long drive."""
+"""Min length of the vehicle's arrow as a fraction of the track's extent."""
 LANDMARK_POINTS: Final = 6.0
 TRUE_CAR_POINTS: Final = 5.0
 
@@ -28,7 +28,7 @@ TRUE_CAR_POINTS: Final = 5.0
 def log_pose(
     recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, NDArray[np.float64]]
 ) -> None:
-    """Path, car and ellipse."""
+    """Log the path, the vehicle and its ellipse."""
     recording.log("plan", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     t_ns = pose["t_ns"].astype(np.int64)
     thin = slice(None, None, max(1, len(t_ns) // PATH_POINTS))
@@ -63,7 +63,7 @@ def log_landmarks(
     pose: Mapping[str, NDArray[np.float64]],
     names: Sequence[str | None],
 ) -> None:
-    """Where landmarks were used, by name."""
+    """Log the places at which landmarks were used, with their names."""
     rows = [i for i, name in enumerate(names) if name is not None]
     if not rows:
         return
@@ -81,7 +81,7 @@ def log_landmarks(
 
 
 def log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TruthTrack) -> None:
-    """The true path, and where the car truly was."""
+    """Log the true path and the true position of the vehicle."""
     flat = np.stack([truth.x_m, truth.y_m, np.zeros(len(truth.t_ns))], axis=1)
     recording.log("plan/truth", rr.LineStrips3D([flat], colors=[TRUTH]), static=True)
     recording.send_columns(
@@ -99,7 +99,7 @@ def log_intersection(
     pose: Mapping[str, NDArray[np.float64]],
     scene: SceneRows,
 ) -> None:
-    """A bar across the road where the intersection starts and ends: ahead of the estimated car."""
+    """Log bars across the road at the intersection's start and end, ahead of the estimated pose."""
     if scene.ranges is None:
         return
     t_ns = scene.ranges["t_ns"].to_numpy()
@@ -125,13 +125,13 @@ def log_intersection(
 def _pieces(
     flat: NDArray[np.float64], segment: NDArray[np.float64], thin: slice
 ) -> list[NDArray[np.float64]]:
-    """The path in pieces that no gap of the drive interrupts."""
+    """Split the path at the gaps of the drive."""
     breaks = np.flatnonzero(np.diff(segment[thin])) + 1
     return [np.asarray(part) for part in np.split(flat[thin], breaks)]
 
 
 def _every(t_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
-    """Indices of about ``rate_hz`` rows per second, the last one included."""
+    """Return the indices of about ``rate_hz`` rows per second, including the last row."""
     slots = (t_ns - t_ns[0]) // round(1e9 / rate_hz)
     first = np.flatnonzero(np.diff(slots, prepend=-1))
     return np.union1d(first, [len(t_ns) - 1]).astype(np.int64)
@@ -147,7 +147,7 @@ def _position_cov(
 def _rings(
     centre: NDArray[np.float64], cov: NDArray[np.float64], points: int = 33
 ) -> NDArray[np.float64]:
-    """2-sigma ellipses, shape (N, points, 3)."""
+    """Return 2-sigma ellipses, shape (N, points, 3)."""
     angle = np.linspace(0.0, 2.0 * np.pi, points)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     values, vectors = np.linalg.eigh(cov)

@@ -1,4 +1,4 @@
-"""A run's cues, ranges and beliefs as a recording needs them; whatever the run lacks is empty."""
+"""Cues, ranges and beliefs of a run for a recording; missing tables are None."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class SceneRows:
     """The run's tables, sorted by time; None where the run has none.
 
     Attributes:
-        frames_ns: Times of frames, each once; empty for a run without camera.
-        gaps_ns: Right after the last frame before each gap of the drive.
-        cues: As in ``cues.parquet``.
-        ranges: As in ``range.parquet``.
-        belief: As in ``belief.parquet``.
+        frames_ns: Unique times of frames; empty for a run without camera.
+        gaps_ns: Times just after the last frame before each gap of the drive.
+        cues: Rows of ``cues.parquet``.
+        ranges: Rows of ``range.parquet``.
+        belief: Rows of ``belief.parquet``.
     """
 
     frames_ns: NDArray[np.int64]
@@ -34,7 +34,7 @@ class SceneRows:
 
 
 def scene_rows(run: TableFolder) -> SceneRows:
-    """Read them.
+    """Read a run's cues, ranges and beliefs.
 
     Raises:
         RunError: A table is damaged.
@@ -51,7 +51,7 @@ def scene_rows(run: TableFolder) -> SceneRows:
 
 
 def longest_m(scene: SceneRows) -> float:
-    """The largest range with its 2-sigma band, in whole tens of metres; 100 m without any."""
+    """Return the largest range with its 2-sigma band, in multiples of 10 m; 100 m without any."""
     if scene.ranges is None:
         return 100.0
     range_m = scene.ranges["range_m"].to_numpy()

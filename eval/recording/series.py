@@ -1,4 +1,4 @@
-"""What is plotted over time: beliefs, ranges, cues, pose."""
+"""Time series of a recording: beliefs, ranges, cues and pose."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RANGE: Final = ("plots", "range")
 CUES: Final = ("cues",)
 FOUND: Final = "found"
 ONE_FRAME_NS: Final = 100_000_000
-"""How long the only frame of a run is shown to last."""
+"""Displayed duration of the only frame of a run."""
 POSE: Final[Mapping[str, str]] = {
     "speed": "Speed (m/s)",
     "heading": "Heading (deg)",
@@ -40,7 +40,7 @@ NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LABELS)
 def log_pose_series(
     recording: rr.RecordingStream, time: DriveTime, pose: Mapping[str, NDArray[np.float64]]
 ) -> None:
-    """One plot for each of ``POSE``."""
+    """Log one plot for each entry of ``POSE``."""
     series = {
         "speed/speed_mps": pose["speed_mps"],
         "heading/heading_deg": np.rad2deg(np.unwrap(pose["heading_rad"])),
@@ -54,7 +54,7 @@ def log_pose_series(
 def log_belief(
     recording: rr.RecordingStream, time: DriveTime, scene: SceneRows, vehicle: Vehicle
 ) -> None:
-    """The probability of every feature, and the line above which it counts as established."""
+    """Log the probability of every feature, and the threshold above which it is established."""
     if scene.belief is None:
         return
     t_ns, pieces = scene.belief["t_ns"].to_numpy(), _pieces(scene.belief)
@@ -71,7 +71,7 @@ def log_belief(
 def log_ranges(
     recording: rr.RecordingStream, time: DriveTime, scene: SceneRows, truth: TrueRanges | None
 ) -> None:
-    """Range to start and end with the 2-sigma band, what signs measured, and the truth."""
+    """Log the range to start and end with the 2-sigma band, the measurements, and the truth."""
     for reference, colour in (("start", START), ("end", END)):
         if scene.ranges is None:
             break
@@ -114,7 +114,7 @@ def _log_measured(
 
 
 def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -> None:
-    """A lane for every cue that was ever found, filled while it is."""
+    """Log a lane for every cue that was ever found, filled while it is found."""
     if scene.cues is None:
         return
     found = scene.cues.filter(pc.greater(scene.cues["count"], 0))
@@ -134,7 +134,7 @@ def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -
 
 
 def of_cue(cue: str) -> Colour:
-    """As the table of cues says; of a user's own by the side in its name."""
+    """Return the colour of a cue: from the table of cues, or by the side in a user-defined name."""
     if cue in cue_table.CUES:
         return cue_table.CUES[cue].colour
     for number, side in enumerate(("left", "right", "straight")):
@@ -149,10 +149,10 @@ def _changes(
     frames_ns: NDArray[np.int64],
     gaps_ns: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Times at which a cue comes or goes, and 1 or 0 from then on.
+    """Return the times at which a cue appears or disappears, and 1 or 0 from then on.
 
-    Where it was not looked for, in gaps of the drive, and once the last frame has lasted as long as
-    frames usually do, it counts as 0.
+    It counts as 0 where it was not evaluated, in gaps of the drive, and after the last frame has
+    lasted for the usual interval between frames.
     """
     frames_ns = np.unique(frames_ns)
     period_ns = int(np.median(np.diff(frames_ns))) if len(frames_ns) > 1 else ONE_FRAME_NS
@@ -163,7 +163,7 @@ def _changes(
 
 
 def _pieces(table: pa.Table) -> tuple[NDArray[Any], NDArray[Any]]:
-    """What a line must not run across: approaches and the drive's segments."""
+    """Return the columns at whose changes lines are interrupted: approaches and segments."""
     return table["approach"].to_numpy(), table["segment"].to_numpy()
 
 

@@ -1,1 +1,1 @@
-"""Reports: HTML pages, figures, JUnit."""
+"""Reports of scores as HTML pages, figures, text, JUnit XML and MLflow runs."""

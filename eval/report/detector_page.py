@@ -1,4 +1,4 @@
-"""The page of a detector's score: one HTML file that needs no network and runs no script."""
+"""Report of a detector's score: one HTML file without network access or scripts."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def write_detector_page(
     *,
     has_figures: bool = True,
 ) -> None:
-    """Write the page.
+    """Write the report.
 
     Args:
-        path: Its file.
-        content: By the names that the template has for it.
-        calibration: Of each class, for the reliability diagram.
-        has_figures: Draw it, for which matplotlib is imported.
+        path: The output file.
+        content: Values by their names in the template.
+        calibration: Reliability of each class, for the diagram.
+        has_figures: Draw the diagram, for which matplotlib is imported.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     figure = draw_reliability(calibration) if has_figures else None
     whole = {**content, "figure": figure, "calibration": calibration}
@@ -40,7 +40,7 @@ def write_detector_page(
 
 
 def draw_reliability(calibration: Sequence[Reliability]) -> str | None:
-    """Fraction right against score, PNG in base64; None where nothing was detected."""
+    """Return the reliability diagram as PNG in base64; None without any detection."""
     some = [one for one in calibration if one.detections]
     if not some:
         return None

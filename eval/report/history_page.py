@@ -1,4 +1,4 @@
-"""The page of a history: each metric over versions, in one file without network or script."""
+"""Report of a history: charts of metrics over versions in one file without network or scripts."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ TEMPLATE: Final = "history.html.j2"
 WIDTH: Final = 460.0
 HEIGHT: Final = 190.0
 LABEL_PX: Final = 52.0
-"""Width that the name of a version needs below a chart."""
+"""Width of a version's name below a chart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A change point as it is drawn.
+    """A change point in a chart.
 
     Attributes:
-        at: Place of the first version that differs.
+        at: Index of the first version that differs.
         verdict: ``better`` or ``worse``.
-        before: Value just before.
-        after: Value of that version.
-        p: How often chance alone does as much.
+        before: Value of the previous version.
+        after: Value of the first version that differs.
+        p: p value of the change.
     """
 
     at: int
@@ -44,12 +44,12 @@ class Chart:
     """One metric over versions.
 
     Attributes:
-        title: Its name.
-        better: Its good direction.
-        values: By version; NaN where it was not scored.
+        title: Name of the metric.
+        better: Good direction of the metric.
+        values: Values by version; NaN where it was not scored.
         low: Lower ends of the intervals; NaN for too few drives.
-        high: Upper ends.
-        drives: By version.
+        high: Upper ends of the intervals.
+        drives: Numbers of drives by version.
         marks: Change points.
     """
 
@@ -65,16 +65,16 @@ class Chart:
 def write_history_page(
     path: Path, versions: Sequence[str], charts: Sequence[Chart], content: Mapping[str, object]
 ) -> None:
-    """Write the page.
+    """Write the report.
 
     Args:
-        path: Its file.
-        versions: Names, in order.
-        charts: Metrics; those with change points are also listed in a table above.
-        content: Further values by the names that the template has for them.
+        path: The output file.
+        versions: Names of the versions, in order.
+        charts: Charts of metrics; those with change points are also listed in a table above.
+        content: Further values by their names in the template.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     drawn = [(one, draw_chart(one, versions)) for one in charts]
     whole = {**content, "versions": versions, "charts": drawn}
@@ -82,7 +82,7 @@ def write_history_page(
 
 
 def draw_chart(one: Chart, versions: Sequence[str]) -> Markup:
-    """Values with intervals, and change points as upright lines."""
+    """Draw values with intervals, and change points as vertical lines."""
     known = [v for v in (*one.values, *one.low, *one.high) if math.isfinite(v)]
     low, high = min(known, default=0.0), max(known, default=1.0)
     margin = 0.08 * (high - low) or max(abs(high) * 0.05, 0.01)
@@ -114,7 +114,7 @@ def _draw_axis(drawing: Drawing, panel: Panel, one: Chart, versions: Sequence[st
         drawing.rule(panel.left, panel.y(value), panel.right, panel.y(value), "grid")
         drawing.text(panel.left - 6, panel.y(value) + 4, f"{value:g}", anchor="end")
     taken: list[float] = []
-    # What matters most is named first; names that would overlap are left out.
+    # The most important versions are named first; names that would overlap are left out.
     wanted = [*(mark.at for mark in one.marks), 0, len(versions) - 1, *range(len(versions))]
     for at in dict.fromkeys(wanted):
         x = panel.x(at)

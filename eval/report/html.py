@@ -1,4 +1,4 @@
-"""Pages from the templates beside this file; whatever is put into them is escaped."""
+"""Pages from the templates of this package; all inserted values are escaped."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def write_page(
     content: Mapping[str, object],
     formats: Mapping[str, Callable[..., str]],
 ) -> None:
-    """Write the page that a template makes.
+    """Render a template and write the page.
 
     Args:
-        path: Its file.
+        path: The output file.
         template: The template's file name, with its ending.
-        content: By the names that the template has for it; a name it asks for and is not given is
-            an error, never an empty place.
+        content: Values by their names in the template; a missing name is an error, never left
+            empty.
         formats: Functions that the template calls.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     write_text(path, page_template(template, formats)(content))
 
@@ -33,14 +33,14 @@ def write_page(
 def page_template(
     template: str, formats: Mapping[str, Callable[..., str]]
 ) -> Callable[[Mapping[str, object]], str]:
-    """A template that makes many pages.
+    """Load a template for many pages.
 
     Args:
-        template: Its file's name, with its ending.
+        template: The template's file name, with its ending.
         formats: Functions that the template calls.
 
     Returns:
-        From the content to the HTML.
+        Function from the content to the HTML.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -53,5 +53,5 @@ def page_template(
 
 
 def template_text(name: str) -> str:
-    """A file beside the templates, as it is."""
+    """Return the unchanged text of a file in the folder of the templates."""
     return files("crosscue.eval.report").joinpath("templates", name).read_text(encoding="utf-8")

@@ -14,23 +14,23 @@ def write_junit(path: Path, results: Sequence[GateResult], suite: str) -> None:
     """Write one test case for each gate.
 
     Args:
-        path: Where to.
-        results: In order.
+        path: The output file.
+        results: Results of the gates, in order.
         suite: Name of the test suite.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     write_text(path, junit_text(results, suite))
 
 
 def junit_text(results: Sequence[GateResult], suite: str) -> str:
-    """The file's text; characters that XML cannot hold are shown, not kept."""
+    """Return the JUnit XML of gates; characters that XML forbids are escaped visibly."""
     return cases_text([(one.gate.text(), one.failure) for one in results], suite, "gate")
 
 
 def cases_text(cases: Sequence[tuple[str, str]], suite: str, kind: str) -> str:
-    """The same of cases of a kind, each with its name and why it fails, if it does."""
+    """Return the JUnit XML of test cases: pairs of name and failure, which is empty if passed."""
     failed = sum(bool(failure) for _, failure in cases)
     counts = {"tests": str(len(cases)), "failures": str(failed), "errors": "0", "skipped": "0"}
     root = ET.Element("testsuites", counts)
@@ -49,7 +49,7 @@ def cases_text(cases: Sequence[tuple[str, str]], suite: str, kind: str) -> str:
 
 
 def fit_for_xml(text: str) -> str:
-    """``text`` with all but XML 1.0's characters written as escapes."""
+    """Return ``text`` with characters that XML 1.0 forbids written as escapes."""
     return "".join(
         c if _is_allowed(ord(c)) else c.encode("unicode_escape", "surrogatepass").decode("ascii")
         for c in text
@@ -57,7 +57,7 @@ def fit_for_xml(text: str) -> str:
 
 
 def _is_allowed(code: int) -> bool:
-    # Tabs and line ends are legal, but within attributes they would come back as spaces.
+    # Tabs and line ends are legal, but in attributes they would be read back as spaces.
     return (
         0x20 <= code <= 0x7E
         or 0xA0 <= code <= 0xD7FF

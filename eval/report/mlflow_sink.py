@@ -1,8 +1,8 @@
-"""Scores in an MLflow tracking server or store.
+"""Logging of scores to an MLflow tracking server or store.
 
-MLflow is imported here only, with its own telemetry off. Its client alone (``mlflow-skinny``) is
-enough for a server. A folder as a store has to be allowed in MLflow 3.17, which no longer develops
-such stores (``MLFLOW_ALLOW_FILE_STORE=true``); a database needs the full ``mlflow``.
+MLflow is imported only here, with its telemetry turned off. For a server, its client
+(``mlflow-skinny``) is enough; a database needs the full ``mlflow``. MLflow 3.17 no longer develops
+stores in folders; they must be allowed with ``MLFLOW_ALLOW_FILE_STORE=true``.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Any, Final
 from crosscue.replay.base import OutputError, UsageError, one_line
 
 MAX_METRICS: Final = 1000
-"""In one request."""
+"""Max number of metrics in one request."""
 MAX_VALUE: Final = 5000
-"""Characters of a tag's value."""
+"""Max characters of a tag's value."""
 _STRANGE: Final = re.compile(r"[^\w .:/-]")
-"""What names in MLflow may not hold."""
+"""Characters not allowed in names in MLflow."""
 SWITCHED: Final = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    # Seven retries with growing pauses would hold a command for minutes.
+    # The default of seven retries with growing pauses would block a command for minutes.
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
 }
@@ -34,13 +34,13 @@ SWITCHED: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """What becomes one run in MLflow.
+    """Content of one run in MLflow.
 
     Attributes:
-        name: Of the run.
-        metrics: By name; those that are not a number are left out.
-        tags: By name.
-        files: Artifacts.
+        name: Name of the run.
+        metrics: Metrics by name; NaN is left out.
+        tags: Tags by name.
+        files: Files stored as artifacts.
     """
 
     name: str
@@ -51,12 +51,12 @@ class Tracked:
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """An experiment of a store that can be reached.
+    """An experiment of a reachable store.
 
     Attributes:
-        uri: Of the store.
-        client: MLflow's.
-        identity: Of the experiment.
+        uri: URI of the store.
+        client: MLflow's client.
+        identity: Id of the experiment.
     """
 
     uri: str
@@ -64,10 +64,10 @@ class Experiment:
     identity: str
 
     def log(self, one: Tracked) -> str:
-        """Write one run; its identity in MLflow comes back.
+        """Write one run and return its id in MLflow.
 
         Raises:
-            OutputError: The store refuses, or can no longer be reached.
+            OutputError: The store refuses the run, or can no longer be reached.
         """
         from mlflow.entities import Metric, RunTag
 
@@ -89,7 +89,7 @@ class Experiment:
 
 
 def open_experiment(uri: str, experiment: str) -> Experiment:
-    """Reach a store, and find or make the experiment in it.
+    """Connect to a store, and find or create the experiment in it.
 
     Raises:
         UsageError: MLflow is not installed.
@@ -126,10 +126,10 @@ def _reported(uri: str) -> Iterator[None]:
         if "MLFLOW_ALLOW_FILE_STORE" in text:
             text = "MLflow no longer opens folders unless MLFLOW_ALLOW_FILE_STORE=true is set"
         raise OutputError(
-            f"--mlflow {uri}: {text[:300]}; the scores are in their folders; give a server's URL"
+            f"--mlflow {uri}: {text[:300]}; the scores are in their folders; try a server's URL"
         ) from None
 
 
 def fit(name: str) -> str:
-    """A name that MLflow takes."""
+    """Return a name without the characters that MLflow forbids."""
     return _STRANGE.sub("_", name)

@@ -1,7 +1,6 @@
-"""The report of scored runs: one HTML file that needs no network and runs no script.
+"""Report of scored runs: one HTML file without network access or scripts.
 
-Whatever comes from logs, truth or settings is escaped. The same runs and scores give the same
-bytes.
+All text from logs, truth or settings is escaped. The same runs and scores yield the same bytes.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ REPORT: Final = "report.html"
 TEMPLATE: Final = "page.html.j2"
 POSE_FIGURES: Final = {
     "pose_plan.png": "True and estimated track, with the 2-sigma ellipse at twelve moments.",
-    "pose_error.png": "Distance from the truth, and what the filter claims.",
-    "pose_heading.png": "Heading error, and what the filter claims.",
-    "pose_nees.png": "Squared error in units of the claimed covariance; the band holds 95 % of it "
-    "where claims are honest.",
+    "pose_error.png": "Distance from the truth, and the filter's standard deviation.",
+    "pose_heading.png": "Heading error, and the filter's standard deviation.",
+    "pose_nees.png": "Squared error in units of the filter's covariance; the band contains 95 % of "
+    "it if the filter is consistent.",
     "pose_major_axis.png": "Length of the 2-sigma ellipse against distance travelled.",
 }
 BELIEFS: Final = 12
-"""Most approaches with a chart of their own."""
+"""Max number of approaches with their own chart."""
 YEAR_2000_NS: Final = 946_684_800_000_000_000
-"""Their published precision is what the source tuned them to reach."""
+"""Cues whose published precision is the target to which the dissertation tuned them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +96,20 @@ def write_report(
     *,
     has_figures: bool = True,
 ) -> Path:
-    """Write ``report.html`` over one run or many, with figures of a single pose beside it.
+    """Write ``report.html`` of one run or many, with figures of a single run's pose next to it.
 
     Args:
-        folder: Where to; for one run its ``score`` folder.
+        folder: Output folder; for one run its ``score`` folder.
         scored: All runs, at least one.
-        scores: Of all of them together.
-        metrics: From ``metrics_of``, with whatever the command added.
-        worst: From ``worst_frames``, to be shown with their pictures.
-        has_figures: Draw, which imports matplotlib? Tables and frames are there without.
+        scores: Pooled scores of all runs.
+        metrics: Metrics from ``metrics_of``, with additions of the command.
+        worst: Frames from ``worst_frames``, shown with their pictures.
+        has_figures: Draw figures, for which matplotlib is imported; tables and frames are always
+            written.
 
     Raises:
         RunError: A run's manifest or tables cannot be read.
-        OutputError: It cannot be written.
+        OutputError: A file cannot be written.
     """
     content = _content(scored, metrics, worst)
     if has_figures and len(scored) == 1 and scored[0].poses is not None:
@@ -133,7 +133,7 @@ def write_report(
 
 
 def _is_simulated(one: RunScored) -> bool:
-    """By the run's record of its logs, or where only the truth says so."""
+    """Return whether the run's manifest or the truth states that the drive is simulated."""
     logs = one.run.drive_manifest().logs
     return all(log.is_simulated for log in logs) or "simulated" in one.truth.truth.source.lower()
 
@@ -190,13 +190,13 @@ def _run(one: RunScored) -> _Run:
 
 
 def _name(one: RunScored) -> str:
-    """The folder's name, with its parent's where that says more than ``run``."""
+    """Return the folder's name, or its parent's if the folder has a generic name."""
     path = one.run.path.resolve()
     return "/".join(path.parts[-2:]) if path.name.startswith("run") else path.name
 
 
 def _cue(name: str, score: Mapping[str, Any]) -> dict[str, Any]:
-    """A cue's scores with what the source published beside them."""
+    """Return a cue's scores with the values published in the dissertation."""
     published = CUES.get(name)
     is_bound = published is not None and published.precision_is_lower_bound
     bound = "at least " if is_bound else ""
@@ -219,7 +219,7 @@ def _frame(one: WorstFrame) -> dict[str, Any]:
 
 
 def reported_time(t_ns: int) -> str:
-    """As the viewer shows it: a date, or seconds for a clock that begins with the machine."""
+    """Return a time as the viewer shows it: a date, or seconds for a clock that starts at boot."""
     if t_ns <= YEAR_2000_NS:
         return f"{t_ns * 1e-9:.3f} s"
     at = datetime.fromtimestamp(t_ns // 1_000_000_000, UTC)
@@ -294,7 +294,7 @@ def _by_cluster(fraction: Mapping[str, Any]) -> str:
 
 
 def _span(mean: Mapping[str, Any], digits: int = 2) -> str:
-    """An interval in brackets, or why none exists; nothing for no rows."""
+    """Return an interval in brackets, or why it is missing; empty without rows."""
     low, high = mean["low"], mean["high"]
     if low is None or high is None or math.isnan(low) or math.isnan(high):
         return f" ({TOO_FEW})" if mean["of"] else ""

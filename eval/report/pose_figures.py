@@ -1,4 +1,4 @@
-"""Pictures of a pose track against its truth."""
+"""Figures of a pose track compared with its truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ELLIPSES: Final = 12
 
 
 def draw_all(poses: ScoredPoses, folder: Path) -> list[Path]:
-    """Write the figures as PNG files; their paths come back. NEES only where it is defined."""
+    """Write the figures as PNG files and return their paths; NEES only if it is defined."""
     jobs: dict[str, tuple[Callable[[Axes, ScoredPoses], None], tuple[float, float]]] = {
         "pose_plan.png": (_plan, (7.0, 6.0)),
         "pose_error.png": (_error, (7.0, 3.4)),
@@ -54,19 +54,19 @@ def _draw(
     axes.grid(alpha=0.3)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    # The library's own stamp would make the same input give other bytes in another version.
+    # The library's own stamp would change the bytes with its version.
     write_whole(path, lambda p: figure.savefig(p, dpi=130, format="png", metadata={"Software": ""}))
     return path
 
 
 def _broken(poses: ScoredPoses, *columns: Floats) -> tuple[Floats, ...]:
-    """Columns with a missing value wherever a gap of the drive is between two rows."""
+    """Return columns with NaN between two rows that a gap of the drive separates."""
     rows = broken_at(poses.gaps, poses.t_ns)
     return tuple(np.insert(np.asarray(one, np.float64), rows, np.nan) for one in columns)
 
 
 def _time_axis(axes: Axes, poses: ScoredPoses) -> None:
-    """Seconds, with each gap of the drive shaded and its length written into it."""
+    """Label the axis in seconds; shade each gap of the drive and label it with its length."""
     first_ns, last_ns = int(poses.t_ns[0]), int(poses.t_ns[-1])
     axes.set_xlim(0.0, float(poses.seconds[-1]))
     shown = [one for one in poses.gaps if first_ns <= one.middle_ns <= last_ns]

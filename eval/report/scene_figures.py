@@ -1,4 +1,4 @@
-"""Charts of a scored scene for the report, after the source's Fig. 29 and 31."""
+"""Charts of a scored scene for the report, after the dissertation's Fig. 29 and 31."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WIDTH: Final = 480.0
 PUBLISHED_DETECTED_M: Final = 34.4
 PUBLISHED_FULL_M: Final = 16.2
 TRACES: Final = 12
-"""More approaches than this are shown as bins alone."""
+"""Max number of approaches drawn as lines; more are shown only as bins."""
 
 
 AXES: Final[Mapping[str, str]] = {
@@ -36,12 +36,12 @@ AXES: Final[Mapping[str, str]] = {
 
 
 def style_of(feature: str) -> str:
-    """A user's own features share one colour."""
+    """Return the style of a feature; user-defined features share one colour."""
     return STYLES.get(feature, "s4")
 
 
 def draw_distances(results: Sequence[ApproachResult]) -> Markup:
-    """Distance at detection and at full detection: a row an intersection, a dot an approach."""
+    """Draw distances at (full) detection with a row per intersection and a dot per approach."""
     names = sorted({one.intersection for one in results})
     known = _known([v for one in results for v in (one.detected_m, one.full_m)])
     panel = Panel(66, 34, WIDTH - 82, 30.0 * len(names), (0.0, max([40.0, *known]) * 1.05), (0, 1))
@@ -50,7 +50,7 @@ def draw_distances(results: Sequence[ApproachResult]) -> Markup:
         panel.bottom + 56,
         "Distance at detection",
         "True distance of the rear axle to the intersection when it was detected and when all "
-        "that is there was, for each approach; the numbers are in the table.",
+        "its features were, for each approach; the numbers are in the table.",
     )
     drawing.axes(panel, "true distance to the intersection (m)", "", y_ticks=[])
     for value, style in (
@@ -105,15 +105,15 @@ def draw_belief(
     threshold: float = THRESHOLD,
     gaps: Sequence[Gap] = (),
 ) -> Markup:
-    """Probability against true distance over one approach, with the cues found on the way.
+    """Draw probability against true distance over one approach, with the cues found.
 
-    Against time, where no true distance is known.
+    The horizontal axis is time if the true distance is unknown.
 
     Args:
-        curve: Of the approach.
-        cues: Of the same drive.
-        threshold: Above it a feature is detected.
-        gaps: Of the drive; shaded.
+        curve: Belief over the approach.
+        cues: Cues of the same drive.
+        threshold: Probability above which a feature counts as detected.
+        gaps: Gaps of the drive, which are shaded.
     """
     curve, cues, kind = _placed(curve, cues)
     label = AXES[kind]
@@ -150,7 +150,7 @@ def draw_belief(
 
 
 def _placed(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Curve, Sequence[CueFrames], str]:
-    """The same with seconds to the last frame as distances where none is known; which it is."""
+    """Return the inputs with seconds to the last frame if distances are unknown, and the axis."""
     if np.isfinite(curve.distance_m).any() or not len(curve.t_ns):
         return curve, cues, "distance"
     mine = [one.t_ns[one.approach == curve.approach] for one in cues]
@@ -161,9 +161,9 @@ def _placed(curve: Curve, cues: Sequence[CueFrames]) -> tuple[Curve, Sequence[Cu
 
 
 def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Times of an approach, sorted, and the distance still to go, shape (N,) each.
+    """Return the sorted times of an approach and the remaining distances, shape (N,) each.
 
-    Frames before the belief's first step belong to it.
+    Frames before the first step of the belief are included.
     """
     mine = [(one, one.approach == curve.approach) for one in cues]
     times = np.concatenate([curve.t_ns, *(one.t_ns[rows] for one, rows in mine)])
@@ -174,12 +174,12 @@ def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[NDArray[np.int64], ND
 
 
 def _between_rows(gaps: Sequence[Gap], t_ns: NDArray[np.int64]) -> list[tuple[Gap, int]]:
-    """Gaps that are between two rows, each with the row after it."""
+    """Return the gaps between two rows, each with the index of the row after it."""
     return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
 
 
 def _shade(drawing: Drawing, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
-    """A gap between two values of x, with its length beside it."""
+    """Shade a gap between two values of x and label it with its length."""
     left, right = sorted(panel.x(value) for value in ends.tolist())
     drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
     drawing.text((left + right) / 2.0, panel.top + 11, text, "halo")
@@ -200,7 +200,7 @@ def _lane(
     found: NDArray[np.bool_],
     gaps: Sequence[Gap],
 ) -> None:
-    """A bar wherever the cue was found in one observation after the other."""
+    """Draw a bar for each span in which the cue was found in successive observations."""
     side = next((s for s in ("left", "right", "straight") if cue.cue.endswith(s)), "intersection")
     side = "straight" if cue.cue.endswith("past") else side
     drawing.rule(panel.left, y + 7, panel.right, y + 7, "grid")
@@ -219,19 +219,19 @@ def _lane(
 
 @dataclass(frozen=True, slots=True)
 class WorstFrame:
-    """A cue that was found and is not there.
+    """A frame with a false positive cue.
 
     Attributes:
-        run: Its drive's name in the scores.
+        run: Name of the drive in the scores.
         t_ns: Log time.
-        cue: Name.
-        count: How many were found.
-        true_count: How many there are, or None where the truth does not say.
-        distance_m: To the intersection ahead, NaN where none is.
-        confidence: Highest score of what stands behind the cue, or None where nothing scores it.
-        frames: Wrong frames of this cue around this one.
-        picture: A JPEG as base64; empty where the log or the picture is gone.
-        size_px: Its width and height.
+        cue: Name of the cue.
+        count: Number of objects found.
+        true_count: True number of objects, or None if unknown.
+        distance_m: Distance to the intersection ahead; NaN if there is no intersection.
+        confidence: Highest score of the cue's detections, or None without scores.
+        frames: Number of wrong frames of this cue around this one.
+        picture: JPEG in base64; empty if the log or the picture is missing.
+        size_px: Width and height of the picture.
     """
 
     run: str
@@ -247,7 +247,7 @@ class WorstFrame:
 
 
 WIDEST_BIN_M: Final = 20.0
-"""Of the usual bins of distance: the middle of the nearest one is no further off its rows."""
+"""Max width of a distance bin, which bounds the distance of its middle from its rows."""
 
 
 def draw_range(
@@ -255,11 +255,11 @@ def draw_range(
     scores: Mapping[str, RangeScore],
     gaps: Mapping[str, Sequence[Gap]] | None = None,
 ) -> Markup:
-    """Range error over true distance, and whether the claimed variances are honest.
+    """Draw range errors over true distance, and the consistency of the estimated variances.
 
-    Above, a line for each approach while they are few, else bias and rms error by bin; below, the
-    mean NEES by bin: 1 is honest, above it the filter is too sure. ``gaps`` of each drive by its
-    name are shaded where there is a line for each approach.
+    The upper panel has a line for each approach, or bias and rms error by bin if there are many.
+    The lower panel has the mean NEES by bin: 1 is consistent, more is overconfident. ``gaps`` of
+    each drive, by name, are shaded if there is a line for each approach.
     """
     rows = [one for one in judged if len(one.true_m)]
     few = sum(len(np.unique(one.approach)) for one in rows) <= TRACES
@@ -269,7 +269,7 @@ def draw_range(
     nearest = min(float(one.true_m.min()) for one in rows)
     near = min(0.0, nearest) if nearest < WIDEST_BIN_M else nearest - WIDEST_BIN_M / 2.0
     if few:
-        # A band that fills the panel says nothing about how wide it is.
+        # A band that fills the panel does not show its width.
         two_sd = np.concatenate([2.0 * np.sqrt(one.var_m2) for one in rows])
         limit_m = max(limit_m, float(np.percentile(two_sd, 90.0)) * 1.15)
     above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-limit_m, limit_m))
@@ -277,7 +277,7 @@ def draw_range(
     drawing = Drawing(
         WIDTH,
         below.bottom + 38,
-        "Range errors and their honesty",
+        "Range errors and their consistency",
         "; ".join(
             f"range to {name}: bias {one.bias_m.value:.2f} m, rms error {one.rmse_m:.2f} m, mean "
             f"NEES {one.nees.mean:.2f}"
@@ -291,7 +291,7 @@ def draw_range(
             _traces(drawing, above, one, style, (gaps or {}).get(one.drive, ()))
         else:
             _bins(drawing, above, scores[one.reference], style)
-    drawing.axes(below, "true range (m)", "mean NEES, 1 is honest")
+    drawing.axes(below, "true range (m)", "mean NEES, 1 is consistent")
     drawing.rule(below.left, below.y(1.0), below.right, below.y(1.0), "line dash")
     for name, score in scores.items():
         style = "s2" if name == "start" else "s5"
@@ -305,7 +305,7 @@ def draw_range(
         [
             ("line s2", "to the start"),
             ("line s5", "to the end"),
-            ("bandkey", "claimed 2 sigma" if few else "rms error"),
+            ("bandkey", "estimated 2 sigma" if few else "rms error"),
         ],
     )
     return drawing.svg()
@@ -338,7 +338,7 @@ def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None
 
 
 def _middle(name: str) -> float:
-    """Of a bin such as ``10-20``; of ``under 0`` and ``over 120`` the border."""
+    """Return the middle of a bin such as ``10-20``, or the edge of ``under 0`` and ``over 120``."""
     ends = [float(end) for end in name.removeprefix("under ").removeprefix("over ").split("-")]
     return sum(ends) / len(ends)
 
@@ -349,21 +349,21 @@ def _max_nees(scores: Mapping[str, RangeScore]) -> float:
 
 
 def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
-    """How often a feature is there against how probable it was held; bars are 95 % intervals."""
+    """Draw the frequency of features against their stated probability, with 95 % intervals."""
     panel = Panel(40, 46, 300, 260, (0.0, 1.0), (0.0, 1.0))
     drawing = Drawing(
         panel.right + 20,
         panel.bottom + 38,
         "Reliability",
         "Fraction of steps in which a feature was there, for ten bins of its stated probability; "
-        "points on the diagonal are honest.",
+        "points on the diagonal are well calibrated.",
     )
     drawing.axes(panel, "stated probability", "observed fraction")
     drawing.rule(panel.x(0), panel.y(0), panel.x(1), panel.y(1), "line dash")
     limit_m = max((one.steps for score in belief.values() for one in score.reliability), default=1)
     for place, (name, score) in enumerate(belief.items()):
         for one in score.reliability:
-            # A little apart, so that features do not hide each other.
+            # Slightly offset, so that features do not hide each other.
             x = panel.x(one.mean_probability) + 3.0 * (place - 1.5)
             low, high = interval(
                 one.there.low, one.there.high, one.there.clusters_low, one.there.clusters_high
@@ -385,7 +385,7 @@ def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
 def interval(
     low: float, high: float, clusters_low: float, clusters_high: float
 ) -> tuple[float, float]:
-    """The wider of both intervals."""
+    """Return the wider of both intervals."""
     if math.isnan(clusters_low):
         return low, high
     return min(low, clusters_low), max(high, clusters_high)

@@ -1,4 +1,4 @@
-"""Scores for a person, within 80 columns, coverage first."""
+"""Text output of scores, at most 80 columns wide, coverage first."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LABEL: Final = 11
 
 
 def summary(scores: Scores, why_no_pose: str = "") -> str:
-    """The pooled scores of any number of drives."""
+    """Return the pooled scores of any number of drives as text."""
     missing = scores.not_scored() | ({"pose": why_no_pose} if why_no_pose else {})
     lines = [*_coverage(scores), *(_line("not scored", f"{k}: {v}") for k, v in missing.items())]
     if scores.cues:
@@ -40,12 +40,12 @@ def summary(scores: Scores, why_no_pose: str = "") -> str:
 
 
 def reported_line(label: str, text: str) -> str:
-    """One labelled line, going on below where it is too long."""
+    """Return a labelled line, wrapped if it is too long."""
     return "\n".join(_wrapped(_line(label, text)))
 
 
 def gate_lines(results: Sequence[GateResult]) -> str:
-    """One line for each gate, failures last."""
+    """Return one line for each gate, failures last."""
     ordered = sorted(results, key=lambda one: bool(one.failure))
     lines = [
         _line("FAILED" if one.failure else "passed", visible(one.gate.text()) + _end(one))
@@ -63,7 +63,7 @@ def _line(label: str, text: str) -> str:
 
 
 def _wrapped(line: str) -> Iterator[str]:
-    """A line too long goes on below, behind the label's column."""
+    """Wrap a long line and indent the continuation to the column after the label."""
     while len(line) > WIDTH:
         cut = line.rfind(" ", LABEL + 1, WIDTH + 1)
         cut = cut if cut > LABEL else WIDTH
@@ -100,14 +100,14 @@ def _cues(cues: Mapping[str, CueScore]) -> list[str]:
             f"{_fraction(one.precision):20}  {recall}".rstrip()
         )
     if any(not one.is_sources_reading for one in shown.values()):
-        lines.append("* judged by the feature or thing that the source does not judge it by")
+        lines.append("* judged by the feature or object that the source does not judge it by")
     if any(math.isnan(one.precision.clusters_low) for one in shown.values() if one.positives):
         lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS} approaches, intervals count frames only")
     return [*lines, *_left_out(cues)]
 
 
 def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
-    """Why frames were not scored, cues with the same reasons together."""
+    """Return the reasons why frames were not scored, with cues of the same reasons merged."""
     same: dict[tuple[tuple[str, int], ...], list[str]] = {}
     for name, one in cues.items():
         reasons = one.readings[one.reading].left_out
@@ -129,7 +129,7 @@ def _fraction(one: Proportion) -> str:
 
 
 def _ends(one: Proportion) -> tuple[float, float]:
-    """The wider interval of the two."""
+    """Return the wider of the two intervals."""
     if math.isnan(one.clusters_low):
         return one.low, one.high
     return min(one.low, one.clusters_low), max(one.high, one.clusters_high)
@@ -219,7 +219,7 @@ def _number(value: float, digits: int = 3) -> str:
 
 
 def headline(name: str, values: Mapping[str, MetricValue]) -> str:
-    """One line for one drive of many."""
+    """Return one line for one drive of many."""
     parts = []
     for label, path in (
         ("detected", "approaches.detected_m"),
@@ -233,7 +233,7 @@ def headline(name: str, values: Mapping[str, MetricValue]) -> str:
 
 
 def pose_summary(result: PoseScore) -> str:
-    """The score for a person, within 80 columns."""
+    """Return the score of a pose as text, at most 80 columns wide."""
     covered = result.coverage
     left_out = [
         f"{count} {why}"
@@ -261,7 +261,7 @@ def pose_summary(result: PoseScore) -> str:
 
 
 def poses_summary(poses: Sequence[PoseScore]) -> str:
-    """The pose of several drives, with intervals over drives; NEES where its frame is defined."""
+    """Return the pose scores of several drives, with intervals over drives; NEES if defined."""
     drives = np.arange(len(poses))
     lost = sum(one.lost_at_m is not None for one in poses)
     lines = [_line("pose", f"{len(poses)} drives, {lost} lost; means over drives (95 %)")]
@@ -278,7 +278,7 @@ def poses_summary(poses: Sequence[PoseScore]) -> str:
 
 
 def _compared_lines(at: PlaneMounting) -> list[str]:
-    """Which body's pose is compared, where it sits, and who says so."""
+    """Return lines on the body whose pose is compared, its mounting, and the mounting's source."""
     body = at.body.replace("_", " ")
     if at.body != "rear_axle" or at.x_m or at.y_m or at.yaw_rad:
         place = f"{at.x_m:.2f} m ahead and {at.y_m:.2f} m left of the rear axle"

@@ -1,11 +1,11 @@
-"""Small charts as SVG inside a page: they take their colours from the page's style, dark or light.
+"""Small SVG charts inside a page, with colours from the page's style sheet, dark or light.
 
-Everything written by others is escaped here. Each chart carries a title and a description for those
-who do not see it. The same input gives the same bytes.
+All external text is escaped here. Each chart has a title and a description for screen readers. The
+same input yields the same bytes.
 
-matplotlib draws the studies' figures and not these: its SVG follows no style of the page and has no
-hints, is twice as large (21 against 11 kB for four curves of 200 points), and twelve of them take
-0.5 s of CPU, and 0.35 s to import it, against 0.01 s.
+matplotlib draws the figures of studies but not these charts. Its SVG does not follow the style of
+the page and has no tooltips. It is also twice as large (21 against 11 kB for four curves of 200
+points), and slower: twelve charts take 0.5 s of CPU, plus 0.35 s for the import, against 0.01 s.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Panel:
     """A rectangle of the drawing with its own axes.
 
     Attributes:
-        left: Of the rectangle, in the drawing's units, y downwards; likewise the next three.
-        top: See there.
-        width: See there.
-        height: See there.
+        left: Left edge, in the drawing's units.
+        top: Top edge; y increases downward.
+        width: Width of the rectangle.
+        height: Height of the rectangle.
         x_range: Values at the left and right edge; the first may be the larger one.
         y_range: Values at the bottom and top edge.
     """
@@ -40,12 +40,12 @@ class Panel:
     y_range: tuple[float, float]
 
     def x(self, value: float) -> float:
-        """Where a value lies across."""
+        """Return the horizontal position of a value."""
         low, high = self.x_range
         return self.left + self.width * (value - low) / (high - low)
 
     def y(self, value: float) -> float:
-        """Where a value lies down."""
+        """Return the vertical position of a value."""
         low, high = self.y_range
         return self.top + self.height * (1.0 - (value - low) / (high - low))
 
@@ -65,10 +65,10 @@ class Drawing:
     """A chart being drawn.
 
     Attributes:
-        width: In units of about a pixel.
-        height: See there.
-        title: What it shows, in a few words.
-        description: What there is to be seen, for those who cannot.
+        width: Width, in units of about a pixel.
+        height: Height, in the same units.
+        title: Title in a few words.
+        description: Description of the chart, for screen readers.
     """
 
     width: float
@@ -78,7 +78,7 @@ class Drawing:
     _parts: list[str] = field(default_factory=list)
 
     def svg(self) -> Markup:
-        """The whole element."""
+        """Return the complete SVG element."""
         head = (
             f'<svg viewBox="0 0 {_n(self.width)} {_n(self.height)}" role="img" '
             f'style="max-width:{_n(self.width * 1.15)}px">'
@@ -89,20 +89,20 @@ class Drawing:
     def text(
         self, x: float, y: float, text: str, style: str = "tick", anchor: str = "middle"
     ) -> None:
-        """A line of text whose baseline is at y."""
+        """Draw a line of text with its baseline at y."""
         self._parts.append(
             f'<text x="{_n(x)}" y="{_n(y)}" class="{style}" text-anchor="{anchor}">'
             f"{escape(text)}</text>"
         )
 
     def rule(self, x0: float, y0: float, x1: float, y1: float, style: str) -> None:
-        """A straight line."""
+        """Draw a straight line."""
         self._parts.append(
             f'<line x1="{_n(x0)}" y1="{_n(y0)}" x2="{_n(x1)}" y2="{_n(y1)}" class="{style}"/>'
         )
 
     def rect(self, x: float, y: float, width: float, height: float, style: str) -> None:
-        """A filled rectangle."""
+        """Draw a filled rectangle."""
         self._parts.append(
             f'<rect x="{_n(x)}" y="{_n(y)}" width="{_n(width)}" height="{_n(height)}" '
             f'class="{style}"/>'
@@ -111,7 +111,7 @@ class Drawing:
     def axes(
         self, panel: Panel, x_label: str, y_label: str, y_ticks: Sequence[float] | None = None
     ) -> None:
-        """Grid, ticks and labels."""
+        """Draw grid, ticks and labels."""
         for value in ticks(*panel.x_range):
             self.rule(panel.x(value), panel.top, panel.x(value), panel.bottom, "grid")
             self.text(panel.x(value), panel.bottom + 13, f"{value:g}")
@@ -124,7 +124,7 @@ class Drawing:
     def curve(
         self, panel: Panel, x: NDArray[np.float64], y: NDArray[np.float64], style: str
     ) -> None:
-        """A line through finite points, broken where one is missing; drawn no finer than seen."""
+        """Draw a line through finite points, interrupted at others, in visible detail."""
         for part in _finite_parts(np.asarray(x, np.float64), np.asarray(y, np.float64)):
             places = [(_n(panel.x(a)), _n(panel.y(b))) for a, b in part]
             kept = [
@@ -143,7 +143,7 @@ class Drawing:
         high: NDArray[np.float64],
         style: str,
     ) -> None:
-        """The area between two lines."""
+        """Draw the area between two lines."""
         there = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
         if there.sum() < 2:
             return
@@ -153,20 +153,20 @@ class Drawing:
         self._parts.append(f'<polygon points="{path}" class="{style}"/>')
 
     def dot(self, x: float, y: float, radius: float, style: str, hint: str = "") -> None:
-        """A filled circle; the hint is shown when pointed at."""
+        """Draw a filled circle; the hint is its tooltip."""
         inside = f"<title>{escape(hint)}</title>" if hint else ""
         self._parts.append(
             f'<circle cx="{_n(x)}" cy="{_n(y)}" r="{_n(radius)}" class="{style}">{inside}</circle>'
         )
 
     def cross(self, x: float, y: float, style: str, hint: str = "") -> None:
-        """For what failed."""
+        """Draw a cross, which marks a failure; the hint is its tooltip."""
         inside = f"<title>{escape(hint)}</title>" if hint else ""
         path = f"M{_n(x - 3.5)} {_n(y - 3.5)}l7 7m0 -7l-7 7"
         self._parts.append(f'<path d="{path}" class="{style}">{inside}</path>')
 
     def legend(self, x: float, y: float, entries: Sequence[tuple[str, str]]) -> None:
-        """Swatches in a row: style and text of each."""
+        """Draw a row of swatches, each with a style and a text."""
         for style, text in entries:
             self.rule(x, y - 4, x + 14, y - 4, style)
             self.text(x + 18, y, text, "tick", "start")
@@ -174,7 +174,7 @@ class Drawing:
 
 
 def ticks(low: float, high: float, max_count: int = 6) -> list[float]:
-    """Round values within a range, either way round."""
+    """Return round values within a range, whose ends may be in either order."""
     low, high = min(low, high), max(low, high)
     rough = (high - low) / max_count
     scale = 10.0 ** math.floor(math.log10(rough))

@@ -1,4 +1,4 @@
-"""The pictures in which a detector is most wrong: false boxes and misses, drawn."""
+"""Pictures with the most mistakes of a detector, with false boxes and misses drawn."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from crosscue.eval.scoring.boxes.matching import match
 from crosscue.replay.base import Bytes, CrosscueError, Floats
 
 APART_NS: Final = 1_000_000_000
-"""Pictures closer than this show the same mistakes; the worst of them is shown."""
+"""Pictures closer in time than this show the same mistakes, so only the worst is shown."""
 WIDTH_PX: Final = 960
 QUALITY: Final = 80
 RED: Final = (60, 60, 250)
@@ -37,14 +37,14 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorstPicture:
-    """One picture.
+    """One picture with mistakes.
 
     Attributes:
-        name: In the labels.
-        t_ns: Of the frame.
-        wrong: Detections above the threshold on no label.
-        missed: Labels that no detection above the threshold is on.
-        picture: JPEG in base64, or None where it cannot be read.
+        name: Name of the picture in the labels.
+        t_ns: Time of the frame.
+        wrong: Number of detections above the threshold that match no label.
+        missed: Number of labels that no detection above the threshold matches.
+        picture: JPEG in base64, or None if it cannot be read.
     """
 
     name: str
@@ -55,7 +55,7 @@ class WorstPicture:
 
 
 def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> list[WorstPicture]:
-    """The pictures with most mistakes, those of one moment once.
+    """Return the pictures with the most mistakes, at most one for each moment.
 
     Raises:
         RunError: The log with the pictures is not found.
@@ -86,7 +86,7 @@ def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> lis
 
 
 def _marks(labelled: LabelledRun, overlap: float) -> list[list[Drawn]]:
-    """By picture: what is ignored, right, missed and wrong."""
+    """Return the ignored, right, missed and wrong boxes of each picture."""
     truth, found = labelled.truth, labelled.found
     marks: list[list[Drawn]] = [[] for _ in labelled.names]
     for row in np.flatnonzero(truth.is_ignored).tolist():
@@ -114,7 +114,7 @@ def _picture(camera: StoredCamera | None, t_ns: int, marks: Sequence[Drawn]) -> 
         found = picture_at(camera, t_ns)
         return None if found is None else _drawn(found, marks)
     except CrosscueError:
-        # One picture of the log: the page says that it cannot be read.
+        # The page states that this picture cannot be read.
         return None
 
 

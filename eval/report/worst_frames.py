@@ -1,4 +1,4 @@
-"""The worst frames of a run: cues found that are not there, with their pictures."""
+"""The worst frames of runs: false positive cues with their pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .scene_figures import WorstFrame
 
 MAX_FRAMES: Final = 6
 APART_NS: Final = 2_000_000_000
-"""Wrong frames of one cue closer than this are one mistake; its most confident frame is shown."""
+"""Wrong frames of one cue closer in time than this are one mistake, shown by its worst frame."""
 WIDTH_PX: Final = 640
 QUALITY: Final = 80
 FOUND: Final = (
@@ -40,7 +40,7 @@ FOUND: Final = (
 
 
 def worst_frames(scored: Sequence[RunScored], max_count: int = MAX_FRAMES) -> list[WorstFrame]:
-    """The most confident wrong cues of all runs, most confident first.
+    """Return the false positive cues of all runs with the highest confidence, sorted by it.
 
     Raises:
         RunError: A run's tables are damaged, or the log with its pictures is not found.
@@ -81,7 +81,7 @@ def _wrong(scored: RunScored) -> list[WorstFrame]:
 
 
 def _mistakes(cue: CueFrames) -> list[np.typing.NDArray[np.intp]]:
-    """Rows in which the cue is wrong, those close in time together."""
+    """Return the rows in which the cue is wrong, grouped by closeness in time."""
     rows = np.flatnonzero(is_wrong(cue))
     breaks = np.flatnonzero(np.diff(cue.t_ns[rows]) > APART_NS) + 1
     return [part for part in np.split(rows, breaks) if len(part)]
@@ -96,7 +96,7 @@ def _confidence(rows: Sequence[Mapping[str, Any]], labels: tuple[str, ...]) -> f
 
 
 def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
-    """Detections at some times."""
+    """Return the detections at the given times."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -120,12 +120,12 @@ def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
         picture = picture_at(camera, one.t_ns)
         return one if picture is None else _drawn(picture, one, rows)
     except CrosscueError:
-        # One picture of the log: the page says that it cannot be read.
+        # The page states that this picture cannot be read.
         return one
 
 
 def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]]) -> WorstFrame:
-    """With the picture, small, and the boxes of what stands behind the cue."""
+    """Return the frame with its reduced picture and the boxes of the cue's detections."""
     import cv2
 
     pixels, whole = decode(picture, View(min_width_px=WIDTH_PX))
