@@ -1,19 +1,20 @@
-"""A drive's approaches to intersections: when one opens and closes, its ranges and its belief.
+"""Divide a drive into approaches to intersections, each with its ranges and its belief.
 
-The source scores one approach for each run; a drive has many. An approach
+The dissertation scores one approach per run, but a drive has many. The life of an approach:
 
-* opens at the first evidence: a sign with a range, or a cue that speaks first (so a neutral belief
-  is never old when an intersection comes);
-* closes once its end is behind the rear axle (the end as ranged, or the start and a usual length),
-  once the car has turned at it, or when evidence has gone stale. Where no sign reports a range it
-  goes stale sooner, and ends after ``longest_m`` in any case, since nothing else could end it;
-* starts over when its first range shows that it began too far away to be about that intersection;
-* that closes before presence was established was noise: counted as neutral, no detection.
+* It opens with the first evidence: a sign with a range, or a cue with ``speaks_first``. A neutral
+  belief is therefore never old at the next intersection.
+* It closes when the intersection's end is behind the rear axle (the measured end, or the start plus
+  a typical length), when the car has turned at the intersection, or when the evidence is stale.
+  Without any range, evidence becomes stale sooner, and the approach ends after ``longest_m``.
+* It restarts if its first range shows that it opened too far away to belong to that intersection.
+* If it closes before presence is established, it was noise: it counts as neutral, not as a
+  detection.
 
-Only signs with a range and cues that speak first keep evidence fresh: road straight ahead is seen
-everywhere. Staleness is a matter of way, not of time, so a car that waits at the line keeps its
-approach. Where odometry is missing the way is reckoned at ``RangeFilter.unseen_mps``, which also
-widens the ranges; a range that has become too wide is dropped.
+Only signs with a range and cues with ``speaks_first`` keep evidence fresh, because road straight
+ahead is seen everywhere. Staleness depends on distance, not on time, so the approach of a car that
+waits at the stop line remains open. Without odometry, the distance is estimated with
+``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ from .range_track import (
 from .temporal import TemporalFilter, TemporalSpeaker, hear, ranges_to_start, temporal_model
 
 TURN_FADES_M: Final = 25.0
-"""A turn counts less and less over this way, so that bends of a road do not add up to one."""
+"""Distance over which an accumulated turn decays, so that bends of a road do not add up to one."""
 
 
 @dataclass(frozen=True, slots=True)
 class RangeRow:
-    """A row of ``range.parquet``; ``measured_m`` is None where nothing was measured or taken."""
+    """A row of ``range.parquet``; ``measured_m`` is None without an accepted measurement."""
 
     reference: Reference
     range_m: float
@@ -68,17 +69,16 @@ class RangeRow:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What is believed after one frame.
+    """Belief after one frame.
 
     Attributes:
-        t_ns: Of the evidence.
-        approach: Number of the open approach; None outside any.
-        counts: The evidence's counts and those of the cues past the intersection.
-        ranges: One row for each reference that has a belief.
-        probabilities: By feature; empty outside approaches.
-        established: Presence of the intersection is established.
-        not_believed: From each cue that was positive and said nothing to the reason; filled where
-            persistence counts.
+        t_ns: Log time of the evidence.
+        approach: Number of the open approach; None outside approaches.
+        counts: Counts of the evidence and of the cues past the intersection.
+        ranges: One row for each reference with a belief.
+        probabilities: Probability of each feature; empty outside approaches.
+        established: True if the intersection's presence is established.
+        not_believed: Reason for each positive cue that sent no message; only with persistence.
     """
 
     t_ns: int
@@ -91,15 +91,15 @@ class Step:
 
 
 def no_past_cues(best: RangeBelief | None, reference: Reference | None) -> Mapping[str, int]:
-    """A car without a Mobileye."""
+    """Return no counts, for a car without a Mobileye."""
     return {}
 
 
 class _Moved(NamedTuple):
-    """Since the evidence before: way gone, forwards or back, and time.
+    """Distance travelled since the previous evidence, regardless of direction, and duration.
 
     Attributes:
-        advanced_m: The way, negative in reverse.
+        advanced_m: Signed distance, negative in reverse.
     """
 
     way_m: float
@@ -110,7 +110,7 @@ class _Moved(NamedTuple):
 
 @dataclass(slots=True)
 class _Open:
-    """The approach at hand."""
+    """State of the open approach."""
 
     number: int
     belief: Belief
@@ -124,10 +124,11 @@ class _Open:
 
 
 class Approaches:
-    """Takes evidence in time order and holds the approach at hand; the only thing with memory.
+    """Processes evidence in time order; it holds all state of the estimation.
 
     Attributes:
-        counts: Approaches opened, established and closed by reason; ranges and evidence refused.
+        counts: Numbers of approaches opened, established and closed, and of rejected ranges and
+            evidence, by reason.
     """
 
     def __init__(self, graph: FactorGraph, fusion: Fusion, range_filter: RangeFilter) -> None:
@@ -145,7 +146,7 @@ class Approaches:
         self._since_range_m = math.inf
 
     def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
-        """Take the next evidence; one that is not later than the last changes nothing."""
+        """Process the next evidence; it is ignored if it is not later than the previous one."""
         moved = self._moved(evidence)
         if moved is None:
             return Step(evidence.t_ns, None, {})
@@ -171,7 +172,7 @@ class Approaches:
         return self._step(self._open, evidence, heard, signs, past, moved)
 
     def restart(self) -> None:
-        """Start over after a gap in time: what was believed is about another place."""
+        """Restart after a gap in time, because the belief is about another place."""
         if self._open is not None:
             self._close("a gap in time")
         if self._persistence is not None:
@@ -182,12 +183,12 @@ class Approaches:
         self._since_range_m = math.inf
 
     def finish(self) -> None:
-        """Say that the drive is over; an approach still open is counted as such."""
+        """End the drive; an open approach is counted as closed by it."""
         if self._open is not None:
             self._close("the drive ended")
 
     def _heard(self, counts: Mapping[str, int], is_new_picture: bool) -> Confirmed:
-        """What of some counts may be believed: all, unless persistence counts."""
+        """Counts that can be used: all, or the confirmed ones with persistence."""
         if self._persistence is None:
             return Confirmed(counts, {})
         return self._persistence(counts, is_new_picture=is_new_picture)
@@ -196,7 +197,7 @@ class Approaches:
         self.counts.update(f"{cue} not believed: {why}" for cue, why in silent.items())
 
     def _moved(self, evidence: FrameEvidence) -> _Moved | None:
-        """Way without sign, reckoned where unknown, and time; None for evidence refused."""
+        """Distance, estimated where unknown, and duration; None for evidence that is rejected."""
         last_ns = self._last_ns
         if last_ns is not None and evidence.t_ns <= last_ns:
             why = "repeated" if evidence.t_ns == last_ns else "out of order"
@@ -204,7 +205,7 @@ class Approaches:
             return None
         self._last_ns = evidence.t_ns
         if last_ns is None:
-            # A log may begin long before its first picture: what was passed then is not ahead.
+            # A log can begin long before its first picture, so earlier motion is ignored.
             return _Moved(0.0, 0.0, 0.0, 0.0)
         passed_s = (evidence.t_ns - last_ns) * 1e-9
         if evidence.travelled_m is not None and _has_way(evidence):
@@ -212,11 +213,11 @@ class Approaches:
             return _Moved(abs(way_m), passed_s, way_m, var_m2)
         self.counts["odometry missing"] += 1
         way_m = self._filter.unseen_mps * passed_s
-        # Nobody knows how far: half of the way that is reckoned with, give or take that half.
+        # The distance is unknown: its mean is half of the estimate, with that half as s.d.
         return _Moved(way_m, passed_s, 0.5 * way_m, 0.25 * way_m * way_m)
 
     def _go_on(self, at_hand: _Open, evidence: FrameEvidence, moved_m: float) -> None:
-        """Carry the approach over the way since the evidence before, and close it if it is over."""
+        """Predict the approach over the distance since the last evidence; close it if over."""
         had = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
         at_hand.start = self._carried(at_hand.start, evidence, moved_m)
         at_hand.end = self._carried(at_hand.end, evidence, moved_m)
@@ -239,7 +240,7 @@ class Approaches:
         return advance(track, evidence.travelled_m, evidence.travelled_var_m2, self._filter)
 
     def _over(self, at_hand: _Open) -> str | None:
-        """Why the approach is over, or None."""
+        """Reason why the approach is over; None if it is not."""
         fusion, end_m = self._fusion, _end_m(at_hand, self._fusion.length_m)
         if end_m is not None and end_m < -fusion.closes_behind_m:
             return "passed"
@@ -270,13 +271,13 @@ class Approaches:
         self._open = None
 
     def _sane(self, signs: Sequence[SignRange]) -> dict[Reference, tuple[float, float]]:
-        """Mean range and variance of each reference's signs; those beyond reason are refused.
+        """Mean range and variance of each reference's signs; implausible ranges are rejected.
 
-        The variance of the mean is that of one sign: all share the curve's error.
+        The variance of the mean is that of one sign, because all share the curve's error.
         """
         found: dict[Reference, list[SignRange]] = {}
         for sign in signs:
-            # Less sure than the furthest range is long: no measurement, and its square overflows.
+            # An s.d. above the maximum range carries no information, and its square overflows.
             max_m = self._filter.max_m
             is_sane = 0.0 < sign.range_m <= max_m and 0.0 < sign.var_m2 <= max_m * max_m
             if is_sane:
@@ -345,7 +346,7 @@ class Approaches:
         moved: _Moved,
         ranges: tuple[tuple[float, float], ...] = (),
     ) -> Situation:
-        """What a frame says outside any approach."""
+        """Situation of a frame outside approaches."""
         return Situation(
             counts,
             is_established=False,
@@ -361,7 +362,7 @@ class Approaches:
     def _to_start(
         self, ranged: Mapping[Reference, tuple[float, float]]
     ) -> tuple[tuple[float, float], ...]:
-        """Measured ranges to the start; one that resembles the frame's before has more variance."""
+        """Measured ranges to the start; correlated successive ranges have more variance."""
         if self._over_drive is None or not ranged:
             return ()
         since_m, self._since_range_m = self._since_range_m, 0.0
@@ -374,7 +375,7 @@ class Approaches:
         posteriors: Sequence[RangePosterior],
         way_m: float,
     ) -> tuple[RangeRow, ...]:
-        """Weigh in the signs and take posteriors up; the rows to write."""
+        """Update with the signs and follow the posteriors; return the rows to write."""
         start_m = end_m = None
         if Reference.START in signs:
             at_hand.start, start_m = self._weigh(at_hand.start, *signs[Reference.START])
@@ -423,7 +424,7 @@ def _has_way(evidence: FrameEvidence) -> bool:
 
 
 def _end_m(at_hand: _Open, length_m: float) -> float | None:
-    """Where the intersection ends, as far as known."""
+    """Distance to the intersection's end; None where unknown."""
     if at_hand.end.belief is not None:
         return at_hand.end.belief.mean_m
     start = at_hand.start.belief
@@ -433,7 +434,7 @@ def _end_m(at_hand: _Open, length_m: float) -> float | None:
 def _is_about_another(
     at_hand: _Open, signs: Mapping[Reference, tuple[float, float]], longest_m: float
 ) -> bool:
-    """Does the first range show that the approach began too far away?"""
+    """Whether the first range shows that the approach opened too far away."""
     is_ranged = at_hand.start.belief is not None or at_hand.end.belief is not None
     if is_ranged or not signs or at_hand.way_m == 0.0:
         return False
@@ -442,7 +443,7 @@ def _is_about_another(
 
 
 def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Reference | None]:
-    """The wanted reference's range, or else the other's as it is."""
+    """Range to the preferred reference, otherwise to the other one, unchanged."""
     known = {Reference.START: at_hand.start.belief, Reference.END: at_hand.end.belief}
     other = Reference.END if wanted is Reference.START else Reference.START
     for reference in (wanted, other):
@@ -452,10 +453,10 @@ def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Refere
 
 
 def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
-    """The belief that goes on from one approach to the next, where there is one.
+    """Build the filter that continues across approaches; None if the vehicle file has no such.
 
     Raises:
-        ValueError: ``temporal`` without what was learned; no vehicle file can say that.
+        ValueError: ``temporal`` has no fitted parameters; a vehicle file cannot have this state.
     """
     if fusion.kind != "temporal":
         return None
@@ -465,10 +466,10 @@ def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
 
 
 def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
-    """Makes the speaker of each approach.
+    """Return a factory of the message model of each approach.
 
     Raises:
-        ValueError: ``calibrated`` without what was learned; no vehicle file can say that.
+        ValueError: ``calibrated`` has no fitted parameters; a vehicle file cannot have this state.
     """
     if fusion.kind == "persistent":
         return lambda: PersistentSpeaker(graph, fusion.dissent)

@@ -1,4 +1,4 @@
-"""Belief over the features of one intersection, in log odds, and what cues say to it (eq. 18)."""
+"""Belief over the features of one intersection, in log odds, and messages of cues (eq. 18)."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from .situation import Situation
 
 
 class Belief(NamedTuple):
-    """What is believed of each feature, in the graph's order.
+    """Belief in each feature, in the graph's order.
 
     Attributes:
-        log_odds: Sum of the prior's and of all messages so far; not limited.
-        is_established: Presence was established; stays so for the approach.
+        log_odds: Sum of the prior's log odds and of all messages so far; not limited.
+        is_established: True once presence is established; permanent for the approach unless
+            ``establish`` withdraws it.
     """
 
     log_odds: tuple[float, ...]
@@ -23,12 +24,12 @@ class Belief(NamedTuple):
 
 
 def begin(graph: FactorGraph) -> Belief:
-    """The belief before any cue."""
+    """Return the prior belief."""
     return Belief(tuple(log_odds(feature.prior) for feature in graph.features))
 
 
 def multiply(belief: Belief, messages: Sequence[float]) -> Belief:
-    """Multiply in one message (in log odds) to each feature and normalise (eq. 18)."""
+    """Multiply each feature's probability by one message, in log odds, and normalise (eq. 18)."""
     sums = tuple(old + new for old, new in zip(belief.log_odds, messages, strict=True))
     return Belief(sums, belief.is_established)
 
@@ -36,14 +37,14 @@ def multiply(belief: Belief, messages: Sequence[float]) -> Belief:
 def establish(
     belief: Belief, graph: FactorGraph, threshold: float, withdrawn: float | None = None
 ) -> Belief:
-    """The belief, established if a feature that establishes presence exceeds ``threshold``.
+    """Establish presence if a feature that establishes it exceeds ``threshold``.
 
     Args:
-        belief: Before.
-        graph: Says which features establish presence.
-        threshold: Probability.
-        withdrawn: Presence is withdrawn once none of them is more probable than this; never, where
-            left out.
+        belief: Belief before.
+        graph: Factor graph, which marks the features that establish presence.
+        threshold: Probability above which presence is established.
+        withdrawn: Probability at or below which, for all these features, presence is withdrawn; by
+            default it is never withdrawn.
     """
     if belief.is_established and withdrawn is None:
         return belief
@@ -56,7 +57,7 @@ def establish(
 
 
 def probabilities(belief: Belief, graph: FactorGraph) -> dict[str, float]:
-    """Each feature's probability, strictly between 0 and 1."""
+    """Probability of each feature, strictly between 0 and 1."""
     return {
         name: probability(odds)
         for name, odds in zip(graph.feature_names, belief.log_odds, strict=True)
@@ -64,12 +65,14 @@ def probabilities(belief: Belief, graph: FactorGraph) -> dict[str, float]:
 
 
 Speaker = Callable[[Situation], Sequence[float]]
-"""From a frame's situation to the sum of messages into each feature, in log odds. May remember
-what it said earlier in the same approach; each approach gets a new one."""
+"""Message model: maps a frame's situation to the sum of messages into each feature, in log odds.
+
+It can depend on earlier messages of the same approach; each approach has a new instance.
+"""
 
 
 class _Line(NamedTuple):
-    """One cue, made ready: what it adds to which feature when detected, and when absent."""
+    """One cue, precomputed: the features that it affects, and its messages if present or absent."""
 
     cue: str
     speaks_first: bool
@@ -80,10 +83,9 @@ class _Line(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SourceSpeaker:
-    """The published messages: precision along direct edges, its reverse along exclusive ones.
+    """The published messages: precision along direct edges, its complement along exclusive ones.
 
-    Until presence is established only cues that speak first do. The frame that establishes it does
-    not open the gate for itself: earlier frames decide.
+    Until earlier frames have established presence, only cues with ``speaks_first`` send messages.
     """
 
     size: int
@@ -108,7 +110,7 @@ class SourceSpeaker:
 
 
 def source_speaker(graph: FactorGraph, dissent: float) -> SourceSpeaker:
-    """Make the graph's table ready; ``dissent`` is what an absent cue sends near by."""
+    """Precompute the graph's messages; ``dissent`` is the message of an absent cue when near."""
     place = {name: i for i, name in enumerate(graph.feature_names)}
     against = log_odds(dissent)
     lines = []

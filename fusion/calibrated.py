@@ -1,24 +1,24 @@
-"""Cues that speak as often as they have been seen to be right, and do not repeat themselves.
+"""Message model with fitted rates, which accounts for correlated observations.
 
-The source multiplies in the same parked car again in every frame, as if each observation were a new
-one, and takes precision for a likelihood ratio. Here a cue is a Markov chain with two states,
-positive or not: where a feature is there it is positive at a rate ``p``, where not at a rate ``q``,
-and an observation resembles the one before by ``rho = exp(-way / fade)`` (or time, for what moves
-by itself). Each look says to the feature
+The dissertation multiplies in the same parked car in every frame, as if observations were
+independent, and uses precision as a likelihood ratio. Here a cue is a Markov chain with two states,
+positive or not. It is positive at rate ``p`` if a feature is present and at rate ``q`` if not.
+Successive observations have the correlation ``rho = exp(-distance / fade)``, or time instead of
+distance for moving objects. The message of an observation to the feature is
 
-    log P(now | before, there) - log P(now | before, not there),
-    P(positive | positive) = p + (1 - p) rho,      P(positive | not) = p (1 - rho),
+    log P(now | before, present) - log P(now | before, absent),
+    P(positive | positive) = p + (1 - p) rho,      P(positive | not) = p (1 - rho).
 
-so a cue that appears says log(p / q) at once and little more while it stays; one that goes says
-log((1 - p) / (1 - q)); a car that stands, or a picture seen before, says nothing new. The chain
-alone would hear noise in a cue that flickers: an appearance soon after another is worth only its
-independent share. A thing not seen before in this approach (a new identity, or more things than
-ever at once) appears again. Absence speaks as much as was learned, in place of the source's 0.49.
-Rates are learned apart for near and far, where the same absence means different things.
+A cue that appears therefore sends log(p / q) at once and little more while it remains. One that
+disappears sends log((1 - p) / (1 - q)). A standing car or a repeated picture adds nothing. A
+flickering cue would add noise, so an appearance soon after another is weighted by its independent
+fraction. An object that is new in this approach (a new identity, or a higher count than before)
+counts as a new appearance. The message of an absent cue is fitted, in place of the dissertation's
+0.49. Near and far rates are fitted separately, because absence has a different meaning there.
 
-Cues are not independent of each other given a feature; one exponent for each feature makes up for
-it. Where nothing was learned for an edge (no annotated drive without the feature, say), the
-published message stands, discounted by the way or time since it was last sent.
+Cues are not conditionally independent given a feature; one exponent per feature compensates for
+this. An edge without fitted rates (for example, without an annotated drive that lacks the feature)
+uses the published message, discounted by the distance or time since it was last sent.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from .independence import effective_sample_fraction
 
 
 class Learned(NamedTuple):
-    """One edge: rates where the feature is there and where not; ``scale`` is its exponent."""
+    """One edge with fitted rates if the feature is present or absent; ``scale`` is its exponent."""
 
     feature: int
     if_there: float
@@ -46,13 +46,13 @@ class Learned(NamedTuple):
     def says(
         self, is_positive: bool, was_positive: bool | None, rho: float, fraction: float
     ) -> float:
-        """Log odds of one observation.
+        """Message of one observation, in log odds.
 
         Args:
-            is_positive: Now.
-            was_positive: At the look before; None for the first.
-            rho: How much this look resembles the one before.
-            fraction: What a change is worth, 0 to 1.
+            is_positive: True if the cue is positive now.
+            was_positive: True if it was positive at the previous observation; None for the first.
+            rho: Correlation with the previous observation.
+            fraction: Weight of a change, 0 to 1.
         """
         p, q = self.if_there, self.if_not
         if was_positive is is_positive:
@@ -64,7 +64,7 @@ class Learned(NamedTuple):
 
 
 class Published(NamedTuple):
-    """One edge of which nothing was learned: what a detection says, times the exponent."""
+    """One edge without fitted rates: the published message of a detection, times the exponent."""
 
     feature: int
     says: float
@@ -72,16 +72,16 @@ class Published(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Voice:
-    """One cue, made ready.
+    """One cue with its edges, precomputed.
 
     Attributes:
-        cue: Its name.
-        speaks_first: Before presence is established.
-        fade: Over what its looks become independent.
-        near: Learned edges near the intersection.
-        far: And elsewhere.
-        published_near: The other edges, near.
-        published_far: And elsewhere.
+        cue: Name of the cue.
+        speaks_first: True if it sends messages before presence is established.
+        fade: Distance or time over which its observations become independent.
+        near: Edges with fitted rates, near the intersection.
+        far: Edges with fitted rates, elsewhere.
+        published_near: Edges with published messages, near the intersection.
+        published_far: Edges with published messages, elsewhere.
     """
 
     cue: str
@@ -95,7 +95,7 @@ class Voice:
 
 @dataclass(slots=True)
 class _Heard:
-    """What one cue said before in this approach; places on the cue's own fading scale."""
+    """History of one cue in this approach; positions are in units of the cue's fade."""
 
     looked_at: float = -math.inf
     was_positive: bool | None = None
@@ -106,7 +106,7 @@ class _Heard:
 
 
 class CalibratedMessageModel:
-    """The cues of one approach."""
+    """Message model of one approach, with fitted rates."""
 
     def __init__(self, size: int, voices: Iterable[Voice]) -> None:
         self._size = size
@@ -115,7 +115,7 @@ class CalibratedMessageModel:
         self._time_s = 0.0
 
     def __call__(self, situation: Situation) -> list[float]:
-        """Sum of the messages of one frame, in log odds."""
+        """Return the sum of the messages of one frame, in log odds."""
         out = [0.0] * self._size
         self._way_m += situation.moved_m
         self._time_s += situation.passed_s
@@ -154,7 +154,7 @@ class CalibratedMessageModel:
 
 
 def _is_fresh(heard: _Heard, count: int, objects: tuple[int, ...] | None) -> bool:
-    """Is there a thing not seen before in this approach? Remembers what there is."""
+    """Whether an object is new in this approach; the current objects are remembered."""
     if objects is None:
         is_fresh = count > heard.max_count
         heard.max_count = max(heard.max_count, count)
@@ -165,7 +165,7 @@ def _is_fresh(heard: _Heard, count: int, objects: tuple[int, ...] | None) -> boo
 
 
 def voices_of(graph: FactorGraph, learned: Calibrated) -> tuple[Voice, ...]:
-    """Join the graph with what was learned."""
+    """Combine the graph with fitted parameters."""
     rates = {(one.cue, one.feature, one.near): one for one in learned.rates}
     scales = {name: learned.exponents.get(name, 1.0) for name in graph.feature_names}
     return tuple(

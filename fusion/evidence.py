@@ -1,4 +1,4 @@
-"""What a frame brings to an approach: ranges, counts of cues, and the way since the last one."""
+"""Evidence of one frame: ranges, counts of cues, and the distance since the previous frame."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from .intersection_range import RangeBelief, Reference
 
 @dataclass(frozen=True, slots=True)
 class SignRange:
-    """The range that one detected sign or light reports.
+    """Measured range of one detected sign or light.
 
     Attributes:
-        reference: Whether it is at the start or the end.
-        range_m: From the rear axle to there.
-        var_m2: How sure that is.
+        reference: Whether the object is at the intersection's start or end.
+        range_m: Distance from the rear axle to the reference.
+        var_m2: Variance of the range.
     """
 
     reference: Reference
@@ -25,13 +25,13 @@ class SignRange:
 
 @dataclass(frozen=True, slots=True)
 class RangePosterior:
-    """All that is known of a range, from a tracker that has weighed its observations itself.
+    """Posterior of a range, from a tracker that combines all its observations.
 
     Attributes:
-        reference: What it goes to.
-        range_m: From the rear axle to there.
-        var_m2: Its variance.
-        measured_m: What this frame's observation alone says.
+        reference: Reference of the range.
+        range_m: Distance from the rear axle to the reference.
+        var_m2: Variance of the range.
+        measured_m: Range by this frame's observation only.
     """
 
     reference: Reference
@@ -42,21 +42,22 @@ class RangePosterior:
 
 @dataclass(frozen=True, slots=True)
 class FrameEvidence:
-    """What one frame brings.
+    """Evidence of one frame.
 
     Attributes:
         t_ns: Log time.
-        travelled_m: Way since the evidence before, negative in reverse; None where odometry is
-            missing.
-        travelled_var_m2: Its variance.
-        signs: Each detection that reports a range.
-        counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
-        objects: From cue to identities of the counted things, where a tracker assigns them.
-        is_new_picture: Not the same picture as the frame before.
-        turned_rad: Change of heading since the evidence before, counter-clockwise, where known.
-        assumed_m: How much of the way was assumed across a gap in time: on it nobody looked, so no
-            approach becomes stale by it.
-        posteriors: Ranges by all observations so far, which the belief takes up along the way.
+        travelled_m: Distance since the previous evidence, negative in reverse; None without
+            odometry.
+        travelled_var_m2: Variance of the distance.
+        signs: Ranges of all detections that have one.
+        counts: Number of objects of each evaluated cue; 0 means searched for and not found.
+        objects: Identities of the counted objects by cue, where a tracker assigns them.
+        is_new_picture: False if the picture repeats the previous one.
+        turned_rad: Change of heading since the previous evidence, counter-clockwise; None where
+            unknown.
+        assumed_m: Part of the distance that was assumed across a gap in time. It does not make
+            evidence stale, because there was no observation on it.
+        posteriors: Ranges by all observations so far, which the belief follows over distance.
     """
 
     t_ns: int
@@ -72,4 +73,4 @@ class FrameEvidence:
 
 
 PastCues = Callable[[RangeBelief | None, Reference | None], Mapping[str, int]]
-"""Cues that need to know where the intersection is: from the best range to counts."""
+"""Counts cues that depend on the intersection's position, given the best range."""

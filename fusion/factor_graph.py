@@ -1,7 +1,7 @@
-"""Which cue speaks about which feature, as a table, and what a cue says (Fig. 27, eq. 18).
+"""Factor graph of features and cues, as a table (Fig. 27, eq. 18).
 
 All features are binary and every cue is observed, so each marginal is the normalised product of the
-messages into it: in log odds, their sum.
+messages into it; in log odds, it is their sum.
 """
 
 from __future__ import annotations
@@ -13,17 +13,20 @@ from typing import Final, Self
 from crosscue.replay.vehicle.fusion import Fade, Fusion
 
 USUAL_FADE: Final = Fade(way_m=10.0)
-"""Of a cue of which nothing else is known."""
+"""Default fade of a cue without a fitted one."""
 LOG_ODDS_LIMIT: Final = 30.0
-"""Beyond it a probability is reported as that of the limit, 1e-13 from 0 or 1. Sums are kept
-whole, so that evidence can turn a belief round and the order in which it came does not matter."""
+"""Limit of log odds in the conversion to a probability, which stays 1e-13 away from 0 and 1.
+
+Sums of log odds are not limited, so that evidence can reverse a belief and its order does not
+matter.
+"""
 
 
 def log_odds(probability: float) -> float:
     """log(p / (1 - p)).
 
     Raises:
-        ValueError: Not strictly between 0 and 1.
+        ValueError: The probability is not strictly between 0 and 1.
     """
     if not 0.0 < probability < 1.0:
         raise ValueError(f"probability: expected inside (0, 1), got {probability}")
@@ -31,18 +34,18 @@ def log_odds(probability: float) -> float:
 
 
 def probability(odds: float) -> float:
-    """The probability of log odds; never 0 or 1, whatever the sum."""
+    """Convert log odds to a probability, which is never 0 or 1."""
     return 1.0 / (1.0 + math.exp(-max(-LOG_ODDS_LIMIT, min(LOG_ODDS_LIMIT, odds))))
 
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A latent node.
+    """A latent node of the graph.
 
     Attributes:
-        name: As in ``belief.parquet``.
+        name: Name, as in ``belief.parquet``.
         prior: Probability at the start of an approach.
-        establishes: Presence is established once it is probable.
+        establishes: True if a high probability of this feature establishes presence.
     """
 
     name: str
@@ -52,18 +55,18 @@ class Feature:
 
 @dataclass(frozen=True, slots=True)
 class CueNode:
-    """An observed node.
+    """An observed node of the graph.
 
     Attributes:
-        name: As in ``cues.parquet``.
-        precision: What a detection sends along a direct edge.
-        speaks_first: Sends before presence is established.
-        counted: One message for each detection.
-        dissents: Near the intersection its absence speaks against what it supports.
-        seen_frames: Where persistence counts: believed once positive in so many frames ...
-        of_frames: ... of the last so many.
-        within_m: Likewise: says nothing about an intersection known to be further away.
-        fade: Likewise: over what its errors become independent.
+        name: Name, as in ``cues.parquet``.
+        precision: Message of a detection along a direct edge, as a probability.
+        speaks_first: True if it sends messages before presence is established.
+        counted: True to send one message per detection.
+        dissents: True if its absence near the intersection is evidence against its features.
+        seen_frames: With persistence: minimum number of positive frames.
+        of_frames: With persistence: number of last frames among which ``seen_frames`` are counted.
+        within_m: With persistence: distance of the intersection beyond which it sends no message.
+        fade: With persistence: distance or time over which its errors become independent.
     """
 
     name: str
@@ -79,7 +82,7 @@ class CueNode:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A cue and a feature; direct if the cue shows the feature to be there, else exclusive."""
+    """A cue and a feature; direct if the cue supports the feature, else exclusive."""
 
     cue: str
     feature: str
@@ -95,10 +98,10 @@ class FactorGraph:
     edges: tuple[Edge, ...]
 
     def __post_init__(self) -> None:
-        """Refuse edges that lead nowhere and names that stand twice.
+        """Reject duplicate names and edges to unknown nodes.
 
         Raises:
-            ValueError: With the name and the names there are.
+            ValueError: A name is duplicate or unknown; the message lists the valid names.
         """
         features, cues = self.feature_names, tuple(cue.name for cue in self.cues)
         for kind, names in (("feature", features), ("cue", cues)):
@@ -116,14 +119,14 @@ class FactorGraph:
 
     @property
     def feature_names(self) -> tuple[str, ...]:
-        """In the order of all lists of log odds."""
+        """Names of all features, in the order of lists of log odds."""
         return tuple(feature.name for feature in self.features)
 
     def without(self, cue: str) -> Self:
-        """The graph with one cue left out.
+        """Return the graph without a cue.
 
         Raises:
-            ValueError: No such cue.
+            ValueError: The graph has no such cue.
         """
         names = [node.name for node in self.cues]
         if cue not in names:
@@ -136,7 +139,7 @@ class FactorGraph:
 
 
 def graph_of(fusion: Fusion) -> FactorGraph:
-    """The graph that a vehicle file describes."""
+    """Build the graph that a vehicle file describes."""
     features = {name: entry for name, entry in fusion.features.items() if entry.use}
     cues = {name: entry for name, entry in fusion.cues.items() if entry.use}
     edges = [

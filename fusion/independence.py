@@ -1,4 +1,4 @@
-"""What one more look at the same thing is worth."""
+"""Weights of correlated observations."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import math
 
 
 def effective_sample_fraction(fades: float) -> float:
-    """How many independent observations one is that comes ``fades`` fading lengths after the last.
+    """Weight of an observation ``fades`` fading lengths after the last, in independent ones.
 
-    Looks that resemble each other by rho are worth (1 - rho) / (1 + rho) independent ones each
-    (first-order autoregression); with rho = exp(-fades) that is tanh(fades / 2).
+    Observations of correlation rho count as (1 - rho) / (1 + rho) independent ones each
+    (first-order autoregression). With rho = exp(-fades) that is tanh(fades / 2).
     """
     return math.tanh(0.5 * fades)

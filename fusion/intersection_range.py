@@ -1,10 +1,10 @@
-"""Distance to an intersection as a scalar Kalman filter, as pure functions.
+"""Scalar Kalman filter of the distance to an intersection, as pure functions.
 
-The state is one number: metres along the path from the rear axle to the start of the intersection
-(a stop sign reports it) or to its end (a traffic light does). The two are never mixed. Equation
-numbers are those of Chipka (2018), chapter 3; filterpy computes them, with the variance in Joseph's
-form, which stays positive. It is imported at the first range: importing it takes longer than
-estimating a short drive without any.
+The state is the distance in metres, along the path, from the rear axle to the start of the
+intersection (measured by a stop sign) or to its end (measured by a traffic light). The two are
+never mixed. Equation numbers are those of Chipka (2018), chapter 3. filterpy computes them, with
+the variance in Joseph's form, which remains positive. It is imported at the first range, because
+the import takes longer than the estimation of a short drive without ranges.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Reference(StrEnum):
-    """What a range is to."""
+    """Reference point of a range."""
 
     START = "start"
     END = "end"
@@ -27,8 +27,8 @@ class RangeBelief(NamedTuple):
     """A Gaussian over the distance to one reference.
 
     Attributes:
-        mean_m: Expected distance; negative once the rear axle is past.
-        var_m2: Its variance, positive.
+        mean_m: Mean distance; negative once the rear axle is past the reference.
+        var_m2: Variance of the distance, positive.
     """
 
     mean_m: float
@@ -36,7 +36,7 @@ class RangeBelief(NamedTuple):
 
 
 def initialise(measured_m: float, sensor_var_m2: float) -> RangeBelief:
-    """What the first measurement alone says.
+    """Initialise the belief with the first measurement.
 
     Raises:
         ValueError: ``sensor_var_m2`` is not positive.
@@ -47,7 +47,7 @@ def initialise(measured_m: float, sensor_var_m2: float) -> RangeBelief:
 
 
 def predict(belief: RangeBelief, travelled_m: float, odometry_var_m2: float) -> RangeBelief:
-    """Go on by ``travelled_m`` (negative in reverse), losing certainty (eq. 8 and 9).
+    """Predict over ``travelled_m`` (negative in reverse) and add its variance (eq. 8 and 9).
 
     Raises:
         ValueError: ``odometry_var_m2`` is negative.
@@ -63,12 +63,12 @@ def predict(belief: RangeBelief, travelled_m: float, odometry_var_m2: float) -> 
 
 
 def nis(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> float:
-    """Innovation squared over the variance it should have; chi-squared with one degree."""
+    """Normalised innovation squared; chi-squared with one degree of freedom if consistent."""
     return (measured_m - belief.mean_m) ** 2 / (belief.var_m2 + sensor_var_m2)
 
 
 def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> RangeBelief:
-    """Weigh in one measured distance (eq. 10 to 12).
+    """Update with one measured distance (eq. 10 to 12).
 
     Raises:
         ValueError: ``sensor_var_m2`` is not positive.
@@ -77,7 +77,7 @@ def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> Rang
         raise ValueError(f"sensor_var_m2: expected > 0, got {sensor_var_m2}")
     from filterpy.kalman import update as kalman_update
 
-    # filterpy reads the number of dimensions off the mean, which a plain float does not have.
+    # filterpy reads the number of dimensions from the mean, which a plain float does not have.
     mean_m, var_m2 = kalman_update(
         x=np.float64(belief.mean_m), P=belief.var_m2, z=measured_m, R=sensor_var_m2
     )
@@ -87,14 +87,14 @@ def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> Rang
 def smooth(
     filtered: Sequence[RangeBelief], travelled_m: Sequence[float], odometry_var_m2: Sequence[float]
 ) -> list[RangeBelief]:
-    """What all measurements together say of each step (Rauch, Tung, Striebel, 1965).
+    """Smooth all steps with all measurements (Rauch, Tung, Striebel, 1965).
 
-    The model is linear and Gaussian, so this is the solution of the factor graph.
+    The model is linear and Gaussian, so this is the exact solution of the factor graph.
 
     Args:
-        filtered: Of N steps, each with the measurements up to it.
-        travelled_m: From each step to the next, N - 1.
-        odometry_var_m2: Of those.
+        filtered: Filtered beliefs of N steps.
+        travelled_m: Distances between successive steps, N - 1.
+        odometry_var_m2: Variances of those distances.
     """
     found = [filtered[-1]]
     steps = zip(filtered[:-1], travelled_m, odometry_var_m2, strict=True)

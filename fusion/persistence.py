@@ -1,17 +1,18 @@
-"""Cues that are believed once they persist, and not again and again for the same thing.
+"""Message model in which cues count once they persist, and repeated observations are discounted.
 
-For real drives, where one false frame in eighty is usual. A detection speaks if
+It is meant for real drives, where one false frame in eighty is typical. A positive cue sends a
+message under two conditions:
 
-* the cue was positive in at least k of the last n frames in which it was looked for; a picture seen
-  before is not a new frame;
-* the intersection is not known to be further away than the cue was ever validated.
+* It was positive in at least k of the last n frames in which it was evaluated. A repeated picture
+  is not a new frame.
+* The intersection is not known to be further away than the cue's validated range.
 
-Then it sends its published message (eq. 18), once a frame however many things it counts, since one
-cause makes all of them false. Errors of successive frames resemble each other: as in a first-order
-autoregression with correlation ``rho = exp(-way / fade)``, a frame is worth (1 - rho) / (1 + rho)
-independent ones (``effective_sample_fraction``), over time instead of way for what moves by itself.
-So a frame from the place of the one before is worth nothing, and a cue that stays over a whole
-approach counts a few times. Dissent is discounted in the same manner.
+The message is the published one (eq. 18), sent once per frame regardless of the count, because the
+errors of all counted objects have a common cause. Errors of successive frames are correlated. In a
+first-order autoregression with correlation ``rho = exp(-distance / fade)``, a frame counts as
+(1 - rho) / (1 + rho) independent ones (``effective_sample_fraction``); for moving objects, time
+replaces distance. A frame at the position of the previous one therefore adds nothing, and a cue
+that remains over a whole approach counts a few times. Dissent is discounted in the same way.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from .independence import effective_sample_fraction
 
 
 class Confirmed(NamedTuple):
-    """What of some counts may be believed.
+    """Counts after the test of persistence.
 
     Attributes:
-        counts: Without positive ones that were not seen often enough: those are neutral.
-        silent: From each of these to the reason.
+        counts: Counts without positive cues that were seen too rarely, which are neutral.
+        silent: Reason for each of these cues.
     """
 
     counts: Mapping[str, int]
@@ -41,14 +42,14 @@ class Confirmed(NamedTuple):
 
 
 class Persistence:
-    """Remembers of every cue in which of its last n frames it was positive."""
+    """Stores for every cue in which of its last n frames it was positive."""
 
     def __init__(self, graph: FactorGraph) -> None:
         self._cues = {cue.name: cue for cue in graph.cues}
         self._seen: dict[str, deque[bool]] = {}
 
     def __call__(self, counts: Mapping[str, int], *, is_new_picture: bool = True) -> Confirmed:
-        """Take a frame's counts; a cue may be absent, which neither confirms nor contradicts."""
+        """Process a frame's counts; a missing cue is neither confirmed nor contradicted."""
         kept: dict[str, int] = {}
         silent: dict[str, str] = {}
         for name, count in counts.items():
@@ -71,7 +72,7 @@ class Persistence:
 
 @dataclass(slots=True)
 class _Sent:
-    """Where one cue sent a message last, on its own fading scale."""
+    """Position of one cue's last message, in units of its fade."""
 
     positive_at: float = -math.inf
     dissent_at: float = -math.inf
@@ -79,7 +80,7 @@ class _Sent:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """One cue, made ready: what a whole message adds to which feature."""
+    """One cue, precomputed: the features that it affects, and its full message."""
 
     cue: CueNode
     detected: tuple[tuple[int, float], ...]
@@ -88,10 +89,10 @@ class _Line:
 
 
 class PersistentSpeaker:
-    """The cues of one approach.
+    """Message model of one approach, with persistence.
 
     Attributes:
-        silent: From each cue that was positive in the newest frame and said nothing to the reason.
+        silent: Reason for each cue that was positive in the newest frame and sent no message.
     """
 
     def __init__(self, graph: FactorGraph, dissent: float) -> None:
@@ -102,7 +103,7 @@ class PersistentSpeaker:
         self._time_s = 0.0
 
     def __call__(self, situation: Situation) -> list[float]:
-        """Sum of the messages of one frame, in log odds."""
+        """Return the sum of the messages of one frame, in log odds."""
         out = [0.0] * self._size
         self.silent = {}
         self._way_m += situation.moved_m

@@ -1,9 +1,9 @@
-"""One reference's range over time: gating, missing odometry, and the way back from a bad start.
+"""Track the range to one reference: gating, missing odometry, and recovery from a wrong start.
 
-A range begins once measurements enough agree: a sign that is there is seen again in the next
-pictures, one that is not there mostly is not. A measurement outside the gate is refused. Refused
-ones that agree among themselves form a rival belief, which takes over once it has been seen often
-enough: otherwise one absurd first measurement would shut out all good ones.
+A range starts once enough measurements agree, because a real sign is seen again in the next
+pictures and a false one mostly is not. A measurement outside the gate is rejected. Rejected
+measurements that agree with each other form a rival belief, which replaces the belief once it has
+enough measurements. Otherwise, one wrong first measurement would exclude all correct ones.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class Verdict(StrEnum):
 
 
 class RangeTrack(NamedTuple):
-    """What is believed of one reference.
+    """State of the range to one reference.
 
     Attributes:
-        belief: None before measurements enough have agreed, and after it was dropped.
-        rival: What measurements say that agree among themselves but are not a belief: the first
-            ones, or refused ones.
-        rival_seen: How many of them in a row.
-        unseen_m: Way gone since the last measurement that was taken, or waits to be.
+        belief: None until enough measurements agree, and after the belief was dropped.
+        rival: Belief of measurements that agree with each other but not with ``belief``: the first
+            ones, or rejected ones.
+        rival_seen: Number of successive measurements in ``rival``.
+        unseen_m: Distance travelled since the last measurement that was accepted or is pending.
     """
 
     belief: RangeBelief | None = None
@@ -47,16 +47,17 @@ class RangeTrack(NamedTuple):
 
 NOTHING: Final = RangeTrack()
 MIN_EFFECTIVE_SAMPLES: Final = 1e-9
-"""Of an observation from the place of the last one: next to nothing, yet no division by zero."""
+"""Weight of an observation at the position of the last one; positive to avoid a division by zero.
+"""
 
 
 def advance(
     track: RangeTrack, travelled_m: float, var_m2: float, settings: RangeFilter
 ) -> RangeTrack:
-    """The track after the car went on.
+    """Predict the track over a distance.
 
-    A belief that has become less sure than ``max_sd_m`` is dropped, and first observations that
-    nothing has confirmed within ``begin_within_m`` are forgotten.
+    A belief with an s.d. above ``max_sd_m`` is dropped. First observations that are not confirmed
+    within ``begin_within_m`` are forgotten.
     """
     if track.belief is None and track.rival is None:
         return track
@@ -74,9 +75,9 @@ def advance(
 def predict_without_odometry(
     track: RangeTrack, widens_m: float, settings: RangeFilter
 ) -> RangeTrack:
-    """The track after a way that nobody measured: the mean stays, the s.d. grows by ``widens_m``.
+    """Predict the track over an unknown distance: same mean, s.d. larger by ``widens_m``.
 
-    Standard deviations add, not variances: the unknown speed of one moment is that of the next.
+    Standard deviations add, not variances, because the unknown speed persists.
     """
     first = track.rival if track.belief is None else track.belief
     if first is None:
@@ -93,15 +94,15 @@ def measure(
     settings: RangeFilter,
     restarts_beyond_m: float,
 ) -> tuple[RangeTrack, Verdict]:
-    """Weigh in a measurement, or refuse it.
+    """Update with a measurement, or reject it.
 
     Args:
-        track: Before the measurement, advanced to its time.
+        track: Track before the measurement, predicted to its time.
         measured_m: Distance to the track's reference.
-        sensor_var_m2: Of the measurement.
-        settings: Gate, fade, how many observations begin a range, and when a rival takes over.
-        restarts_beyond_m: No rival takes over from a belief nearer than this: signs further away
-            are then the next intersection's.
+        sensor_var_m2: Variance of the measurement.
+        settings: Gate, fade, and number of observations that start a range or replace it.
+        restarts_beyond_m: Distance below which no rival replaces the belief, because signs further
+            away then belong to the next intersection.
     """
     belief = track.belief
     if belief is not None and _inside(belief, measured_m, sensor_var_m2, settings.gate_nis):
@@ -125,21 +126,21 @@ def measure(
 def follow(
     track: RangeTrack, whole_m: float, var_m2: float, way_m: float, settings: RangeFilter
 ) -> tuple[RangeTrack, Verdict]:
-    """Take up a range that somebody else has weighed from all observations so far.
+    """Follow a range that a tracker has estimated from all observations so far.
 
-    Its errors are those of the one before, but for what is new, so it is not an independent
-    measurement: one after the other would make the belief far too sure. It is one (eq. 10 to 12)
-    whose gain follows the way gone, ``1 - exp(-way / take_up_m)``, so that a correction smaller
-    than ``take_up_m`` never makes the range grow while the car goes on, and nothing changes while
-    it stands. The later of two such ranges is the better one, so their covariance is its variance;
-    with that, the belief's variance is exact.
+    Successive estimates share most of their errors, so they are not independent measurements, and a
+    Kalman update with each would make the belief overconfident. Instead, the gain of the update
+    (eq. 10 to 12) depends on the distance travelled, ``1 - exp(-distance / take_up_m)``. A
+    correction smaller than ``take_up_m`` then never increases the range while the car moves
+    forwards, and nothing changes while it stands. The later of two such estimates is the better
+    one, so their covariance is its variance; with it, the belief's variance is exact.
 
     Args:
-        track: Advanced to the range's time.
-        whole_m: The range, by all observations so far.
-        var_m2: Its variance.
-        way_m: Gone since the last one that was taken up.
-        settings: ``take_up_m``, and the gate beyond which it replaces the belief.
+        track: Track, predicted to the range's time.
+        whole_m: Range by all observations so far.
+        var_m2: Variance of the range.
+        way_m: Distance travelled since the previous such update.
+        settings: ``take_up_m``, and the gate beyond which the range replaces the belief.
     """
     belief = track.belief
     if belief is None:
@@ -161,7 +162,7 @@ def _inside(
 
 
 def _worth(since_m: float, fade_m: float) -> float:
-    """How many independent observations one is, so soon after another; as in ``calibrated``."""
+    """Weight of an observation soon after another, in independent ones; as in ``calibrated``."""
     if fade_m == 0.0:
         return 1.0
     return max(effective_sample_fraction(since_m / fade_m), MIN_EFFECTIVE_SAMPLES)

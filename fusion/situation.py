@@ -1,4 +1,4 @@
-"""What the cues of one frame are heard in: all that decides their messages."""
+"""Situation of a frame: the input of a message model."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """All that decides what the cues of one frame say.
+    """All inputs that determine the messages of one frame's cues.
 
     Attributes:
-        counts: From cue to how many; 0 is looked for and not found, absent is not looked for.
-        is_established: Presence was established by earlier frames.
-        is_near: The intersection is known to be near, or passed.
-        may_dissent: It is, and the car has moved since dissent was last sent.
-        objects: From cue to identities of the counted things, where a tracker assigns them.
-        is_new_picture: Not the same picture as before.
-        moved_m: Way gone since the frame before, forwards or back.
-        passed_s: Time since then.
-        range_m: To the intersection, as far as known.
+        counts: Number of objects of each evaluated cue; 0 means searched for and not found.
+        is_established: True if earlier frames established presence.
+        is_near: True if the intersection is known to be near or passed.
+        may_dissent: True if ``is_near`` and the car has moved since dissent was last sent.
+        objects: Identities of the counted objects by cue, where a tracker assigns them.
+        is_new_picture: False if the picture repeats the previous one.
+        moved_m: Distance since the previous frame, regardless of direction.
+        passed_s: Time since the previous frame.
+        range_m: Distance to the intersection; None where unknown.
         advanced_m: As ``moved_m``, but negative in reverse.
-        advanced_var_m2: Its variance.
-        ranges: To the start of the intersection as measured in this frame, with their variances.
+        advanced_var_m2: Variance of ``advanced_m``.
+        ranges: Ranges to the intersection's start measured in this frame, with their variances.
     """
 
     counts: Mapping[str, int]

@@ -1,23 +1,24 @@
-"""A belief over time: a hidden Markov model of what is ahead, filtered exactly.
+"""Hidden Markov model of the intersection ahead, filtered exactly over a drive.
 
 The state is either that no intersection is within reach, or a cell of distance to one together with
-the ways that lead on from it. So what is believed of left, right or straight is never more than
-what is believed of the intersection itself, and it is withdrawn with it.
+its set of outgoing roads (its *ways*). The belief in left, right or straight is therefore never
+higher than the belief in the intersection itself, and is withdrawn with it.
 
-* *Motion.* Cells move with the odometer by whole cells, its remainder is kept; its variance spreads
-  them. An intersection that is passed leaves the state, one comes into reach every ``spacing_m``.
-* *Cues.* Given the state a cue is a Markov chain with two values, positive or not. Its transitions
-  depend on the features that it speaks of and on the distance. A cue that nothing looked for says
-  nothing, and its chain begins again. Cues are evaluated once a step (of distance, or of time
-  where the car stands), so that the result does not depend on the frame rate.
-* *Ranges.* A sign's range is Gaussian about the distance, or stray and uniform. A false
-  sign, where no intersection is, has a fixed place too, and its ranges agree with one another; so
-  that state has a distance as well, and ranges alone say where, not whether.
+* *Motion.* The distribution moves by whole cells with the odometer, whose remainder is kept; its
+  variance spreads the distribution. A passed intersection leaves the state, and a new one comes
+  within reach every ``spacing_m``.
+* *Cues.* Given the state, a cue is a Markov chain with two values, positive or not. Its transitions
+  depend on the features that it supports and on the distance. A cue that is not evaluated has no
+  effect, and its chain restarts. Cues are evaluated once per step (of distance, or of time while
+  the car stands), so that the result does not depend on the frame rate.
+* *Ranges.* A sign's range is Gaussian about the distance, or stray and uniform. A false sign
+  without an intersection also has a fixed position, and its ranges agree with each other. That
+  state therefore has a distance, too, and ranges alone are evidence of position, not of existence.
 
-What is reported is the posterior, but for a *lapse*: a place may be unlike all that were learned
-from, and then the prior holds. Both probabilities obey the same bounds.
+The reported probability is the posterior, mixed with the prior by the probability of a *lapse*: a
+place that differs from all places of the fit. Both probabilities obey the same bounds.
 
-With likelihoods raised to one exponent (cues repeat one another), the posterior is
+With likelihoods raised to an exponent, because cues are redundant, the posterior is
 ``p(x | now) ~ L(now | x)^a sum p(x | x') p(x' | before)``: the forward recursion (Rabiner, *A
 Tutorial on Hidden Markov Models*, Proc. IEEE 77, 1989, section III.A).
 """
@@ -40,19 +41,20 @@ from .independence import effective_sample_fraction
 from .intersection_range import Reference
 
 PRESENCE: Final = "intersection"
-"""The feature that all others need."""
+"""Feature on which all others depend."""
 MAX_RANGE_M: Final = 150.0
-"""Stray ranges are spread over this."""
+"""Stray ranges are uniform up to this distance."""
 FLOOR: Final = 1e-9
-"""A probability is reported no nearer to 0 or 1."""
+"""Minimum distance of a reported probability from 0 and 1."""
 MAX_SPREAD: Final = 0.25
-"""Of a cell's mass to either side in one step; more variance waits for the next."""
+"""Maximum fraction of a cell's mass that moves to either side per step; the remaining variance is
+applied in the next step."""
 
 
 LENGTH_SD_FRACTION: Final = 0.25
-"""How well a usual length stands for an intersection whose end alone was ranged."""
+"""Relative s.d. of the default length, for an intersection whose end only was measured."""
 MIN_WORTH: Final = 1e-3
-"""A range that is worth less as an independent one is not heard again."""
+"""Minimum weight of a range in independent ranges; below it, a repeated range is ignored."""
 
 
 def ranges_to_start(
@@ -61,13 +63,13 @@ def ranges_to_start(
     fade_m: float,
     length_m: float,
 ) -> tuple[tuple[float, float], ...]:
-    """Ranges to the start of an intersection, and their variances, as the filter takes them.
+    """Convert measured ranges to ranges and variances to the start of an intersection.
 
     Args:
-        measured: From a reference to a range and its variance.
-        since_m: Way since the frame that was ranged before; its errors resemble this one's.
-        fade_m: Over which errors become independent.
-        length_m: From start to end.
+        measured: Range and variance of each reference.
+        since_m: Distance since the previous frame with ranges, whose errors are correlated.
+        fade_m: Distance over which errors become independent.
+        length_m: Distance from start to end.
     """
     worth = 1.0 if fade_m == 0.0 else effective_sample_fraction(since_m / fade_m)
     if worth < MIN_WORTH:
@@ -89,11 +91,11 @@ class MeasuredRange(NamedTuple):
 
 
 class _Chain(NamedTuple):
-    """One cue, made ready: columns are first, after a negative step, after a positive one.
+    """Probabilities that one cue is positive: at first, after a negative and a positive step.
 
     Attributes:
-        nowhere: Shape (3,): positive where no intersection is ahead.
-        ahead: Shape (3, distances, ways).
+        nowhere: Shape (3,): without an intersection ahead.
+        ahead: Shape (3, distances, ways): with an intersection ahead.
     """
 
     cue: str
@@ -103,14 +105,14 @@ class _Chain(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TemporalModel:
-    """What was learned, as arrays.
+    """Fitted parameters, as arrays.
 
     Attributes:
-        settings: As the vehicle file has it.
-        ways: W tuples of features.
+        settings: Section of the vehicle file.
+        ways: W sets of outgoing roads, as tuples of features.
         way_probabilities: Shape (W,).
-        chains: One for each cue of which anything was learned.
-        has_feature: Shape (features, W): in the graph's order, 1 where a way has it.
+        chains: Chain of each fitted cue.
+        has_feature: Shape (features, W): 1 if a set has the feature, in the graph's order.
     """
 
     settings: Temporal
@@ -121,21 +123,21 @@ class TemporalModel:
 
     @property
     def usual(self) -> NDArray[np.float64]:
-        """Probabilities before a drive, shape (features,)."""
+        """Prior probabilities at the start of a drive, shape (features,)."""
         return np.asarray(self.settings.ahead * (self.has_feature @ self.way_probabilities))
 
     @property
     def cells(self) -> int:
-        """Of distance."""
+        """Number of cells of distance."""
         reach_m = self.settings.edges_m[-1] + self.settings.behind_m
         return max(math.ceil(reach_m / self.settings.cell_m), 2)
 
 
 def temporal_model(graph: FactorGraph, settings: Temporal) -> TemporalModel:
-    """Join the graph's features with what was learned.
+    """Combine the graph's features with fitted parameters.
 
     Raises:
-        ValueError: The graph has no intersection.
+        ValueError: The graph has no feature ``intersection``.
     """
     if PRESENCE not in graph.feature_names:
         raise ValueError(f"no feature {PRESENCE!r}; there are: {', '.join(graph.feature_names)}")
@@ -149,7 +151,7 @@ def temporal_model(graph: FactorGraph, settings: Temporal) -> TemporalModel:
 
 
 def ways_of(name: str) -> tuple[str, ...]:
-    """Features of a key of ``Temporal.ways``."""
+    """Features in a key of ``Temporal.ways``."""
     return () if name == "none" else tuple(name.split("+"))
 
 
@@ -175,13 +177,13 @@ def _fits(chain: CueChain, way: tuple[str, ...]) -> bool:
 
 @dataclass(slots=True, eq=False)
 class TemporalFilter:
-    """The belief along one drive.
+    """Filter of one drive.
 
     Attributes:
-        model: What was learned.
-        nowhere: Shape (cells,): no intersection is within reach, and what may be taken for one is
-            at this distance.
-        ahead: Shape (cells, ways): joint probability of distance and ways.
+        model: Fitted parameters.
+        nowhere: Shape (cells,): probability that no intersection is within reach and a potential
+            false sign is at this distance.
+        ahead: Shape (cells, ways): joint probability of distance and outgoing roads.
     """
 
     model: TemporalModel
@@ -194,7 +196,7 @@ class TemporalFilter:
     _before: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Know what is known before a drive."""
+        """Start with the prior."""
         settings = self.model.settings
         is_ahead = self.centers_m() > 0.0
         spread = is_ahead / is_ahead.sum()
@@ -202,20 +204,20 @@ class TemporalFilter:
         self.ahead = settings.ahead * spread[:, None] * self.model.way_probabilities[None, :]
 
     def centers_m(self) -> NDArray[np.float64]:
-        """Distance of each cell's middle from the rear axle, shape (cells,)."""
+        """Distance of each cell's centre from the rear axle, shape (cells,)."""
         settings = self.model.settings
         middle = (np.arange(self.model.cells) + 0.5) * settings.cell_m
         return np.asarray(middle - settings.behind_m - self._moved_m)
 
     def probabilities(self) -> NDArray[np.float64]:
-        """Of each feature, in the graph's order, within (0, 1)."""
+        """Probability of each feature, in the graph's order, within (0, 1)."""
         lapse = self.model.settings.lapse
         mass = self.model.has_feature @ self.ahead.sum(axis=0)
         mixed = (1.0 - lapse) * mass + lapse * self.model.usual
         return np.asarray(np.clip(mixed, FLOOR, 1.0 - FLOOR))
 
     def distance_m(self) -> float:
-        """Expected distance, if an intersection is ahead."""
+        """Mean distance, given that an intersection is ahead."""
         mass = self.ahead.sum(axis=1)
         return float(mass @ self.centers_m() / max(float(mass.sum()), FLOOR))
 
@@ -229,15 +231,15 @@ class TemporalFilter:
         *,
         is_new_picture: bool = True,
     ) -> None:
-        """Take one frame.
+        """Process one frame.
 
         Args:
-            counts: From each cue that was looked for to how often it was found.
-            ranges: Measured in this frame; one that repeats an earlier one has more variance.
-            moved_m: Way since the frame before, forwards.
-            moved_var_m2: Its variance.
-            passed_s: Time since then.
-            is_new_picture: Not the same as before.
+            counts: Number of objects of each evaluated cue.
+            ranges: Ranges measured in this frame; correlated ranges have more variance.
+            moved_m: Distance since the previous frame, forwards positive.
+            moved_var_m2: Variance of the distance.
+            passed_s: Time since the previous frame.
+            is_new_picture: False if the picture repeats the previous one.
         """
         self._move(moved_m, moved_var_m2)
         self._since_m += abs(moved_m)
@@ -265,7 +267,7 @@ class TemporalFilter:
         self.ahead /= total
 
     def _cues(self, counts: Mapping[str, int]) -> tuple[float, NDArray[np.float64]]:
-        """Log likelihoods of all cues that were looked for."""
+        """Log likelihoods of all evaluated cues."""
         settings = self.model.settings
         at = np.searchsorted(np.array(settings.edges_m[1:-1]), self.centers_m(), side="right")
         nowhere, by_distance = 0.0, np.zeros(self.model.chains[0].ahead.shape[1:])
@@ -306,18 +308,18 @@ class TemporalFilter:
         self._spread()
 
     def _shift(self) -> None:
-        """One cell nearer: the nearest is passed, and one comes into reach."""
+        """Move all mass one cell nearer; the nearest cell is passed, and a new one is in reach."""
         settings = self.model.settings
         comes = min(settings.cell_m / settings.spacing_m, 1.0)
         coming = float(self.nowhere.sum()) * comes
         passed = float(self.ahead[0].sum()) / self.model.cells
-        # What was taken for an intersection and is passed: the next is far away.
+        # The nearest false sign is passed, too; the next one is at the maximum distance.
         self.nowhere = np.roll(self.nowhere, -1) * (1.0 - comes) + passed
         self.ahead = np.roll(self.ahead, -1, axis=0)
         self.ahead[-1] = coming * self.model.way_probabilities
 
     def _shift_back(self) -> None:
-        """One cell further away: the furthest is out of reach."""
+        """Move all mass one cell further away; the furthest cell is out of reach."""
         lost = float(self.ahead[-1].sum()) / self.model.cells
         self.nowhere = np.roll(self.nowhere, 1) + lost
         self.ahead = np.roll(self.ahead, 1, axis=0)
@@ -334,7 +336,7 @@ class TemporalFilter:
 
 
 def _blurred(mass: NDArray[np.float64], side: float) -> NDArray[np.float64]:
-    """Mass with ``side`` of each cell in either neighbour; the ends keep what would leave."""
+    """Move the fraction ``side`` of each cell to either neighbour; the end cells keep theirs."""
     blurred = mass * (1.0 - 2.0 * side)
     blurred[:-1] += side * mass[1:]
     blurred[1:] += side * mass[:-1]
@@ -343,15 +345,15 @@ def _blurred(mass: NDArray[np.float64], side: float) -> NDArray[np.float64]:
 
 
 class TemporalSpeaker:
-    """The filter as the messages of one approach: what it adds to the log odds before."""
+    """Message model of one approach: the filter's changes of the log odds."""
 
     def __init__(self, graph: FactorGraph, over_drive: TemporalFilter) -> None:
-        """Begin an approach; the filter goes on along the drive."""
+        """Start an approach; the filter continues along the drive."""
         self._filter = over_drive
         self._odds = [log_odds(feature.prior) for feature in graph.features]
 
     def __call__(self, situation: Situation) -> list[float]:
-        """From the belief before this frame to that after it."""
+        """Process a frame; return the change of the log odds."""
         hear(self._filter, situation)
         odds = [log_odds(p) for p in self._filter.probabilities().tolist()]
         out = [now - before for now, before in zip(odds, self._odds, strict=True)]
@@ -360,7 +362,7 @@ class TemporalSpeaker:
 
 
 def hear(over_drive: TemporalFilter, situation: Situation) -> None:
-    """Let the filter take a frame."""
+    """Process a frame's situation with the filter."""
     over_drive.hear(
         situation.counts,
         [MeasuredRange(range_m, var_m2) for range_m, var_m2 in situation.ranges],

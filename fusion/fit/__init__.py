@@ -1,1 +1,1 @@
-"""What annotated approaches teach: how much each message says, and how soon it fades."""
+"""Fit of message models to annotated approaches."""

@@ -1,4 +1,4 @@
-"""An approach of a run beside what is true of its intersection."""
+"""An approach of a run with the ground truth of its intersection."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from crosscue.fusion.factor_graph import CueNode
 
 NOT_LOOKED: Final = -1
-"""Count of a cue that nothing looked for."""
+"""Count of a cue that was not evaluated."""
 
 Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnnotatedApproach:
-    """N frames of one approach and what is true of its intersection.
+    """N frames of one approach, with the ground truth of its intersection.
 
     Attributes:
-        way_m: Shape (N,), gone since its first frame, never falling.
-        time_s: Shape (N,), likewise.
-        is_near: Shape (N,): the intersection was known to be near.
-        is_established: Shape (N,): its presence was, by earlier frames.
-        counts: From cue to shape (N,): how many, or ``NOT_LOOKED``.
-        features: Which are there, and which are not; one not named is not known.
-        place: Which intersection; drives up to the same one are not new evidence about others.
+        way_m: Shape (N,): distance since the first frame, non-decreasing.
+        time_s: Shape (N,): time since the first frame, non-decreasing.
+        is_near: Shape (N,): True if the intersection was known to be near.
+        is_established: Shape (N,): True if earlier frames had established presence.
+        counts: Counts of each cue, shape (N,), or ``NOT_LOOKED``.
+        features: True or False for each known feature; a missing one is unknown.
+        place: Name of the intersection; drives to the same one are not independent evidence.
     """
 
     way_m: NDArray[np.float64]
@@ -40,7 +40,7 @@ class AnnotatedApproach:
     place: str
 
     def looks(self, cue: CueNode) -> NDArray[np.int64]:
-        """Frames in which the cue was looked for and would speak."""
+        """Indices of frames in which the cue was evaluated and would send a message."""
         count = self.counts.get(cue.name)
         if count is None:
             return np.empty(0, np.int64)

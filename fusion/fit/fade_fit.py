@@ -1,10 +1,11 @@
-"""How many independent observations an approach holds: a cue's fade.
+"""Fit a cue's fade: the distance or time over which its observations become independent.
 
-A cue's residual (positive or not, less the rate to be expected) resembles itself at a distance by
-``always + fading * exp(-distance / scale)``, the rest being noise of single looks; ``always`` is
-what a place keeps saying wrongly all the way. Least squares on products of residuals at many lags;
-distance is way or time, whichever leaves less. The fade is the integral of that over an approach's
-length: the scale of the one exponential that is worth as many observations.
+The autocorrelation of a cue's residual (positive or not, minus the expected rate) is modelled as
+``always + fading * exp(-distance / scale)``; the rest is noise of single observations. ``always``
+is the constant error of a place. The curve is fitted by least squares to products of residuals at
+many lags, once over distance and once over time; the better fit is used. The fade is the curve's
+integral over an approach's length. It is the scale of the single exponential that yields the same
+number of independent observations.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from crosscue.fusion.fit.annotated_approach import AnnotatedApproach, Bools
 from crosscue.replay.vehicle.fusion import Fade
 
 MIN_POSITIVES: Final = 20
-"""Fewer positive observations do not determine a fade."""
+"""Minimum number of positive observations for a fit."""
 LAGS: Final = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 WAYS_M: Final = np.geomspace(0.3, 100.0, 36)
 TIMES_S: Final = np.geomspace(0.05, 20.0, 36)
@@ -28,7 +29,7 @@ BINS: Final = 60
 
 
 class FadeFit(NamedTuple):
-    """A cue's fade; ``is_learned`` is false where the usual one stands in."""
+    """A cue's fade; ``is_learned`` is False for the default."""
 
     cue: str
     fade: Fade
@@ -38,12 +39,12 @@ class FadeFit(NamedTuple):
 
 
 class Binned(NamedTuple):
-    """Products of residuals over their variance, in bins of distance, columns of equal length.
+    """Autocorrelations of residuals in bins of distance, as columns of equal length.
 
     Attributes:
-        pairs: How many.
-        distance: Mean, in metres or seconds.
-        correlation: Mean.
+        pairs: Number of pairs in each bin.
+        distance: Mean distance, in metres or seconds.
+        correlation: Mean product of residuals over their variance.
     """
 
     pairs: NDArray[np.float64]
@@ -52,7 +53,7 @@ class Binned(NamedTuple):
 
 
 def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode) -> FadeFit:
-    """A cue's fade, or the usual one where too few positive observations report it."""
+    """Fit a cue's fade; with too few positive observations, the default is returned."""
     residuals = _residuals(approaches, graph, cue)
     looks, positives, squares = 0, 0, 0.0
     ways, times, products = [np.empty(0)], [np.empty(0)], [np.empty(0)]
@@ -83,7 +84,7 @@ def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: C
 def _residuals(
     approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode
 ) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Looks of each approach, and positive (1) or not (0) less the rate among looks alike."""
+    """Rows of each approach's observations, and residuals from the rate in similar situations."""
     ends = [edge.feature for edge in graph.edges if edge.cue == cue.name]
     rows = [approach.looks(cue) for approach in approaches]
     groups: dict[tuple[object, ...], list[tuple[int, Bools]]] = {}
@@ -106,7 +107,7 @@ def _residuals(
 
 
 def _binned(distance: NDArray[np.float64], correlation: NDArray[np.float64]) -> Binned:
-    """Equally many pairs in each bin, but equal distances never parted."""
+    """Divide pairs into bins of equal number; equal distances are in the same bin."""
     edges = np.unique(np.quantile(distance, np.linspace(0.0, 1.0, BINS + 1)))
     which = np.searchsorted(edges, distance, side="right")
     pairs = np.bincount(which).astype(np.float64)
@@ -119,7 +120,7 @@ def _binned(distance: NDArray[np.float64], correlation: NDArray[np.float64]) -> 
 
 
 def _integral(binned: Binned, scales: NDArray[np.float64], length: float) -> tuple[float, float]:
-    """Integral of the best curve over ``length``, and its misfit less what no curve can repair."""
+    """Integral of the best curve over ``length``, and its squared error up to a constant."""
     best, lowest = float(scales[0]), float("inf")
     for scale in scales.tolist():
         shape = np.exp(-binned.distance / scale)
@@ -133,7 +134,7 @@ def _integral(binned: Binned, scales: NDArray[np.float64], length: float) -> tup
 
 
 def _line(shape: NDArray[np.float64], binned: Binned) -> tuple[float, float]:
-    """Least squares of ``always + fading * shape``, both from 0 to 1."""
+    """Fit ``always + fading * shape`` by least squares, with both between 0 and 1."""
     weight = binned.pairs / binned.pairs.sum()
     middle, level = float(weight @ shape), float(weight @ binned.correlation)
     spread = float(weight @ (shape - middle) ** 2)

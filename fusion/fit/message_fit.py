@@ -1,14 +1,14 @@
-"""From annotated approaches to what ``fusion = "calibrated"`` needs: fades, rates and exponents.
+"""Fit the parameters of ``fusion = "calibrated"`` to annotated approaches.
 
-* A cue's *fade* reports how many independent observations an approach holds; see ``fade_fit``.
-* A *rate* is the fraction of positive observations where a feature is there, and where it is not,
-  near and far. Each frame is weighted by how independent it is, and each place equally: a
-  thousand frames at three crossroads say little about a fourth. Both rates are pulled towards their
-  common one as if by one more place there (Laplace's rule with the pooled rate for a prior), so
-  that few places say that there is no difference.
-* A feature's *exponent* is the factor on all its log odds, at most 1, that makes its log score over
-  the annotated places best, each place weighing the same, against a mild pull towards 1 (a
-  log-normal prior of unit width), so that few places do not silence a feature.
+* A cue's *fade* determines the number of independent observations in an approach; see ``fade_fit``.
+* A *rate* is the fraction of positive observations with a feature, and without it, near and far.
+  Each frame is weighted by its independence, and all places equally, because a thousand frames at
+  three intersections are little evidence about a fourth. Both rates are shrunk towards their common
+  rate by one additional place (Laplace's rule with the pooled rate as prior), so that few places
+  yield little difference.
+* A feature's *exponent* is the factor on all its log odds, at most 1, with the best log score over
+  the annotated places, all of equal weight. A weak log-normal prior about 1, of unit width,
+  prevents a few places from disabling a feature.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 MIN_PLACES: Final = 3
-"""With the feature and without, each; fewer fix no rate or exponent. A rate also needs
-as
-many that were positive at all: of a cue never seen nothing is known but what was published."""
+"""Minimum number of places with the feature, and of places without it, for a rate or exponent.
+
+A rate also requires this number of places where the cue was positive; otherwise only the published
+message is known.
+"""
 PULL_PLACES: Final = 1.0
-"""So many places at the pooled rate are added to either side."""
+"""Number of places at the pooled rate that are added to either side."""
 EXPONENTS: Final = np.linspace(0.05, 1.0, 96)
 
 
@@ -40,10 +42,10 @@ class Side(NamedTuple):
     """One side of a rate.
 
     Attributes:
-        rates: Fraction of positive frames at each place that has any.
+        rates: Fraction of positive frames at each place with observations.
         frames: Number of frames.
-        looks: How many independent observations they are worth.
-        hits: The same for positive frames.
+        looks: Number of independent observations to which the frames are equivalent.
+        hits: Number of independent observations to which the positive frames are equivalent.
     """
 
     rates: tuple[float, ...]
@@ -53,12 +55,12 @@ class Side(NamedTuple):
 
     @property
     def places(self) -> int:
-        """With at least one observation."""
+        """Number of places with at least one observation."""
         return len(self.rates)
 
 
 class RateFit(NamedTuple):
-    """An edge's rates near or far; None where too little was seen."""
+    """An edge's rates near or far; None with too few observations."""
 
     cue: str
     feature: str
@@ -70,13 +72,13 @@ class RateFit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MessageFit:
-    """All that was learned.
+    """Result of the fit.
 
     Attributes:
-        calibrated: For the vehicle file.
-        fades: By cue, in the graph's order.
-        rates: By edge, near and far.
-        approaches: How many there were.
+        calibrated: Section of the vehicle file.
+        fades: Fade of each cue, in the graph's order.
+        rates: Rates of each edge, near and far.
+        approaches: Number of approaches.
     """
 
     calibrated: Calibrated
@@ -86,7 +88,7 @@ class MessageFit:
 
 
 def fit_messages(approaches: Sequence[AnnotatedApproach], graph: FactorGraph) -> MessageFit:
-    """Learn fades, then rates with them, then exponents with both."""
+    """Fit fades, then rates with these fades, then exponents with both."""
     fades = tuple(fit_fade(approaches, graph, cue) for cue in graph.cues)
     known = {one.cue: one.fade for one in fades}
     rates = tuple(
@@ -176,7 +178,7 @@ def _exponents(
 def log_odds_of(
     approach: AnnotatedApproach, graph: FactorGraph, learned: Calibrated
 ) -> NDArray[np.float64]:
-    """Sums of messages after each frame, without the prior, shape (N, features)."""
+    """Sum of messages after each frame, without the prior, shape (N, features)."""
     speaker = CalibratedMessageModel(len(graph.features), voices_of(graph, learned))
     messages = [speaker(situation) for situation in _situations(approach)]
     return np.cumsum(np.array(messages).reshape(-1, len(graph.features)), axis=0)

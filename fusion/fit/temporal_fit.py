@@ -1,15 +1,16 @@
-"""From annotated drives to what ``fusion.kind = "temporal"`` needs, by counting.
+"""Fit the parameters of ``fusion.kind = "temporal"`` to annotated drives, by counting.
 
-* A cue's *chain*: how often it is positive after a positive step, after a negative one, and at all,
-  in each state that it depends on: no intersection ahead, or which of its features are there, by
-  distance. Counts are pulled towards those of all distances, these towards those of all states, and
-  these towards one half, each as if by ``PULL_STEPS`` more steps, so that a state that was never
-  seen says what others say.
-* *Ways*: how often which roads lead on from an intersection, each place counting once, with half a
-  place more for each.
-* *Stray* ranges: more than ``STRAY_SD`` standard deviations off, one more of two added.
-* *Exponent* and *lapse*: the pair of ``EXPONENTS`` and ``LAPSES`` with the best log score where one
-  half of the places is judged by chains counted on the other half, and the other way round.
+* A cue's *chain* has its frequency of being positive after a positive step, after a negative one,
+  and overall. It depends on the state: no intersection ahead, or the combination of the cue's
+  features and the distance. Frequencies are shrunk towards those of all distances, these towards
+  those of all states, and these towards one half, each by ``PULL_STEPS`` additional steps. A state
+  without observations therefore has the frequencies of the others.
+* *Ways* are the frequencies of combinations of outgoing roads. Each place counts once, and each
+  combination gets half a place more.
+* *Stray* ranges are more than ``STRAY_SD`` standard deviations off; one of two additional ranges is
+  counted as stray.
+* *Exponent* and *lapse* are the pair of ``EXPONENTS`` and ``LAPSES`` with the best log score in a
+  cross-validation over two halves of the places.
 """
 
 from __future__ import annotations
@@ -37,27 +38,27 @@ from .annotated_approach import NOT_LOOKED
 
 EDGES_M: Final = (0.0, 10.0, 20.0, 35.0, 50.0, 80.0)
 PULL_STEPS: Final = 20.0
-"""About as many as a drive has: one more place that says what others say."""
+"""Number of additional steps; about that of a drive, so the effect is that of one more place."""
 STRAY_SD: Final = 3.0
 EXPONENTS: Final = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 LAPSES: Final = (0.0, 0.02, 0.05, 0.1)
 MIN_RATE: Final = 0.002
-"""No probability is learned nearer to 0 or 1: what was never seen can happen."""
+"""Minimum distance of a fitted probability from 0 and 1, because rare events can occur."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnnotatedDrive:
-    """N frames of a drive and what is true of them.
+    """N frames of a drive, with ground truth.
 
     Attributes:
-        advanced_m: Shape (N,): way since the frame before, negative in reverse; 0 in the first.
-        advanced_var_m2: Shape (N,): its variance.
-        passed_s: Shape (N,): time since then.
-        start_m: Shape (N,): true distance to the intersection ahead, NaN where none is.
-        counts: From cue to shape (N,): how many, or ``NOT_LOOKED``.
-        ranges: N times the ranges to the start that were measured.
-        features: What is true of the intersection, or of a road without one.
-        place: Which layout or crossroads.
+        advanced_m: Shape (N,): distance since the previous frame, negative in reverse; 0 at first.
+        advanced_var_m2: Shape (N,): variance of the distance.
+        passed_s: Shape (N,): time since the previous frame.
+        start_m: Shape (N,): true distance to the intersection ahead, NaN without one.
+        counts: Counts of each cue, shape (N,), or ``NOT_LOOKED``.
+        ranges: Measured ranges to the start in each of the N frames.
+        features: True features of the intersection, or of a road without one.
+        place: Name of the layout or intersection.
     """
 
     advanced_m: NDArray[np.float64]
@@ -71,7 +72,7 @@ class AnnotatedDrive:
 
 
 class State(NamedTuple):
-    """What a cue's chain depends on; ``bin`` is None for all distances."""
+    """State on which a cue's chain depends; ``bin`` is None for all distances."""
 
     there: tuple[str, ...]
     missing: tuple[str, ...]
@@ -79,25 +80,25 @@ class State(NamedTuple):
 
     @property
     def is_ahead(self) -> bool:
-        """Is there an intersection?"""
+        """Whether an intersection is ahead."""
         return bool(self.there or self.missing)
 
 
 NOWHERE: Final = State((), (), None)
 Tally = Counter[tuple[State, str, bool]]
-"""From a state, what was before (``first``, ``stays``, ``appears``), and whether it is positive."""
+"""Number of steps by state, previous step (``first``, ``stays``, ``appears``) and current value."""
 
 
 class TemporalFit(NamedTuple):
-    """What was learned.
+    """Result of the fit.
 
     Attributes:
-        temporal: For the vehicle file.
-        drives: Learned from.
-        places: That they were at.
-        steps: Heard in all.
-        model: The same, ready for a filter.
-        log_scores: From exponent and lapse to the log score by which they were chosen.
+        temporal: Section of the vehicle file.
+        drives: Number of drives.
+        places: Number of places.
+        steps: Total number of steps in which cues were evaluated.
+        model: The same parameters, as arrays for a filter.
+        log_scores: Log score of each pair of exponent and lapse.
     """
 
     temporal: Temporal
@@ -109,10 +110,10 @@ class TemporalFit(NamedTuple):
 
 
 def fit_temporal(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> TemporalFit:
-    """Learn chains, ways, stray ranges and the exponent.
+    """Fit chains, ways, stray ranges, exponent and lapse.
 
     Raises:
-        ValueError: Not at least two places, one with an intersection.
+        ValueError: There are fewer than two places, or none has an intersection.
     """
     places = sorted({one.place for one in drives})
     if len(places) < 2 or not any(one.features.get(PRESENCE) for one in drives):
@@ -147,7 +148,7 @@ def _scores(
 
 
 def log_loss(drive: AnnotatedDrive, graph: FactorGraph, beliefs: NDArray[np.float64]) -> float:
-    """Mean over frames and known features of -ln(probability of what is so)."""
+    """Mean of -ln(probability of the true value) over frames and known features."""
     losses = [
         -np.log(beliefs[:, column] if drive.features[name] else 1.0 - beliefs[:, column])
         for column, name in enumerate(graph.feature_names)
@@ -179,7 +180,7 @@ def _frames(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
 
 
 def _steps(drive: AnnotatedDrive, about: Temporal) -> np.typing.NDArray[np.bool_]:
-    """Frames in which the filter hears cues."""
+    """Mark the frames in which the filter evaluates cues."""
     is_step = np.zeros(len(drive.start_m), np.bool_)
     since_m = since_s = np.inf
     for i in range(len(is_step)):
@@ -258,7 +259,7 @@ def _tally(
                 before = None
                 continue
             state = _state(drive, features, at[i]) if is_ahead[i] else NOWHERE
-            # How a chain begins is learned from all its steps: few are first ones.
+            # The initial probability is counted over all steps, because few are first ones.
             tally[state, "first", now > 0] += 1
             if before is not None:
                 tally[state, "stays" if before else "appears", now > 0] += 1
@@ -267,7 +268,7 @@ def _tally(
 
 
 def _features_of(cue: CueNode, graph: FactorGraph) -> tuple[str, ...]:
-    """Features besides presence that a cue speaks of, in the graph's order."""
+    """Features other than presence that a cue affects, in the graph's order."""
     mine = {edge.feature for edge in graph.edges if edge.cue == cue.name}
     return tuple(name for name in graph.feature_names if name in mine and name != PRESENCE)
 
@@ -279,7 +280,7 @@ def _state(drive: AnnotatedDrive, features: tuple[str, ...], at: int) -> State:
 
 
 def _chains(cue: CueNode, graph: FactorGraph, tally: Tally) -> Iterator[CueChain]:
-    """One for no intersection and one for each combination of the cue's features."""
+    """Yield a chain for no intersection, and one for each combination of the cue's features."""
     if not tally:
         return
     features = _features_of(cue, graph)
