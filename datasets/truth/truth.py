@@ -16,8 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from crosscue.replay.base import (
     MIB,
     AnnotationError,
+    CrosscueError,
     EmptyResultError,
     json_tree,
+    one_line,
     read_at_most,
     strict_json,
     write_text,
@@ -173,21 +175,34 @@ class Writer(Protocol):
 
 
 def write_carried(format_name: str, path: Path, folder: Path) -> Path:
-    """Write the truth that a data set carries.
+    """Write the truth that a data set contains.
 
     Raises:
-        UsageError: The format carries none.
+        EmptyResultError: The format contains no truth.
+        CrosscueError: The function of a plug-in failed.
     """
-    carried = CARRIED
-    if format_name not in carried:
-        carried = CARRIED | {name: one.truth for name, one in data_sets().items()}
-    if format_name not in carried:
-        known = ", ".join(sorted(carried))
+    if format_name in CARRIED:
+        return _writer(CARRIED[format_name])(path, folder)
+    added = {name: one.truth for name, one in data_sets().items()}
+    if format_name not in added:
+        known = ", ".join(sorted(CARRIED | added))
         raise EmptyResultError(
             f"{path}: a {format_name} log carries no truth; those that do: {known}"
         )
-    module, _, function = carried[format_name].partition(":")
-    return cast("Writer", getattr(import_module(module), function))(path, folder)
+    try:
+        return _writer(added[format_name])(path, folder)
+    except CrosscueError:
+        raise
+    except Exception as error:
+        why = f"{type(error).__name__}: {one_line(error, 200)}"
+        raise CrosscueError(
+            f"{path}: {added[format_name]} failed ({why}); correct this plug-in"
+        ) from error
+
+
+def _writer(name: str) -> Writer:
+    module, _, function = name.partition(":")
+    return cast("Writer", getattr(import_module(module), function))
 
 
 def save(truth: Truth, folder: Path) -> Path:

@@ -1,0 +1,65 @@
+"""A plug-in's function that writes truth is named when it fails."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from crosscue.datasets.truth import truth as truth_file
+from crosscue.replay.base import AnnotationError, CrosscueError
+from crosscue.replay.formats import DataSet, Format
+
+NAME = "line-drive"
+FUNCTION = "dummy_lines:truth"
+
+
+def _install(monkeypatch: pytest.MonkeyPatch, function: Callable[[Path, Path], object]) -> None:
+    module = ModuleType("dummy_lines")
+    vars(module)["truth"] = function
+    monkeypatch.setitem(sys.modules, "dummy_lines", module)
+    data_set = DataSet(Format((), ("drive.lines",), "dummy_lines:open_drive", "folder"), FUNCTION)
+    monkeypatch.setattr(truth_file, "data_sets", lambda: {NAME: data_set})
+
+
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (ValueError("line 3:\nno time"), "ValueError: line 3: no time"),
+        (KeyError("t_ns"), "KeyError: 't_ns'"),
+    ],
+)
+def test_the_function_that_failed_is_named(
+    error: Exception, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def truth(log: Path, folder: Path) -> Path:
+        raise error
+
+    _install(monkeypatch, truth)
+
+    with pytest.raises(CrosscueError) as caught:
+        truth_file.write_carried(NAME, tmp_path, tmp_path / "out")
+
+    assert str(caught.value) == f"{tmp_path}: {FUNCTION} failed ({why}); correct this plug-in"
+    assert caught.value.__cause__ is error
+
+
+def test_a_function_that_does_not_exist_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _install(monkeypatch, lambda log, folder: folder)
+    del vars(sys.modules["dummy_lines"])["truth"]
+
+    with pytest.raises(CrosscueError, match=f"{FUNCTION} failed .AttributeError: .*correct this"):
+        truth_file.write_carried(NAME, tmp_path, tmp_path / "out")
+
+
+def test_its_message_about_the_log_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def truth(log: Path, folder: Path) -> Path:
+        raise AnnotationError(f"{log}: no times; record it again")
+
+    _install(monkeypatch, truth)
+
+    with pytest.raises(AnnotationError, match=r"no times; record it again$"):
+        truth_file.write_carried(NAME, tmp_path, tmp_path / "out")
