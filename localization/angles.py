@@ -12,7 +12,7 @@ TWO_PI: Final = 2.0 * math.pi
 
 
 def wrap(angle_rad: float) -> float:
-    """The same direction in (-pi, pi]; an angle already there is returned unchanged."""
+    """Wrap an angle to (-pi, pi]; an angle already in this interval is returned unchanged."""
     if -math.pi < angle_rad <= math.pi:
         return angle_rad
     return angle_rad - TWO_PI * math.ceil((angle_rad - math.pi) / TWO_PI)
@@ -29,13 +29,13 @@ def interpolate_angle(
     angles_rad: NDArray[np.float64],
     max_gap_ns: int | None = None,
 ) -> NDArray[np.float64]:
-    """Angles at other times, along the shorter way round between neighbours.
+    """Interpolate angles at other times, along the shorter arc between neighbours.
 
     Args:
-        at_ns: Shape (M,): wanted times.
+        at_ns: Shape (M,): requested times.
         t_ns: Shape (N,), increasing: times of the known angles.
         angles_rad: Shape (N,).
-        max_gap_ns: Neighbours further apart than this are not bridged.
+        max_gap_ns: Maximum distance of neighbours to interpolate between.
 
     Returns:
         Shape (M,), wrapped; NaN outside the known times and inside gaps.
@@ -59,11 +59,11 @@ def circular_mean(angles_rad: NDArray[np.float64]) -> float:
     """Direction of the mean unit vector.
 
     Raises:
-        ValueError: No angles, or they cancel out.
+        ValueError: There are no angles, or they cancel out.
     """
     if len(angles_rad) == 0:
         raise ValueError("circular_mean: expected at least one angle, got none")
     east, north = float(np.mean(np.cos(angles_rad))), float(np.mean(np.sin(angles_rad)))
     if math.hypot(east, north) < 1e-9:
-        raise ValueError("circular_mean: the angles cancel out, there is no mean direction")
+        raise ValueError("circular_mean: the angles cancel out, so they have no mean direction")
     return math.atan2(north, east)

@@ -1,10 +1,10 @@
 """Heading from a magnetometer.
 
 A reading is corrected for iron that turns with the car (hard iron: an offset; soft iron: a
-matrix), laid into the car's axes forward, left, up, levelled where roll and pitch are known, and
-the level part points to magnetic north. Heading is counter-clockwise from east; magnetic north
-lies ``declination_rad`` clockwise of true north. Model: M. Caruso, "Applications of Magnetic
-Sensors for Low Cost Compass Systems", IEEE PLANS 2000.
+matrix), rotated into the car's axes forward, left, up, and levelled if roll and pitch are known.
+Its horizontal part points to magnetic north. Heading is counter-clockwise from east; magnetic north
+is ``declination_rad`` clockwise of true north. Model: M. Caruso, "Applications of Magnetic Sensors
+for Low Cost Compass Systems", IEEE PLANS 2000.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ IDENTITY: Final[Matrix] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True, slots=True)
 class CompassSettings:
-    """From a magnetometer's reading to a heading.
+    """Mounting and calibration of a magnetometer.
 
     Attributes:
-        mounting_rotation: Turns the sensor's axes into forward, left, up.
-        mounting_yaw_rad: By how much the sensor is turned, counter-clockwise, besides.
-        hard_iron_t: Offset in the sensor's axes, in the readings' unit, taken off first.
-        soft_iron: Applied, in the sensor's axes, to what then remains.
-        declination_rad: Of magnetic north from the map's north, east positive.
+        mounting_rotation: Rotation from the sensor's axes to forward, left, up.
+        mounting_yaw_rad: Additional rotation of the sensor, counter-clockwise.
+        hard_iron_t: Offset in the sensor's axes, in the readings' unit, subtracted first.
+        soft_iron: Matrix that is then applied, in the sensor's axes.
+        declination_rad: Angle of magnetic north from the map's north, positive to the east.
     """
 
     mounting_rotation: Matrix = IDENTITY
@@ -43,10 +43,10 @@ class CompassSettings:
     declination_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is not a rotation, a correction or a number.
+        """Validate the settings.
 
         Raises:
-            ValueError: Naming the field.
+            ValueError: A field is not finite, not a rotation or not a valid correction.
         """
         for f in fields(self):
             if not np.isfinite(np.array(getattr(self, f.name))).all():
@@ -58,7 +58,7 @@ class CompassSettings:
             )
         if np.linalg.det(turn) < 0.0:
             raise ValueError(
-                "mounting_rotation: expected a rotation, got a mirror; turn one axis round"
+                "mounting_rotation: expected a rotation, got a reflection; reverse one axis"
             )
         soft = np.array(self.soft_iron)
         if soft.shape != (3, 3) or not np.linalg.det(soft) > 0.0:
@@ -71,19 +71,19 @@ def heading(
     roll_rad: NDArray[np.float64] | None = None,
     pitch_rad: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Headings of the car, counter-clockwise from east.
+    """Compute headings of the car, counter-clockwise from east.
 
     Args:
-        field_t: Shape (N, 3): readings in the sensor's axes; any unit that ``hard_iron_t`` shares.
-        settings: The compass.
-        roll_rad: Shape (N,): about forward, right side down positive; None: level.
-        pitch_rad: Shape (N,): about left, nose down positive; None: level.
+        field_t: Shape (N, 3): readings in the sensor's axes, in the unit of ``hard_iron_t``.
+        settings: Mounting and calibration of the compass.
+        roll_rad: Shape (N,): about forward, right side down positive; None for a level car.
+        pitch_rad: Shape (N,): about left, nose down positive; None for a level car.
 
     Returns:
-        Shape (N,), in (-pi, pi]; NaN where a reading is not finite or has no level part.
+        Shape (N,), in (-pi, pi]; NaN where a reading is not finite or has no horizontal part.
 
     Raises:
-        ValueError: Columns do not line up.
+        ValueError: Columns differ in length.
     """
     level = level_field(field_t, settings, roll_rad, pitch_rad)
     forward, left = level[:, 0], level[:, 1]
@@ -98,9 +98,9 @@ def level_field(
     roll_rad: NDArray[np.float64] | None = None,
     pitch_rad: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Corrected readings in level axes forward, left, up, before the mounting yaw.
+    """Correct readings and rotate them to level axes forward, left, up, without the mounting yaw.
 
-    Arguments and errors as for ``heading``; shape (N, 3).
+    Arguments and errors are those of ``heading``; the result has shape (N, 3).
     """
     n = len(field_t)
     if field_t.shape != (n, 3):
@@ -135,15 +135,15 @@ def course_at(
     min_speed_mps: float = 3.0,
     max_gap_s: float = 1.5,
 ) -> NDArray[np.float64]:
-    """The course over ground at other times, NaN where the car was too slow to have one.
+    """Interpolate the course over ground at other times; NaN where the car was too slow.
 
     Args:
-        at_ns: Shape (M,): wanted times.
+        at_ns: Shape (M,): requested times.
         course_t_ns: Shape (N,), increasing.
         course_rad: Shape (N,): counter-clockwise from east.
-        speed_mps: Shape (N,): over ground.
-        min_speed_mps: Rows below are left out: their course is noise.
-        max_gap_s: Rows further apart are not bridged.
+        speed_mps: Shape (N,): speed over ground.
+        min_speed_mps: Speed below which rows are left out, because their course is noise.
+        max_gap_s: Maximum distance of rows to interpolate between.
     """
     usable = np.isfinite(course_rad) & (speed_mps >= min_speed_mps)
     return interpolate_angle(at_ns, course_t_ns[usable], course_rad[usable], round(max_gap_s * 1e9))

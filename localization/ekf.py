@@ -1,8 +1,8 @@
-"""Extended Kalman filter on the pose of a car, as pure functions from belief to belief.
+"""Extended Kalman filter for the pose of a car, as pure functions from belief to belief.
 
 State ``[x_m, y_m, heading_rad, speed_mps]``: the centre of the rear axle in a planar map frame
 (x east, y north), heading counter-clockwise from +x (REP-103), speed negative in reverse.
-Motion is the source's bicycle model (eq. 5 and 6): an arc of length d that turns by dtheta,
+Motion is the dissertation's bicycle model (eq. 5 and 6): an arc of length d that turns by dtheta,
 
     dx = d sin(dtheta) / dtheta,    dy = d (1 - cos(dtheta)) / dtheta    (in the car's frame),
 
@@ -30,7 +30,7 @@ X: Final = 0
 Y: Final = 1
 
 LOST_M: Final = 100.0
-"""Full major axis of the 2-sigma ellipse above which the source calls the car lost."""
+"""Full major axis of the 2-sigma ellipse above which the car is lost, by the dissertation."""
 
 _ROUNDING: Final = 1e-9
 
@@ -50,10 +50,10 @@ class PoseBelief:
     cov: Floats
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be a Gaussian.
+        """Validate mean and covariance.
 
         Raises:
-            ValueError: Wrong shape, a value that is not finite, or a negative variance.
+            ValueError: A shape is wrong, a value is not finite, or a variance is negative.
         """
         if self.mean.shape != (4,) or self.cov.shape != (4, 4):
             raise ValueError(
@@ -67,14 +67,14 @@ class PoseBelief:
 
 @dataclass(frozen=True, slots=True)
 class MotionNoise:
-    """The car's geometry and how far its inputs are off, as standard deviations of one step.
+    """The car's geometry, and standard deviations of its inputs in one step.
 
     Attributes:
         wheelbase_m: Distance between the axles.
-        accel_mps2: Of the acceleration.
-        steering_rad: Of the road-wheel angle.
-        yaw_rate_radps: Of the yaw rate.
-        slip_per_sqrt_m: Of the travelled distance after one metre; grows with its root.
+        accel_mps2: S.d. of the acceleration.
+        steering_rad: S.d. of the road-wheel angle.
+        yaw_rate_radps: S.d. of the yaw rate.
+        slip_per_sqrt_m: S.d. of the travelled distance after one metre; it grows with its root.
     """
 
     wheelbase_m: float
@@ -84,10 +84,10 @@ class MotionNoise:
     slip_per_sqrt_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse impossible values.
+        """Validate the values.
 
         Raises:
-            ValueError: Wheelbase not positive or a negative standard deviation.
+            ValueError: The wheelbase is not positive, or a standard deviation is negative.
         """
         if not self.wheelbase_m > 0.0:
             raise ValueError(f"wheelbase_m: expected > 0, got {self.wheelbase_m}")
@@ -100,9 +100,9 @@ class Motion(NamedTuple):
     """One step of the motion model.
 
     Attributes:
-        mean: Shape (4,): the state after it.
-        by_state: Shape (4, 4): its Jacobian by the state before.
-        by_input: Shape (4, 2): its Jacobian by the two inputs.
+        mean: Shape (4,): the state after the step.
+        by_state: Shape (4, 4): Jacobian by the state before.
+        by_input: Shape (4, 2): Jacobian by the two inputs.
     """
 
     mean: Floats
@@ -114,9 +114,9 @@ class Updated(NamedTuple):
     """The outcome of one measurement.
 
     Attributes:
-        belief: The posterior; the prior unchanged where the gate refused the measurement.
-        is_accepted: Inside the gate.
-        innovation: Shape (m,): measured less expected, angles wrapped.
+        belief: The posterior, or the unchanged prior if the gate rejected the measurement.
+        is_accepted: True if the measurement is inside the gate.
+        innovation: Shape (m,): measured minus expected, angles wrapped.
         nis: Normalised innovation squared; chi-square with m degrees of freedom.
     """
 
@@ -131,7 +131,7 @@ def bicycle(
 ) -> Motion:
     """Equations 5 and 6 with their Jacobians by state and by (acceleration, steering).
 
-    The source's curvature is steering / wheelbase, without the tangent.
+    The dissertation's curvature is steering / wheelbase, without the tangent.
     """
     distance_m = mean[SPEED] * dt_s + 0.5 * accel_mps2 * dt_s**2
     curvature = steering_rad / wheelbase_m
@@ -141,7 +141,7 @@ def bicycle(
 
 
 def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float) -> Motion:
-    """The same arc with the yaw rate given; Jacobians by state and by (acceleration, yaw rate)."""
+    """The same arc by yaw rate, with Jacobians by state and by (acceleration, yaw rate)."""
     distance_m = mean[SPEED] * dt_s + 0.5 * accel_mps2 * dt_s**2
     distance_by = np.array([dt_s, 0.5 * dt_s**2, 0.0])
     turn_by = np.array([0.0, 0.0, dt_s])
@@ -151,7 +151,7 @@ def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float)
 def predict(
     belief: PoseBelief, accel_mps2: float, steering_rad: float, dt_s: float, noise: MotionNoise
 ) -> PoseBelief:
-    """Drive for ``dt_s`` with the given acceleration and road-wheel angle (eq. 5 and 6).
+    """Predict over ``dt_s`` with the given acceleration and road-wheel angle (eq. 5 and 6).
 
     Raises:
         ValueError: An input is not finite or ``dt_s`` is negative.
@@ -164,7 +164,7 @@ def predict(
 def predict_yaw_rate(
     belief: PoseBelief, accel_mps2: float, yaw_rate_radps: float, dt_s: float, noise: MotionNoise
 ) -> PoseBelief:
-    """Drive for ``dt_s`` with the given acceleration and yaw rate.
+    """Predict over ``dt_s`` with the given acceleration and yaw rate.
 
     Raises:
         ValueError: An input is not finite or ``dt_s`` is negative.
@@ -183,11 +183,11 @@ def predict_odometry(
     dt_s: float,
     accel_var_m2ps3: float,
 ) -> PoseBelief:
-    """Follow the arc that odometry measured; speed keeps its mean and grows less sure.
+    """Predict along the arc that odometry measured; the speed's mean remains, its variance grows.
 
     Args:
-        belief: Before the interval.
-        distance_m: Travelled by the rear axle, negative in reverse.
+        belief: Belief before the interval.
+        distance_m: Distance travelled by the rear axle, negative in reverse.
         turn_rad: Change of heading.
         distance_var_m2: Variance of the distance.
         turn_var_rad2: Variance of the change of heading.
@@ -209,7 +209,7 @@ def predict_odometry(
 def coast(
     belief: PoseBelief, dt_s: float, accel_var_m2ps3: float, turn_var_rad2ps: float
 ) -> PoseBelief:
-    """Go on blindly, straight and at the same speed, ever less sure of both.
+    """Predict without measurements, straight and at constant speed, with growing variances.
 
     Acceleration and yaw rate are white noise of the given power, so that two short coasts make
     one long one (Bar-Shalom, Li, Kirubarajan, section 6.2.2).
@@ -234,13 +234,13 @@ def coast(
 def update_speed(
     belief: PoseBelief, speed_mps: float, var_m2ps2: float, gate_nis: float | None = None
 ) -> Updated:
-    """Weigh in a measured speed.
+    """Update with a measured speed.
 
     Args:
         belief: The prior.
-        speed_mps: Of the rear axle, negative in reverse.
-        var_m2ps2: The reading's variance.
-        gate_nis: Refuse the reading when its NIS is larger; None accepts everything.
+        speed_mps: Speed of the rear axle, negative in reverse.
+        var_m2ps2: Variance of the reading.
+        gate_nis: NIS above which the reading is rejected; None accepts everything.
 
     Raises:
         ValueError: The reading is not finite or its variance not positive.
@@ -252,7 +252,7 @@ def update_speed(
 def update_heading(
     belief: PoseBelief, heading_rad: float, var_rad2: float, gate_nis: float | None = None
 ) -> Updated:
-    """Weigh in a compass heading; the innovation is taken the shorter way round.
+    """Update with a compass heading; the innovation is wrapped.
 
     Raises:
         ValueError: The reading is not finite or its variance not positive.
@@ -264,16 +264,16 @@ def update_heading(
 def update_position(
     belief: PoseBelief, xy_m: Floats, cov_m2: Floats, gate_nis: float | None = None
 ) -> Updated:
-    """Weigh in a measured position with its own covariance, such as a matched landmark's.
+    """Update with a measured position and its covariance, such as a matched landmark's.
 
     Args:
         belief: The prior.
         xy_m: Shape (2,).
         cov_m2: Shape (2, 2), positive definite.
-        gate_nis: Refuse the position when its NIS is larger; None accepts everything.
+        gate_nis: NIS above which the position is rejected; None accepts everything.
 
     Raises:
-        ValueError: Wrong shape, not finite, or ``cov_m2`` not positive definite.
+        ValueError: A shape is wrong, a value is not finite, or ``cov_m2`` is not positive definite.
     """
     if xy_m.shape != (2,):
         raise ValueError(f"xy_m: expected (2,), got {xy_m.shape}")
@@ -294,7 +294,7 @@ def major_axis_m(belief: PoseBelief) -> float:
 
 
 def is_lost(belief: PoseBelief, lost_m: float = LOST_M) -> bool:
-    """Is the major axis longer than ``lost_m``?"""
+    """Whether the major axis is longer than ``lost_m``."""
     return major_axis_m(belief) > lost_m
 
 
@@ -307,7 +307,7 @@ def _drive(
     distance_by: Floats,
     turn_by: Floats,
 ) -> Motion:
-    """Lay the arc into the map; ``*_by`` are derivatives by speed and by the two inputs."""
+    """Transform the arc to the map; ``*_by`` are derivatives by speed and by the two inputs."""
     step = arc(distance_m, turn_rad)
     heading = mean[HEADING]
     cosine, sine = math.cos(heading), math.sin(heading)
@@ -396,13 +396,13 @@ def _check_measurement(innovation: Floats, cov: Floats) -> None:
 
 
 def packed(belief: PoseBelief) -> State:
-    """The belief's numbers; its time stays behind."""
+    """Convert a belief to a state, without its time."""
     p = belief.cov
     return State(*map(float, (*belief.mean, *p[0], *p[1, 1:], *p[2, 2:], p[3, 3])))
 
 
 def unpacked(t_ns: int, state: State) -> PoseBelief:
-    """A belief with just these numbers."""
+    """Convert a state and a time to a belief."""
     x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
     cov = np.array([[xx, xy, xh, xv], [xy, yy, yh, yv], [xh, yh, hh, hv], [xv, yv, hv, vv]])
     return PoseBelief(t_ns, np.array([x, y, heading, speed]), cov)

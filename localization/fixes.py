@@ -24,10 +24,10 @@ class Fixes:
     cov_m2: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
+        """Reject columns of unequal length.
 
         Raises:
-            ValueError: Naming the shapes wanted and given.
+            ValueError: A shape is wrong; the message has expected and actual shapes.
         """
         n = len(self.t_ns)
         if self.xy_m.shape != (n, 2) or self.cov_m2.shape != (n, 2, 2):
@@ -40,7 +40,7 @@ class Fixes:
         return len(self.t_ns)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Fixes:
-        """The fixes picked by ``index``."""
+        """Select fixes by ``index``."""
         return Fixes(self.t_ns[index], self.xy_m[index], self.cov_m2[index])
 
 

@@ -1,12 +1,12 @@
-"""Crossing a stretch of time in which nothing was measured: what the car could have done.
+"""Predict a belief across a gap without measurements, from the car's possible motion.
 
-Across a short gap the car is taken to have gone on straight at its last speed. It may have changed
-its speed by up to ``max_accel_mps2`` and turned by up to ``max_turn_rate_radps``; its place is
-spread evenly over the disc that this allows.
+Across a short gap, the car is assumed to continue straight at its last speed. It can change its
+speed by up to ``max_accel_mps2`` and turn by up to ``max_turn_rate_radps``; its position is
+uniformly distributed over the resulting disc.
 
-Beyond a stated length nothing is assumed. The mean stays where the car was last seen, and the
-position is spread evenly over the disc that the car could have reached (the variance along each
-axis is a quarter of the radius squared), the heading over what turning allows.
+Across a longer gap, nothing is assumed. The mean remains at the last position. The position is
+uniformly distributed over the disc that the car can reach (the variance along each axis is a
+quarter of the radius squared), and the heading over the angles that it can turn.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from .ekf import PoseBelief, coast
 from .pose_filter import HEADING, SPEED
 
 FULL_TURN_VAR_RAD2 = math.pi**2 / 3.0
-"""Of a heading of which nothing is known."""
+"""Variance of an unknown heading."""
 
 
 @dataclass(frozen=True, slots=True)
 class GapSettings:
-    """What a car can do while nothing is measured.
+    """Limits of a car's motion during a gap.
 
     Attributes:
-        restart_after_s: Longer gaps are not crossed at the last speed.
-        max_accel_mps2: Change of speed.
-        max_turn_rate_radps: Change of heading.
-        max_speed_mps: Speed.
+        restart_after_s: Length of a gap above which constant speed is not assumed.
+        max_accel_mps2: Maximum acceleration.
+        max_turn_rate_radps: Maximum yaw rate.
+        max_speed_mps: Maximum speed.
     """
 
     restart_after_s: float = 5.0
@@ -45,8 +45,8 @@ class Crossed(NamedTuple):
     """A belief at the end of a gap.
 
     Attributes:
-        belief: After the gap.
-        distance_m: How far its mean was moved along the heading.
+        belief: Belief after the gap.
+        distance_m: Distance by which the mean was moved along the heading.
         distance_var_m2: Variance that the gap added to the position, along each axis.
         turn_var_rad2: Variance that the gap added to the heading.
     """
@@ -60,16 +60,16 @@ class Crossed(NamedTuple):
 def cross_gap(
     belief: PoseBelief, until_ns: int, settings: GapSettings, *, restarts: bool = False
 ) -> Crossed:
-    """Carry a belief over a gap that nothing measured.
+    """Predict a belief across a gap without measurements.
 
     Args:
-        belief: At the last measurement before it.
-        until_ns: Time of the first one after it.
-        settings: What the car can do.
-        restarts: Assume nothing of the motion, however short the gap: its length is not known.
+        belief: Belief at the last measurement before the gap.
+        until_ns: Time of the first measurement after the gap.
+        settings: Limits of the car's motion.
+        restarts: True to assume nothing about the motion, because the gap's length is unknown.
 
     Raises:
-        ValueError: ``until_ns`` lies before the belief's time.
+        ValueError: ``until_ns`` is before the belief's time.
     """
     dt_s = (until_ns - belief.t_ns) * 1e-9
     if dt_s < 0.0:

@@ -1,10 +1,10 @@
-"""Which way to go at an intersection, knowing little more than where the goal lies (eq. 4).
+"""Decide which road to take at an intersection, from the direction of the goal (eq. 4).
 
     decision = argmin over options of |heading after - bearing to goal after| + penalty
 
-Usable alone: headings and bearings in, decision out, for any number of roads at any angle. The
-penalty grows each time the same option is taken at the same intersection, which the source likens
-to Tabu search. Intersections are recognised from the *estimated* position only.
+``choose`` maps headings and bearings to a decision, for any number of roads at any angle. The
+penalty grows each time the same option is taken at the same intersection, which the dissertation
+compares to tabu search. Intersections are recognised by the *estimated* position only.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from .angles import wrap
 
 Ints = NDArray[np.int64]
 NONE: Final = -1
-"""In place of a number where there is nothing: no place, no option, no landmark."""
+"""Index that stands for no place, no option or no landmark."""
 PLACES, OPTIONS = 0, 1
 _ROOM: Final = 64
 
 
 class Strategy(IntEnum):
-    """What the car drives to; the source's three variants."""
+    """Target of the car; the dissertation's three variants."""
 
     STRAIGHT = 0
     LANDMARKS = 1
@@ -38,13 +38,13 @@ STRATEGIES: Final = {
     "landmark to landmark": Strategy.LANDMARKS,
     "hybrid": Strategy.HYBRID,
 }
-"""By the names in a study's settings."""
+"""Strategies by their names in a study's settings."""
 _LANDMARKS: Final = int(Strategy.LANDMARKS)
 _HYBRID: Final = int(Strategy.HYBRID)
 
 
 def option_cost(heading_rad: float, bearing_rad: float, penalty_rad: float) -> float:
-    """What eq. 4 minimises: how far an option's heading is off the goal, plus its penalty."""
+    """Cost in eq. 4: angle between an option's heading and the goal, plus the penalty."""
     return abs(wrap(heading_rad - bearing_rad)) + penalty_rad
 
 
@@ -53,15 +53,15 @@ def choose(
     bearings_rad: NDArray[np.float64],
     penalties_rad: NDArray[np.float64],
 ) -> int:
-    """The option of least cost (eq. 4); of equal ones the first.
+    """Index of the option of least cost (eq. 4), the first of equal ones.
 
     Args:
-        headings_rad: Shape (N,): of the car after each option.
-        bearings_rad: Shape (N,): direction from the car to the goal after it.
-        penalties_rad: Shape (N,): for having done so here before.
+        headings_rad: Shape (N,): heading of the car after each option.
+        bearings_rad: Shape (N,): bearing from the car to the goal after each option.
+        penalties_rad: Shape (N,): penalty for earlier choices of the option.
 
     Raises:
-        ValueError: No options.
+        ValueError: There are no options.
     """
     if len(headings_rad) == 0:
         raise ValueError("choose: expected at least one option, found none")
@@ -76,15 +76,15 @@ def choose(
 def bearing_after(
     x_m: float, y_m: float, heading_rad: float, goal_x_m: float, goal_y_m: float, after_m: float
 ) -> float:
-    """Direction to the goal once the car has left an intersection.
+    """Bearing to the goal after the car has left an intersection.
 
     Args:
-        x_m: Of the intersection, as believed.
-        y_m: Likewise.
-        heading_rad: Of the road taken.
-        goal_x_m: Of the goal.
-        goal_y_m: Likewise.
-        after_m: How far into that road the car is then.
+        x_m: Estimated x of the intersection.
+        y_m: Estimated y of the intersection.
+        heading_rad: Heading of the chosen road.
+        goal_x_m: X of the goal.
+        goal_y_m: Y of the goal.
+        after_m: Distance of the car along the chosen road.
     """
     after_x = x_m + after_m * math.cos(heading_rad)
     after_y = y_m + after_m * math.sin(heading_rad)
@@ -92,16 +92,16 @@ def bearing_after(
 
 
 class Memory(NamedTuple):
-    """Places where the car believes to have decided, and what it did there; arrays with room.
+    """Estimated places of earlier decisions, with the options taken; arrays have spare capacity.
 
     Attributes:
-        sizes: Shape (2,): how many places and options there are.
-        x_m: Of each place.
-        y_m: Likewise.
-        first: Of each place: its first option.
-        following: Of each option: the next one of the same place, or ``NONE``.
-        headings_rad: Of each option.
-        times: Of each option: how often it was taken.
+        sizes: Shape (2,): number of places and of options.
+        x_m: X of each place.
+        y_m: Y of each place.
+        first: Index of each place's first option.
+        following: Index of the next option of the same place, or ``NONE``, for each option.
+        headings_rad: Heading of each option.
+        times: Number of times that each option was taken.
     """
 
     sizes: Ints
@@ -114,7 +114,7 @@ class Memory(NamedTuple):
 
 
 def empty_memory() -> Memory:
-    """Nothing decided yet."""
+    """Return a memory without decisions."""
     return Memory(
         np.zeros(2, np.int64),
         np.empty(_ROOM),
@@ -127,7 +127,7 @@ def empty_memory() -> Memory:
 
 
 def recognise(memory: Memory, x_m: float, y_m: float, radius_m: float) -> int:
-    """The nearest known place within the radius, or ``NONE``."""
+    """Index of the nearest known place within the radius, or ``NONE``."""
     nearest, lowest = NONE, radius_m**2
     for i in range(memory.sizes[PLACES]):
         square = (memory.x_m[i] - x_m) ** 2 + (memory.y_m[i] - y_m) ** 2
@@ -137,7 +137,7 @@ def recognise(memory: Memory, x_m: float, y_m: float, radius_m: float) -> int:
 
 
 def known_option(memory: Memory, place: int, heading_rad: float, same_rad: float) -> int:
-    """The option of a place whose heading is nearest and closer than ``same_rad``, or ``NONE``."""
+    """Index of a place's option of nearest heading, within ``same_rad``, or ``NONE``."""
     if place == NONE:
         return NONE
     nearest, lowest = NONE, same_rad
@@ -153,7 +153,7 @@ def known_option(memory: Memory, place: int, heading_rad: float, same_rad: float
 def penalty(
     memory: Memory, place: int, heading_rad: float, same_rad: float, each_rad: float
 ) -> float:
-    """``each_rad`` for each time that this option was taken at this place."""
+    """Penalty of an option: ``each_rad`` for each time that it was taken at this place."""
     option = known_option(memory, place, heading_rad, same_rad)
     return 0.0 if option == NONE else each_rad * memory.times[option]
 
@@ -161,7 +161,7 @@ def penalty(
 def remember(
     memory: Memory, place: int, x_m: float, y_m: float, heading_rad: float, same_rad: float
 ) -> Memory:
-    """The memory after a road was taken at a place, or at a new one where ``place`` is ``NONE``."""
+    """Add a decision at a place, or at a new place if ``place`` is ``NONE``."""
     if place == NONE:
         place = memory.sizes[PLACES]
         if place == len(memory.x_m):
@@ -177,7 +177,7 @@ def remember(
         memory = _with_room_for_options(memory)
     memory.sizes[OPTIONS] += 1
     memory.headings_rad[option], memory.times[option] = heading_rad, 1.0
-    # New ones last: of options equally near, the first remembered counts.
+    # New options are appended, because the first of equally near options counts.
     memory.following[option] = NONE
     if memory.first[place] == NONE:
         memory.first[place] = option
@@ -223,16 +223,15 @@ def landmark_ahead(
     landmarks_m: NDArray[np.float64],
     is_visited: NDArray[np.bool_],
 ) -> int:
-    """The nearest landmark that brings the car closer to its goal, or ``NONE``.
+    """Index of the nearest landmark that brings the car closer to its goal, or ``NONE``.
 
-    A landmark further off than the goal itself is no help on the way; neither is one that was
-    visited already.
+    Landmarks further away than the goal and visited landmarks are left out.
 
     Args:
-        x_m: Where the car believes to be.
-        y_m: Likewise.
-        goal_x_m: Where it wants to.
-        goal_y_m: Likewise.
+        x_m: Estimated x of the car.
+        y_m: Estimated y of the car.
+        goal_x_m: X of the goal.
+        goal_y_m: Y of the goal.
         landmarks_m: Shape (L, 2).
         is_visited: Shape (L,).
     """
@@ -248,7 +247,7 @@ def landmark_ahead(
 
 
 def seeks_landmarks(strategy: int, major_axis_m: float, hybrid_above_m: float) -> bool:
-    """Does this strategy look for landmarks at the present uncertainty?"""
+    """Whether a strategy drives to landmarks at the current uncertainty."""
     if strategy == _HYBRID:
         return major_axis_m > hybrid_above_m
     return strategy == _LANDMARKS

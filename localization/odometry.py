@@ -1,14 +1,14 @@
 """Distance and change of heading between wheel-speed samples, with variances.
 
-Dead reckoning for the centre of the rear axle. Change of heading comes from the best source
-there is: a yaw rate, else the steering angle, else the difference between left and right wheels.
-All noise is stated so that it does not depend on the sampling rate: errors that grow with the
-root of distance or time, besides the wheel sensors' rounding. A wheel scale, track width or gyro
-bias that is wrong all drive long is not noise: fit it first.
+Dead reckoning for the centre of the rear axle. The change of heading comes from the best available
+source: a yaw rate, otherwise the steering angle, otherwise the difference between left and right
+wheels. The noise parameters do not depend on the sampling rate: errors grow with the root of
+distance or time, apart from the wheel sensors' rounding. A constant error of wheel scale, track
+width or gyro bias is not noise; fit it first.
 
-Long drives go in windows. Cut every column at one common time and pass that time as ``until_ns``:
-rows whose interval cannot be closed yet wait in ``Pending``, and the increments are the same, bit
-for bit, as in one piece.
+Long drives are processed in windows. Cut every column at one common time and pass that time as
+``until_ns``. Rows whose interval cannot be completed yet wait in ``Pending``, and the increments
+are identical, bit for bit, to those of a single window.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BY_YAW_RATE: Final = 0
 BY_STEERING: Final = 1
 BY_WHEELS: Final = 2
 BY_NOTHING: Final = 3
-"""No odometry: a gap between two time segments."""
+"""Turn source of a gap between two time segments, without odometry."""
 
 _POSITIVE: Final = (
     "track_width_m",
@@ -47,28 +47,29 @@ class OdometrySettings:
     """Geometry, corrections and noise of one car's odometry.
 
     Attributes:
-        track_width_m: Between left and right wheels.
-        wheelbase_m: Between the axles; needed for steering and for the front wheels.
+        track_width_m: Distance between left and right wheels.
+        wheelbase_m: Distance between the axles; needed for steering and for the front wheels.
         wheel_scale: True speed per reported speed.
-        right_wheel_scale: Further scale of the right-hand wheels. A tyre a thousandth larger than
-            the other turns the wheels' heading by half a radian in a kilometre.
-        use_front_wheels: Average all four wheels where there are four; else the rear two.
-        wheel_step_mps: One bit of the reported wheel speed; readings are off by up to half of it.
+        right_wheel_scale: Additional scale of the right-hand wheels. A tyre that is 0.1 % larger
+            than the other turns the wheels' heading by half a radian per kilometre.
+        use_front_wheels: True to average all four wheels, where available; else the rear two.
+        wheel_step_mps: Resolution of the reported wheel speed; errors are up to half of it.
         slip_per_sqrt_m: S.d. of the distance after one metre.
         yaw_rate_scale: True yaw rate per reported yaw rate.
-        gyro_bias_radps: Reported yaw rate at rest, taken off before scaling.
+        gyro_bias_radps: Reported yaw rate at rest, subtracted before scaling.
         gyro_noise_rad_per_sqrt_s: S.d. of the heading after one second.
         steering_ratio: Steering-wheel angle per road-wheel angle; 1 for road-wheel angles.
         steering_offset_rad: Reported angle when driving straight, before the ratio.
-        steering_noise_rad_sqrt_m: Noise density of the road-wheel angle along the way; its s.d.
+        steering_noise_rad_sqrt_m: Noise density of the road-wheel angle over distance: its s.d.
             times the root of the distance over which its error persists.
         wheel_turn_rad_per_sqrt_m: S.d. of the heading by wheel difference after one metre.
         turn_per_turn: S.d. of the change of heading as a fraction of that change.
         turn_rad_per_sqrt_rad: S.d. of the heading after one radian of turning.
-        turn_delay_s: How long after the wheel speeds' the stamps of the turn signal come.
-        max_gap_s: Samples further apart are a gap: counted, and the variances grow.
-        gap_accel_mps2: How fast the speed may have changed, unseen, inside a gap.
-        gap_yaw_accel_radps2: How fast the yaw rate may have changed inside a gap.
+        turn_delay_s: Delay of the turn signal's timestamps relative to those of the wheel speeds.
+        max_gap_s: Distance of samples above which there is a gap: it is counted, and the variances
+            grow.
+        gap_accel_mps2: Assumed s.d. of acceleration inside a gap.
+        gap_yaw_accel_radps2: Assumed s.d. of yaw acceleration inside a gap.
     """
 
     track_width_m: float
@@ -93,10 +94,10 @@ class OdometrySettings:
     gap_yaw_accel_radps2: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing.
+        """Validate the settings.
 
         Raises:
-            ValueError: Naming the field and the value.
+            ValueError: A value is invalid; the message has field and value.
         """
         for name in _POSITIVE:
             value = getattr(self, name)
@@ -122,8 +123,9 @@ class WheelSpeeds:
     Attributes:
         t_ns: Shape (N,), int64.
         wheels_mps: Shape (N, 2) rear left, rear right; or (N, 4) front left, front right, rear
-            left, rear right. Signed where the sensor knows the direction.
-        is_reverse: Shape (N,), bool: the speeds have no sign and the car backs; or None.
+            left, rear right. Signed if the sensor measures the direction.
+        is_reverse: Shape (N,), bool: True while the car reverses, for speeds without a sign; or
+            None.
     """
 
     t_ns: Int64s
@@ -131,10 +133,10 @@ class WheelSpeeds:
     is_reverse: Bools | None = None
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
+        """Reject columns of unequal length.
 
         Raises:
-            ValueError: Naming the column, the shape wanted and the shape given.
+            ValueError: A shape is wrong; the message has column, expected and actual shape.
         """
         n = len(self.t_ns)
         if self.wheels_mps.shape not in ((n, 2), (n, 4)):
@@ -156,12 +158,12 @@ class WheelSpeeds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnSignal:
-    """N samples of what reports how the car turns.
+    """N samples of yaw rate or steering angle.
 
     Attributes:
         t_ns: Shape (N,), int64.
         values: Shape (N,): yaw rate in rad/s, or steering angle in rad; positive to the left.
-        kind: Which of the two.
+        kind: Kind of the values.
     """
 
     t_ns: Int64s
@@ -169,10 +171,10 @@ class TurnSignal:
     kind: TurnKind
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
+        """Reject columns of unequal length.
 
         Raises:
-            ValueError: Naming the shape wanted and the shape given.
+            ValueError: A shape is wrong; the message has expected and actual shape.
         """
         if self.values.shape != self.t_ns.shape or self.t_ns.ndim != 1:
             raise ValueError(f"values: expected {self.t_ns.shape}, got {self.values.shape}")
@@ -183,19 +185,19 @@ class TurnSignal:
 
 @dataclass(frozen=True, slots=True)
 class OdometryCounts:
-    """What became of the rows; counts add up over windows.
+    """Account of the rows; counts of several windows can be added.
 
     Attributes:
-        rows: Wheel rows given.
-        not_finite: Dropped: a wheel that is used is NaN or infinite.
-        repeated: Dropped: same time as the row before.
-        out_of_order: Dropped: earlier than a row before.
-        turn_rows: Yaw-rate or steering rows given.
-        turn_dropped: Of those, dropped for any of the three reasons.
-        intervals: Increments made.
-        gaps: Increments longer than the settings allow.
-        turn_missing: Increments whose turn signal had a gap, so that the heading came from the
-            wheels.
+        rows: Number of wheel rows.
+        not_finite: Wheel rows dropped because a wheel in use is NaN or infinite.
+        repeated: Wheel rows dropped because they have the time of the previous row.
+        out_of_order: Wheel rows dropped because they are earlier than a previous row.
+        turn_rows: Number of yaw-rate or steering rows.
+        turn_dropped: Turn rows dropped for any of these three reasons.
+        intervals: Number of increments.
+        gaps: Number of increments longer than ``max_gap_s``.
+        turn_missing: Number of increments with a gap in the turn signal, whose heading comes from
+            the wheels.
     """
 
     rows: int = 0
@@ -220,15 +222,15 @@ class Increments:
     Attributes:
         start_ns: Shape (N,), int64.
         stop_ns: Shape (N,), int64.
-        distance_m: Shape (N,): of the rear axle, negative in reverse.
+        distance_m: Shape (N,): distance of the rear axle, negative in reverse.
         turn_rad: Shape (N,): change of heading, positive to the left.
         distance_var_m2: Shape (N,).
         turn_var_rad2: Shape (N,).
-        speed_mps: Shape (N,): of the rear axle at the end.
+        speed_mps: Shape (N,): speed of the rear axle at the end.
         speed_var_m2ps2: Shape (N,).
         turn_source: Shape (N,), uint8: ``BY_YAW_RATE``, ``BY_STEERING``, ``BY_WHEELS``; or
-            ``BY_NOTHING``, where what was assumed in a gap stands in for odometry.
-        is_gap: Shape (N,), bool: longer than the settings allow.
+            ``BY_NOTHING`` for an assumed increment in a gap.
+        is_gap: Shape (N,), bool: True if longer than ``max_gap_s``.
     """
 
     start_ns: Int64s
@@ -248,13 +250,13 @@ class Increments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pending:
-    """Rows that wait for the next window; start with ``Pending()``.
+    """Rows that wait for the next window; the first window starts with ``Pending()``.
 
     Attributes:
-        t_ns: Shape (N,): wheel rows, the last one used first.
+        t_ns: Shape (N,): times of wheel rows, starting with the last used one.
         axle_mps: Shape (N,): speed of the rear axle.
         yaw_radps: Shape (N,): yaw rate by wheel difference.
-        turn_t_ns: Shape (M,): turn rows from the last one used on.
+        turn_t_ns: Shape (M,): times of turn rows, starting with the last used one.
         turn_values: Shape (M,).
     """
 
@@ -266,7 +268,7 @@ class Pending:
 
 
 class Odometry(NamedTuple):
-    """One window's result."""
+    """Result of one window."""
 
     increments: Increments
     pending: Pending
@@ -287,18 +289,18 @@ def integrate(
     pending: Pending | None = None,
     until_ns: int | None = None,
 ) -> Odometry:
-    """Distance and change of heading from one wheel row to the next.
+    """Compute distance and change of heading from each wheel row to the next.
 
     Args:
-        wheels: The window's wheel rows, stored order.
-        settings: The car.
-        turn: The window's yaw rate or steering; None where the car has neither (the same choice
-            in every window).
-        pending: What the window before left over.
-        until_ns: All rows before this time have been given. None: nothing more will come.
+        wheels: The window's wheel rows, in stored order.
+        settings: Geometry, corrections and noise of the car.
+        turn: The window's yaw rate or steering; None if the car has neither. The choice must be the
+            same in every window.
+        pending: Pending rows of the previous window.
+        until_ns: Time before which all rows are complete; None for the last window.
 
     Raises:
-        ValueError: A length that the chosen source needs is missing from the settings.
+        ValueError: The settings lack a length that the chosen source needs.
     """
     pending = pending or Pending()
     _check_geometry(settings, turn)
@@ -312,7 +314,7 @@ def integrate(
 
     ready = len(t_ns)
     if joined is not None and until_ns is not None:
-        # Turn rows up to here are known, on the wheels' clock.
+        # Turn rows are complete up to this time, on the wheels' clock.
         turn_until_ns = until_ns - max(delay_ns, 0)
         ready = _ready(t_ns, joined.t_ns, round(settings.max_gap_s * 1e9), turn_until_ns)
     made = _increments(t_ns[:ready], axle_mps[:ready], yaw_radps[:ready], joined, settings)
@@ -333,7 +335,7 @@ def integrate(
 
 
 def first_reading(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[int, float] | None:
-    """Time, and speed of the rear axle in m/s, of the first row that is a number; or None."""
+    """Time and rear-axle speed in m/s of the first finite row; None without one."""
     axle_mps, _ = _at_rear_axle(wheels, settings)
     rows = np.flatnonzero(np.isfinite(axle_mps))
     return (int(wheels.t_ns[rows[0]]), float(axle_mps[rows[0]])) if len(rows) else None
@@ -346,7 +348,7 @@ def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None
 
 
 def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floats, Floats]:
-    """Speed of the rear axle's centre and yaw rate by the difference of left and right."""
+    """Speed of the rear axle's centre, and yaw rate by the difference of left and right wheels."""
     sides = np.tile([1.0, settings.right_wheel_scale], wheels.wheels_mps.shape[1] // 2)
     speeds = wheels.signed_mps() * settings.wheel_scale * sides
     left, right = speeds[:, -2], speeds[:, -1]
@@ -358,12 +360,12 @@ def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floa
 
 
 def _along_body(front_mps: Floats, sideways_mps: Floats) -> Floats:
-    """A steered wheel rolls along its own direction: the part along the car's axis."""
+    """Component of a steered wheel's speed along the car's axis."""
     return np.sign(front_mps) * np.sqrt(np.maximum(front_mps**2 - sideways_mps**2, 0.0))
 
 
 def _clean(t_ns: Int64s, values: Floats, before_ns: Int64s) -> _Clean:
-    """Rows that are finite and later than every row kept before them."""
+    """Select rows that are finite and later than every row kept before them."""
     finite = np.isfinite(values)
     floor = before_ns[-1] if len(before_ns) else np.iinfo(np.int64).min
     times = np.where(finite, t_ns, floor)
@@ -378,7 +380,7 @@ def _clean(t_ns: Int64s, values: Floats, before_ns: Int64s) -> _Clean:
 def _join_turn(
     turn: TurnSignal | None, pending: Pending, delay_ns: int
 ) -> tuple[_Turn | None, int]:
-    """Rows that waited and new ones, these moved to the wheels' clock."""
+    """Join pending rows and new ones; the new ones are shifted to the wheels' clock."""
     if turn is None:
         return None, 0
     moved_ns = turn.t_ns - delay_ns
@@ -389,7 +391,7 @@ def _join_turn(
 
 
 def _keep_turn(rest: Pending, turn: _Turn, until_ns: int | None) -> Pending:
-    """Add the turn rows from the last one at or before the first wheel row that waits or comes."""
+    """Keep the turn rows that are still needed for pending or future wheel rows."""
     next_ns = rest.t_ns[0] if len(rest.t_ns) else until_ns
     used = len(turn.t_ns)
     if next_ns is not None:
@@ -399,7 +401,7 @@ def _keep_turn(rest: Pending, turn: _Turn, until_ns: int | None) -> Pending:
 
 
 def _ready(t_ns: Int64s, turn_t_ns: Int64s, max_gap_ns: int, until_ns: int) -> int:
-    """How many wheel rows can be closed: up to the turn signal or, in its gaps, ``until_ns``."""
+    """Number of wheel rows that are complete: up to the turn signal or, in gaps, ``until_ns``."""
     if len(turn_t_ns) == 0 or until_ns - turn_t_ns[-1] > max_gap_ns:
         return int(np.searchsorted(t_ns, until_ns))
     return int(np.searchsorted(t_ns, turn_t_ns[-1], side="right"))
@@ -416,7 +418,7 @@ def _increments(
     is_gap = np.diff(t_ns) > round(settings.max_gap_s * 1e9)
     distance_m = _trapezoid(axle_mps, dt_s)
     by_slip = settings.slip_per_sqrt_m**2 * np.abs(distance_m)
-    # Neighbouring intervals share a sample, so each carries a whole sample's rounding.
+    # Neighbouring intervals share a sample, so each includes the rounding of a whole sample.
     by_step = 0.5 * settings.wheel_step_mps**2 / 12.0
     unseen_s2 = np.where(is_gap, 0.25 * dt_s**2, 0.0)
     turn_rad, turn_var = _turn_by_wheels(yaw_radps, dt_s, distance_m, unseen_s2, settings)
@@ -465,7 +467,7 @@ def _turn_by_wheels(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
-    """A turn signal over the whole window, rows of the window before included."""
+    """A turn signal over the whole window, including rows of the previous window."""
 
     t_ns: Int64s
     values: Floats
@@ -476,7 +478,7 @@ class _Turn:
         return BY_YAW_RATE if self.kind == "yaw rate" else BY_STEERING
 
     def covers(self, t_ns: Int64s, settings: OdometrySettings) -> Bools:
-        """Between which wheel rows is the signal without a gap?"""
+        """Mark the intervals between wheel rows in which the signal has no gap."""
         if len(self.t_ns) == 0:
             return np.zeros(max(len(t_ns) - 1, 0), np.bool_)
         is_gap = np.diff(self.t_ns) > round(settings.max_gap_s * 1e9)
@@ -492,7 +494,7 @@ class _Turn:
     def over(
         self, t_ns: Int64s, distance_m: Floats, settings: OdometrySettings
     ) -> tuple[Floats, Floats]:
-        """Change of heading from row to row, and its variance; of no meaning where not covered."""
+        """Change of heading from row to row, and its variance; undefined where not covered."""
         dt_s = np.diff(t_ns) * 1e-9
         area = self._integral(t_ns)
         if self.kind == "yaw rate":
@@ -506,7 +508,7 @@ class _Turn:
         return distance_m * curvature, variance
 
     def _integral(self, t_ns: Int64s) -> Floats:
-        """Area below the signal, linear between its samples, from wheel row to wheel row."""
+        """Integral of the signal, linear between its samples, from wheel row to wheel row."""
         n = max(len(t_ns) - 1, 0)
         if n == 0 or len(self.t_ns) == 0:
             return np.zeros(n)

@@ -1,6 +1,6 @@
 """The pose filter: an EKF on x, y, heading and speed, as plain functions on plain numbers.
 
-Motion is the source's bicycle model (eq. 5 and 6): an arc of length d that turns by dtheta,
+Motion is the dissertation's bicycle model (eq. 5 and 6): an arc of length d that turns by dtheta,
 
     dx = d sin(dtheta) / dtheta,    dy = d (1 - cos(dtheta)) / dtheta    (in the car's frame).
 
@@ -8,8 +8,8 @@ Measurements are of states themselves (a compass heading, a speed, a landmark's 
 equations: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
 section 10.3 (EKF) and 5.2.3 (update, here as P - K S K').
 
-This is the one copy of these equations: the replay calls them, and ``crosscue.localization.ekf``
-wraps them for beliefs with a time; the Monte Carlo studies compile them.
+These equations exist only here. The replay calls them, ``crosscue.localization.ekf`` wraps them for
+beliefs with a time, and the Monte Carlo studies compile them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .angles import wrap
 HEADING: Final = 2
 SPEED: Final = 3
 SMALL_RAD: Final = 1e-2
-"""Below this angle ``arc`` takes series, which are exact to rounding there."""
+"""Angle below which ``arc`` uses series, which are exact to rounding there."""
 
 
 class State(NamedTuple):
@@ -48,12 +48,12 @@ class Arc(NamedTuple):
     """A step along a circle in the car's frame, with its derivatives.
 
     Attributes:
-        dx_m: Forward.
-        dy_m: To the left.
+        dx_m: Displacement forward.
+        dy_m: Displacement to the left.
         dx_by_distance: Derivative of ``dx_m`` by the arc's length.
-        dy_by_distance: Of ``dy_m`` by the arc's length.
-        dx_by_turn: Of ``dx_m`` by the angle turned, m/rad.
-        dy_by_turn: Of ``dy_m`` by the angle turned, m/rad.
+        dy_by_distance: Derivative of ``dy_m`` by the arc's length.
+        dx_by_turn: Derivative of ``dx_m`` by the angle turned, m/rad.
+        dy_by_turn: Derivative of ``dy_m`` by the angle turned, m/rad.
     """
 
     dx_m: float
@@ -65,7 +65,7 @@ class Arc(NamedTuple):
 
 
 def arc(distance_m: float, turn_rad: float) -> Arc:
-    """Follow a circle for ``distance_m`` while turning by ``turn_rad`` (eq. 6)."""
+    """Compute the arc of length ``distance_m`` that turns by ``turn_rad`` (eq. 6)."""
     t, t2 = turn_rad, turn_rad * turn_rad
     if abs(t) < SMALL_RAD:
         along = 1.0 - t2 / 6.0 * (1.0 - t2 / 20.0)
@@ -96,15 +96,15 @@ def predict(
     turn_var_rad2: float,
     speed_var_m2ps2: float,
 ) -> State:
-    """Follow the arc that odometry measured; the speed keeps its mean and its variance grows.
+    """Predict along the arc that odometry measured; the speed's mean remains, its variance grows.
 
     Args:
-        state: Before the interval.
-        distance_m: Travelled by the rear axle, negative in reverse.
+        state: State before the interval.
+        distance_m: Distance travelled by the rear axle, negative in reverse.
         turn_rad: Change of heading.
         distance_var_m2: Variance of the distance.
         turn_var_rad2: Variance of the change of heading.
-        speed_var_m2ps2: Added to the variance of the speed.
+        speed_var_m2ps2: Increase of the speed's variance.
     """
     x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
     step = arc(distance_m, turn_rad)
@@ -136,10 +136,10 @@ def update(state: State, measured: int, innovation: float, var: float) -> State:
     """Fuse a measurement of one state.
 
     Args:
-        state: Before.
+        state: State before.
         measured: ``HEADING`` or ``SPEED``.
-        innovation: Measured minus expected; for a heading wrapped.
-        var: The measurement's variance.
+        innovation: Measured minus expected value; wrapped for a heading.
+        var: Variance of the measurement.
     """
     x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
     px, py, ph, pv = (xh, yh, hh, hv) if measured == HEADING else (xv, yv, hv, vv)
@@ -164,7 +164,7 @@ def update(state: State, measured: int, innovation: float, var: float) -> State:
 
 
 class PositionUpdate(NamedTuple):
-    """What became of a measured position; refused, the state is the one before."""
+    """Outcome of a measured position; if it is rejected, the state is unchanged."""
 
     state: State
     is_accepted: bool
@@ -177,13 +177,13 @@ def update_position(
     """Fuse a measured position, unless its normalised innovation squared exceeds the gate.
 
     Args:
-        state: Before.
-        x_m: Measured.
-        y_m: Measured.
-        var_x: Of the measurement, m2.
-        cov_xy: Likewise.
-        var_y: Likewise.
-        gate_nis: Infinity accepts everything.
+        state: State before.
+        x_m: Measured x.
+        y_m: Measured y.
+        var_x: Variance of the measured x, m2.
+        cov_xy: Covariance of the measured x and y, m2.
+        var_y: Variance of the measured y, m2.
+        gate_nis: NIS above which the position is rejected; infinity accepts everything.
     """
     x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
     ix, iy = x_m - x, y_m - y
@@ -218,12 +218,12 @@ def update_position(
 
 
 def at_point(state: State, ahead_m: float, left_m: float) -> State:
-    """The same belief of another point of the car, which swings with the heading's error.
+    """Transform a state to another point of the car, with the effect of the heading's error.
 
     Args:
-        state: Of a point of the car.
-        ahead_m: The other point, ahead of it.
-        left_m: And to its left.
+        state: State of a point of the car.
+        ahead_m: Distance of the other point ahead of it.
+        left_m: Distance of the other point to its left.
     """
     x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
     c, s = math.cos(heading), math.sin(heading)
@@ -253,7 +253,7 @@ def major_axis_m(var_x: float, cov_xy: float, var_y: float) -> float:
 
 
 def nees(ex: float, ey: float, eh: float, state: State) -> float:
-    """Normalised estimation error squared of x, y, heading, by the Cholesky factor."""
+    """Normalised estimation error squared of x, y and heading, by the Cholesky factor."""
     a = math.sqrt(state.xx)
     b, c = state.xy / a, state.xh / a
     d = math.sqrt(state.yy - b * b)

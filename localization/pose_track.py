@@ -1,21 +1,22 @@
-"""A pose track from odometry and compass: the filter of ``ekf`` run over columns.
+"""Estimate a pose track from odometry and compass, by running the filter of ``ekf`` over columns.
 
-Events are taken in order of time: the end of an odometry interval, then a heading, then a wanted
-row. An interval that a heading or a wanted row falls into is driven in parts, distance, turn and
-variances by fraction of its time. The numbers are those of ``predict_odometry``, ``update_speed``
-and ``update_heading``, written out in plain floats because a drive has millions of steps; tests
-hold the two equal.
+Events are processed in order of time: the end of an odometry interval, then a heading, then a
+requested row. An interval that contains a heading or a requested row is divided, with distance,
+turn and variances in proportion to time. The results are those of ``predict_odometry``,
+``update_speed`` and ``update_heading``, implemented with plain floats because a drive has millions
+of steps; tests verify the equality.
 
-Compass errors last (a bridge, a lorry, the car's own current), so ten readings a second do not
-report ten times as much as one. A filter configured otherwise is soon overconfident. Here a
-reading counts only once the car has gone ``heading_interval_m`` and ``heading_interval_s`` have
-passed since the last one that counted: the source's compass of variance r every ds metres.
+Compass errors persist (a bridge, a lorry, the car's own current), so ten readings per second do not
+carry ten times the information of one, and a filter that assumes so is overconfident. Here a
+reading is used only after a distance of ``heading_interval_m`` and a time of ``heading_interval_s``
+since the last used one. This is the dissertation's compass of variance r every ds metres.
 ``fit_compass`` estimates the time over which a compass's error persists; twice that is a good
 ``heading_interval_s``.
 
-Long drives go in windows: hand each call's ``TrackState`` to the next. Headings and wanted rows
-later than the odometry given so far wait in it, and the track is the same, bit for bit, as in one
-piece. ``Looks`` are let in at times of their own (a camera's frames) to weigh landmarks in.
+Long drives are processed in windows: pass each call's ``TrackState`` to the next. It stores
+headings and requested rows that are later than the odometry so far, and the track is identical, bit
+for bit, to that of a single window. ``Looks`` add measurements at times of their own, such as
+landmarks at a camera's frames.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ REJECTED: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class TrackSettings:
-    """How headings are weighed and how the speed wanders.
+    """Settings of the use of headings and of the process noise.
 
     Attributes:
-        heading_interval_m: Least distance travelled between two headings that count.
-        heading_interval_s: Least time between two headings that count.
-        heading_gate_nis: Refuse a heading whose normalised innovation squared is larger (10.8: one
-            good reading in a thousand); None accepts all.
+        heading_interval_m: Minimum distance travelled between two headings in use.
+        heading_interval_s: Minimum time between two headings in use.
+        heading_gate_nis: Normalised innovation squared above which a heading is rejected (10.8
+            rejects one good reading in a thousand); None accepts all.
         accel_var_m2ps3: Growth of the speed's variance per second between readings.
         coast_turn_var_rad2ps: Growth of the heading's variance per second without odometry.
     """
@@ -60,10 +61,10 @@ class TrackSettings:
     coast_turn_var_rad2ps: float = 0.01
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing.
+        """Validate the settings.
 
         Raises:
-            ValueError: Naming the field and the value.
+            ValueError: A value is invalid; the message has field and value.
         """
         for f in fields(self):
             value = getattr(self, f.name)
@@ -86,10 +87,10 @@ class Headings:
     var_rad2: Floats
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
+        """Reject columns of unequal length.
 
         Raises:
-            ValueError: Naming the column, the shape wanted and the shape given.
+            ValueError: A shape is wrong; the message has column, expected and actual shape.
         """
         for name in ("heading_rad", "var_rad2"):
             if getattr(self, name).shape != self.t_ns.shape:
@@ -107,20 +108,20 @@ NO_TIMES: Final[Int64s] = np.empty(0, np.int64)
 
 @dataclass(frozen=True, slots=True)
 class TrackCounts:
-    """What became of the measurements; counts add up over windows.
+    """Account of the measurements; counts of several windows can be added.
 
     Attributes:
-        intervals: Odometry intervals driven.
-        intervals_late: Skipped: they end before the belief's time.
-        coasts: Stretches without odometry, driven blind.
-        coast_ns: Their length together.
-        headings: Compass readings that came up.
-        headings_accepted: Weighed in.
-        headings_thinned: Not counted: too soon after the last one that counted.
-        headings_rejected: Refused by the gate.
-        headings_late: Skipped: before the belief's time.
-        headings_bad: Skipped: not finite, or variance not positive.
-        rows_late: Wanted rows before the belief's time: not given.
+        intervals: Number of odometry intervals used.
+        intervals_late: Intervals skipped because they end before the belief's time.
+        coasts: Number of gaps in odometry, crossed without measurements.
+        coast_ns: Total length of those gaps.
+        headings: Number of compass readings processed.
+        headings_accepted: Readings used.
+        headings_thinned: Readings skipped because they are too soon after the last used one.
+        headings_rejected: Readings rejected by the gate.
+        headings_late: Readings skipped because they are before the belief's time.
+        headings_bad: Readings skipped because they are not finite or have no positive variance.
+        rows_late: Requested rows before the belief's time, which are missing from the result.
     """
 
     intervals: int = 0
@@ -142,15 +143,15 @@ class TrackCounts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackState:
-    """Everything that one window hands to the next; start with ``TrackState(belief)``.
+    """State between two windows; the first window starts with ``TrackState(belief)``.
 
     Attributes:
-        belief: At the end of the odometry driven so far.
-        travelled_m: Distance measured so far, forth and back both counted.
-        counted_ns: Time of the last heading that counted, or None.
-        counted_m: ``travelled_m`` then.
+        belief: Belief at the end of the odometry so far.
+        travelled_m: Total distance so far, forwards and in reverse.
+        counted_ns: Time of the last used heading, or None.
+        counted_m: ``travelled_m`` at the last used heading.
         waiting: Headings later than the belief.
-        waiting_rows_ns: Wanted rows later than the belief.
+        waiting_rows_ns: Times of requested rows later than the belief.
     """
 
     belief: PoseBelief
@@ -173,7 +174,7 @@ class PoseColumns:
         speed_mps: Shape (N,), negative in reverse.
         cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
         major_axis_m: Shape (N,): full major axis of the 2-sigma position ellipse.
-        travelled_m: Shape (N,): distance measured so far.
+        travelled_m: Shape (N,): total distance so far.
     """
 
     t_ns: Int64s
@@ -196,8 +197,8 @@ class HeadingColumns:
     Attributes:
         t_ns: Shape (N,), int64.
         heading_rad: Shape (N,): as measured.
-        var_rad2: Shape (N,): of the measurement.
-        innovation_rad: Shape (N,): measured less expected, wrapped.
+        var_rad2: Shape (N,): variance of the measurement.
+        innovation_rad: Shape (N,): measured minus expected, wrapped.
         nis: Shape (N,): normalised innovation squared, chi-square with one degree of freedom.
         outcome: Shape (N,), uint8: ``ACCEPTED`` or ``REJECTED`` by the gate.
     """
@@ -214,45 +215,45 @@ class HeadingColumns:
 
 
 class Looks(Protocol):
-    """What weighs in at given times whatever it finds there."""
+    """Source of additional measurements at times of its own, such as a camera's landmarks."""
 
     def times_ns(self) -> Sequence[int]:
-        """When to be asked, in order; those later than the odometry are not asked this time."""
+        """Times of measurements, in order; times after the odometry are not used in this call."""
         ...
 
     def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """The posterior at the belief's time, or None where there is nothing to weigh in."""
+        """Return the posterior at the belief's time, or None without a measurement."""
         ...
 
 
 class NoLooks:
-    """Nothing to look for."""
+    """``Looks`` without measurements."""
 
     def times_ns(self) -> Sequence[int]:
-        """Never."""
+        """Return no times."""
         return ()
 
     def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """Nothing."""
+        """Return None."""
         return None
 
 
 @dataclass(slots=True)
 class BothLooks:
-    """Two ``Looks`` as one, each asked at its own times."""
+    """Two ``Looks`` combined, each used at its own times."""
 
     first: Looks
     second: Looks
     _due: list[tuple[int, bool]] = field(default_factory=list)
 
     def times_ns(self) -> Sequence[int]:
-        """Of both, in order."""
+        """Times of both, in order."""
         of_first = [(t_ns, False) for t_ns in self.first.times_ns()]
         self._due = sorted(of_first + [(t_ns, True) for t_ns in self.second.times_ns()])
         return [t_ns for t_ns, _ in self._due]
 
     def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """Ask the one whose time it is."""
+        """Update with the measurement of the one whose time it is."""
         while self._due[0][0] < belief.t_ns:
             self._due.pop(0)
         _, is_second = self._due.pop(0)
@@ -261,7 +262,7 @@ class BothLooks:
 
 
 class Advance(NamedTuple):
-    """One window's result."""
+    """Result of one window."""
 
     state: TrackState
     poses: PoseColumns
@@ -282,7 +283,7 @@ def start_belief(
     heading_sd_rad: float = 0.0,
     speed_sd_mps: float = 10.0,
 ) -> PoseBelief:
-    """A belief whose errors are independent of each other."""
+    """Build a belief with independent errors."""
     mean = np.array([x_m, y_m, wrap(heading_rad), speed_mps])
     sd = np.array([position_sd_m, position_sd_m, heading_sd_rad, speed_sd_mps])
     return PoseBelief(t_ns, mean, np.diag(sd**2))
@@ -296,20 +297,20 @@ def advance(
     rows_ns: Int64s | None = None,
     looks: Looks = NO_LOOKS,
 ) -> Advance:
-    """Drive along the increments, weighing in headings by time.
+    """Predict along the increments, and update with headings in order of time.
 
     Args:
-        state: What the window before left.
-        increments: From ``odometry.integrate``, in order.
-        settings: How.
-        headings: The window's compass readings in any order; those later than the odometry wait.
-        rows_ns: Shape (M,): times at which rows are wanted. None: after every interval. Make the
-            same choice in every window.
-        looks: Asked at their times, after headings; rows made after every interval are made after
-            an observation that found something, too.
+        state: State after the previous window.
+        increments: Increments by ``odometry.integrate``, in order.
+        settings: Settings of the track.
+        headings: The window's compass readings in any order; later ones wait for odometry.
+        rows_ns: Shape (M,): times of requested rows; None for a row after every interval. The
+            choice must be the same in every window.
+        looks: Additional measurements, used after headings of the same time. If rows are after
+            every interval, there is also a row after each measurement.
 
     Returns:
-        The state for the next window, the rows, what became of each heading that reached the
+        The state for the next window, the rows, the outcome of each heading that reached the
         filter, and counts.
     """
     headings = _by_time(_joined(state.waiting, headings))
@@ -336,7 +337,7 @@ _NEVER: Final = np.iinfo(np.int64).max
 
 
 class _Run:
-    """One call of ``advance`` under way."""
+    """State during a call of ``advance``."""
 
     def __init__(
         self,
@@ -430,7 +431,7 @@ class _Run:
         self.t_ns = to_ns
 
     def _coast(self, stop_ns: int) -> None:
-        """Go on at the last speed; what is assumed of the way is not travelled distance."""
+        """Predict at the last speed; the assumed distance does not count as travelled."""
         self.tally["coasts"] += 1
         self.tally["coast_ns"] += stop_ns - self.t_ns
         while self.t_ns < stop_ns:
@@ -445,7 +446,7 @@ class _Run:
                 self._handle_events()
 
     def _handle_events(self) -> None:
-        """Take what falls on the present time: rows last, so that they show the rest."""
+        """Process the events of the current time; rows come last, so that they include the rest."""
         rows = self.heading_rows
         while self.next_heading < len(rows) and rows[self.next_heading][0] == self.t_ns:
             self._weigh_heading(*rows[self.next_heading][1:])

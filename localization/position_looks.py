@@ -1,8 +1,8 @@
-"""GNSS positions weighed into a pose track, as an option: the published method never does.
+"""Updates of a pose track with GNSS positions; optional, because the published method has none.
 
-A receiver's errors last for many seconds, so readings closer together than ``interval_s`` do not
-count. A reading is about ``delay_s`` old when it is stamped: it is carried ahead by the distance
-that the car goes in that time.
+A receiver's errors persist for many seconds, so readings closer together than ``interval_s`` are
+skipped. A reading is about ``delay_s`` old at its timestamp, so it is moved ahead by the distance
+that the car travels in that time.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from .pose_filter import at_point, update_position
 
 @dataclass(slots=True)
 class PositionCounts:
-    """What became of every position.
+    """Account of the positions.
 
     Attributes:
-        received: Positions that came up.
-        accepted: Weighed in.
-        thinned: Too soon after the last one used.
-        rejected: Refused by the gate.
-        late: Earlier than the estimate, or without odometry.
+        received: Number of positions processed.
+        accepted: Positions used.
+        thinned: Positions skipped because they are too soon after the last used one.
+        rejected: Positions rejected by the gate.
+        late: Positions skipped because they are earlier than the estimate or without odometry.
     """
 
     received: int = 0
@@ -42,12 +42,12 @@ class PositionLooks:
     """``Looks`` of a pose track: positions of the antenna in the map frame.
 
     Attributes:
-        lever_m: The antenna, ahead of and to the left of the rear axle.
-        interval_s: Time between two positions that count.
-        gate_nis: Refuse a position whose normalised innovation squared (two degrees of freedom) is
-            larger.
-        delay_s: How old a position is at its stamp.
-        counts: What became of them.
+        lever_m: Position of the antenna, ahead of and to the left of the rear axle.
+        interval_s: Minimum time between two positions in use.
+        gate_nis: Normalised innovation squared (two degrees of freedom) above which a position is
+            rejected.
+        delay_s: Age of a position at its timestamp.
+        counts: Account of the positions.
     """
 
     lever_m: tuple[float, float] = (0.0, 0.0)
@@ -60,7 +60,7 @@ class PositionLooks:
     _counted_ns: int | None = None
 
     def add(self, fixes: Fixes) -> None:
-        """Take a window's positions; those later than the odometry wait."""
+        """Add a window's positions; those later than the odometry wait."""
         self.counts.received += len(fixes)
         if len(fixes):
             self._waiting = Fixes(
@@ -70,12 +70,12 @@ class PositionLooks:
             )
 
     def times_ns(self) -> Sequence[int]:
-        """Of the positions that wait."""
+        """Times of waiting positions."""
         times: list[int] = self._waiting.t_ns.tolist()
         return times
 
     def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """Weigh in the position of the belief's time."""
+        """Update with the position of the belief's time."""
         self.let_go(belief.t_ns)
         fix, self._waiting = self._waiting.take(slice(0, 1)), self._waiting.take(slice(1, None))
         if not self._is_due(belief.t_ns):
@@ -97,13 +97,13 @@ class PositionLooks:
         return unpacked(belief.t_ns, at_point(done.state, -ahead_m, -left_m))
 
     def let_go(self, before_ns: int) -> None:
-        """Drop positions that no odometry will reach any more."""
+        """Drop positions that are before all further odometry."""
         late = int(np.searchsorted(self._waiting.t_ns, before_ns))
         self.counts.late += late
         self._waiting = self._waiting.take(slice(late, None))
 
     def take_used(self) -> list[tuple[int, float, float, float, float, float]]:
-        """Time, x, y, xx, xy and yy of the positions weighed in since the last call."""
+        """Return time, x, y, xx, xy and yy of the positions used since the last call."""
         taken, self._used = self._used, []
         return taken
 
@@ -112,6 +112,6 @@ class PositionLooks:
         return asdict(self.counts)
 
     def _is_due(self, t_ns: int) -> bool:
-        # A little early is on time: a row of a jittery clock.
+        # A tolerance for jitter of the clock.
         spacing_ns = 0.95e9 * self.interval_s
         return self._counted_ns is None or t_ns - self._counted_ns >= spacing_ns

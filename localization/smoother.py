@@ -1,9 +1,9 @@
-"""The best pose that the measurements allow: a batch smoother over the filter's own measurements.
+"""Batch smoother of the pose over all of the filter's measurements.
 
-A factor graph of planar poses (F. Dellaert, M. Kaess, "Factor Graphs for Robot Perception", 2017),
-solved by GTSAM, an optional package: odometry between the poses, headings and landmarks on them,
-the start as prior. Where the filter knows only the past, the smoother knows all, and it linearises
-about its solution, not about each first guess. It is a reference, not a part of the replay.
+It is a factor graph of planar poses (F. Dellaert, M. Kaess, "Factor Graphs for Robot Perception",
+2017), solved by GTSAM, an optional package. Odometry connects the poses, headings and landmarks are
+measurements of them, and the start is the prior. Unlike the filter, the smoother also uses later
+measurements, and it linearises about its solution. It is a reference, not a part of the replay.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     import gtsam
 
 STEP_NS: Final = 1_000_000_000
-"""Longest time between two poses of the graph."""
+"""Maximum time between two poses of the graph."""
 _MIN_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
-"""Added so that exact odometry (an arc has no sideways error) can be inverted: 3 mm, 0.1 mrad."""
+"""Variance added to make the covariance of an arc, which has no sideways error, invertible: 3 mm
+and 0.1 mrad."""
 RELATIVE_TOLERANCE: Final = 1e-10
 ABSOLUTE_TOLERANCE: Final = 1e-6
 _AT_REST: Final = State(*(0.0,) * len(State._fields))
@@ -38,7 +39,7 @@ _AT_REST: Final = State(*(0.0,) * len(State._fields))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """M poses given all measurements.
+    """M smoothed poses.
 
     Attributes:
         t_ns: Shape (M,), int64.
@@ -59,21 +60,21 @@ def smooth(
     at_ns: Int64s | None = None,
     lever_m: Floats | tuple[float, float] = (0.0, 0.0),
 ) -> Smoothed:
-    """Poses at the wanted times that fit all measurements best.
+    """Compute the poses that fit all measurements best.
 
     Args:
-        start: The first belief; its time is where the graph begins.
-        increments: Odometry without holes, from the start's time on.
-        headings: Those that count, with their variances.
-        fixes: Landmarks and GNSS positions weighed in.
-        at_ns: Wanted times; None: the graph's own, at most ``STEP_NS`` apart. Times outside the
-            odometry are left out.
-        lever_m: What the fixes are positions of, ahead of and to the left of the rear axle: one
-            point, or shape (N, 2).
+        start: The first belief, at whose time the graph starts.
+        increments: Odometry without gaps, from the start's time on.
+        headings: Headings in use, with their variances.
+        fixes: Landmarks and GNSS positions in use.
+        at_ns: Requested times; None for the graph's own, at most ``STEP_NS`` apart. Times outside
+            the odometry are left out.
+        lever_m: Point of the car whose positions the fixes are, ahead of and to the left of the
+            rear axle: one point, or shape (N, 2).
 
     Raises:
         UsageError: GTSAM is not installed.
-        ValueError: The odometry has a hole, or is empty.
+        ValueError: The odometry has a gap or is empty.
     """
     _need_gtsam()
     import gtsam
@@ -109,7 +110,7 @@ def _check(start: PoseBelief, increments: Increments) -> None:
     holes = np.flatnonzero(increments.start_ns[1:] != increments.stop_ns[:-1])
     if len(holes) or increments.start_ns[0] > start.t_ns:
         where = increments.stop_ns[holes[0]] if len(holes) else start.t_ns
-        raise ValueError(f"increments: expected no holes, got one at {where} ns")
+        raise ValueError(f"increments: expected no gaps, got one at {where} ns")
 
 
 def _times(
@@ -128,7 +129,7 @@ def _times(
 
 
 def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]:
-    """Relative pose and its covariance, in the frame of its beginning, from time to time."""
+    """Relative poses between successive times, with covariances, in the earlier pose's frame."""
     columns = (
         increments.distance_m,
         increments.turn_rad,
@@ -152,7 +153,7 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
             now = to
             i += now == stops[i]
         x, y, heading, _, xx, xy, xh, _, yy, yh, _, hh, _, _ = state
-        # In a gap the car may have gone aside as far as ahead.
+        # In a gap the error to the side is as large as that ahead.
         cov = np.array([[xx, xy, xh], [xy, yy + aside_var, yh], [xh, yh, hh]])
         steps.append((np.array([x, y, heading]), cov))
     return steps
@@ -161,9 +162,9 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
 def _guessed(
     start: PoseBelief, times: Int64s, steps: list[tuple[Floats, Floats]], headings: Headings
 ) -> list[tuple[float, float, float]]:
-    """Where to begin: odometry, its heading held by the readings, each weighed as a filter would.
+    """Compute initial poses from odometry, with headings corrected as in a filter.
 
-    Hours of wheels alone end headings and kilometres away, from where no solver comes back.
+    Odometry alone is radians and kilometres off after hours, and no solver converges from there.
     """
     read = dict(
         zip(
@@ -188,10 +189,10 @@ def _guessed(
 
 
 def _solved(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.Values:
-    """The minimum.
+    """Optimise the graph.
 
-    A long drive's position is held so loosely that a hundred metres cost a thousandth of the whole
-    error: GTSAM's own tolerances stop before it is found.
+    The position in a long drive is determined so weakly that an error of 100 m changes the total
+    error by a thousandth. GTSAM's default tolerances stop before the minimum is reached.
     """
     import gtsam
 
@@ -208,7 +209,7 @@ def _rotation(angle_rad: float) -> Floats:
 
 
 def _in_end_frame(cov: Floats, turn_rad: float) -> Floats:
-    """GTSAM states a pose's error in that pose's own axes."""
+    """Rotate a covariance to the axes of the later pose, as in GTSAM."""
     back = _rotation(-turn_rad)
     turned: Floats = back @ cov @ back.T + _MIN_VARIANCE
     return turned
@@ -245,7 +246,7 @@ def _add_fixes(
     fixes: Fixes,
     lever_m: Floats | tuple[float, float],
 ) -> None:
-    """Each fix holds a pose of the camera or the antenna, rigidly tied to the car's."""
+    """Add each fix as a measurement of a camera or antenna pose, rigidly connected to the car's."""
     import gtsam
 
     levers_m = np.broadcast_to(np.asarray(lever_m, np.float64), (len(fixes), 2))
@@ -268,7 +269,7 @@ def _read(
 ) -> Smoothed:
     import gtsam
 
-    # What a long drive holds of its position is lost to rounding in gtsam.Marginals (Cholesky).
+    # On a long drive, rounding in gtsam.Marginals (Cholesky) loses the position's information.
     params = gtsam.ISAM2Params()
     params.setFactorization("QR")
     marginals = gtsam.ISAM2(params)

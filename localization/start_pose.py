@@ -1,4 +1,4 @@
-"""Where a drive begins and which way the car faces then, from its first known positions."""
+"""Estimate the pose at the start of a drive from its first known positions."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .odometry import Increments
 from .pose_filter import State
 
 START_S: Final = 15.0
-"""How much of the beginning is used."""
+"""Duration of the start of the drive that is used."""
 INDEPENDENT_S: Final = 1.0
-"""Positions nearer to each other in time count as one: errors of GNSS last."""
+"""Time over which positions count as one observation, because GNSS errors persist."""
 
 
 class Path(NamedTuple):
-    """Dead reckoning from pose (0, 0, 0), shape (N,) each."""
+    """Dead reckoning from pose (0, 0, 0), as arrays of shape (N,)."""
 
     x_m: NDArray[np.float64]
     y_m: NDArray[np.float64]
@@ -28,7 +28,7 @@ class Path(NamedTuple):
 
 
 def path_of(increments: Increments, at_ns: NDArray[np.int64], begin_ns: int) -> Path:
-    """Dead reckoning from the pose at ``begin_ns`` to given times; linear inside increments."""
+    """Compute poses relative to the one at ``begin_ns``; linear inside increments."""
     heading = np.append(0.0, np.cumsum(increments.turn_rad))
     half = 0.5 * increments.turn_rad
     chord = increments.distance_m * np.sinc(half / np.pi)
@@ -48,17 +48,17 @@ def start_pose(
     lever_m: tuple[float, float],
     at_ns: int | None = None,
 ) -> State:
-    """Pose of the rear axle at one time: the first seconds' odometry laid onto the fixes.
+    """Estimate the pose of the rear axle by aligning the first seconds' odometry with the fixes.
 
-    The planar case of S. Umeyama (PAMI 13, 1991) without scale. The covariance follows from what
-    the fixes say of themselves, or from the residuals where these are larger. Of a car that did
-    not move the heading stays unknown.
+    This is the planar case of S. Umeyama (PAMI 13, 1991) without scale. The covariance follows from
+    the fixes' covariances, or from the residuals if these are larger. The heading of a car that
+    does not move remains unknown.
 
     Args:
         increments: Odometry that covers the first seconds of fixes.
-        fixes: At least one, in order.
-        lever_m: The point they are of, ahead of and to the left of the rear axle.
-        at_ns: When; None for the first fix.
+        fixes: At least one fix, in order.
+        lever_m: Point of the fixes, ahead of and to the left of the rear axle.
+        at_ns: Time of the pose; None for the first fix.
     """
     first = fixes.take(fixes.t_ns <= fixes.t_ns[0] + round(START_S * 1e9))
     begin_ns = int(first.t_ns[0]) if at_ns is None else at_ns
@@ -78,7 +78,7 @@ def start_pose(
     inside = increments.stop_ns <= first.t_ns[-1]
     heading_var += float(increments.turn_var_rad2[inside].sum()) / 3.0
     heading_var = min(heading_var, math.pi**2)
-    # The middle of the fixes is where they hold the path; its start swings about that.
+    # The fixes fix the path at their centre, and the heading's error rotates the start about it.
     arm = -turned * middle
     at = to + arm
     return State(

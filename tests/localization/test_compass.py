@@ -302,7 +302,7 @@ def test_readings_unrelated_to_the_heading_are_refused() -> None:
 def test_nonsense_is_refused_by_name() -> None:
     mirror: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
     stretch: Matrix = ((2.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match="got a mirror"):
+    with pytest.raises(ValueError, match="got a reflection"):
         CompassSettings(mounting_rotation=mirror)
     with pytest.raises(ValueError, match="mounting_rotation: expected a rotation"):
         CompassSettings(mounting_rotation=stretch)

@@ -187,7 +187,7 @@ def test_holes_and_odd_columns_are_refused() -> None:
     early = start_belief(-1, 0.0, 0.0, 0.0)
     with pytest.raises(ValueError, match="expected odometry after 9000000000 ns"):
         smooth(late, made, NO_HEADINGS)
-    with pytest.raises(ValueError, match="expected no holes, got one at -1 ns"):
+    with pytest.raises(ValueError, match="expected no gaps, got one at -1 ns"):
         smooth(early, made, NO_HEADINGS)
     with pytest.raises(ValueError, match=r"expected xy_m \(1, 2\)"):
         Fixes(np.zeros(1, np.int64), np.zeros((2, 2)), np.zeros((1, 2, 2)))
