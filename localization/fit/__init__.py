@@ -1,1 +1,1 @@
-"""Compass and odometry fitted to known positions."""
+"""Fit of compass and odometry to known positions."""

@@ -1,15 +1,15 @@
-"""Fit a compass to a drive, and say which of its parameters the drive could show.
+"""Fit a compass to a drive, and report which of its parameters are observable.
 
-With z the direction of magnetic north as a complex number in the car's level axes, the readings'
-level part is
+With z the direction of magnetic north as a complex number in the car's level axes, the horizontal
+part of the readings is
 
     m = c z + d conj(z) + b,
 
-a circle (d = 0) or ellipse about the hard iron b. A drive that turned all the way round shows b,
-c and d; one that turned half-way shows b and c; a straight one shows the mounting yaw alone, and
-that only together with whatever hard iron there is. What a drive cannot show keeps the value that
-was given and is named, with the reason. Without a reference heading an ellipse is fitted to the
-readings, which leaves the mounting yaw unknown.
+a circle (d = 0) or ellipse about the hard iron b. A drive with a full turn determines b, c and d;
+one with a half turn determines b and c. A straight drive determines only the mounting yaw, combined
+with the effect of hard iron. A parameter that is not observable keeps its given value and is
+reported with the reason. Without a reference heading, an ellipse is fitted to the readings, and the
+mounting yaw remains unknown.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ SOFT_IRON: Final = "soft iron"
 _BIN_DEG: Final = 10
 _BIN_READINGS: Final = 3
 _RING: Final = 0.2
-"""Scatter of a ring about its radius, as a fraction of it; a shapeless cloud has about half."""
+"""Maximum scatter of a ring, as a fraction of its radius; an unstructured cloud has about 0.5."""
 
 
 class NotObservable(NamedTuple):
-    """A parameter that kept its given value, and why."""
+    """A parameter that keeps its given value, and the reason."""
 
     parameter: str
     reason: str
@@ -46,12 +46,12 @@ class NotObservable(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """What a drive must offer.
+    """Requirements on a drive.
 
     Attributes:
-        hard_iron_deg: Headings covered, in degrees of the circle, before hard iron is fitted.
-        soft_iron_deg: The same for soft iron.
-        min_readings: Fewest readings with a reference.
+        hard_iron_deg: Minimum coverage of headings, in degrees of the circle, to fit hard iron.
+        soft_iron_deg: Minimum coverage of headings to fit soft iron.
+        min_readings: Minimum number of readings with a reference.
     """
 
     hard_iron_deg: float = 180.0
@@ -61,22 +61,23 @@ class FitSettings:
 
 @dataclass(frozen=True, slots=True)
 class CompassFit:
-    """A fitted compass and how far to trust it.
+    """A fitted compass with measures of its quality.
 
     Attributes:
         settings: The compass; parameters not observable keep their given values.
-        observable: Names of the parameters that were fitted.
-        not_observable: The others, with reasons.
-        readings: Given.
-        readings_used: Finite and, where a reference is used, with one.
-        coverage_deg: Headings that the drive covered, in steps of 10 degrees.
-        residual_sd_rad: S.d. of heading less reference: the filter's compass noise. NaN without
+        observable: Names of the fitted parameters.
+        not_observable: Other parameters, with reasons.
+        readings: Number of readings.
+        readings_used: Number of readings that are finite and, if required, have a reference.
+        coverage_deg: Coverage of headings, in steps of 10 degrees.
+        residual_sd_rad: S.d. of heading minus reference: the filter's compass noise. NaN without
             a reference.
-        residual_autocorrelation: Of one residual with the next; NaN where it cannot be determined.
-        persists_s: Time over which the residuals' autocorrelation falls to 1/e; give the filter
-            twice this as its ``heading_interval_s``. At least this, if they never fell so far.
-        persists_is_bound: They never fell so far.
-        mounting_yaw_sd_rad: Of the fitted mounting yaw, with correlated residuals counted as few.
+        residual_autocorrelation: Correlation of successive residuals; NaN where undetermined.
+        persists_s: Time over which the residuals' autocorrelation falls to 1/e. Twice this is a
+            good ``heading_interval_s`` of the filter.
+        persists_is_bound: True if the autocorrelation does not fall to 1/e; ``persists_s`` is then
+            a lower bound.
+        mounting_yaw_sd_rad: S.d. of the fitted mounting yaw, corrected for correlated residuals.
     """
 
     settings: CompassSettings
@@ -93,7 +94,7 @@ class CompassFit:
 
 
 class _Shape(NamedTuple):
-    """How the level field is bent: ``m = bend @ north + hard``."""
+    """Distortion of the horizontal field: ``m = bend @ north + hard``."""
 
     bend: Floats
     hard: Floats
@@ -106,20 +107,20 @@ def fit_compass(
     given: CompassSettings,
     settings: FitSettings | None = None,
 ) -> CompassFit:
-    """Fit what the drive shows of hard iron, soft iron and mounting.
+    """Fit the observable parameters of hard iron, soft iron and mounting.
 
     Args:
         t_ns: Shape (N,), increasing: times of the readings.
         field_t: Shape (N, 3): readings in the sensor's axes.
-        reference_rad: Shape (N,): the car's heading then, counter-clockwise from east, such as
-            the GNSS course of ``course_at``; NaN where unknown. None: there is no reference.
-        given: Mounting rotation and declination, and what stays if it cannot be fitted.
-        settings: What a drive must offer.
+        reference_rad: Shape (N,): heading of the car, counter-clockwise from east, such as the GNSS
+            course of ``course_at``; NaN where unknown. None without a reference.
+        given: Mounting rotation and declination, and default values of the other parameters.
+        settings: Requirements on the drive.
 
     Raises:
-        VehicleError: Too few readings, axes that are mirrored, or readings that have nothing to
-            do with the headings.
-        ValueError: Columns do not line up.
+        VehicleError: There are too few readings, the axes are mirrored, or the readings are not
+            correlated with the headings.
+        ValueError: Columns differ in length.
     """
     settings = settings or FitSettings()
     if field_t.shape != (len(t_ns), 3):
@@ -133,7 +134,7 @@ def fit_compass(
     if n < settings.min_readings:
         raise VehicleError(
             f"compass: {n} of {len(t_ns)} readings are finite and have a reference heading, "
-            f"{settings.min_readings} are required; take a longer drive"
+            f"{settings.min_readings} are required; use a longer drive"
         )
     if reference_rad is None:
         return _fit_alone(field_t, usable, given, settings)
@@ -141,7 +142,7 @@ def fit_compass(
 
 
 def coverage_deg(directions_rad: Floats) -> int:
-    """How much of the circle the directions cover, in steps of 10 degrees with three readings."""
+    """Coverage of the circle in degrees, by steps of 10 degrees with at least three readings."""
     steps = 360 // _BIN_DEG
     bins = np.floor(np.degrees(directions_rad) / _BIN_DEG).astype(np.int64) % steps
     return int((np.bincount(bins, minlength=steps) >= _BIN_READINGS).sum()) * _BIN_DEG
@@ -192,13 +193,13 @@ def _fit_to(
 def _fit_alone(
     field_t: Floats, usable: NDArray[np.bool_], given: CompassSettings, settings: FitSettings
 ) -> CompassFit:
-    """Without a reference: the readings themselves must go round an ellipse."""
+    """Fit without a reference, if the readings cover an ellipse."""
     base = replace(given, hard_iron_t=(0.0, 0.0, 0.0), soft_iron=IDENTITY)
     level = level_field(field_t[usable], base)[:, :2]
     shape = _ellipse(level)
     covered, fitted = 0, given
     observable: tuple[str, ...] = ()
-    short = "the readings do not go round an ellipse"
+    short = "the readings do not cover an ellipse"
     if shape is not None:
         north = np.linalg.solve(shape.bend, (level - shape.hard).T)
         covered = coverage_deg(np.arctan2(north[1], north[0]))
@@ -225,8 +226,8 @@ def _missing(
     observable: tuple[str, ...], no_hard_iron: str, no_soft_iron: str
 ) -> tuple[NotObservable, ...]:
     found = (
-        NotObservable("declination", "turns every heading just as the mounting yaw does; as given"),
-        NotObservable("hard iron, upward part", "only the level part shows while the car is level"),
+        NotObservable("declination", "has the same effect as the mounting yaw; as given"),
+        NotObservable("hard iron, upward part", "has no effect while the car is level"),
         NotObservable(MOUNTING, "there is no reference heading"),
         NotObservable(HARD_IRON, no_hard_iron),
         NotObservable(SOFT_IRON, no_soft_iron),
@@ -244,7 +245,7 @@ def _fitted_yaw(field_t: Floats, reference_rad: Floats, given: CompassSettings) 
         return replace(given, mounting_yaw_rad=circular_mean(apart[np.isfinite(apart)]))
     except ValueError:
         raise VehicleError(
-            "compass: the readings have nothing to do with the headings; check the topic and axes"
+            "compass: the readings are not correlated with the headings; check the topic and axes"
         ) from None
 
 
@@ -278,7 +279,7 @@ def _fitted_ellipse(field_t: Floats, north: Complexes, given: CompassSettings) -
 
 
 def _corrected(base: CompassSettings, shape: _Shape) -> CompassSettings:
-    """Undo the bend's stretch, its turn left to the mounting yaw; areas keep their size."""
+    """Correct the distortion at constant area; its rotation is left to the mounting yaw."""
     left, stretch, _ = np.linalg.svd(shape.bend)
     level = np.eye(3)
     level[:2, :2] = math.sqrt(stretch[0] * stretch[1]) * (left / stretch) @ left.T
@@ -298,7 +299,7 @@ def _in_sensor_axes(base: CompassSettings, level: Floats) -> Vector:
 
 
 def _ellipse(level: Floats) -> _Shape | None:
-    """The conic through the points, by least squares; None unless they lie along an ellipse."""
+    """Fit a conic to the points by least squares; None unless they are along an ellipse."""
     middle, scale = level.mean(axis=0), float(np.std(level)) or 1.0
     x, y = ((level - middle) / scale).T
     terms = np.column_stack([x * x, 2.0 * x * y, y * y, 2.0 * x, 2.0 * y])
@@ -325,19 +326,19 @@ def _least_squares(terms: Complexes, wanted: Complexes) -> tuple[Complexes, floa
 
 def _mirrored() -> VehicleError:
     return VehicleError(
-        "compass: the readings turn the wrong way round; the axes must be forward, left, up "
-        "(many sensors give forward, right, down): correct the mounting rotation"
+        "compass: the readings turn in the wrong direction; expected axes forward, left, up (many "
+        "sensors have forward, right, down); correct the mounting rotation"
     )
 
 
 class Persistence(NamedTuple):
-    """How long residuals stay alike.
+    """Persistence of residuals.
 
     Attributes:
-        next_correlation: Of one with the next.
-        seconds: Until the autocorrelation falls to 1/e.
-        is_bound: It never fell so far; ``seconds`` is half of what was seen.
-        independent: As how many independent residuals they count.
+        next_correlation: Correlation of successive residuals.
+        seconds: Time until the autocorrelation falls to 1/e.
+        is_bound: True if it does not fall to 1/e; ``seconds`` is then half of the duration.
+        independent: Equivalent number of independent residuals.
     """
 
     next_correlation: float
@@ -347,7 +348,7 @@ class Persistence(NamedTuple):
 
 
 def persistence(t_ns: Int64s, residual: Floats) -> Persistence:
-    """Autocorrelation of residuals taken at about regular times."""
+    """Estimate the persistence of residuals at approximately regular times."""
     n = len(residual)
     centred = residual - residual.mean()
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2

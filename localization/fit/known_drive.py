@@ -1,4 +1,4 @@
-"""A drive whose positions are known: its odometry cut at them, followed with or without them."""
+"""A drive with known positions: odometry between them, and a filter with or without updates."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]
 
 STEP_S: Final = 0.2
-"""Odometry is followed in arcs no longer than this."""
+"""Maximum duration of an arc of odometry."""
 GATE_NIS: Final = 13.8
-"""One good position in a thousand is further off; beyond, it counts for less and less."""
+"""Normalised innovation squared beyond which a position has less weight; one good position in a
+thousand exceeds it."""
 
 
 class Steps(NamedTuple):
     """M arcs of odometry between positions.
 
     Attributes:
-        at_fix: Shape (M,): the position at the arc's end, or -1.
+        at_fix: Shape (M,): index of the position at the arc's end, or -1.
         distance_m: Shape (M,).
         turn_rad: Shape (M,).
         distance_var_m2: Shape (M,).
@@ -42,7 +43,7 @@ class Steps(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """What a filter expects of N positions, before it gets them.
+    """Predictions of a filter for N positions, before their updates.
 
     Attributes:
         xy_m: Shape (N, 2).
@@ -56,7 +57,7 @@ class Predicted(NamedTuple):
 
 
 class KnownDrive:
-    """Wheel speeds, what reports turns, and positions while both speak."""
+    """Wheel speeds, a turn signal, and positions while both are available."""
 
     def __init__(
         self,
@@ -65,13 +66,13 @@ class KnownDrive:
         fixes: Fixes,
         lever_m: tuple[float, float],
     ) -> None:
-        """Take the positions that are within the odometry.
+        """Select the positions that are within the odometry.
 
         Args:
             wheels: The drive's wheel speeds.
-            turn: Yaw rate or steering; None takes the wheels' difference.
+            turn: Yaw rate or steering; None uses the wheels' difference.
             fixes: Positions in order of time.
-            lever_m: The point they are of, ahead of and to the left of the rear axle.
+            lever_m: Point of the positions, ahead of and to the left of the rear axle.
         """
         self.wheels, self.turn, self.lever_m = wheels, turn, lever_m
         self.source = "wheels" if turn is None else turn.kind
@@ -88,23 +89,24 @@ class KnownDrive:
 
     @property
     def fix_sd_m(self) -> float:
-        """Of the positions on average, east and north, as they state it."""
+        """Mean stated s.d. of the positions, per axis."""
         return math.sqrt(float(np.mean(np.trace(self.fixes.cov_m2, axis1=1, axis2=2))) / 2.0)
 
     def until(self, t_ns: int) -> KnownDrive:
-        """The same drive with the positions before a time."""
+        """Return the drive with only the positions before a time."""
         before = self.fixes.take(self.fixes.t_ns < t_ns)
         return KnownDrive(self.wheels, self.turn, before, self.lever_m)
 
     def steps(
         self, settings: OdometrySettings, drift_radps2: float = 0.0, delay_s: float = 0.0
     ) -> Steps:
-        """Odometry between the positions.
+        """Compute the odometry between the positions.
 
         Args:
-            settings: The car.
-            drift_radps2: Of the gyro's bias, which is the settings' in the middle of the drive.
-            delay_s: How long after they were true the positions are stamped.
+            settings: Odometry settings of the car.
+            drift_radps2: Drift of the gyro's bias, whose value in the settings is that in the
+                middle of the drive.
+            delay_s: Delay of the positions' timestamps.
         """
         turn = self.turn
         if turn is not None and drift_radps2:
@@ -127,22 +129,22 @@ class KnownDrive:
         )
 
     def start(self, settings: OdometrySettings) -> State:
-        """A first guess of the pose at the first position."""
+        """Estimate the pose at the first position, as an initial value."""
         made = integrate(self.wheels, settings, self.turn).increments
         return start_pose(made, self.fixes, self.lever_m)
 
     def follow(self, start: State, steps: Steps, cov_m2: Floats | None = None) -> Predicted:
-        """Drive along the steps.
+        """Run the filter along the steps.
 
         Args:
-            start: Of the rear axle, at the first position.
-            steps: From there on.
-            cov_m2: Shape (N, 2, 2): of the positions, which the filter then weighs in one after
-                the other; None lets it dead reckon.
+            start: State of the rear axle at the first position.
+            steps: Odometry from there on.
+            cov_m2: Shape (N, 2, 2): covariances of the positions for updates of the filter; None
+                for dead reckoning.
         """
         found = np.empty((len(self.fixes), len(State._fields)))
         cov = np.empty((0, 2, 2)) if cov_m2 is None else cov_m2
-        # A fit drives along hundreds of times.
+        # Compiled, because a fit calls it hundreds of times.
         count = kept(_follow)(start, *steps, self.fixes.xy_m, cov, *self.lever_m, found)
         x, y, heading, _, xx, xy, _, _, yy = found[:count].T[:9]
         spread = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
@@ -162,7 +164,7 @@ def _follow(
     left_m: float,
     found: Floats,
 ) -> int:
-    """Write the state at each position into ``found``; how many there are."""
+    """Write the state at each position into ``found``; return their number."""
     count = 0
     for row in range(len(at_fix)):
         state = predict(
@@ -183,22 +185,22 @@ def _follow(
 
 
 def _weighed(seen: State, x: float, y: float, var_x: float, cov_xy: float, var_y: float) -> State:
-    """After one position; an outlier counts as one that bad, without a jump at the gate."""
+    """Update with one position; the weight of an outlier is reduced continuously at the gate."""
     nis = update_position(seen, x, y, var_x, cov_xy, var_y, 0.0).nis
     more = max(nis / GATE_NIS, 1.0)
     return update_position(seen, x, y, more * var_x, more * cov_xy, more * var_y, math.inf).state
 
 
 def whitened(predicted: Predicted, xy_m: Floats, cov_m2: Floats) -> tuple[Floats, Floats]:
-    """What positions differ from the prediction, in units of their common covariance.
+    """Whiten the differences of positions from their predictions.
 
     Args:
-        predicted: Of N positions.
+        predicted: Predictions of N positions.
         xy_m: Shape (N, 2).
-        cov_m2: Shape (N, 2, 2): of the positions alone.
+        cov_m2: Shape (N, 2, 2): covariances of the positions.
 
     Returns:
-        Shape (N, 2), and the logarithm of each covariance's determinant, shape (N,).
+        Whitened differences, shape (N, 2), and log determinants of the covariances, shape (N,).
     """
     root = np.linalg.cholesky(predicted.cov_m2 + cov_m2)
     white: Floats = np.linalg.solve(root, (xy_m - predicted.xy_m)[:, :, None])[:, :, 0]
@@ -207,7 +209,7 @@ def whitened(predicted: Predicted, xy_m: Floats, cov_m2: Floats) -> tuple[Floats
 
 
 def _covered(wheels: WheelSpeeds, turn: TurnSignal | None, fixes: Fixes) -> Fixes:
-    """Positions while everything speaks, a little inside because of the delays fitted."""
+    """Positions while all signals are available, with a margin for the fitted delays."""
     spans = [wheels.t_ns] + ([] if turn is None else [turn.t_ns])
     if any(len(t_ns) < 2 for t_ns in spans):
         return fixes.take(slice(0, 0))

@@ -1,16 +1,17 @@
-"""Fit a car's odometry to a drive with known positions, and say what the drive could show.
+"""Fit a car's odometry to a drive with known positions, and report the observable parameters.
 
-Maximum likelihood by prediction errors (L. Ljung, *System Identification*, 2nd ed., section 7.4):
-the pose filter runs along the drive under trial parameters, and what each position differs from
-the filter's prediction, in units of its own covariance, is a residual of ``least_squares`` with a
-robust loss. Unlike dead reckoning against positions, this keeps residuals independent, because
-what odometry had accumulated is taken off at each position. The noise densities are those under
-which the residuals are most likely; fitting and noise take turns.
+The method is maximum likelihood by prediction errors (L. Ljung, *System Identification*, 2nd ed.,
+section 7.4). The pose filter runs along the drive with trial parameters. The difference of each
+position from the filter's prediction, in units of its covariance, is a residual of
+``least_squares`` with a robust loss. Unlike residuals of dead reckoning, these are independent,
+because each position corrects the accumulated error. The noise densities maximise the likelihood of
+the residuals; the fits of parameters and noise alternate.
 
-The inverse of the information matrix states each parameter's variance. Parameters are measured in
-what would be plausible for a car: one that the drive determines to no better than a fraction of
-that keeps its given value and is named, the worst first, and the rest is fitted without it. So one
-of two that only show together (steering ratio and wheelbase) stays as given.
+The inverse of the information matrix yields each parameter's variance. The unit of a parameter is
+its plausible deviation for a car. A parameter whose s.d. exceeds a fraction of that is not
+observable: it keeps its given value and is reported. The worst is removed first, and the others are
+fitted again. If two parameters are observable only in combination (steering ratio and wheelbase),
+one of them therefore remains as given.
 """
 
 from __future__ import annotations
@@ -33,22 +34,22 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 LOSS_SD: Final = 2.0
-"""Where the robust loss turns from squares to absolute values."""
+"""Residual at which the robust loss changes from squares to absolute values."""
 DETERMINED: Final = 0.5
-"""Largest s.d., as a fraction of what is plausible, of a parameter that the drive shows."""
+"""Maximum s.d. of an observable parameter, as a fraction of its plausible deviation."""
 MIN_FIX_SD_M: Final = 0.1
-"""No position says better where the rear axle is: a body leans and slips, levers are measured by
-hand. Without it a smooth track looks perfect, and its every sway a turn."""
+"""Minimum s.d. of a position of the rear axle, because the body leans and slips, and levers are
+measured by hand. Without it, a smooth track would count as perfect, and its sway as turns."""
 NO_INFORMATION_SD: Final = 1e5
-"""Taken for a direction without information, in units of what is plausible."""
+"""S.d. of a direction without information, in units of the plausible deviation."""
 WITHOUT_EFFECT: Final = 1e3
-"""Parameters with a larger s.d. in those units had no effect on the drive."""
+"""S.d. in those units above which a parameter has no effect on the drive."""
 REACH: Final = 4.5
-"""Max distance from the given value that is tried, in units of what is plausible."""
+"""Maximum deviation from the given value in the fit, in units of the plausible deviation."""
 ROUNDS: Final = 8
-"""Max number of alternations between fit and noise."""
+"""Maximum number of alternations between fit and noise."""
 SETTLED: Final = 0.05
-"""Noise that changes by a smaller fraction has settled."""
+"""Relative change of the noise below which it has converged."""
 MIN_FIXES: Final = 15
 MIN_DISTANCE_M: Final = 100.0
 _MIN_SD: Final = 1e-6
@@ -59,7 +60,7 @@ DRIFT: Final = "gyro_drift_radps2"
 
 
 class _Kind(NamedTuple):
-    """A parameter: how far off it may plausibly be, and what a drive needs to show it."""
+    """A parameter: its plausible deviation, and the kind of drive that makes it observable."""
 
     plausible: float
     is_fraction: bool
@@ -87,7 +88,7 @@ OF_TURN: Final[Mapping[str, tuple[str, ...]]] = {
     "steering": ("steering_ratio", "steering_offset_rad", "wheelbase_m", "turn_delay_s"),
     "wheels": ("right_wheel_scale", "track_width_m"),
 }
-"""By what turns the pose."""
+"""Parameters by turn source."""
 TURN_NOISE: Final[Mapping[str, str]] = {
     "yaw rate": "gyro_noise_rad_per_sqrt_s",
     "steering": "steering_noise_rad_sqrt_m",
@@ -96,7 +97,7 @@ TURN_NOISE: Final[Mapping[str, str]] = {
 
 
 class Fitted(NamedTuple):
-    """One parameter that the drive showed."""
+    """One fitted parameter."""
 
     parameter: str
     given: float
@@ -109,17 +110,17 @@ class OdometryFit:
     """A fitted car.
 
     Attributes:
-        source: What turned the pose: "yaw rate", "steering" or "wheels".
-        settings: With the fitted values and noise; the rest as given.
-        fitted: What the drive showed: value and s.d. The gyro's drift and the delay of the
-            positions are stated here alone.
-        not_observable: What it did not show, and what it would take.
+        source: Source of the change of heading: "yaw rate", "steering" or "wheels".
+        settings: Settings with the fitted values and noise; the others as given.
+        fitted: Value and s.d. of the observable parameters. The gyro's drift and the delay of the
+            positions are only here, not in ``settings``.
+        not_observable: Other parameters, and the kind of drive that they need.
         start: Pose of the rear axle at the first position, with the covariance of the fit.
-        start_ns: When.
+        start_ns: Time of the first position.
         fix_sd_m: S.d. of the positions, by the residuals.
-        residual_rms: Of the whitened residuals; 1 is right.
-        fixes: Used.
-        outliers: How many of those are farther off than 99.9 % of good positions.
+        residual_rms: Root mean square of the whitened residuals; 1 if consistent.
+        fixes: Number of positions used.
+        outliers: Number of positions further off than 99.9 % of good positions.
     """
 
     source: str
@@ -134,7 +135,7 @@ class OdometryFit:
     outliers: int
 
     def value(self, parameter: str, otherwise: float = 0.0) -> float:
-        """A fitted value; ``otherwise`` where the drive did not show it."""
+        """Return a fitted value, or ``otherwise`` if it is not observable."""
         return next((one.value for one in self.fitted if one.parameter == parameter), otherwise)
 
 
@@ -144,17 +145,19 @@ def fit_odometry(
     """Fit scale, biases, geometry, delays and noise to known positions.
 
     Args:
-        drive: Its positions' covariances count relative to each other: how good they are is fitted.
-        given: Where to begin, and what stays if the drive does not show it.
-        whole_s: The noise is to cover, on a drive of this length, what the fit leaves uncertain;
-            None: as long as the fitted one.
+        drive: The drive. Only the ratios of its positions' covariances matter; their scale is
+            fitted.
+        given: Initial values, which parameters that are not observable keep.
+        whole_s: Duration of a drive over which the noise covers the remaining uncertainty of the
+            fit; None for that of the fitted drive.
 
     Raises:
-        VehicleError: Too few positions, too short a way, or nothing that reports turns.
+        VehicleError: There are too few positions, the distance is too short, or no signal measures
+            turns.
     """
     _check(drive, given)
     names = _free(drive, given)
-    # Wide at first: a filter that trusts a wrong bias is soon where no derivative leads back.
+    # Large noise at first: a filter that trusts a wrong bias diverges, and derivatives are useless.
     plausible = {name: _unit(given, name) for name in names}
     wide = _with_doubt(given, drive.steps(given), plausible, float(drive.seconds[-1]), 1.0)
     fit = _Fit(drive, names, wide, 1.0)
@@ -186,7 +189,7 @@ def fit_odometry(
 
 
 def _own(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Without the start pose."""
+    """Names of the parameters other than the start pose."""
     return tuple(name for name in names if name not in START)
 
 
@@ -194,14 +197,14 @@ def _check(drive: KnownDrive, given: OdometrySettings) -> None:
     n = len(drive.fixes)
     if n < MIN_FIXES:
         raise VehicleError(
-            f"odometry: {n} positions lie within the wheel speeds; expected {MIN_FIXES} or more; "
-            "take a longer drive"
+            f"odometry: {n} positions are within the wheel speeds; expected {MIN_FIXES} or more; "
+            "use a longer drive"
         )
     gone_m = float(np.abs(drive.steps(given).distance_m).sum())
     if gone_m < MIN_DISTANCE_M:
         raise VehicleError(
             f"odometry: the car went {gone_m:.0f} m while its position is known; expected "
-            f"{MIN_DISTANCE_M:.0f} m or more; take a longer drive"
+            f"{MIN_DISTANCE_M:.0f} m or more; use a longer drive"
         )
 
 
@@ -211,8 +214,8 @@ def _free(drive: KnownDrive, given: OdometrySettings) -> tuple[str, ...]:
     one_speed = bool(np.array_equal(speeds[:, -2], speeds[:, -1]))
     if drive.source == "wheels" and one_speed:
         raise VehicleError(
-            "odometry: left and right wheels report one speed, and there is neither yaw rate nor "
-            "steering; name one of them in the vehicle file"
+            "odometry: left and right wheels have the same speed, and yaw rate and steering are "
+            "missing; name one of them in the vehicle file"
         )
     return tuple(name for name in names if name != "wheelbase_m" or given.wheelbase_m is not None)
 
@@ -222,7 +225,7 @@ Values: TypeAlias = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """One state of the fit: what is free, and the noise taken for the weights."""
+    """One state of the fit: the free parameters, and the noise used for the weights."""
 
     drive: KnownDrive
     names: tuple[str, ...]
@@ -249,12 +252,12 @@ class _Fit:
         return whitened(drive.follow(start, steps, cov), drive.fixes.xy_m, cov)
 
     def solve(self, values: Values) -> Values:
-        """The most likely values under the present noise."""
+        """Fit the most likely values under the current noise."""
         found = self._least_squares(values, max_nfev=30)
         return self._values(found.x, values)
 
     def information(self, values: Values) -> Floats:
-        """Of the parameters in units of what is plausible, by the residuals' derivatives."""
+        """Information matrix by the residuals' derivatives, in units of plausible deviations."""
         derivatives = self._least_squares(values, max_nfev=1).jac
         return np.asarray(derivatives.T @ derivatives)
 
@@ -276,7 +279,7 @@ class _Fit:
         )
 
     def covariance(self, values: Values) -> Floats:
-        """Of the parameters in their own units; residuals that hang together count as few."""
+        """Covariance of the parameters in their own units, corrected for correlated residuals."""
         white, _ = self.whitened(values)
         t_ns = self.drive.fixes.t_ns
         independent = min(persistence(t_ns, white[:, i]).independent for i in range(2))
@@ -286,12 +289,12 @@ class _Fit:
         return inverse * np.outer(unit, unit) * excess * len(t_ns) / independent
 
     def deviations(self, values: Values) -> dict[str, float]:
-        """The parameters' s.d. in their own units."""
+        """Standard deviations of the parameters in their own units."""
         sd = np.sqrt(np.diagonal(self.covariance(values)))
         return dict(zip(self.names, sd.tolist(), strict=True))
 
     def observable(self, values: Values) -> tuple[tuple[str, ...], list[NotObservable]]:
-        """The names that the drive determines, and the others; the worst goes first."""
+        """Names of the observable parameters, and the others, removed from the worst on."""
         kept = list(self.names)
         full = self.information(values)
         lost: list[NotObservable] = []
@@ -310,7 +313,7 @@ class _Fit:
             lost.append(NotObservable(name, f"{sure}; it needs {PARAMETERS[name].needs}"))
 
     def with_noise(self, values: Values) -> _Fit:
-        """The noise under which these residuals are most likely."""
+        """Fit the noise that maximises the likelihood of the residuals."""
         from scipy.optimize import minimize
 
         names = self._noises()
@@ -352,7 +355,7 @@ class _Fit:
         return np.array([_unit(self.given, name) for name in self.names])
 
     def _bounds(self, values: Values) -> tuple[Floats, Floats]:
-        """About what was given: a scale or a length must stay positive."""
+        """Bounds about the given values; a scale or a length must remain positive."""
         is_start = np.array([name in START for name in self.names])
         given = np.array([_given(self.given, name) for name in self.names])
         at = np.array([values[name] for name in self.names])
@@ -361,7 +364,7 @@ class _Fit:
         return np.where(is_start, -np.inf, low), np.where(is_start, np.inf, high)
 
     def _values(self, p: Floats, origin: Values) -> Values:
-        # About 1 and not 0, so that finite differences know how large a step is.
+        # About 1 and not 0, so that finite differences have a sensible step.
         away = (p - 1.0) * self._units()
         return {name: origin[name] + by for name, by in zip(self.names, away.tolist(), strict=True)}
 
@@ -371,14 +374,14 @@ def _given(settings: OdometrySettings, name: str) -> float:
 
 
 def _inverse(information: Floats) -> Floats:
-    """The covariance; directions without information stay finite, so that all can be compared."""
+    """Invert the information matrix; directions without information remain finite."""
     values, axes = np.linalg.eigh(information)
     inverse: Floats = (axes / np.maximum(values, 1.0 / NO_INFORMATION_SD**2)) @ axes.T
     return inverse
 
 
 def _unit(settings: OdometrySettings, name: str) -> float:
-    """How far off a parameter may plausibly be."""
+    """Plausible deviation of a parameter."""
     kind = PARAMETERS[name]
     return kind.plausible * (abs(_given(settings, name)) if kind.is_fraction else 1.0)
 
@@ -419,11 +422,11 @@ def _result(
 def _with_doubt(
     settings: OdometrySettings, steps: Steps, sd: Values, seconds: float, factor: float
 ) -> OdometrySettings:
-    """Noise that covers, at the end of a drive as long, what the fit leaves uncertain.
+    """Increase the noise to cover the remaining uncertainty of the fit at the end of a drive.
 
-    A filter without a state for them cannot know that scales and biases stay wrong all drive long.
-    A wrong scale moves a pose by as much as the drive led away from its start, whatever the way
-    there: what turns to the left take, turns to the right return.
+    A filter without states for scales and biases ignores that their errors are constant. A scale
+    error moves the pose in proportion to the drive's displacement from its start, regardless of the
+    path, because left and right turns cancel.
     """
     way_m = float(np.abs(steps.distance_m).sum()) * factor
     turned_rad = float(np.abs(steps.turn_rad).sum()) * factor
@@ -457,7 +460,7 @@ def _with_doubt(
 
 
 def _per_sqrt(reach: float, way: float) -> float:
-    """The density of a random walk that spreads as far as ``reach`` on a way as long."""
+    """Density of a random walk whose s.d. is ``reach`` after the distance ``way``."""
     return reach / math.sqrt(way) if way > 0.0 else 0.0
 
 

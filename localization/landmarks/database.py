@@ -1,11 +1,11 @@
-"""Landmarks in one SQLite file: pictures' features, where they were taken, and how surely.
+"""Landmark database: features of pictures with positions and covariances, in one SQLite file.
 
-An R*Tree over positions makes the 2-sigma ellipse a query, so that a million landmarks cost disk
-and no memory. The file keeps SQLite's rollback journal: a process that dies while writing leaves
-the landmarks there were before, and no second file is needed for reading. Everything one writer
-adds is one transaction.
+An R*Tree over positions answers queries by 2-sigma ellipse, so that a million landmarks need disk
+space but no memory. The file uses SQLite's rollback journal: if a process dies while writing, the
+earlier landmarks remain, and reading needs no second file. All additions of one writer are one
+transaction.
 
-Every landmark carries a CRC-32 over place and features, checked when its features are read.
+Every landmark has a CRC-32 over place and features, which is verified when its features are read.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from .file import (
 )
 
 REACH_SIGMAS: Final = 4.0
-"""Most sigmas that a search may ask for: the R*Tree's boxes hold each landmark's own so many."""
+"""Maximum sigmas of a search: the R*Tree's boxes include this many of each landmark's own."""
 MAX_POINTS: Final = 20_000
 MAX_TEXT: Final = 1024
 
@@ -53,15 +53,15 @@ _COLUMNS: Final = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where a picture was taken: the camera's position, in the map frame.
+    """Position of the camera when a picture was taken, in the map frame.
 
     Attributes:
-        name: Unique in its database.
-        xy_m: Shape (2,).
-        cov_m2: Shape (2, 2), positive definite: how far ``xy_m`` may be off, and how far from it
-            the car may have been when its picture still matches.
-        heading_rad: Of the car, or None where unknown.
-        source: Who took it: a log, a folder.
+        name: Name, unique in its database.
+        xy_m: Position, shape (2,).
+        cov_m2: Covariance, shape (2, 2), positive definite. It includes the error of ``xy_m`` and
+            the distance at which pictures still match.
+        heading_rad: Heading of the car, or None where unknown.
+        source: Origin of the picture: a log or a folder.
     """
 
     name: str
@@ -71,11 +71,11 @@ class Place:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be a landmark.
+        """Validate the place.
 
         Raises:
-            ValueError: A name that is empty or too long, wrong shapes, a number that is not finite,
-                or a covariance that is not positive definite.
+            ValueError: A name is empty or too long, a shape is wrong, a number is not finite, or
+                the covariance is not positive definite.
         """
         if not 0 < len(self.name) <= MAX_TEXT or len(self.source) > MAX_TEXT:
             raise ValueError(f"name, source: expected up to {MAX_TEXT} letters, got {self.name!r}")
@@ -100,12 +100,12 @@ class Place:
 
 
 def _is_unicode(text: str) -> bool:
-    """Surrogates, as in file names that are not UTF-8, cannot be stored."""
+    """Whether a text can be stored; surrogates, as in file names that are not UTF-8, cannot."""
     return not any("\ud800" <= c <= "\udfff" for c in text)
 
 
 def is_positive(cov_m2: Floats) -> bool:
-    """Is a finite 2x2 matrix symmetric and positive definite, by more than rounding?"""
+    """Whether a finite 2x2 matrix is symmetric and positive definite, by more than rounding."""
     (xx, xy), (yx, yy) = cov_m2
     return bool(
         math.isclose(xy, yx, rel_tol=1e-9, abs_tol=1e-300)
@@ -119,9 +119,9 @@ class Nearby(NamedTuple):
     """A landmark inside a search ellipse.
 
     Attributes:
-        key: For ``LandmarkDatabase.features``.
-        place: Where it is.
-        sigmas: Its distance from the ellipse's centre in standard deviations.
+        key: Key for ``LandmarkDatabase.features``.
+        place: Place of the landmark.
+        sigmas: Distance from the ellipse's centre in standard deviations.
     """
 
     key: int
@@ -134,15 +134,15 @@ class LandmarkDatabase:
 
     Attributes:
         path: The file.
-        kind: Name of the matcher whose features it holds.
+        kind: Name of the matcher of its features.
     """
 
     def __init__(self, path: Path) -> None:
         """Open and check the file.
 
         Raises:
-            LogError: Not there, or not to be read.
-            LogFormatError: Foreign, of another version, cut, or damaged.
+            LogError: The file is missing or cannot be read.
+            LogFormatError: The file is of another kind or version, truncated, or damaged.
         """
         self.path: Final = path
         check_length(path)
@@ -162,27 +162,26 @@ class LandmarkDatabase:
     def near(
         self, xy_m: Floats, cov_m2: Floats, sigmas: float = 2.0, max_count: int = 50
     ) -> tuple[Nearby, ...]:
-        """Landmarks inside the ellipse around a position, nearest (in sigmas) first.
+        """Find the landmarks inside the ellipse around a position, nearest (in sigmas) first.
 
-        A landmark's own covariance widens the ellipse for it: the distance is that of Mahalanobis
-        under the sum of both covariances.
+        The distance is that of Mahalanobis, with the sum of the ellipse's covariance and the
+        landmark's.
 
         Args:
-            xy_m: Shape (2,): where the camera is believed to be.
-            cov_m2: Shape (2, 2): how surely; may be singular.
+            xy_m: Shape (2,): estimated position of the camera.
+            cov_m2: Shape (2, 2): its covariance, which can be singular.
             sigmas: Size of the ellipse, at most ``REACH_SIGMAS``.
-            max_count: Give no more than these.
+            max_count: Maximum number of landmarks to return.
 
         Raises:
-            ValueError: ``sigmas`` out of range, or numbers that are not finite.
+            ValueError: ``sigmas`` is out of range, or a number is not finite.
             LogFormatError: The file is damaged.
         """
         if not 0.0 < sigmas <= REACH_SIGMAS:
             raise ValueError(f"sigmas: expected 0 to {REACH_SIGMAS}, got {sigmas}")
         if not (np.isfinite(xy_m).all() and np.isfinite(cov_m2).all()):
             raise ValueError(f"near: expected finite numbers, got {xy_m}, {cov_m2}")
-        # An R*Tree keeps 32-bit floats, rounded outwards for what is stored: round the question
-        # outwards as well.
+        # An R*Tree stores 32-bit floats, rounded outwards, so the query is rounded outwards, too.
         reach = sigmas * np.sqrt(np.maximum(np.diagonal(cov_m2), 0.0))
         margin = 1e-6 * np.abs(xy_m) + 1e-6
         low, high = (xy_m - reach - margin).tolist(), (xy_m + reach + margin).tolist()
@@ -197,7 +196,7 @@ class LandmarkDatabase:
             return tuple(heapq.nsmallest(max_count, inside, key=lambda one: (one.sigmas, one.key)))
 
     def within(self, xy_m: Floats, radius_m: float) -> Iterator[Nearby]:
-        """Landmarks no further than ``radius_m`` from a position, in the order of adding."""
+        """Yield the landmarks within ``radius_m`` of a position, in the order of their addition."""
         low, high = (xy_m - radius_m).tolist(), (xy_m + radius_m).tolist()
         with errors_in_one_line(self.path):
             rows = self._sql.execute(
@@ -211,16 +210,16 @@ class LandmarkDatabase:
                     yield one
 
     def __iter__(self) -> Iterator[Nearby]:
-        """All landmarks in the order of adding, one at a time; ``sigmas`` is 0."""
+        """Yield all landmarks in the order of their addition; ``sigmas`` is 0."""
         with errors_in_one_line(self.path):
             for row in self._sql.execute(f"SELECT {_COLUMNS} FROM landmark AS l ORDER BY id"):  # noqa: S608
                 yield Nearby(cast("int", row[0]), _place(row, self.path), 0.0)
 
     def features(self, key: int) -> Features:
-        """The features of one landmark, their checksum verified.
+        """Read the features of one landmark and verify its checksum.
 
         Raises:
-            LogFormatError: Not there, or damaged.
+            LogFormatError: The features are missing or damaged.
         """
         with errors_in_one_line(self.path):
             row = self._sql.execute(
@@ -233,7 +232,7 @@ class LandmarkDatabase:
         place = _place(row[:9], self.path)
         width, height, points, points_px, descriptors, crc = row[9:]
         if crc != _crc(place, width, height, points_px, descriptors):
-            raise damaged(self.path, f"landmark {place.name}: its checksum does not fit")
+            raise damaged(self.path, f"landmark {place.name}: its checksum does not match")
         try:
             at = np.frombuffer(points_px, "<f4").reshape(points, 2)
             per = len(descriptors) // points if points else 0
@@ -268,20 +267,20 @@ class LandmarkDatabase:
 class LandmarkWriter:
     """Adds landmarks to a new or existing database, all or none. Use it as a context manager.
 
-    Leaving the block without an error commits; an error, or death, leaves the file as it was.
+    The block commits when it ends without an error; otherwise, the file remains unchanged.
     """
 
     def __init__(self, path: Path, kind: str) -> None:
-        """Open, or make, the file.
+        """Open or create the file.
 
         Args:
             path: The file.
             kind: Name of the matcher that made the features.
 
         Raises:
-            LogFormatError: A file is there that is not ours, is cut, or of another version.
-            UsageError: It holds another matcher's features.
-            OutputError: It cannot be written, or another process is writing it.
+            LogFormatError: The existing file is of another kind or version, or truncated.
+            UsageError: The file holds another matcher's features.
+            OutputError: The file cannot be written, or another process is writing it.
         """
         self._path: Final = path
         self._is_new: Final = not path.exists() or path.stat().st_size == 0
@@ -303,7 +302,7 @@ class LandmarkWriter:
         """Add one landmark.
 
         Raises:
-            UsageError: Its name is there already.
+            UsageError: A landmark of this name already exists.
             OutputError: The disk is full.
         """
         if len(features) > MAX_POINTS:
@@ -323,8 +322,8 @@ class LandmarkWriter:
                 ).lastrowid
             except sqlite3.IntegrityError:
                 raise UsageError(
-                    f"{self._path}: a landmark {place.name!r} is there already; "
-                    "give another --source, or another database"
+                    f"{self._path}: a landmark {place.name!r} already exists; "
+                    "use another --source, or another database"
                 ) from None
             self._sql.execute(
                 "INSERT INTO picture VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -354,7 +353,7 @@ class LandmarkWriter:
         self._sql.close()
 
     def _begin(self, kind: str) -> None:
-        # EXTRA: the journal's disappearance, which is the commit, survives a power cut too.
+        # EXTRA: the deletion of the journal, which is the commit, survives a power failure, too.
         self._sql.execute("PRAGMA synchronous = EXTRA")
         self._sql.execute("BEGIN IMMEDIATE")
         if self._is_new:
@@ -368,12 +367,12 @@ class LandmarkWriter:
         if there != kind:
             raise UsageError(
                 f"{self._path}: holds features of matcher {there!r}, not {kind!r}; "
-                f"give --matcher {there} or another database"
+                f"use --matcher {there} or another database"
             )
 
     def _abandon(self) -> None:
-        """Roll back; a file that was not there goes again."""
-        # Where even this fails, a journal stays, and the next to open the file rolls it back.
+        """Roll back; a newly created file is deleted."""
+        # If even this fails, a journal remains, and the next process to open the file rolls back.
         with suppress(sqlite3.Error):
             self._sql.execute("ROLLBACK")
         self._sql.close()

@@ -1,8 +1,8 @@
-"""What is kept of a picture, and who makes and compares it: the door for other matchers.
+"""Features of pictures, and the interface of matchers.
 
-A matcher is named in ``MATCHERS`` or as ``module:factory`` and turns a grey picture into
-``Features``, and two ``Features`` into a score. ORB is one; a learned one can stand in: its
-descriptors are bytes too, whatever they mean to it.
+A matcher is named in ``MATCHERS`` or as ``module:factory``. It extracts ``Features`` from a grey
+picture and scores two ``Features``. ORB is built in; a learned matcher can replace it, because
+descriptors are bytes that only their matcher interprets.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Features:
     """N keypoints of one picture.
 
     Attributes:
-        width_px: Of the picture.
-        height_px: Of the picture.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
         points_px: Shape (N, 2), float32: x right, y down, from the top-left pixel.
-        descriptors: Shape (N, B), uint8: B bytes a point, of meaning to their matcher only.
+        descriptors: Shape (N, B), uint8: B bytes per point, which only their matcher interprets.
     """
 
     width_px: int
@@ -40,10 +40,10 @@ class Features:
     descriptors: Bytes
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
+        """Reject columns of unequal length.
 
         Raises:
-            ValueError: Naming the column, the shape wanted and the shape given.
+            ValueError: A shape is wrong; the message has column, expected and actual shape.
         """
         n = len(self.descriptors)
         if self.descriptors.ndim != 2 or self.descriptors.dtype != np.uint8:
@@ -58,12 +58,13 @@ class Features:
 
 
 class Match(NamedTuple):
-    """How alike two pictures are.
+    """Similarity of two pictures.
 
     Attributes:
-        score: Larger is more certain; ``crosscue fit landmarks`` calibrates it.
-        pairs: Points that look alike.
-        agreeing: Of those, the ones that move as one scene would.
+        score: Score of the match, higher for a more certain one; ``crosscue fit landmarks``
+            calibrates it.
+        pairs: Number of points with similar descriptors.
+        agreeing: Number of those that are consistent with one rigid scene.
     """
 
     score: float
@@ -72,11 +73,11 @@ class Match(NamedTuple):
 
 
 class CameraGeometry(NamedTuple):
-    """The pinhole camera, as far as known.
+    """Geometry of a pinhole camera, where known.
 
     Attributes:
         focal_px: Focal length, or None.
-        center_px: Principal point (x, y), or None for the middle of the picture.
+        center_px: Principal point (x, y), or None for the centre of the picture.
     """
 
     focal_px: float | None = None
@@ -84,19 +85,19 @@ class CameraGeometry(NamedTuple):
 
 
 class Matcher(Protocol):
-    """Makes and compares features."""
+    """Extracts and compares features."""
 
     @property
     def kind(self) -> str:
-        """Name kept in the database; features of other kinds cannot be compared."""
+        """Name stored in the database; features of other kinds cannot be compared."""
         ...
 
     def describe(self, grey: Bytes, /) -> Features:
-        """The features of a grey picture, shape (H, W), uint8; none is a valid result."""
+        """Extract the features of a grey picture, shape (H, W), uint8; zero points are valid."""
         ...
 
     def match(self, seen: Features, known: Features, /) -> Match:
-        """Compare two pictures; the same answer every time."""
+        """Compare two pictures; the result is deterministic."""
         ...
 
 
@@ -104,7 +105,7 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
     """Build a matcher by its name in ``MATCHERS`` or as ``module:factory``.
 
     Raises:
-        UsageError: No such name, module or factory; or it makes no matcher.
+        UsageError: The name, module or factory does not exist, or the result is not a matcher.
     """
     target = MATCHERS.get(name, name)
     module, colon, factory = target.partition(":")
@@ -124,6 +125,6 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
     lacks = [part for part in ("kind", "describe", "match") if not hasattr(made, part)]
     if lacks:
         raise UsageError(
-            f"matcher {name!r}: what the factory returns has no {lacks[0]}; expected a Matcher"
+            f"matcher {name!r}: the factory's result has no {lacks[0]}; expected a Matcher"
         )
     return made

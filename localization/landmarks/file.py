@@ -1,7 +1,7 @@
-"""The landmark database as an SQLite file: its tables, how it is opened, and what is refused.
+"""The SQLite file of a landmark database: its tables, and checks when it is opened.
 
-A file is refused unless it says it is ours (``application_id``), is of this version
-(``user_version``), is as long as its own header says, and holds exactly our tables.
+A file is rejected unless it has crosscue's ``application_id``, this version as ``user_version``,
+the length that its header specifies, and exactly the expected tables.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ TABLES: Final = (
 
 
 def connect_reading(path: Path) -> sqlite3.Connection:
-    """Open for reading; where a writer died, its journal is rolled back first.
+    """Open for reading; the journal of an interrupted writer is rolled back first.
 
     Raises:
-        LogError: It cannot be opened.
+        LogError: The file cannot be opened.
     """
     sql = connect(path, "rw" if journal_of(path).exists() else "ro")
     sql.execute("PRAGMA query_only = ON")
@@ -53,9 +53,9 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
     """Open in one of SQLite's modes ``ro``, ``rw``, ``rwc``.
 
     Raises:
-        LogError: It cannot be opened.
+        LogError: The file cannot be opened.
     """
-    # Percent-encoded, or '%41', '?' and '#' in a file's name would open another file.
+    # Percent-encoded, because '%41', '?' and '#' in a file name would open another file.
     uri = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?mode={mode}"
     try:
         sql = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_BUSY_S)
@@ -67,16 +67,16 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
 
 
 def check_length(path: Path) -> None:
-    """Compare the file's length with what its header says.
+    """Compare the file's length with the one in its header.
 
     Raises:
-        LogError: It cannot be read.
-        LogFormatError: No SQLite file, or a part of one.
+        LogError: The file cannot be read.
+        LogFormatError: The file is not an SQLite file, or truncated.
     """
     try:
         length = path.stat().st_size
         if not path.is_file():
-            raise LogError(f"{path}: no regular file; give a landmark database")
+            raise LogError(f"{path}: not a regular file; expected a landmark database")
         with path.open("rb") as file:
             header = file.read(100)
     except OSError as error:
@@ -84,12 +84,12 @@ def check_length(path: Path) -> None:
             f"{path}: {error.strerror}; make a landmark database with: crosscue landmarks add"
         ) from None
     if len(header) < 100 or not header.startswith(_HEADER):
-        raise LogFormatError(f"{path}: no landmark database (not SQLite); give one")
+        raise LogFormatError(f"{path}: not SQLite; expected a landmark database")
     (page,) = struct.unpack_from(">H", header, 16)
     changes, pages = struct.unpack_from(">II", header, 24)
     page = 65_536 if page == 1 else page
     (valid_for,) = struct.unpack_from(">I", header, 92)
-    # While a journal waits to be rolled back, the header cannot be trusted.
+    # Before a journal is rolled back, the header cannot be trusted.
     is_settled = changes == valid_for and not journal_of(path).exists()
     if is_settled and length < pages * page:
         raise LogFormatError(
@@ -99,19 +99,19 @@ def check_length(path: Path) -> None:
 
 
 def journal_of(path: Path) -> Path:
-    """Where SQLite keeps what a transaction overwrites, until it is done."""
+    """Path of SQLite's rollback journal."""
     return path.with_name(path.name + "-journal")
 
 
 def check_ours(sql: sqlite3.Connection, path: Path) -> None:
-    """Is it a landmark database of this version?
+    """Check that the file is a landmark database of this version.
 
     Raises:
         LogFormatError: It is not.
     """
     application = sql.execute("PRAGMA application_id").fetchone()[0]
     if application != APPLICATION_ID:
-        raise LogFormatError(f"{path}: an SQLite file, but no landmark database; give one")
+        raise LogFormatError(f"{path}: another SQLite file; expected a landmark database")
     version = sql.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:
         raise LogFormatError(
@@ -126,15 +126,15 @@ def check_ours(sql: sqlite3.Connection, path: Path) -> None:
 
 
 def kind_of(sql: sqlite3.Connection, path: Path) -> str:
-    """Name of the matcher whose features it holds."""
+    """Read the name of the matcher of its features."""
     row = sql.execute("SELECT value FROM setting WHERE key = 'matcher'").fetchone()
     if row is None:
-        raise damaged(path, "it does not say whose features it holds")
+        raise damaged(path, "the name of its matcher is missing")
     return str(row[0])
 
 
 def damaged(path: Path, why: str) -> LogFormatError:
-    """The error to raise where the file contradicts itself."""
+    """Return the error for an inconsistent file."""
     return LogFormatError(
         f"{path}: damaged: {why}; copy it again, or build it again with: crosscue landmarks add"
     )
@@ -142,7 +142,7 @@ def damaged(path: Path, why: str) -> LogFormatError:
 
 @contextmanager
 def errors_in_one_line(path: Path, *, writing: bool = False) -> Iterator[None]:
-    """SQLite's errors as ours."""
+    """Convert SQLite's errors to crosscue's."""
     try:
         yield
     except UnicodeDecodeError as error:
@@ -159,5 +159,5 @@ def errors_in_one_line(path: Path, *, writing: bool = False) -> Iterator[None]:
             full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             raise cannot_write(path, full) from None
         if writing:
-            raise OutputError(f"{path}: {error}; choose a place you may write to") from None
+            raise OutputError(f"{path}: {error}; choose a writable folder") from None
         raise LogFormatError(f"{path}: {error}; check the file and its folder") from None

@@ -1,9 +1,10 @@
-"""The match threshold for a wanted false-match rate, and how sure one may be of it.
+"""Fit the match threshold to a target false-match rate, with confidence intervals.
 
-Pairs of pictures, labelled as one place or two, are scored. Half of the query pictures choose the
-threshold: the lowest at which no more than the wanted fraction of two-place pairs match. The other
-half, never examined until then, yields the rates. Intervals: false matches by Clopper and Pearson
-(Biometrika 26, 1934), which holds even where none was seen; found places by Wilson (JASA 22, 1927).
+Pairs of pictures are labelled as one place or two, and scored. The threshold is fitted on half of
+the query pictures: it is the lowest at which at most the target fraction of two-place pairs match.
+The rates are measured on the other half, which is not used before. The interval of false matches is
+that of Clopper and Pearson (Biometrika 26, 1934), which is valid even without an observation; that
+of found places is Wilson's (JASA 22, 1927).
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ class ScoredPairs:
 
     Attributes:
         score: Shape (N,).
-        is_same: Shape (N,), bool: both show one place.
-        query: Shape (N,), int64: number of the query picture; pairs of one go to one half.
+        is_same: Shape (N,), bool: True if both show one place.
+        query: Shape (N,), int64: number of the query picture, whose pairs are all in one half.
     """
 
     score: NDArray[np.float64]
@@ -34,10 +35,10 @@ class ScoredPairs:
     query: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up.
+        """Reject columns of unequal length.
 
         Raises:
-            ValueError: Naming the column, the shape wanted and the shape given.
+            ValueError: A shape is wrong; the message has column, expected and actual shape.
         """
         for name in ("is_same", "query"):
             if getattr(self, name).shape != self.score.shape:
@@ -54,10 +55,10 @@ class Rate:
     """A fraction with its 95 % interval.
 
     Attributes:
-        hits: How many were so.
-        of: Of how many.
-        low: Lower end.
-        high: Upper end.
+        hits: Numerator.
+        of: Denominator.
+        low: Lower bound.
+        high: Upper bound.
     """
 
     hits: int
@@ -68,15 +69,15 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkFit:
-    """A threshold and what it is worth.
+    """A fitted threshold and its rates.
 
     Attributes:
-        min_score: Matches from here on.
-        wanted_rate: The false-match rate asked for.
-        fitted_false: On the half that chose it.
-        fitted_found: On that half: same-place pairs that match.
-        held_out_false: On the other half.
-        held_out_found: On the other half.
+        min_score: Minimum score of a match.
+        wanted_rate: Target false-match rate.
+        fitted_false: Rate of two-place pairs that match, on the half of the fit.
+        fitted_found: Rate of same-place pairs that match, on the half of the fit.
+        held_out_false: Rate of two-place pairs that match, on the held-out half.
+        held_out_found: Rate of same-place pairs that match, on the held-out half.
     """
 
     min_score: float
@@ -88,20 +89,20 @@ class LandmarkFit:
 
     @property
     def is_shown(self) -> bool:
-        """Do the held-out pairs show that the rate is no higher than wanted?"""
+        """Whether the held-out pairs show that the rate does not exceed the target."""
         return self.held_out_false.high <= self.wanted_rate
 
 
 def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> LandmarkFit:
-    """Choose the threshold on one half of the queries, measure the rates on the other.
+    """Fit the threshold on one half of the queries, and measure the rates on the other.
 
     Args:
-        pairs: Labelled and scored.
-        wanted_rate: Fraction of two-place pairs that may match.
-        seed: Of the split.
+        pairs: Labelled and scored pairs.
+        wanted_rate: Maximum fraction of two-place pairs that match.
+        seed: Seed of the split.
 
     Raises:
-        ValueError: A rate out of range, or a half without two-place pairs.
+        ValueError: The rate is out of range, or a half has no two-place pairs.
     """
     if not 0.0 <= wanted_rate < 1.0:
         raise ValueError(f"wanted_rate: expected 0 to 1, got {wanted_rate}")
@@ -128,7 +129,7 @@ def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> Land
 def _threshold(
     score: NDArray[np.float64], is_false: NDArray[np.bool_], wanted_rate: float
 ) -> float:
-    """Half-way between the highest score that must not match and the next one seen."""
+    """Threshold half-way between the highest score that must not match and the next higher one."""
     worst_first = np.sort(score[is_false])[::-1]
     allowed = math.floor(wanted_rate * len(worst_first) + 1e-9)
     below = float(worst_first[allowed])
@@ -146,7 +147,7 @@ def _rate(
 
 
 def wilson(count: int, of: int) -> Rate:
-    """The 95 % score interval of a fraction; 0 to 1 where nothing was tried."""
+    """Wilson's 95 % score interval of a fraction; 0 to 1 without trials."""
     if of == 0:
         return Rate(0, 0, 0.0, 1.0)
     fraction, z2 = count / of, Z_95**2
@@ -157,7 +158,7 @@ def wilson(count: int, of: int) -> Rate:
 
 
 def clopper_pearson(count: int, of: int) -> Rate:
-    """The exact 95 % interval of a fraction; 0 to 1 where nothing was tried."""
+    """Exact 95 % interval of a fraction; 0 to 1 without trials."""
     if of == 0:
         return Rate(0, 0, 0.0, 1.0)
     low = 0.0 if count == 0 else _fraction_at(count - 1, of, 0.975)
@@ -166,7 +167,7 @@ def clopper_pearson(count: int, of: int) -> Rate:
 
 
 def _fraction_at(count: int, of: int, probability: float) -> float:
-    """The fraction at which no more than ``count`` of ``of`` come up with the given probability."""
+    """Fraction at which at most ``count`` of ``of`` trials succeed with the given probability."""
     low, high = 0.0, 1.0
     for _ in range(60):
         middle = 0.5 * (low + high)

@@ -1,4 +1,4 @@
-"""Pictures for feature matching: grey, at full size, of files as well as of logs."""
+"""Read grey pictures of full size, from files and logs, for feature matching."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ GREY: Final = View(is_grey=True)
 
 
 def picture_of(images: Images, row: int) -> Encoded:
-    """One row of a block, copied out of the block's buffer, which is large and would stay."""
+    """Copy one picture of a block, so that the block's large buffer can be released."""
     picture = encoded(images, row)
     return replace(picture, content=memoryview(bytes(picture.content)))
 
 
 def read_picture(path: Path, limits: Limits = DEFAULT_LIMITS) -> Encoded:
-    """A picture file, not decoded yet.
+    """Read a picture file without decoding it.
 
     Raises:
-        LogError: It cannot be read.
-        LogTooLargeError: Larger than one encoded picture may be.
-        LogFormatError: No picture that is known here.
+        LogError: The file cannot be read.
+        LogTooLargeError: The file exceeds the maximum size of an encoded picture.
+        LogFormatError: The file is not a supported picture.
     """
     try:
         return read_file(path, limits.message_bytes)
     except OSError as error:
-        raise LogError(f"{path}: {error.strerror}; give a picture") from None
+        raise LogError(f"{path}: {error.strerror}; expected a picture") from None
     except LogError as error:
-        raise type(error)(f"{path}: {error}; give another") from None
+        raise type(error)(f"{path}: {error}; use another picture") from None
 
 
 def grey_of(picture: Encoded) -> Bytes:
-    """The picture's pixels, shape (H, W), uint8.
+    """Decode a picture to grey pixels, shape (H, W), uint8.
 
     Raises:
-        LogFormatError: Damaged, cut short, or of a coding that is not decoded here.
-        LogTooLargeError: It says it has more pixels than are decoded.
+        LogFormatError: The picture is damaged, truncated or of an unsupported coding.
+        LogTooLargeError: The picture exceeds the maximum number of pixels.
     """
     return decode(picture, GREY)[0]

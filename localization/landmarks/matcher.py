@@ -1,10 +1,10 @@
-"""ORB features, compared by ratio test and the geometry of one scene.
+"""Matcher of ORB features, by ratio test and scene geometry.
 
-E. Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011. Points of two
-pictures that look alike (nearest neighbour in Hamming distance, well ahead of the second, and
-mutual) are held against one homography (a plane, or a camera that only turned) or one essential
-matrix (any rigid scene, seen by one known camera). Both estimates are OpenCV's, drawn with a fixed
-seed, so that the answer is the same every time. The score is the number of agreeing points.
+See E. Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011. Two points match
+if they are mutual nearest neighbours in Hamming distance, much nearer than the second neighbour.
+The matches are verified with a homography (a plane, or a camera that only rotates) or an essential
+matrix (any rigid scene, with a known camera). OpenCV estimates both with a fixed seed, so the
+result is deterministic. The score is the number of consistent points.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from crosscue.replay.base import Bytes, UsageError
 from .features import CameraGeometry, Features, Match
 
 _MIN_SIDE_PX: Final = 32
-"""ORB examines patches of this size."""
+"""Minimum side of a picture: the size of ORB's patches."""
 _MIN_PAIRS: Final = {"homography": 6, "essential": 8}
-"""Below these a fit says nothing: four or five points fit one by making."""
+"""Minimum number of pairs for a geometry, which four or five points always fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class OrbSettings:
-    """How ORB features are made and compared.
+    """Settings of ORB features and their comparison.
 
     Attributes:
-        features: Most points kept of one picture.
-        side_px: Pictures with a longer side are made smaller first.
-        ratio: The nearest neighbour's distance by the second's must be below.
-        tolerance_px: How far an agreeing point may be off.
-        geometry: What agreeing points share.
-        camera: Needed for ``essential``; the same camera for database and drive.
+        features: Maximum number of points per picture.
+        side_px: Maximum length of a picture's longer side; larger pictures are scaled down.
+        ratio: Upper bound of the nearest neighbour's distance over the second's.
+        tolerance_px: Maximum error of a consistent point.
+        geometry: Geometric model of consistent points.
+        camera: Camera of database and drive, required for ``essential``.
     """
 
     features: int = 500
@@ -47,10 +47,10 @@ class OrbSettings:
     camera: CameraGeometry = field(default_factory=CameraGeometry)
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing.
+        """Validate the settings.
 
         Raises:
-            ValueError: Naming the field and the value.
+            ValueError: A value is invalid; the message has field and value.
         """
         if not 0.0 < self.ratio <= 1.0:
             raise ValueError(f"ratio: expected 0 to 1, got {self.ratio}")
@@ -65,11 +65,11 @@ class OrbMatcher:
     kind: Final = "orb"
 
     def __init__(self, settings: OrbSettings) -> None:
-        """Compare as ``settings`` say."""
+        """Create the matcher with these settings."""
         self.settings: Final = settings
 
     def describe(self, grey: Bytes, /) -> Features:
-        """The picture's ORB features; see ``Matcher``."""
+        """Extract the picture's ORB features; see ``Matcher``."""
         import cv2
 
         height, width = grey.shape
@@ -87,7 +87,7 @@ class OrbMatcher:
         return Features(width, height, at, np.asarray(descriptors, np.uint8))
 
     def match(self, seen: Features, known: Features, /) -> Match:
-        """Count the points that agree; see ``Matcher``."""
+        """Count the consistent points; see ``Matcher``."""
         if (
             len(seen) < 2
             or len(known) < 2
@@ -103,7 +103,7 @@ class OrbMatcher:
     def _pairs(
         self, seen: Features, known: Features
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Points that look alike, each shape (N, 2)."""
+        """Matching points of both pictures, shape (N, 2) each."""
         import cv2
 
         found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(seen.descriptors, known.descriptors, k=2)
@@ -112,7 +112,7 @@ class OrbMatcher:
             for first, second in found
             if first.distance < self.settings.ratio * second.distance
         ]
-        # Of several points that chose the same one, the nearest has it.
+        # If several points have the same neighbour, only the nearest is kept.
         best: dict[int, tuple[float, int]] = {}
         for one in good:
             rank = (one.distance, one.queryIdx)
@@ -148,7 +148,7 @@ class OrbMatcher:
                     params,
                 )
         except cv2.error:
-            # Points on one spot or line: no such geometry, hence nothing that agrees.
+            # All points coincide or are on one line, so the geometry is undefined.
             return 0
         return 0 if mask is None else int(np.count_nonzero(mask))
 
@@ -163,19 +163,19 @@ def _nothing() -> tuple[NDArray[np.float32], Bytes]:
 
 
 def orb(camera: CameraGeometry) -> OrbMatcher:
-    """ORB and one homography."""
+    """Build a matcher of ORB features with a homography."""
     return OrbMatcher(OrbSettings(camera=camera))
 
 
 def orb_essential(camera: CameraGeometry) -> OrbMatcher:
-    """ORB and one essential matrix.
+    """Build a matcher of ORB features with an essential matrix.
 
     Raises:
-        UsageError: The camera's focal length is not known.
+        UsageError: The camera's focal length is unknown.
     """
     if camera.focal_px is None or not math.isfinite(camera.focal_px):
         raise UsageError(
-            "matcher 'orb-essential': needs camera.focal_px in the vehicle file; give it with "
-            "--vehicle, or use orb"
+            "matcher 'orb-essential': needs camera.focal_px in the vehicle file; name the file "
+            "with --vehicle, or use orb"
         )
     return OrbMatcher(OrbSettings(geometry="essential", camera=camera))

@@ -1,4 +1,4 @@
-"""A landmark recognised in a frame, as the pose filter takes it."""
+"""A recognised landmark as a measurement of the pose filter."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ class Sighting(NamedTuple):
     """A landmark that reached the filter.
 
     Attributes:
-        t_ns: When it was weighed in.
-        name: The landmark's.
-        xy_m: Shape (2,): the camera's position as measured, carried to ``t_ns``.
-        cov_m2: Shape (2, 2).
-        score: At its best.
+        t_ns: Time of the update.
+        name: Name of the landmark.
+        xy_m: Shape (2,): measured position of the camera, moved to ``t_ns``.
+        cov_m2: Covariance of the position, shape (2, 2).
+        score: Highest score of the match.
         nis: Normalised innovation squared, chi-square with two degrees of freedom.
         outcome: ``ACCEPTED`` or ``REJECTED`` by the gate.
     """

@@ -1,17 +1,17 @@
-"""Landmarks weighed into the pose: search in the ellipse, match, gate, update.
+"""Update the pose with landmarks: search in the ellipse, match, gate, update.
 
 A picture is compared only with landmarks inside the 2-sigma ellipse of the camera's estimated
-position. A match measures that position: the landmark's coordinates, with the landmark's own
-covariance. The camera sits ``lever_m`` before the rear axle, so that heading takes part:
+position. A match measures that position: the landmark's coordinates, with the landmark's
+covariance. The camera is ``lever_m`` ahead of the rear axle, so the measurement depends on heading:
 
     z = p + R(heading) lever,    H = [I, dR/dheading lever, 0]
 
 with the update in Joseph form (Bar-Shalom, Li, Kirubarajan, eq. 5.2.3-18).
 
-A car that drives by a landmark matches it many times, from far off at first. It counts once, at its
-best: when the score has fallen from its peak, the position at the peak is weighed in, carried to
-the present by the motion estimated since. A landmark's error is the same every time, so it counts
-again only after ``revisit_m``.
+A car that passes a landmark matches it many times, at first from a distance. It is used once, at
+the best match: when the score has fallen from its peak, the position at the peak is moved to the
+current time by the estimated motion and used as measurement. A landmark's error is the same every
+time, so it is used again only after ``revisit_m``.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from .features import Features, Match, Matcher
 from .sighting import Sighting
 
 FALLEN_SHARE: Final = 0.8
-"""A score below this fraction of its peak has passed it."""
+"""Fraction of the peak score below which the peak is over."""
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkSettings:
-    """How landmarks are searched for and weighed.
+    """Settings of the search for landmarks and of their use.
 
     Attributes:
-        min_score: Matches with a lower score are ignored; ``crosscue fit landmarks`` chooses it.
+        min_score: Minimum score of a match; ``crosscue fit landmarks`` fits it.
         sigmas: Size of the search ellipse.
-        max_candidates: Compare with no more landmarks than these, the nearest.
-        gate_nis: Refuse a match whose normalised innovation squared is larger; None accepts all.
-        interval_m: Look again once the car has gone this far.
-        revisit_m: A landmark counts again once the car has gone this far since it counted.
-        lever_m: The camera's place ahead of and to the left of the rear axle.
+        max_candidates: Maximum number of landmarks to compare, the nearest first.
+        gate_nis: Normalised innovation squared above which a match is rejected; None accepts all.
+        interval_m: Distance between two frames that are examined.
+        revisit_m: Distance after which the same landmark can be used again.
+        lever_m: Position of the camera, ahead of and to the left of the rear axle.
     """
 
     min_score: float = 20.0
@@ -61,10 +61,10 @@ class LandmarkSettings:
     lever_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing.
+        """Validate the settings.
 
         Raises:
-            ValueError: Naming the field and the value.
+            ValueError: A value is invalid; the message has field and value.
         """
         if not 0.0 < self.sigmas <= REACH_SIGMAS:
             raise ValueError(f"sigmas: expected 0 to {REACH_SIGMAS}, got {self.sigmas}")
@@ -76,19 +76,19 @@ class LandmarkSettings:
 
 @dataclass(slots=True)
 class LandmarkCounts:
-    """What became of the frames, for the manifest.
+    """Account of the frames, for the manifest.
 
     Attributes:
-        frames: Pictures that came up.
-        thinned: Not examined: too soon after the last one.
-        late: Not examined: before the belief's time.
-        undecodable: Not examined: the picture does not decode.
-        without_candidate: No landmark inside the ellipse, so that nothing was decoded.
-        candidates: Landmarks compared, over all frames.
+        frames: Number of pictures processed.
+        thinned: Pictures skipped because they are too soon after the last examined one.
+        late: Pictures skipped because they are before the belief's time.
+        undecodable: Pictures skipped because they do not decode.
+        without_candidate: Pictures not decoded because no landmark is inside the ellipse.
+        candidates: Number of landmarks compared, over all frames.
         matched: Frames whose best score was high enough.
-        repeated: Peaks of a landmark that had counted a short while before.
-        accepted: Landmarks weighed in.
-        gated: Landmarks refused by the gate.
+        repeated: Peaks of landmarks that had been used within ``revisit_m``.
+        accepted: Landmarks used.
+        gated: Landmarks rejected by the gate.
     """
 
     frames: int = 0
@@ -103,12 +103,12 @@ class LandmarkCounts:
     gated: int = 0
 
     def as_dict(self) -> dict[str, int]:
-        """Plain numbers by name."""
+        """Return the counts by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 class Best(NamedTuple):
-    """The best of one frame's candidates."""
+    """Best candidate of one frame."""
 
     place: Place
     match: Match
@@ -130,10 +130,10 @@ def update_camera_position(
     lever_m: tuple[float, float] = (0.0, 0.0),
     gate_nis: float | None = None,
 ) -> Updated:
-    """Weigh in a measured position of the camera; with no lever, ``ekf.update_position``.
+    """Update with a measured position of the camera; without a lever, ``ekf.update_position``.
 
     Raises:
-        ValueError: Wrong shape, not finite, or ``cov_m2`` not positive definite.
+        ValueError: A shape is wrong, a value is not finite, or ``cov_m2`` is not positive definite.
     """
     if xy_m.shape != (2,) or not np.isfinite(xy_m).all():
         raise ValueError(f"xy_m: expected two finite numbers, got {xy_m}")
@@ -170,7 +170,7 @@ def _observed(
 def best_of(
     seen: Features, candidates: tuple[Nearby, ...], database: LandmarkDatabase, matcher: Matcher
 ) -> Best | None:
-    """The candidate that matches best; of equals the nearest. None without a candidate.
+    """Find the best matching candidate, the nearest of equal ones; None without candidates.
 
     Raises:
         LogFormatError: The database is damaged.
@@ -192,14 +192,14 @@ class _Peak(NamedTuple):
 
 @dataclass(slots=True)
 class LandmarkSearch:
-    """Keeps what one frame's look needs of the frames before it.
+    """Search for landmarks in a sequence of frames.
 
     Attributes:
-        database: Open.
-        matcher: Of the database's kind.
-        settings: How.
-        counts: What became of the frames.
-        sightings: Landmarks that reached the filter since they were last taken.
+        database: An open database.
+        matcher: A matcher of the database's kind.
+        settings: Settings of search and use.
+        counts: Account of the frames.
+        sightings: Landmarks that reached the filter since ``take_sightings`` was last called.
     """
 
     database: LandmarkDatabase
@@ -214,16 +214,16 @@ class LandmarkSearch:
     def look(
         self, belief: PoseBelief, travelled_m: float, describe: Callable[[], Features | None]
     ) -> PoseBelief | None:
-        """Look at one frame.
+        """Process one frame.
 
         Args:
-            belief: At the frame's time.
+            belief: Belief at the frame's time.
             travelled_m: Distance driven so far.
-            describe: Returns the frame's features, or None if it does not decode; asked only where
-                there is something to compare with.
+            describe: Returns the frame's features, or None if it does not decode; called only if
+                there are candidates.
 
         Returns:
-            The posterior, or None where nothing was weighed in.
+            The posterior, or None without an update.
         """
         self.counts.frames += 1
         gone_m = math.inf if self._looked_m is None else travelled_m - self._looked_m
@@ -237,11 +237,11 @@ class LandmarkSearch:
         return None if passed is None else self._weigh(belief, travelled_m, passed)
 
     def cross_gap(self) -> None:
-        """Forget the landmark in view: nobody measured how far it has been left behind."""
+        """Forget the landmark in view, because the distance since its peak is unknown."""
         self._peak = None
 
     def take_sightings(self) -> list[Sighting]:
-        """The sightings since the last call."""
+        """Return the sightings since the last call."""
         taken, self.sightings = self.sightings, []
         return taken
 
@@ -268,7 +268,7 @@ class LandmarkSearch:
         return best
 
     def _passed(self, best: Best | None, belief: PoseBelief, travelled_m: float) -> _Peak | None:
-        """The peak that this frame shows to be over."""
+        """Return the peak that is over with this frame; None if there is no such peak."""
         peak = self._peak
         here = None
         if best is not None:
@@ -280,7 +280,7 @@ class LandmarkSearch:
                 return None
             if here.score >= FALLEN_SHARE * peak.score:
                 return None
-            # What is left of this landmark leaves the view and is not a new peak.
+            # The remaining matches of this landmark are not a new peak.
             here = here._replace(score=math.inf)
         self._peak = here
         return None if peak is None or math.isinf(peak.score) else peak
@@ -309,10 +309,10 @@ class LandmarkSearch:
         return done.belief
 
     def _moved(self, belief: PoseBelief, travelled_m: float, peak: _Peak) -> NDArray[np.float64]:
-        """How far the camera has moved since the peak.
+        """Displacement of the camera since the peak.
 
-        From way and heading, not from the two estimated positions: what the filter corrected
-        meanwhile is not motion.
+        It is computed from distance and heading, not from the two estimated positions, because the
+        filter's corrections since then are not motion.
         """
         heading = float(belief.mean[HEADING])
         turned = wrap(heading - peak.heading_rad)

@@ -198,7 +198,7 @@ def test_without_a_reference_a_straight_drive_shows_nothing() -> None:
     fit = fit_compass(times(600), field, None, given)
 
     assert fit.observable == ()
-    assert dict(fit.not_observable)["hard iron"] == "the readings do not go round an ellipse"
+    assert dict(fit.not_observable)["hard iron"] == "the readings do not cover an ellipse"
     assert fit.settings == given
 
 
@@ -214,7 +214,7 @@ def test_without_a_reference_half_an_ellipse_is_not_enough() -> None:
 def test_mirrored_axes_are_refused(fraction: float) -> None:
     truth = around(fraction)
     mirrored = readings(truth, IRON) * [1.0, -1.0, 1.0]
-    with pytest.raises(VehicleError, match="turn the wrong way round"):
+    with pytest.raises(VehicleError, match="turn in the wrong direction"):
         fit_compass(times(600), mirrored, truth, given_mounting(IRON))
 
 
@@ -295,7 +295,7 @@ def test_opposite_angles_have_no_mean() -> None:
 
 def test_readings_unrelated_to_the_heading_are_refused() -> None:
     field = np.tile([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], (50, 1))
-    with pytest.raises(VehicleError, match="nothing to do with the headings"):
+    with pytest.raises(VehicleError, match="not correlated with the headings"):
         fit_compass(times(100), field, np.full(100, 0.2), CompassSettings())
 
 

@@ -166,7 +166,7 @@ def test_too_short_a_drive_is_refused() -> None:
     rng = np.random.default_rng(seed=3)
     there = straight()
 
-    with pytest.raises(VehicleError, match="5 positions lie within the wheel speeds; expected 15"):
+    with pytest.raises(VehicleError, match="5 positions are within the wheel speeds; expected 15"):
         fit_odometry(known(there, rng).until(int(there.t_ns[81])), CAR)
 
 

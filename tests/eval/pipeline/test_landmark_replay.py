@@ -287,7 +287,7 @@ def test_pictures_with_coordinates_become_landmarks(
         ("image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2\n0.png,1,2,1,2,1\n", 4, "positive definite"),
         ("image,x_m,y_m,sd_m\nbad.png,1,2,1\n", 4, "bad.png: not a JPEG, PNG or WebP picture"),
         ("image,x_m,y_m,sd_m\nmissing.png,1,2,1\n", 4, "missing.png: No such file"),
-        ("image,x_m,y_m,sd_m\n0.png,1,2,1\n0.png,1,2,1\n", 2, "'photos/0.png' is there already"),
+        ("image,x_m,y_m,sd_m\n0.png,1,2,1\n0.png,1,2,1\n", 2, "'photos/0.png' already exists"),
     ],
 )
 def test_bad_coordinates_are_refused_and_nothing_is_written(

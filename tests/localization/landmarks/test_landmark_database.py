@@ -181,13 +181,13 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
     other.close()
     (tmp_path / "text.sqlite").write_text("not a database at all\n" * 20)
 
-    with pytest.raises(LogFormatError, match="no landmark database; give one"):
+    with pytest.raises(LogFormatError, match="another SQLite file; expected a landmark database"):
         LandmarkDatabase(tmp_path / "other.sqlite")
     with pytest.raises(LogFormatError, match="not SQLite"):
         LandmarkDatabase(tmp_path / "text.sqlite")
     with pytest.raises(LogError, match="crosscue landmarks add"):
         LandmarkDatabase(tmp_path / "missing.sqlite")
-    with pytest.raises(LogError, match="no regular file"):
+    with pytest.raises(LogError, match="not a regular file"):
         LandmarkDatabase(tmp_path)
 
 
@@ -212,7 +212,7 @@ def test_a_changed_byte_is_found_before_the_features_are_used(tmp_path: Path) ->
     with LandmarkDatabase(path) as database:
         keys = [one.key for one in database]
         assert len(database.features(keys[0])) == 20
-        with pytest.raises(LogFormatError, match="landmark 1: its checksum does not fit"):
+        with pytest.raises(LogFormatError, match="landmark 1: its checksum does not match"):
             database.features(keys[1])
 
 
@@ -274,11 +274,11 @@ def test_a_failure_leaves_all_as_it_was(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     before = path.read_bytes()
 
-    with pytest.raises(UsageError, match="'2' is there already"):
+    with pytest.raises(UsageError, match="'2' already exists"):
         _add(path, ["new", "2"])
     assert path.read_bytes() == before
 
-    with pytest.raises(UsageError, match="'twin' is there already"):
+    with pytest.raises(UsageError, match="'twin' already exists"):
         _add(tmp_path / "fresh.sqlite", ["twin", "twin"])
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
