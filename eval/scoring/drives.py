@@ -16,7 +16,13 @@ from crosscue.eval.scoring.scene import approaches as score_approaches
 from crosscue.eval.scoring.scene import belief as score_belief
 from crosscue.eval.scoring.scene.approaches import ApproachesJudged, ApproachScore, judge_approaches
 from crosscue.eval.scoring.scene.belief import BeliefJudged, BeliefScore, judge_belief
-from crosscue.eval.scoring.scene.cues import CueFrames, CueScore, match_cues, score_cues
+from crosscue.eval.scoring.scene.cues import (
+    CueFrames,
+    CueScore,
+    features_not_looked_for,
+    match_cues,
+    score_cues,
+)
 from crosscue.eval.scoring.scene.detection import RULES
 from crosscue.eval.scoring.scene.detection import Definition as Definition
 from crosscue.eval.scoring.scene.ranges import FilterAndSmoother as FilterAndSmoother
@@ -136,7 +142,9 @@ def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAUL
     """
     covered_s = _check_fits(tables, truth)
     cues = tuple(match_cues(tables, truth))
-    approaches = judge_approaches(tables, truth, settings.threshold, settings.detection)
+    approaches = judge_approaches(
+        tables, truth, settings.threshold, settings.detection, features_not_looked_for(tables)
+    )
     belief, ranges = tuple(judge_belief(tables, truth)), tuple(judge_range(tables, truth))
     frames = _frames(tables)
     ambiguous = tables.ambiguous.get("frames", 0)

@@ -17,7 +17,7 @@ that meets no true approach is extra.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -32,6 +32,8 @@ from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
 
 THRESHOLD: Final = 0.9
+UNLIKELY: Final = "never probable enough"
+NOT_LOOKED_FOR: Final = "not looked for"
 BRIEF: Final = f"for fewer than {CONFIRM_FRAMES} frames"
 WRONG_RANGE: Final = "range outside its 95 % interval"
 NEAR_M: Final = 8.0
@@ -183,8 +185,18 @@ def judge_approaches(
     truth: DriveTruth,
     threshold: float = THRESHOLD,
     definition: Definition = "confirmed",
+    not_looked_for: Collection[str] = (),
 ) -> ApproachesJudged | None:
-    """Lay the run's approaches beside the true ones; None for a run or truth without any."""
+    """Lay the run's approaches beside the true ones; None for a run or truth without any.
+
+    Args:
+        tables: The run's tables.
+        truth: The drive's truth.
+        threshold: Probability above which a feature is believed.
+        definition: When a detection counts.
+        not_looked_for: Features that no cue of the run could show. Where one of them is missing,
+            the reason says so.
+    """
     belief = tables.belief
     if belief is None or not truth.truth.approaches:
         return None
@@ -204,7 +216,10 @@ def judge_approaches(
         mine = _steps_of(kept, pairs.get(one.id), one)
         others = [n for n in spans if n not in pairs.values() and overlap_ns(one, spans[n]) > 0]
         number, rule = pairs.get(one.id), RULES[definition]
-        results.append(_result(one, mine, number, len(others), tables, truth, threshold, rule))
+        result = _result(
+            one, mine, number, len(others), tables, truth, threshold, rule, not_looked_for
+        )
+        results.append(result)
         if len(mine.t_ns):
             curves.append(_curve(one, mine, truth))
     extra, detected, outside = _extras(kept, spans, pairs, truth, threshold)
@@ -265,6 +280,7 @@ def _result(
     truth: DriveTruth,
     threshold: float,
     rule: Rule,
+    not_looked_for: Collection[str],
 ) -> ApproachResult:
     present = tuple(name for name in FEATURES if has_feature(one, name))
     absent = tuple(name for name in FEATURES if has_feature(one, name) is False)
@@ -303,10 +319,14 @@ def _result(
         detected_m=_first(detected, distance),
         full_m=_first(full, distance),
         why_not_detected=_why(
-            number, detected, _spurious_reason(published, is_right) or _range_reason(likely, ranged)
+            number,
+            detected,
+            _spurious_reason(published, is_right) or _range_reason(likely, ranged, not_looked_for),
         ),
         why_not_full=_why(
-            number, full, BRIEF if was_full and not missing else _full_reason(missing, steps)
+            number,
+            full,
+            BRIEF if was_full and not missing else _full_reason(missing, steps, not_looked_for),
         ),
         spurious_m=_first(published, distance) if is_spurious else None,
         why_spurious=_spurious_reason(published, is_right) if is_spurious else "",
@@ -344,9 +364,11 @@ def _why(number: int | None, holds: NDArray[np.bool_], otherwise: str) -> str:
     return "the run has no approach here" if number is None else otherwise
 
 
-def _range_reason(likely: NDArray[np.bool_], ranged: NDArray[np.bool_]) -> str:
+def _range_reason(
+    likely: NDArray[np.bool_], ranged: NDArray[np.bool_], not_looked_for: Collection[str]
+) -> str:
     if not likely.any():
-        return "never probable enough"
+        return NOT_LOOKED_FOR if "intersection" in not_looked_for else UNLIKELY
     return "no range" if not ranged.any() else "range only while not probable enough"
 
 
@@ -357,13 +379,15 @@ def _spurious_reason(published: NDArray[np.bool_], is_right: NDArray[np.bool_]) 
     return BRIEF if is_right[np.argmax(published)] else WRONG_RANGE
 
 
-def _full_reason(missing: Sequence[str], steps: BeliefRows) -> str:
-    """What was never probable enough, and what the run never changed its mind about."""
+def _full_reason(missing: Sequence[str], steps: BeliefRows, not_looked_for: Collection[str]) -> str:
+    """List the features that are missing: improbable, without evidence, or not looked for."""
     if not missing:
         return "never all at once"
-    unseen = [name for name in missing if name in steps.features and _never_changes(steps, name)]
-    unlikely = [name for name in missing if name not in unseen]
-    parts = (("never probable enough", unlikely), ("not seen", unseen))
+    unsought = [name for name in missing if name in not_looked_for]
+    others = [name for name in missing if name not in not_looked_for]
+    unseen = [name for name in others if name in steps.features and _never_changes(steps, name)]
+    unlikely = [name for name in others if name not in unseen]
+    parts = ((UNLIKELY, unlikely), ("not seen", unseen), (NOT_LOOKED_FOR, unsought))
     return "; ".join(f"{what}: {', '.join(names)}" for what, names in parts if names)
 
 

@@ -32,7 +32,7 @@ from crosscue.eval.scoring.pooling import (
     first_reasons,
     summed,
 )
-from crosscue.eval.scoring.truth import DriveTruth, cue_at, has_feature
+from crosscue.eval.scoring.truth import FEATURES, DriveTruth, cue_at, has_feature
 from crosscue.replay.vehicle.vehicle import CUES, Scoring
 
 Reading = Scoring
@@ -177,6 +177,21 @@ def match_cues(tables: RunTables, truth: DriveTruth) -> list[CueFrames]:
     others = sorted({*np.unique(rows.cue).tolist(), *stated} - {*CUES})
     ambiguous = tables.ambiguous.get("frames", 0)
     return [_judge(cue, rows, frames, truth, ambiguous) for cue in (*CUES, *others)]
+
+
+def features_not_looked_for(tables: RunTables) -> frozenset[str]:
+    """Return the features of an intersection that no cue of the run could show or exclude.
+
+    A cue that the table of cues does not know may stand for any feature. A run without a table of
+    cues does not state what was looked for, so nothing is returned.
+    """
+    if tables.cues is None:
+        return frozenset()
+    looked = np.unique(tables.cues.cue).tolist()
+    if any(cue not in CUES for cue in looked):
+        return frozenset()
+    shown = {name for cue in looked for name in (*CUES[cue].supports, *CUES[cue].excludes)}
+    return frozenset(FEATURES) - shown
 
 
 def _judge(

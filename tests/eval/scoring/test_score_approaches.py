@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crosscue.eval.scoring.drives import judge
 from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.scene.approaches import associate, judge_approaches, score_approaches
 from crosscue.eval.scoring.scene.belief import (
@@ -58,6 +59,27 @@ def test_a_feature_that_nothing_spoke_of_is_not_seen_rather_than_improbable() ->
 
     assert judged is not None
     assert judged.results[0].why_not_full == "never probable enough: right; not seen: left"
+
+
+@pytest.mark.parametrize(
+    ("cues", "detected", "full"),
+    [
+        ({"road_left": {0: 0}}, "not looked for", "not looked for: intersection, right"),
+        ({"stop_sign": {0: 0}}, "never probable enough", "not seen: intersection"),
+        ({"own": {0: 0}}, "never probable enough", "not seen: intersection, right"),
+        ({}, "not looked for", "not looked for: intersection, right"),
+        (None, "never probable enough", "not seen: intersection, right"),
+    ],
+)
+def test_what_no_cue_looked_for_is_neither_improbable_nor_unseen(
+    cues: dict[str, dict[int, int]] | None, detected: str, full: str
+) -> None:
+    steps = {**BELIEF, "intersection": {}, "right": {}}
+    judged = judge(tables(cues, belief_table(steps)), truth()).approaches
+
+    assert judged is not None
+    assert judged.results[0].why_not_detected == detected
+    assert judged.results[0].why_not_full.startswith(full)
 
 
 def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None:
