@@ -80,6 +80,9 @@ class Boxes:
         self.turn_deg: Final[Floats] = np.degrees(turn[kept])
         self.motion: Final = np.array(table["motion"].to_pylist())[kept]
         self.visible: Final[Floats] = _visible(frame, boxes_px, depth_m)[kept]
+        self.outline_px: Final[Floats] = boxes_px[kept]
+        self.at_m: Final[Floats] = at[kept]
+        """From the camera, along the map's axes."""
 
     def across(self, motion: str, *, to_left: bool) -> NDArray[np.bool_]:
         """Vehicles across the road that move so, by where they head."""

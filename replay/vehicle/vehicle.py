@@ -254,9 +254,10 @@ class Cars(Section):
     crossing_mps: Positive = 2.0
     """Minimum lateral speed of a crossing car, and maximum speed of a parked car. Also the minimum
     longitudinal speed of an oncoming or outgoing car past the intersection."""
-    past_within_m: Positive = 120.0
+    past_within_m: Positive | None = None
     """Maximum distance, derived from their height, of oncoming and outgoing cars past the
-    intersection."""
+    intersection. If left out: 120 m, or the distance at which a car is 15 px high where that is
+    greater."""
     past_aside_m: Positive = 12.0
     """Maximum lateral distance of these cars from the ego path, about three lanes."""
     past_frames: Annotated[int, Field(ge=3, le=100)] = 30

@@ -37,6 +37,11 @@ BOX_FRACTION: Final = 0.03
 """Part of that standard deviation proportional to the height; the two add in squares."""
 FASTEST_MPS: Final = 25.0
 """Maximum speed of a car between two frames; a faster one is a different car."""
+PAST_WITHIN_M: Final = 120.0
+"""Maximum distance of oncoming and outgoing cars, unless a car farther away is large enough."""
+FAR_PX: Final = 15.0
+"""Minimum height of a car farther away than ``PAST_WITHIN_M``. A pixel is then 7 % of the height,
+less than half of the spread of car heights."""
 HIDDEN_FRACTION: Final = 0.15
 """Replaces ``BOX_FRACTION`` for a car whose lower end is hidden."""
 MIN_OVERLAP: Final = 0.4
@@ -88,6 +93,7 @@ class CarTracks:
         self.seen = 0
         self._camera = camera
         self._settings = settings
+        self._farthest_m = max(settings.within_m, past_within_m(camera, settings))
         self._tracks: list[_Track] = []
         self._again: list[_Track] = []
         self._axle = self._pose = (0.0, 0.0, 0.0)
@@ -178,7 +184,7 @@ class CarTracks:
             return None
         depth_m = focal_px * CAR_HEIGHT_M / (y1 - y0)
         distance_m = depth_m * float(rays[:, 0].mean())
-        if distance_m > max(self._settings.within_m, self._settings.past_within_m):
+        if distance_m > self._farthest_m:
             return None
         left, right = np.arctan2(-rays[:, 1], rays[:, 0]).tolist()
         error = math.hypot(BOX_PX / (y1 - y0), HIDDEN_FRACTION if is_hidden else BOX_FRACTION)
@@ -219,6 +225,13 @@ class CarTracks:
                 self._begun += 1
                 self._tracks.append(_Track(self._begun, box, np.zeros(4), [one]))
         return again
+
+
+def past_within_m(camera: Camera, settings: Cars) -> float:
+    """Return the maximum distance of oncoming and outgoing cars, in metres."""
+    if settings.past_within_m is not None:
+        return settings.past_within_m
+    return max(PAST_WITHIN_M, (camera.focal_px or 0.0) * CAR_HEIGHT_M / FAR_PX)
 
 
 def are_hidden(boxes_px: NDArray[np.float64], are_sure: NDArray[np.bool_]) -> list[bool]:

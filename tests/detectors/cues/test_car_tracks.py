@@ -290,6 +290,24 @@ def test_an_unsure_box_carries_on_a_car_that_a_sure_one_began(scores: tuple[floa
     assert [car.frames for car in now] == ([4] if scores[0] > 0.5 else [])
 
 
+@pytest.mark.parametrize(
+    ("focal_px", "past_within_m", "outgoing"),
+    [(704.0, None, 0), (2000.0, None, 1), (2000.0, 120.0, 0)],
+)
+def test_a_car_goes_far_away_where_the_camera_resolves_it(
+    focal_px: float, past_within_m: float | None, outgoing: int
+) -> None:
+    camera = CAMERA.model_copy(update={"focal_px": focal_px})
+    rules = RULES.model_copy(update={"past_within_m": past_within_m})
+    tracks = CarTracks(camera, rules)
+    for step in range(20):
+        height_px = focal_px * CAR_HEIGHT_M / (130.0 + 1.5 * step)
+        box = (640.0 - 0.6 * height_px, 375.0 - height_px, 640.0 + 0.6 * height_px, 375.0)
+        tracks([found(np.array([box]), [0])], Motion(0.0, 0.0, 0.0, PERIOD_S))
+
+    assert cars_past(tracks.longer(), camera, rules, Place(5.0, 15.0, 1.0)) == Ways(0, outgoing)
+
+
 @settings(max_examples=100, deadline=None)
 @given(steps=ego_motions, car=standing)
 def test_a_standing_car_neither_comes_nor_goes(steps: list[Motion], car: Car) -> None:
