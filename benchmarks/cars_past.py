@@ -1,4 +1,4 @@
-"""Why the cues of oncoming and outgoing cars miss a frame of PandaSet's sequence 002.
+"""Reasons why the cues of oncoming and outgoing cars miss frames of PandaSet's sequence 002.
 
 Run it as ``python benchmarks/cars_past.py RUN SEQUENCE``. RUN is a run of ``replay`` over SEQUENCE,
 which has its 3-D boxes in ``annotations/cuboids.parquet``. In every frame with a car that moves
@@ -45,14 +45,14 @@ REASONS = (
     "no steady motion",
     "lower end behind another car",
     "followed in fewer than three frames",
-    "detected below the score, or too far away",
+    "detected with too low a score, or for the first time",
     "not detected",
 )
-"""From the last condition of the rule to the first."""
+"""Unmet conditions, from the last condition of the rule to the first."""
 
 
 class Missed(NamedTuple):
-    """One frame in which a cue misses: the reason, and the car that got furthest."""
+    """A frame without a positive: the reason, and the car that meets most conditions."""
 
     reason: str
     distance_m: float
