@@ -1,1 +1,1 @@
-"""One file a format; ``crosscue.replay.formats.FORMATS`` is the table that names them."""
+"""Readers of log formats; ``crosscue.replay.formats.FORMATS`` is the table of all formats."""

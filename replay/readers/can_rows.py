@@ -1,4 +1,4 @@
-"""What all readers of CAN logs share: bus names and handing rows on, bus by bus."""
+"""Functions shared by all readers of CAN logs: bus names, and division of rows by bus."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from crosscue.replay.base import (
 )
 
 BUSES_MAX: Final = 256
-"""Most buses of one log; more names than that are damage, not buses."""
+"""Maximum number of buses of a log; more names are a sign of damage."""
 
 FD_LENGTHS: Final = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.int64)
-"""Payload bytes by DLC code (ISO 11898-1)."""
+"""Number of payload bytes by DLC code (ISO 11898-1)."""
 IS_FD_LENGTH: Final = np.isin(np.arange(65), FD_LENGTHS)
-"""May a CAN FD frame carry that many bytes?"""
+"""True for numbers of payload bytes that a CAN FD frame can have."""
 
 
 def keep_memory() -> None:
-    """Let the C library keep freed memory of this size for reuse instead of returning it.
+    """Make the C library keep freed memory of this size for reuse.
 
-    glibc raises its thresholds when one large block is freed. Without it every chunk's short-lived
-    columns are mapped and cleared again, which costs a quarter of the reading time.
+    glibc raises its thresholds when a large block is freed. Otherwise every chunk's short-lived
+    columns are mapped and cleared again, which takes a quarter of the reading time.
     """
     np.empty(31 << 20, np.uint8)
 
 
 def bus_name(spelled: str) -> str:
-    """Topic name of a bus: as the log spells it, a bare number ``1`` as ``can/1``."""
+    """Return the topic name of a bus: as in the log, but ``can/1`` for the bare number ``1``."""
     return f"can/{int(spelled)}" if spelled.isascii() and spelled.isdigit() else spelled
 
 
 def bus_number(spelled: str, names: dict[str, int]) -> int:
-    """A bus's place among those met so far, which it joins; -1 when there are ``BUSES_MAX``."""
+    """Return a bus's index in ``names`` and add new names; -1 if there are ``BUSES_MAX``."""
     name = bus_name(spelled)
     if name not in names and len(names) >= BUSES_MAX:
         return -1
@@ -53,7 +53,7 @@ def bus_number(spelled: str, names: dict[str, int]) -> int:
 
 
 def bus_topic(name: str, declared: int | None = None) -> Topic:
-    """The topic of one bus."""
+    """Return the topic of a bus."""
     return Topic(name, "crosscue/CanFrames", "columns", declared=declared)
 
 
@@ -64,7 +64,7 @@ class FrameRows:
     Attributes:
         place: Shape (N,), int64, ascending: line in its chunk, or byte offset.
         bus: Shape (N,), int64: index into the reader's bus names.
-        log_ns: Shape (N,), int64.
+        log_ns: Shape (N,), int64: log times.
         frames: N frames.
     """
 
@@ -77,7 +77,7 @@ class FrameRows:
         return len(self.place)
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameRows:
-        """The rows picked by ``index``."""
+        """Return the selected rows."""
         if isinstance(index, np.ndarray) and index.dtype == np.bool_:
             index = np.flatnonzero(index)
         return FrameRows(
@@ -104,12 +104,12 @@ NO_ROWS: Final = FrameRows(
 
 
 def joined(first: FrameRows, second: FrameRows) -> FrameRows:
-    """Both, by place."""
+    """Merge two groups of rows by place."""
     return merged((first, second))
 
 
 def merged(all_rows: Sequence[FrameRows]) -> FrameRows:
-    """All of them, one sequence at least, by place."""
+    """Merge one or more groups of rows by place."""
     some = [rows for rows in all_rows if len(rows)] or [all_rows[0]]
     if len(some) == 1:
         return some[0]
@@ -135,10 +135,10 @@ def merged(all_rows: Sequence[FrameRows]) -> FrameRows:
 
 
 def merged_by_time(streams: Sequence[Iterator[FrameRows]]) -> Iterator[FrameRows]:
-    """All rows of several groups in time order, each group's own order kept.
+    """Merge several streams of rows by time and keep the order within each stream.
 
-    Holds what each group's next rows are, and no more. A group whose clock was set back comes in
-    its own order all the same.
+    Only the next rows of each stream are in memory. A stream whose clock was set back also keeps
+    its own order.
     """
     if len(streams) == 1:
         yield from streams[0]
@@ -160,7 +160,7 @@ def merged_by_time(streams: Sequence[Iterator[FrameRows]]) -> Iterator[FrameRows
 
 
 def _next_by_time(stream: Iterator[FrameRows], before: FrameRows | None = None) -> FrameRows | None:
-    """The stream's next rows, placed by time, after those before; None at its end."""
+    """Return the stream's next rows, with places from their times; None at its end."""
     for rows in stream:
         if len(rows):
             place = rows.log_ns
@@ -173,7 +173,7 @@ def _next_by_time(stream: Iterator[FrameRows], before: FrameRows | None = None) 
 
 
 def widened(payload: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """``payload`` of shape (N, W) with zero columns up to ``width``."""
+    """Pad a payload of shape (N, W) with zero columns up to ``width``."""
     missing = width - payload.shape[1]
     return np.pad(payload, ((0, 0), (0, missing))) if missing else payload
 
@@ -181,7 +181,7 @@ def widened(payload: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 def blocks_by_bus(
     rows: FrameRows, names: Sequence[str], ledger: Ledger, selection: Selection
 ) -> Iterator[Block]:
-    """Account for ``rows`` and give the wanted ones, a bus and at most ``BLOCK_ROWS`` at a time."""
+    """Account for ``rows`` and yield the selected ones in blocks of one bus and ``BLOCK_ROWS``."""
     for bus, name in enumerate(names):
         is_here = rows.bus == bus
         if not bool(is_here.any()):
@@ -204,7 +204,7 @@ def blocks_by_bus(
 
 
 def in_time(log_ns: Int64s, selection: Selection) -> NDArray[np.bool_] | None:
-    """Which times are in the half-open span asked for; None for all of them."""
+    """Return a mask of the times in the selected range; None if all are selected."""
     inside: NDArray[np.bool_] | None = None
     if selection.start_ns is not None:
         inside = log_ns >= selection.start_ns
@@ -215,7 +215,7 @@ def in_time(log_ns: Int64s, selection: Selection) -> NDArray[np.bool_] | None:
 
 
 def narrowed(frames: CanFrames) -> CanFrames:
-    """With eight payload columns when no frame is CAN FD."""
+    """Reduce the payload to eight columns if no frame is CAN FD."""
     if frames.data.shape[1] == 8 or bool(frames.is_fd.any()):
         return frames
     return CanFrames(

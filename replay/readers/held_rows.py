@@ -1,4 +1,4 @@
-"""Drives of data sets: cameras beside streams of numbers, which are held in memory where short."""
+"""Drives of data sets: cameras, and numeric streams that are kept in memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NO_PARTNER: Final = "a row without its time, or a time without its row"
 
 
 class Loss(NamedTuple):
-    """Rows that could not be understood; ``rows`` is None where it cannot be known how many."""
+    """Rows that could not be parsed; ``rows`` is None if their number is unknown."""
 
     reason: str
     rows: int | None
@@ -37,13 +37,13 @@ class Loss(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldRows:
-    """One topic's rows in order of time.
+    """The rows of a topic in order of time.
 
     Attributes:
-        topic: Its ``declared`` counts lost rows, too.
-        t_ns: Shape (N,), int64.
+        topic: The topic; its ``declared`` count includes dropped rows.
+        t_ns: Shape (N,), int64: times.
         table: N rows.
-        losses: What was found damaged when they were read.
+        losses: Losses found when the rows were read.
     """
 
     topic: Topic
@@ -57,7 +57,7 @@ class HeldRows:
         return (self.topic,)
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        """The rows asked for, with their account."""
+        """Yield the selected rows and account for them."""
         name, n = self.topic.name, len(self.t_ns)
         ledger.declare(name, self.topic.declared)
         ledger.find(name, n)
@@ -74,7 +74,7 @@ class HeldRows:
             ledger.settle(name, NO_PARTNER)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Rows without a time, times without a row, and damaged ones; see ``KnowsItsEnd``."""
+        """Report rows without a time, times without a row, and damage; see ``KnowsItsEnd``."""
         lost = sum(loss.rows or 0 for loss in self.losses)
         for loss in self.losses:
             ledger.drop(self.topic.name, *loss)
@@ -83,24 +83,24 @@ class HeldRows:
 
 
 class Numbers(Protocol):
-    """Streams of numbers beside a drive's cameras."""
+    """Numeric streams of a drive."""
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """What they are called."""
+        """Topics of the streams."""
         ...
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        """The rows asked for, with their account."""
+        """Yield the selected rows and account for them."""
         ...
 
     def report_missing(self, ledger: Ledger) -> None:
-        """See ``KnowsItsEnd``."""
+        """Report missing rows; see ``KnowsItsEnd``."""
         ...
 
 
 class CameraDrive(Closing):
-    """A drive of a data set as a ``Log``; a data set adds its ``format`` and its intrinsics."""
+    """A drive of a data set as a ``Log``; subclasses add the ``format`` and the intrinsics."""
 
     def __init__(
         self,
@@ -113,16 +113,16 @@ class CameraDrive(Closing):
         unreadable: Sequence[tuple[str, str, int | None, str]] = (),
         notices: Sequence[str] = (),
     ) -> None:
-        """Put a drive together.
+        """Create a drive.
 
         Args:
-            path: Its folder.
-            cameras: Their pictures.
-            numbers: Beside them.
-            limits: That its files are read with.
-            touched: Which files are read, for a seal.
-            unreadable: What could not be opened, as arguments for ``Ledger.drop``.
-            notices: What is odd about it, a sentence each.
+            path: Folder of the drive.
+            cameras: Image files of the cameras.
+            numbers: Numeric streams.
+            limits: Maximum sizes of its files.
+            touched: Record of the files read, for a seal.
+            unreadable: Parts that could not be opened, as arguments of ``Ledger.drop``.
+            notices: Remarks on the drive, one sentence each.
         """
         self.path: Final = path
         self.touched: Final = touched
@@ -134,14 +134,14 @@ class CameraDrive(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Cameras, then numbers."""
+        """Topics of the cameras, then of the numeric streams."""
         return (
             *(camera.topic for camera in self._cameras),
             *(topic for numbers in self._numbers for topic in numbers.topics),
         )
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams side by side, in order of each block's first time; see ``Log.read``."""
+        """Yield all streams, merged by each block's first time; see ``Log.read``."""
         for loss in self._unreadable:
             ledger.drop(*loss)
         for sentence in self._notices:
@@ -151,7 +151,7 @@ class CameraDrive(Closing):
         yield from heapq.merge(*streams, key=lambda block: int(block.log_ns[0]))
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Pictures and rows without a time, times without them; see ``KnowsItsEnd``."""
+        """Report images and rows without a time, and times without them; see ``KnowsItsEnd``."""
         for loss in self._unreadable:
             ledger.drop(*loss)
         for camera in self._cameras:
@@ -160,4 +160,4 @@ class CameraDrive(Closing):
             numbers.report_missing(ledger)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because no file stays open."""

@@ -1,4 +1,4 @@
-"""Opaque messages of many topics in one buffer, sorted into a block per topic."""
+"""Division of messages of several topics in one buffer into blocks of one topic."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class MixedRows:
 
     Attributes:
         buffer: Shape (B,), uint8.
-        topic: Shape (N,), int64: which of the names that go with these rows.
-        log_ns: Shape (N,), int64.
-        start: Shape (N,), int64: first byte of each message.
-        stop: Shape (N,), int64: one past its last byte.
+        topic: Shape (N,), int64: index of the topic's name.
+        log_ns: Shape (N,), int64: log times.
+        start: Shape (N,), int64: offset of each message's first byte.
+        stop: Shape (N,), int64: offset one past its last byte.
     """
 
     buffer: Bytes
@@ -50,16 +50,16 @@ class MixedRows:
 def blocks_of(
     rows: MixedRows, names: Sequence[str], selection: Selection, limits: Limits, ledger: Ledger
 ) -> Iterator[Block]:
-    """A block or more for each topic, stored order kept within a topic; every row accounted for.
+    """Yield blocks of each topic in stored order, and account for every row.
 
     Args:
-        rows: What was read.
-        names: Topic names, by the numbers in ``rows.topic``.
+        rows: Rows of several topics.
+        names: Topic names, indexed by ``rows.topic``.
         selection: Rows outside it are counted as skipped.
-        limits: A message over ``message_bytes`` is skipped.
-        ledger: Takes the counts.
+        limits: Messages over ``message_bytes`` are skipped.
+        ledger: Records the counts.
     """
-    # NumPy sorts numbers of 16 bits by their digits.
+    # NumPy uses a radix sort for 16-bit numbers.
     narrow = rows.topic.astype(np.int16) if len(names) <= 1 << 15 else rows.topic
     order = np.argsort(narrow, kind="stable")
     ordered = rows.topic[order]

@@ -1,4 +1,4 @@
-"""A text file with a row of numbers in each line; a reader states only how a line is read."""
+"""Base reader of text files with one row of numbers per line; a format adds the line parser."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from crosscue.replay.base import (
 )
 
 MAX_LINE: Final = 4096
-"""Characters of a line; a longer one is not a row of numbers, and memory stays bounded."""
+"""Maximum length of a line, which bounds memory; a longer line is not a row of numbers."""
 Row: TypeAlias = tuple[int, *tuple[float, ...]]
-"""Time in nanoseconds of the log's clock, and a number for each column."""
+"""Time in nanoseconds on the log's clock, and a number for each column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +34,12 @@ class TextLog(Closing):
     """A log of one topic whose rows are the lines of a text file.
 
     Attributes:
-        path: The file.
-        format: Its name in the table of formats.
-        topic: What the topic is called.
+        path: Path of the file.
+        format: Name in the table of formats.
+        topic: Name of the topic.
         columns: Names of the columns after the time, each with its unit at the end.
-        row_of: From a line to its row. A ``ValueError`` drops the line and reports it. Empty lines
-            are not rows.
+        row_of: Parses a line into a row. A line for which it raises ``ValueError`` is dropped.
+            Empty lines are ignored.
     """
 
     path: Path
@@ -50,11 +50,11 @@ class TextLog(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The one topic."""
+        """The only topic."""
         return (Topic(self.topic, "crosscue/Table", "columns"),)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The lines, a block at a time; see ``Log.read``."""
+        """Yield the rows, one block at a time; see ``Log.read``."""
         ledger.integrity = "not checkable: lines carry no checksum"
         with self.path.open(encoding="utf-8", errors="replace") as file:
             whole = _lines(file)
@@ -89,11 +89,11 @@ class TextLog(Closing):
         return Block(self.topic, np.array(t_ns, np.int64), Table(columns))
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because no file stays open."""
 
 
 def _lines(file: TextIO) -> Iterator[str | None]:
-    """Every line that is not empty; None for one that is longer than ``MAX_LINE``."""
+    """Yield every line that is not empty, with None for lines longer than ``MAX_LINE``."""
     while line := file.readline(MAX_LINE):
         is_cut = len(line) == MAX_LINE and not line.endswith("\n")
         piece = line

@@ -1,21 +1,22 @@
-"""Time files: one line for each picture or video frame.
+"""Parser of time files, which have one line per image or video frame.
 
-Lines hold a time, or a file name and a time in either order, split by a comma, semicolon or blanks
-(``12.35``; ``frame_07.jpg,12.35``; TUM's ``1305031102.175304 rgb/1305031102.175304.png``). Empty
-lines and those that begin with ``#`` are passed over. A first line without any time names columns;
-the one whose name has ``time`` or ``stamp`` is the time, and a unit there (``time_ns``,
-``time_us``, ``time_ms``, ``time [s]``) counts. A time is
+A line contains a time, or a file name and a time in either order, separated by a comma, a semicolon
+or blanks (``12.35``; ``frame_07.jpg,12.35``; TUM's ``1305031102.175304
+rgb/1305031102.175304.png``). Empty lines and lines that start with ``#`` are ignored. A first line
+without a time names the columns. The time column is the one whose name contains ``time`` or
+``stamp``, and a unit in its name (``time_ns``, ``time_us``, ``time_ms``, ``time [s]``) applies. A
+time is one of
 
 * seconds with a decimal point or exponent (``12.35``, ``1.2e-1``);
-* an integer, which counts nanoseconds unless the column's name states another unit;
-* a date-time (``2011-09-26 13:02:25.964389445``, ``...T13:02:25Z``, ``...+02:00``), UTC where it
-  names no zone.
+* an integer in nanoseconds, or in the unit of the column's name;
+* a date-time (``2011-09-26 13:02:25.964389445``, ``...T13:02:25Z``, ``...+02:00``), in UTC if it
+  has no zone.
 
-A last line without a line end that is not a time, or has fewer decimals than all lines above it,
-was cut while it was written: it yields no time, and a notice says so.
+A last line without a line end was truncated if it is not a time, or has fewer decimals than all
+lines above it. It yields no time, and a notice is added.
 
-Instead of times, one line ``rate_hz: 15`` says that they were not kept and pictures came at that
-rate. Times are computed in integers and fractions, never in floats.
+If the times were not recorded, a single line ``rate_hz: 15`` specifies the frame rate instead.
+Times are computed with integers and fractions, never with floats.
 """
 
 from __future__ import annotations
@@ -48,14 +49,14 @@ _UNIX_START: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeFile:
-    """What a time file says.
+    """The contents of a time file.
 
     Attributes:
-        path: Where it is.
-        t_ns: Shape (N,), int64; empty where only a rate is given.
-        names: N file names without folders, or None where lines hold times only.
-        period: Nanoseconds between pictures where only a rate is given, else None.
-        notices: What is odd about the file, a sentence each.
+        path: Path of the file.
+        t_ns: Shape (N,), int64: times; empty if the file states only a rate.
+        names: N file names without folders, or None if lines contain only times.
+        period: Nanoseconds between images if the file states only a rate, else None.
+        notices: Remarks on the file, one sentence each.
     """
 
     path: Path
@@ -65,14 +66,14 @@ class TimeFile:
     notices: tuple[str, ...] = ()
 
     def times_at(self, index: Int64s) -> Int64s:
-        """Times of the pictures with these numbers, counted from 0; shape (N,)."""
+        """Return the times of the images with these indices, shape (N,)."""
         if self.period is None:
             return self.t_ns[index]
         return np.array([round(int(i) * self.period) for i in index], dtype=np.int64)
 
 
 class _Line(NamedTuple):
-    """A line's time and file name; is it an integer without a unit; digits behind its point."""
+    """A line's time and file name, a flag for integers without a unit, and the decimals."""
 
     t_ns: int
     name: str | None
@@ -81,11 +82,11 @@ class _Line(NamedTuple):
 
 
 def read_time_file(path: Path, limits: Limits) -> TimeFile:
-    """Read and check a time file.
+    """Read and validate a time file.
 
     Raises:
-        LogFormatError: A line cannot be understood; the message names it.
-        LogTooLargeError: The file is larger than one message may be.
+        LogFormatError: A line cannot be parsed; the message names it.
+        LogTooLargeError: The file exceeds the size limit of a message.
     """
     lines, has_end = _lines(path, limits)
     if len(lines) == 1 and (rate := _RATE.fullmatch(lines[0][1])):
@@ -114,12 +115,14 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
         if one is None or (may_be_cut and _is_shorter(one, times)):
             notices = (
                 f"{path.name}: line {number}, the last one, is cut: {line[:80]!r}; it has no "
-                "time (end the line if it is whole)",
+                "time (add a line end if the line is complete)",
             )
             continue
         times.append(one)
         if (one.name is None) != (times[0].name is None):
-            raise LogFormatError(f"{where}: {line[:80]!r}: names a file or not, unlike line above")
+            raise LogFormatError(
+                f"{where}: {line[:80]!r}: expected a file name in every line or in none"
+            )
     if not times:
         raise LogFormatError(f"{path}: no time in it; expected one line for each picture")
     t_ns = np.array([one.t_ns for one in times], dtype=np.int64)
@@ -130,13 +133,13 @@ def read_time_file(path: Path, limits: Limits) -> TimeFile:
 
 
 def _is_shorter(last: _Line, above: list[_Line]) -> bool:
-    """Has a line fewer decimals than all those above it, which have equally many?"""
+    """Return whether a line has fewer decimals than the lines above, which all have the same."""
     usual = {one.decimals for one in above}
     return len(usual) == 1 and last.decimals < max(usual)
 
 
 def _lines(path: Path, limits: Limits) -> tuple[list[tuple[int, str]], bool]:
-    """Numbers and text of the lines that say something, and whether the file ends with a line."""
+    """Return the non-empty lines with their numbers, and whether the last one has a line end."""
     raw = read_at_most(path, limits.message_bytes)
     if raw is None:
         raise LogTooLargeError(
@@ -153,7 +156,7 @@ def _lines(path: Path, limits: Limits) -> tuple[list[tuple[int, str]], bool]:
 
 
 def _split(line: str) -> list[str]:
-    """The cells of a line; a blank between date and time does not split."""
+    """Split a line into cells; a blank between date and time does not separate cells."""
     if date := _DATE.search(line):
         written = date[0].rstrip()
         line = line.replace(written, written.replace(" ", "T", 1).replace(",", "."))
@@ -212,7 +215,7 @@ def _time_ns(text: str, unit_ns: int | None, where: str) -> int:
 
 
 def _date_ns(date: re.Match[str]) -> int:
-    """Nanoseconds since 1970 of a matched date-time, to the last digit."""
+    """Convert a matched date-time to nanoseconds since 1970, exactly."""
     zone = (date[4] or "Z").replace("Z", "+0000").replace(":", "")
     moment = datetime.strptime(f"{date[1]} {date[2]} {zone}", "%Y-%m-%d %H:%M:%S %z")
     whole_s = (moment - _UNIX_START) // timedelta(seconds=1)
@@ -229,13 +232,13 @@ def _period(path: Path, line: int, text: str) -> Fraction:
 
 
 def _check_period(path: Path, t_ns: Int64s, *, integers: bool) -> None:
-    """Refuse integers that are too close together to be nanoseconds."""
+    """Check that integer times are not too close together to be nanoseconds."""
     if not integers or len(t_ns) < 2:
         return
     step_ns = int(np.median(np.abs(np.diff(t_ns))))
     if step_ns <= _SHORTEST_PERIOD_NS:
         raise LogFormatError(
-            f"{path}: integers {step_ns} apart count nanoseconds, which is too fast for pictures; "
+            f"{path}: integers {step_ns} apart are read as nanoseconds, too close for pictures; "
             "write seconds with a decimal point, or name the column time_us or time_ms in a first "
             "line"
         )
@@ -246,6 +249,6 @@ def _check_twins(path: Path, names: Sequence[str]) -> None:
     for name in names:
         if name in seen:
             raise LogFormatError(
-                f"{path}: {name[:80]!r} stands twice; expected one time for each picture"
+                f"{path}: {name[:80]!r} occurs twice; expected one time for each picture"
             )
         seen.add(name)

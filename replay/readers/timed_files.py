@@ -1,8 +1,13 @@
-"""Numbered files in a folder and a time for each.
+"""Pairing of the files in a folder with the times of a time file.
 
-Files and times are paired by name where the time file has names; else one by one where there are
-as many of each; else by the numbers in the file names where these span as many; else in order from
-the first, which is reported. Nothing is paired in silence when the counts differ.
+Files and times are paired by the first of these rules that applies:
+
+* by name, if the time file has names;
+* one by one, if their numbers are equal;
+* by the numbers in the file names, if these span as many values as there are times;
+* in order from the first, with a notice.
+
+Whenever the counts differ, a notice is added.
 """
 
 from __future__ import annotations
@@ -29,10 +34,10 @@ class TimedFiles:
 
     Attributes:
         paths: N files in natural order.
-        t_ns: Shape (N,), int64; -1 for a file without time.
-        missing_ns: Shape (M,), int64: times whose file is not there.
-        declared: How many times the time file has, or None where it states a rate.
-        notices: What is odd about the pairing, a sentence each.
+        t_ns: Shape (N,), int64: times; -1 for a file without a time.
+        missing_ns: Shape (M,), int64: times without a file.
+        declared: Number of times in the time file, or None if it states a rate.
+        notices: Remarks on the pairing, one sentence each.
     """
 
     paths: tuple[Path, ...]
@@ -43,16 +48,19 @@ class TimedFiles:
 
 
 def list_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
-    """Files with these suffixes in natural order (``2.png`` before ``10.png``), hidden ones not."""
+    """List files with these suffixes in natural order (``2.png`` before ``10.png``).
+
+    Hidden files are omitted.
+    """
     paths = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name[0] != "."]
     return sorted(paths, key=lambda path: _natural(path.name))
 
 
 def pair(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
-    """Give each file its time, as the module's text says.
+    """Pair each file with its time by the rules in the module's docstring.
 
     Raises:
-        LogFormatError: Not one file gets a time.
+        LogFormatError: No file can be paired with a time.
     """
     notices = list(times.notices)
     if times.names is not None:
@@ -74,47 +82,47 @@ def pair(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
 
 
 def _by_name(paths: Sequence[Path], names: Sequence[str]) -> Int64s:
-    """Line of each file, by its name with or without suffix; -1 where none exists."""
+    """Return the line of each file, by its name with or without suffix; -1 if missing."""
     at = {name: i for i, name in enumerate(names)}
     found = [at.get(path.name, at.get(path.stem, -1)) for path in paths]
     return np.array(found, dtype=np.int64)
 
 
 def _in_order(paths: Sequence[Path], times: TimeFile, notices: list[str]) -> Int64s:
-    """Line of each file where lines hold no names."""
+    """Return the line of each file, for time files without names."""
     n, lines = len(paths), len(times.t_ns)
     numbers, place = _numbers(paths), paths[0].parent.name
     has_gaps = numbers is not None and int(numbers[-1]) + 1 > n
     if times.period is not None:
         notices.append(
-            f"{place}: times are made up from a constant rate of "
+            f"{place}: times are computed from a constant rate of "
             f"{float(1_000_000_000 / times.period):g} Hz ({times.path.name}), starting at 0"
         )
     elif numbers is None or n == lines or int(numbers[-1]) + 1 != lines:
         if n != lines:
             notices.append(
-                f"{place}: {n} files and {lines} times ({times.path.name}), and nothing says "
-                "which belong together: paired in order from the first"
+                f"{place}: {n} files and {lines} times ({times.path.name}), which cannot be "
+                "matched: paired in order from the first"
             )
         elif has_gaps and numbers is not None:
             notices.append(
-                f"{place}: the numbers in the file names leave out {int(numbers[-1]) + 1 - n}; "
-                "there are as many times as files, so they are paired one by one"
+                f"{place}: {int(numbers[-1]) + 1 - n} numbers are missing in the file names; there "
+                "are as many times as files, so they are paired one by one"
             )
         index = np.arange(n, dtype=np.int64)
         return np.where(index < lines, index, -1)
     if has_gaps and numbers is not None:
         notices.append(
             f"{place}: {int(numbers[-1]) + 1 - n} numbers are missing in the file names; "
-            "times go by number"
+            "times are paired by number"
         )
     return np.arange(n, dtype=np.int64) if numbers is None else numbers
 
 
 def _numbers(paths: Sequence[Path]) -> Int64s | None:
-    """Each file's place by the last number in its name, from 0, or None where none exists.
+    """Return each file's index from the last number in its name; None if a name has no number.
 
-    The usual step between numbers counts as one place, if all steps are whole multiples of it.
+    The median step between numbers counts as one, if all steps are multiples of it.
     """
     texts = [_DIGITS.findall(path.stem) for path in paths]
     if not all(texts) or any(len(found[-1]) > 18 for found in texts):

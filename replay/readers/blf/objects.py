@@ -1,10 +1,10 @@
-"""The objects inside BLF containers as columns: found by their signature, checked as a chain.
+"""Columnar parsing of the objects in BLF containers.
 
 No official specification of the format is public; the layouts are those that Vector's tools and
-python-can write. Every object begins with ``LOBJ``, its header's size and version, its own size
-and its type; the next one follows at its end, after at most seven bytes of padding. All places
-where ``LOBJ`` stands are found at once, and only where they do not form a chain (a payload that
-holds ``LOBJ``, damage) are single objects examined.
+python-can write. Every object starts with ``LOBJ``, its header's size and version, its own size
+and its type. The next object follows at its end, after at most seven bytes of padding. All
+occurrences of ``LOBJ`` are found at once. Objects are examined one by one only where the
+occurrences do not form a chain (a payload that contains ``LOBJ``, or damage).
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ PADDING_MAX: Final = 8
 BASE_BYTES: Final = 16
 CONTAINER: Final = 10
 RESTORE_POINT: Final = 115
-"""Not counted by the file header."""
+"""Object type that the file header does not count."""
 TYPE_MAX: Final = 255
-"""No type known is above 150."""
+"""Maximum plausible object type; no known type is above 150."""
 _UNSEEN_MAX: Final = BASE_BYTES + PADDING_MAX
-"""Bytes after an object in which no other can be seen yet."""
+"""Number of bytes after an object that are too few to detect the next one."""
 _PLACES_KEPT: Final = 5
 _SIGNATURE: Final = int.from_bytes(MAGIC, "little")
 _EXTENDED: Final = 0x80000000
 _ID_MASK: Final = 0x1FFFFFFF
 _TEN_MICROSECONDS: Final = 1
 _NANOS_MAX: Final = 1 << 60
-"""36 years from the start; a longer recording is damage."""
+"""Maximum time from the start, 36 years; a later time is damage."""
 
 
 @dataclass(slots=True)
 class Tally:
-    """What one pass met, to be held against the file header.
+    """Counts of one pass, which are compared with the file header.
 
     Attributes:
-        counted: Objects of the kinds that the header counts, used or not.
-        others: Objects that are no CAN frames, by reason.
-        reasons: How often each kind of damage was met.
-        places: The first damages, each with its place.
-        padded: Frames that store fewer bytes than their length.
-        last_tick_ns: The latest time met, from the start of the recording.
+        counted: Number of objects of the types that the header counts, used or not.
+        others: Number of objects that are not CAN frames, by reason.
+        reasons: Number of damaged places, by reason.
+        places: The first damaged places.
+        padded: Number of frames that store fewer bytes than their length.
+        last_tick_ns: Latest time, from the start of the recording.
     """
 
     counted: int = 0
@@ -61,7 +61,7 @@ class Tally:
     last_tick_ns: int = 0
 
     def damage(self, reason: str, place: str) -> None:
-        """Note something that cannot be read."""
+        """Record an unreadable part of the file."""
         self.reasons[reason] += 1
         if len(self.places) < _PLACES_KEPT:
             self.places.append(f"{reason}: {place}" if place else reason)
@@ -69,11 +69,11 @@ class Tally:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Consecutive whole objects.
+    """Consecutive complete objects.
 
     Attributes:
-        start: Shape (N,), int64: first byte of each object.
-        rest: Where the first incomplete object begins, to be kept for more bytes to come.
+        start: Shape (N,), int64: offset of each object.
+        rest: Offset of the first incomplete object, which is kept until more bytes are read.
     """
 
     start: Int64s
@@ -83,15 +83,16 @@ class Chain:
 def chain_of(
     stream: Bytes, *, is_resumed: bool, is_end: bool, size_max: int, tally: Tally, place: str
 ) -> Chain:
-    """Find the whole objects in ``stream``.
+    """Find the complete objects in ``stream``.
 
     Args:
         stream: Bytes of consecutive containers.
-        is_resumed: What came before is lost, so the first object may begin anywhere.
-        is_end: No more bytes follow.
-        size_max: Largest object to wait for.
+        is_resumed: True if the preceding bytes are lost, so that the first object may start
+            anywhere.
+        is_end: True if no more bytes follow.
+        size_max: Maximum size of an incomplete object for which more bytes are read.
         tally: Records damage.
-        place: Where the stream is in the file, in words.
+        place: Place of the stream in the file, for messages.
     """
     at = _signatures(stream)
     words = _u32(stream)
@@ -125,7 +126,7 @@ def chain_of(
     is_whole = keep & (at < rest)
     last = int(end[is_whole][-1]) if bool(is_whole.any()) else rest
     if not is_end and rest == len(stream) and last < rest <= last + _UNSEEN_MAX:
-        # Padding, or the next object's header, of which the rest is still to come.
+        # Padding, or an incomplete header of the next object.
         rest = last
     return Chain(at[is_whole], rest)
 
@@ -140,11 +141,11 @@ def _repair(
     length: int,
     is_end: bool,
 ) -> int:
-    """Look at object ``k``, which the next signature does not follow.
+    """Examine object ``k``, whose end is not followed by the next signature.
 
     Returns:
-        The stream's length when the chain goes on, where object ``k`` begins when it must wait
-        for more bytes, or -1 when it is damaged.
+        The stream's length if the chain continues, the start of object ``k`` if it needs more
+        bytes, or -1 if it is damaged.
     """
     if is_sound[k] and end[k] <= length:
         following = int(np.searchsorted(at, end[k]))
@@ -169,12 +170,12 @@ def _without_objects(
 ) -> Chain:
     rest = max(len(stream) - len(MAGIC) - PADDING_MAX, 0) if not is_end else len(stream)
     if len(stream) - rest != len(stream) and not is_resumed and bool(stream.any()):
-        tally.damage("bytes that are no object", f"{place}, {len(stream)} bytes")
+        tally.damage("bytes without an object", f"{place}, {len(stream)} bytes")
     return Chain(np.zeros(0, np.int64), rest)
 
 
 def _signatures(stream: Bytes) -> Int64s:
-    """Every place where a whole object header could begin."""
+    """Return the offsets at which a complete object header could start."""
     if len(stream) < BASE_BYTES:
         return np.zeros(0, np.int64)
     letter = np.flatnonzero(stream[: len(stream) - BASE_BYTES + 1] == MAGIC[0])
@@ -183,7 +184,7 @@ def _signatures(stream: Bytes) -> Int64s:
 
 
 def _u32(stream: Bytes) -> NDArray[np.uint32]:
-    """Every four consecutive bytes as a number; not copied."""
+    """Return a view of every four consecutive bytes as a number."""
     numbers: NDArray[np.uint32] = np.ndarray(
         (max(len(stream) - 3, 0),), np.dtype("<u4"), stream.data, strides=(1,)
     )
@@ -233,14 +234,14 @@ FRAME_TYPES: Final = frozenset(type_ for types, _ in _KINDS for type_ in types)
 
 
 def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: str) -> FrameRows:
-    """The CAN frames among the objects at ``start``; ``bus`` holds channel numbers.
+    """Parse the CAN frames among the objects at ``start``; ``bus`` contains channel numbers.
 
     Args:
-        stream: What ``start`` points into.
-        start: From ``chain_of``.
+        stream: Bytes of the objects.
+        start: Offsets of the objects, from ``chain_of``.
         start_ns: Log time of the recording's start.
-        tally: Counts everything.
-        place: Where the stream is in the file, in words.
+        tally: Records the counts and damage.
+        place: Place of the stream in the file, for messages.
     """
     if not len(start):
         return NO_ROWS
@@ -297,7 +298,7 @@ def _kind_rows(
 
 
 def _records(stream: Bytes, start: Int64s, layout: np.dtype[np.void]) -> NDArray[np.void]:
-    """Copies of the structures at ``start``."""
+    """Copy the structures at ``start``."""
     rows = sliding_window_view(stream, layout.itemsize)[start]
     return np.ascontiguousarray(rows).view(layout)[:, 0]
 
@@ -346,7 +347,7 @@ def _fits_code(
     is_fd: NDArray[np.bool_],
     kind: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
-    """Does the payload's length go with the length code?"""
+    """Return whether each payload length is consistent with its length code."""
     promised = FD_LENGTHS[code & 15]
     promised = np.where(is_fd, promised, np.minimum(promised, 8))
     fits: NDArray[np.bool_] = (kind == REMOTE) | (length == promised)
@@ -390,7 +391,7 @@ def _frames(
     payload: Bytes,
     is_fd: NDArray[np.bool_],
 ) -> tuple[CanFrames, NDArray[np.bool_]]:
-    """Frames with bytes beyond their length cleared, and which of them are possible."""
+    """Return frames with the bytes beyond their length cleared, and a mask of the valid frames."""
     is_extended = (identifier & _EXTENDED) != 0
     number = identifier & _ID_MASK
     width = 64 if payload.shape[1] > 8 else 8

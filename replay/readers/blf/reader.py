@@ -1,8 +1,8 @@
-"""Vector BLF logs: containers of objects, mostly zlib-compressed, behind a header that counts them.
+"""Reader of Vector BLF logs: a header with an object count, then containers of objects.
 
-Each compressed container carries a checksum, which is verified before anything in it is given.
-The header's object count is held against what was met. Its start time is local to the machine
-that recorded, without a zone; it is taken as UTC, with a notice.
+Containers are usually compressed with zlib. Each compressed container has a checksum, which is
+verified before its contents are used. The header's object count is compared with the number of
+objects found. The start time is local time without a time zone; it is read as UTC, with a notice.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ _BASE: Final = struct.Struct("<4sHHLL")
 _CONTAINER: Final = struct.Struct("<H6xL4x")
 _STORED, _DEFLATED = 0, 2
 _PEEKED: Final = 8
-"""Containers examined for bus names before the log is read."""
+"""Number of containers examined for bus names before the log is read."""
 STREAM_BYTES: Final = 1 << 20
-"""How much inflated content is put into columns at a time."""
+"""Number of decompressed bytes that are parsed at a time."""
 _SCAN_BYTES: Final = 1 << 20
 _PIECE_BYTES: Final = 1 << 16
 _WASTE: Final = 8
-"""How many times the file's size may be read from containers that turn out damaged."""
+"""Maximum number of bytes read from damaged containers, as a multiple of the file's size."""
 _NOT_READ: Final = "outside the window"
 NOT_CLOSED: Final = "file was not closed by its writer"
 _UNCLOSED: Final = "the writer never closed the file: what it had not yet written is missing"
@@ -63,14 +63,14 @@ _UNCLOSED: Final = "the writer never closed the file: what it had not yet writte
 
 @dataclass(frozen=True, slots=True)
 class FileHeader:
-    """What the first bytes declare.
+    """The header of a BLF file.
 
     Attributes:
-        size: Bytes of this header.
-        file_bytes: Bytes of the whole file when it was closed.
-        objects: Objects in it; 0 when it was never closed, or is empty.
-        start_ns: When the recording began, or None.
-        stop_ns: When it ended, or None.
+        size: Size of this header in bytes.
+        file_bytes: Size of the file in bytes when it was closed.
+        objects: Number of objects in the file; 0 if it was never closed or is empty.
+        start_ns: Start time of the recording, or None.
+        stop_ns: End time of the recording, or None.
     """
 
     size: int
@@ -84,7 +84,7 @@ def open_blf(path: Path, limits: Limits) -> Log:
     """Open a BLF log.
 
     Raises:
-        LogFormatError: It does not begin with a BLF header.
+        LogFormatError: It does not start with a BLF header.
     """
     return BlfLog(path, limits)
 
@@ -93,10 +93,10 @@ class BlfLog(Closing):
     """An open BLF log (``Log``)."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
-        """Read the header and look into the first containers for bus names.
+        """Read the header and search the first containers for bus names.
 
         Raises:
-            LogFormatError: It does not begin with a BLF header.
+            LogFormatError: The file does not start with a BLF header.
         """
         self._path, self._limits = path, limits
         self.touched: Final = Touched()
@@ -110,7 +110,7 @@ class BlfLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file."""
         return self._path
 
     @property
@@ -120,14 +120,14 @@ class BlfLog(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The buses seen so far: those of the first containers, and after a pass all of them."""
+        """The buses found so far: those in the first containers, or all buses after a pass."""
         return tuple(bus_topic(name) for name in self._names)
 
     def close(self) -> None:
-        """Nothing stays open between passes."""
+        """Do nothing, because no file stays open between passes."""
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Bytes that the header declares and the file lacks; see ``KnowsItsEnd``."""
+        """Report that the file is shorter than the header declares; see ``KnowsItsEnd``."""
         declared, size = self._header.file_bytes, self._path.stat().st_size
         if not self._header.objects:
             if self._names:
@@ -137,7 +137,7 @@ class BlfLog(Closing):
             ledger.drop("", "file is cut", None, detail)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All frames, a stretch of containers at a time; see ``Log.read``."""
+        """Yield all frames, several containers at a time; see ``Log.read``."""
         keep_memory()
         reading = _Pass(
             self._path, self._header, self._limits, self._names, self.touched, selection
@@ -146,14 +146,14 @@ class BlfLog(Closing):
             for rows in reading.rows():
                 yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
         except OSError as error:
-            reading.tally.damage("file cannot be read on", error.strerror or str(error))
+            reading.tally.damage("reading the file failed", error.strerror or str(error))
         for name in self._names:
             ledger.topic(name)
         reading.settle(ledger)
 
 
 class _Pass:
-    """One reading pass: containers in, rows out, and the account at the end."""
+    """One pass over the file, from containers to rows, with the account at the end."""
 
     def __init__(
         self,
@@ -174,13 +174,13 @@ class _Pass:
         self._skipped_bytes = 0
 
     def rows(self) -> Iterator[FrameRows]:
-        """The file's frames, a stretch at a time."""
+        """Yield the file's frames, several containers at a time."""
         parts: list[bytes] = []
         place, held = "", 0
         with open_noted(self._path, self._touched) as file:
             for content, where in self._contents(file):
                 if content is None:
-                    # Where nothing is missing, only not read, an object may end in what follows.
+                    # If containers are skipped but not missing, an object may continue in them.
                     is_end = where != _NOT_READ
                     if parts or self._tail:
                         yield self._rows(b"".join(parts), place, is_end=is_end)
@@ -195,13 +195,13 @@ class _Pass:
             yield self._rows(b"".join(parts), place, is_end=True)
 
     def settle(self, ledger: Ledger) -> None:
-        """Hold what was met against the header, and say what was verified."""
+        """Compare the counts with the header, and report the verified checksums."""
         tally, header = self.tally, self._header
         for reason, count in sorted(tally.others.items()):
             ledger.find("", count)
             ledger.skip("", reason, count)
         self._settle_losses(ledger)
-        self._say(ledger)
+        self._add_notices(ledger)
         plain = f"; {self._stored} stored without one" if self._stored else ""
         unread = f"; {self._skipped_bytes} bytes outside --from/--to not read"
         ledger.integrity = (
@@ -235,14 +235,14 @@ class _Pass:
         if header.objects and missing < 0:
             ledger.notice(f"the header declares {header.objects} objects, found {tally.counted}")
 
-    def _say(self, ledger: Ledger) -> None:
+    def _add_notices(self, ledger: Ledger) -> None:
         start_ns, stop_ns = self._header.start_ns, self._header.stop_ns
         if start_ns is None:
             ledger.notice("the log states no start time; times count from 1970-01-01")
         else:
             ledger.notice("the log states no time zone; its start time is read as UTC")
             if stop_ns is not None and start_ns + self.tally.last_tick_ns > stop_ns + 10_000_000:
-                ledger.notice("frames come after the stop time in the header; one of both is wrong")
+                ledger.notice("some frames are later than the stop time in the header")
         if self.tally.padded:
             ledger.notice(
                 f"{self.tally.padded} CAN FD frames store fewer bytes than their length; the rest "
@@ -284,14 +284,14 @@ class _Pass:
         return named
 
     def _contents(self, file: BufferedReader) -> Iterator[tuple[bytes | None, str]]:
-        """What the outer objects hold, in order; None where something is missing."""
+        """Yield the contents of the outer objects in order; None for missing contents."""
         size = self._path.stat().st_size
         position = self._header.size
         if size < position:
             self.tally.damage("file is cut", "inside its header")
-        if self._header.objects:  # otherwise nothing says how many objects are not read
+        if self._header.objects:  # otherwise the number of skipped objects is unknown
             start_ns = self._header.start_ns or 0
-            # Heads of containers that are left out do not count as read.
+            # The headers of skipped containers do not count as read.
             with self._path.open("rb") as heads:
                 self._skips = unwanted(heads, position, size, start_ns, self._selection)
         while position < size:
@@ -304,13 +304,13 @@ class _Pass:
             head = file.read(BASE_BYTES)
             place = f"byte {position}"
             if self._wasted > _WASTE * size:
-                self.tally.damage("too damaged to read on", place)
+                self.tally.damage("too damaged to continue", place)
                 return
             if not head.startswith(MAGIC):
                 near = head[: PADDING_MAX + len(MAGIC) - 1].find(MAGIC)
                 found = position + near if near > 0 else self._next(file, position + 1)
                 if near <= 0 and (found is not None or head.strip(b"\0")):
-                    self.tally.damage("bytes that are no container", place)
+                    self.tally.damage("bytes without a container", place)
                     yield None, place
                 if found is None:
                     return
@@ -327,7 +327,7 @@ class _Pass:
             yield content, place
 
     def _next(self, file: BufferedReader, position: int) -> int | None:
-        """Where the next object to go on with begins, at or after ``position``."""
+        """Return the offset of the next object at or after ``position``, to resume reading."""
         file.seek(position)
         kept = b""
         while more := file.read(_SCAN_BYTES):
@@ -347,7 +347,7 @@ class _Pass:
     def _loose(
         self, file: BufferedReader, position: int, object_bytes: int, size: int
     ) -> tuple[bytes | None, int]:
-        """An object outside containers, with its padding, and where it ends."""
+        """Return an object outside containers, with its padding, and its end."""
         self._has_loose = True
         whole = object_bytes + object_bytes % 4
         is_possible = BASE_BYTES <= object_bytes <= self._limits.message_bytes
@@ -360,7 +360,7 @@ class _Pass:
     def _container(
         self, file: BufferedReader, position: int, object_bytes: int, size: int
     ) -> tuple[bytes | None, int]:
-        """Content and end of a container; None if damaged, and the end is then as far as known."""
+        """Return a container's content and end; None and the probable end if it is damaged."""
         place = f"container at byte {position}"
         file.seek(position + BASE_BYTES)
         head = file.read(_CONTAINER.size)
@@ -395,7 +395,7 @@ class _Pass:
     def _stored_content(
         self, file: BufferedReader, body_bytes: int, declared: int, place: str, is_cut: bool
     ) -> tuple[bytes, int]:
-        """Uncompressed content; where the two sizes differ the smaller one is believed."""
+        """Return uncompressed content; if the two sizes differ, the smaller one is used."""
         content = file.read(min(body_bytes, declared))
         self._stored += 1
         if body_bytes != declared:
@@ -406,7 +406,7 @@ class _Pass:
     def _inflated(
         self, file: BufferedReader, body_bytes: int, declared: int, place: str, is_cut: bool
     ) -> tuple[bytes | None, int]:
-        """Verified content; of a container that the file's end cuts, what comes before the cut."""
+        """Return verified content; of a truncated container, the part before the file's end."""
         inflater = zlib.decompressobj()
         parts: list[bytes] = []
         produced = used = 0
@@ -432,8 +432,8 @@ class _Pass:
             self.tally.damage("file is cut, or a container's size is wrong", place)
             return b"".join(parts), used
         self._wasted += used
-        gave = f"more than {declared}" if produced > declared else str(produced)
-        detail = f"{place}: inflates to {gave} bytes, declares {declared}"
+        found = f"more than {declared}" if produced > declared else str(produced)
+        detail = f"{place}: inflates to {found} bytes, declares {declared}"
         self.tally.damage("container differs from its declared size", detail)
         return None, 0
 
@@ -445,7 +445,7 @@ def _header_of(file: BufferedReader, path: Path) -> FileHeader:
     if len(head) < _HEADER.size or not head.startswith(b"LOGG"):
         raise LogFormatError(
             f"{path}: no BLF header at its start (expected 'LOGG', got {head[:4]!r}); "
-            "check that it is a BLF log, and whole"
+            "check that it is a complete BLF log"
         )
     fields = _HEADER.unpack(head)
     size = fields[1]
@@ -461,7 +461,7 @@ def _header_of(file: BufferedReader, path: Path) -> FileHeader:
 
 
 def _system_time_ns(fields: tuple[int, ...]) -> int | None:
-    """Windows' SYSTEMTIME (year, month, weekday, day, hour, minute, second, millisecond)."""
+    """Convert a Windows SYSTEMTIME (year, month, weekday, day, hour, minute, second, ms)."""
     year, month, _, day, hour, minute, second, millisecond = fields
     try:
         at = datetime(year, month, day, hour, minute, second, tzinfo=UTC)

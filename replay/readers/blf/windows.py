@@ -1,7 +1,8 @@
-"""Which containers of a BLF log may hold frames of a window, told from the first time in each.
+"""Selection of the containers of a BLF log that may contain frames of a time window.
 
-BLF has no index. But each container says how long it is, and its first few hundred bytes hold an
-object with a time, so that a container costs one small read instead of being inflated whole.
+BLF has no index. But each container states its size, and its first few hundred bytes contain an
+object with a time. Examining a container therefore takes one small read instead of a complete
+decompression.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from crosscue.replay.base import Selection
 from .objects import BASE_BYTES, CONTAINER, FRAME_TYPES, MAGIC, PADDING_MAX
 
 SLACK_NS: Final = 1_200_000_000
-"""How far frames of several channels may be out of order."""
+"""Maximum time by which frames of several channels are out of order."""
 _HEAD: Final = struct.Struct("<4sHHLLH6xL4x")
 _OBJECT: Final = struct.Struct("<4sHHLLLLQ")
 _STORED, _DEFLATED = 0, 2
@@ -25,11 +26,11 @@ _PEEKED_BYTES: Final = 1024
 _INFLATED_BYTES: Final = 4096
 _TICK_NS: Final = {1: 10_000, 2: 1}
 _HEADERS: Final = {1: 32, 2: 40}
-"""Bytes of an object's header, by its version."""
+"""Size of an object's header in bytes, by version."""
 
 
 class _Container(NamedTuple):
-    """Where a container begins and ends, and the first time in it; None where none was found."""
+    """Start and end of a container, and the first time in it, or None if none was found."""
 
     start: int
     end: int
@@ -39,20 +40,20 @@ class _Container(NamedTuple):
 def unwanted(
     file: BufferedReader, position: int, size: int, start_ns: int, selection: Selection
 ) -> Mapping[int, int]:
-    """Stretches of containers that no frame of the window can be in.
+    """Find sequences of containers that cannot contain frames of the window.
 
-    A container is left out when it and its neighbors begin well before the window or after it.
-    Where the file is not one chain of whole containers, nothing is.
+    A container is skipped if it and its neighbors start well before the window or after it. If the
+    file is not one chain of complete containers, none is skipped.
 
     Args:
         file: The log.
-        position: Where its first container begins.
-        size: Bytes of the file.
+        position: Offset of the first container.
+        size: Size of the file in bytes.
         start_ns: Log time of the recording's start.
-        selection: What is asked for.
+        selection: The selected time range.
 
     Returns:
-        From the start of each stretch to its end.
+        The end of each sequence by its start.
     """
     if selection.start_ns is None and selection.end_ns is None:
         return {}
@@ -60,7 +61,7 @@ def unwanted(
     skips: dict[int, int] = {}
     begun: int | None = None
     for k, one in enumerate(containers):
-        # An object may run on into the next container, so both neighbors count as well.
+        # An object may continue in the next container, so both neighbors must be outside too.
         around = containers[max(k - 1, 0) : k + 3]
         if _is_outside([c.first_ns for c in around], selection):
             begun = one.start if begun is None else begun
@@ -72,7 +73,7 @@ def unwanted(
 
 def _is_outside(times_ns: list[int | None], selection: Selection) -> bool:
     known = [t for t in times_ns if t is not None]
-    # The last container's frames run on for an unknown time.
+    # The time of the last container's last frame is unknown.
     is_last = len(times_ns) < 3
     if len(known) < len(times_ns):
         return False
@@ -82,7 +83,7 @@ def _is_outside(times_ns: list[int | None], selection: Selection) -> bool:
 
 
 def _containers(file: BufferedReader, position: int, size: int, start_ns: int) -> list[_Container]:
-    """All containers of the file, or none of them where their chain is broken."""
+    """List all containers of the file; empty if their chain is broken."""
     found = []
     while position < size:
         file.seek(position)
@@ -108,7 +109,7 @@ def _containers(file: BufferedReader, position: int, size: int, start_ns: int) -
 
 
 def _first_ns(body: bytes, method: int) -> int | None:
-    """Time of the first frame in a container's content, from the recording's start."""
+    """Return the time of the first frame in a container, from the recording's start."""
     if method == _DEFLATED:
         try:
             body = zlib.decompressobj().decompress(body, _INFLATED_BYTES)

@@ -1,1 +1,1 @@
-"""Image folders and video."""
+"""Readers of image folders and video files."""

@@ -1,4 +1,4 @@
-"""Is an encoded picture whole? As far as its own bytes can tell, without decoding it."""
+"""Damage checks of encoded images, by checksums, lengths and end markers, without decoding."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 _PNG_HEAD: Final = 8
 _JPEG_END: Final = b"\xff\xd9"
 _JPEG_TAIL: Final = 4096
-"""Cameras append padding and notes after the end marker."""
+"""Number of bytes searched for the end marker, because cameras append padding and metadata."""
 
 CUT: Final = "picture cut short"
 DAMAGED: Final = "picture damaged (checksum)"
@@ -19,20 +19,20 @@ CHECKED: Final = {
     "jpeg": "JPEG: no checksum, end marker seen",
     "webp": "WebP: no checksum, length compared",
 }
-"""What ``damage_of`` checks, by coding, for the summary of a log."""
+"""Checks of ``damage_of`` by coding, for the summary of a log."""
 
 
 def damage_of(picture: bytes, coding: str) -> str | None:
-    """Why a picture is known not to be whole, or None where nothing is known against it.
+    """Return the reason why an image is damaged, or None if no damage is detected.
 
     Args:
-        picture: Its bytes.
+        picture: Bytes of the image.
         coding: ``jpeg``, ``png`` or ``webp``; others are not checked.
     """
     if coding == "png":
         return _png_damage(picture)
     if coding == "jpeg":
-        # Inside the coded pixels 0xFF is always followed by 0, so a cut picture has no such end.
+        # Coded pixels never contain the marker, because 0xFF is always followed by 0 there.
         return None if _JPEG_END in picture[-_JPEG_TAIL:] else CUT
     if coding == "webp":
         declared = struct.unpack_from("<I", picture, 4)[0] + 8
@@ -41,7 +41,7 @@ def damage_of(picture: bytes, coding: str) -> str | None:
 
 
 def _png_damage(picture: bytes) -> str | None:
-    """Walk the chunks: length, type, content, CRC of type and content."""
+    """Check every chunk: length, type, content, CRC of type and content."""
     at = _PNG_HEAD
     while at + 12 <= len(picture):
         (length,) = struct.unpack_from(">I", picture, at)

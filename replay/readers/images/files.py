@@ -1,4 +1,4 @@
-"""One camera as files in a folder: their bytes in blocks, accounted for."""
+"""The image files of one camera, read into blocks and accounted for."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ _DETAILS_TOLD: Final = 20
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """Picture files in natural order, hidden ones not."""
+    """List the image files of a folder in natural order, without hidden files."""
     return list_files(folder, IMAGE_SUFFIXES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PictureFiles:
-    """Pictures of one camera and their times.
+    """Image files of one camera and their times.
 
     Attributes:
-        topic: The camera.
-        files: Its pictures.
-        touched: Takes note of what is read, for a seal.
+        topic: Topic of the camera.
+        files: The image files and their times.
+        touched: Record of the files read, for a seal.
     """
 
     topic: Topic
@@ -52,7 +52,7 @@ class PictureFiles:
     touched: Touched = field(default_factory=Touched)
 
     def read(self, ledger: Ledger, selection: Selection, limits: Limits) -> Iterator[Block]:
-        """The pictures in blocks, accounted for; codings met are added to ``ledger.integrity``."""
+        """Yield the images in blocks; add the check of each coding to ``ledger.integrity``."""
         name = self.topic.name
         ledger.declare(name, self.topic.declared)
         if not selection.wants(name):
@@ -67,14 +67,14 @@ class PictureFiles:
             ledger.settle(name)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Pictures without a time, times without a picture; no picture is opened."""
+        """Report images without a time and times without an image, without opening an image."""
         for sentence in self.files.notices:
             ledger.notice(sentence)
         self._drop_timeless(ledger)
         self._drop_missing(ledger, EVERYTHING)
 
     def _drop_timeless(self, ledger: Ledger) -> int:
-        """Drop the pictures without a time, and count them."""
+        """Drop the images without a time, and return their number."""
         without = [p.name for p, t in zip(self.files.paths, self.files.t_ns, strict=True) if t < 0]
         reason = "a picture without its time"
         ledger.drop(self.topic.name, reason, len(without), _few(without))
@@ -107,7 +107,7 @@ class PictureFiles:
 
 
 class _Batch:
-    """Pictures waiting to become a block."""
+    """Images collected for the next block."""
 
     def __init__(self, topic: str) -> None:
         self._topic = topic
@@ -129,7 +129,7 @@ class _Batch:
 def image_block(
     topic: str, t_ns: Sequence[int], pictures: Sequence[bytes], codings: Sequence[str]
 ) -> Block:
-    """A block of encoded pictures, copied into one buffer."""
+    """Return a block of encoded images, copied into one buffer."""
     stop = np.cumsum([len(picture) for picture in pictures], dtype=np.int64)
     start = np.concatenate([np.zeros(1, dtype=np.int64), stop[:-1]])
     buffer = np.frombuffer(b"".join(pictures), dtype=np.uint8)
@@ -140,7 +140,7 @@ def image_block(
 def _read_picture(
     path: Path, topic: str, t_ns: int, ledger: Ledger, limits: Limits, touched: Touched
 ) -> tuple[bytes, str] | None:
-    """A whole picture and its coding; else None, and the ledger knows why."""
+    """Return an undamaged image and its coding, or None after recording the reason."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise OSError("not a regular file")

@@ -1,7 +1,7 @@
-"""A folder of pictures and a time file: one camera.
+"""Reader of a folder with the images of one camera and a time file.
 
-Which files are time files and how they are read: ``time_file``; how pictures get their times:
-``timed_files``. The topic is called after the folder.
+``time_file`` parses the time file, and ``timed_files`` pairs images with times. The topic has the
+name of the folder.
 """
 
 from __future__ import annotations
@@ -31,43 +31,43 @@ from .files import PictureFiles, list_pictures
 
 
 class ImageFolder(Closing):
-    """A folder of pictures as a ``Log``."""
+    """A folder of images as a ``Log``."""
 
     format: Final = "images"
 
     def __init__(self, path: Path, pictures: PictureFiles, limits: Limits) -> None:
-        """Read ``pictures`` from ``path`` within ``limits``."""
+        """Create a log of ``pictures`` in the folder ``path``."""
         self.path: Final = path
         self._pictures: Final = pictures
         self._limits: Final = limits
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The one camera."""
+        """The topic of the camera."""
         return (self._pictures.topic,)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The pictures in natural order of their names; see ``Log.read``."""
+        """Yield the images in natural order of their names; see ``Log.read``."""
         yield from self._pictures.read(ledger, selection, self._limits)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Pictures without a time, times without a picture; see ``KnowsItsEnd``."""
+        """Report images without a time and times without an image; see ``KnowsItsEnd``."""
         self._pictures.report_missing(ledger)
 
     @property
     def touched(self) -> Touched:
-        """Which files were read, for a seal."""
+        """Record of the files read, for a seal."""
         return self._pictures.touched
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because no file stays open."""
 
 
 def open_images(path: Path, limits: Limits) -> ImageFolder:
-    """Open a folder of pictures; see ``crosscue.replay.formats.FORMATS``.
+    """Open a folder of images; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
-        LogFormatError: No picture, no time file, or a time file that cannot be understood.
+        LogFormatError: There is no image or no time file, or the time file cannot be parsed.
     """
     paths = list_pictures(path)
     if not paths:
@@ -76,8 +76,8 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     if time_file is None:
         raise LogFormatError(
             f"{path}: {len(paths)} pictures but no time file; write timestamps.txt into it with "
-            "one time a line (seconds with a decimal point), or with the one line 'rate_hz: 15' "
-            "if their times were not kept"
+            "one time per line (seconds with a decimal point), or with the single line "
+            "'rate_hz: 15' if their times were not recorded"
         )
     times = read_time_file(time_file, limits)
     name = path.resolve()
@@ -91,7 +91,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
 
 
 def picture_names(log: Log) -> Mapping[str, int]:
-    """From file name to time, for a folder of pictures."""
+    """Return the times of a folder's images by file name."""
     if log.format != "images":
         return {}
     time_file = find_time_file(log.path)

@@ -1,14 +1,15 @@
-"""A video file and a time file: one camera, as the stream's packets.
+"""Reader of video files: the packets of one camera, with times from a time file.
 
 A row is one packet of the first video stream, in stored order (which is decoding order): H.264 and
-H.265 in Annex B form with parameter sets before key frames, AV1 as stored, Motion JPEG as pictures.
-Other codecs are decoded here into ``raw`` pictures (``rgb8``). A row's time is the time of the
-picture that the packet becomes, so times of packets go back and forth where pictures are coded out
-of order. A decoder can only begin at a key frame: ask for a little more than is needed.
+H.265 in Annex B form with parameter sets before key frames, AV1 as stored, Motion JPEG as images.
+The reader decodes other codecs into ``raw`` images (``rgb8``). A row's time is the time of the
+image that the packet decodes to, so the times of packets are not monotonic where images are coded
+out of order. A decoder can only start at a key frame, so select a slightly longer time range than
+needed.
 
-Times come from the time file next to the video (``time_file``), whose lines count pictures in the
-order in which they are shown; without one from the container's own presentation times, which begin
-at 0. A raw ``.h264`` or ``.hevc`` stream has none and needs the file.
+Times are read from the time file next to the video (``time_file``), with one line per image in
+presentation order. Without a time file, the container's presentation times are used, which start at
+0. A raw ``.h264`` or ``.hevc`` stream has no times and needs the time file.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ DEMUXERS: Final = {
     ".hevc": "hevc",
     ".h264": "h264",
 }
-"""Which of FFmpeg's demuxers reads which suffix; none is guessed, since some open other files."""
+"""FFmpeg's demuxers by suffix; none is probed, because some demuxers open other files."""
 WITHOUT_TIMES: Final = frozenset({".hevc", ".h264"})
 CODINGS: Final = {"h264": "h264", "hevc": "h265", "av1": "av1", "mjpeg": "jpeg", "png": "png"}
 TO_ANNEX_B: Final = {"h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb"}
@@ -65,14 +66,14 @@ NO_TIME: Final = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Index:
-    """What a first pass over the packets reports.
+    """Results of a first pass over the packets.
 
     Attributes:
-        t_ns: Shape (N,), int64: time of each packet's picture, or ``NO_TIME``.
+        t_ns: Shape (N,), int64: time of each packet's image, or ``NO_TIME``.
         is_damaged: N flags.
-        stopped: Why the pass ended before the file did, or empty.
-        notices: Sentences on the times.
-        missing: How many lines of the time file have no packet.
+        stopped: Reason why the pass ended before the file's end, or empty.
+        notices: Remarks on the times, one sentence each.
+        missing: Number of lines of the time file without a packet.
     """
 
     t_ns: Int64s
@@ -91,7 +92,7 @@ class Video(Closing):
         """Read the header.
 
         Raises:
-            LogFormatError: It is cut or damaged, or has no video stream.
+            LogFormatError: The file is truncated or damaged, or has no video stream.
         """
         self.path: Final = path
         self._file: Final = file
@@ -116,7 +117,7 @@ class Video(Closing):
         self.topics: Final = (Topic(path.stem, "crosscue/Images", "columns", declared=declared),)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The packets in stored order; see ``Log.read`` and the module's text."""
+        """Yield the packets in stored order; see ``Log.read`` and the module's docstring."""
         (topic,) = self.topics
         ledger.integrity = "video packets carry no checksum: a changed picture cannot be seen"
         if self.path.suffix.lower() in WITHOUT_TIMES:
@@ -138,7 +139,7 @@ class Video(Closing):
         self._settle(index, ledger)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Where container and time file count differently; see ``KnowsItsEnd``."""
+        """Report different counts of the container and the time file; see ``KnowsItsEnd``."""
         (topic,) = self.topics
         if self._times is None or self._times.period is not None or topic.declared is None:
             return
@@ -165,7 +166,7 @@ class Video(Closing):
             ) from None
 
     def _index(self) -> _Index:
-        """Go over all packets once, for their number, times and damage."""
+        """Examine all packets once for their number, times and damage."""
         pts: list[int | None] = []
         is_damaged: list[bool] = []
         stopped = ""
@@ -199,7 +200,7 @@ class Video(Closing):
         lines = len(self._times.t_ns) if self._times.period is None else len(pts)
         if self._times.period is not None:
             rate_hz = float(SECOND_NS / self._times.period)
-            notices.append(f"times are made up from a constant rate of {rate_hz:g} Hz, from 0 on")
+            notices.append(f"times are computed from a constant rate of {rate_hz:g} Hz, from 0 on")
         elif lines != len(pts):
             notices.append(
                 f"{len(pts)} pictures and {lines} times ({self._times.path.name}): paired in order "
@@ -212,28 +213,28 @@ class Video(Closing):
         return _Index(t_ns, tuple(is_damaged), stopped, tuple(notices), missing)
 
     def _shown_order(self, pts: list[int | None], notices: list[str]) -> Int64s:
-        """Each packet's place in the order in which pictures are shown."""
+        """Return each packet's index in presentation order."""
         stored = np.arange(len(pts), dtype=np.int64)
         if self.path.suffix.lower() == ".avi" and not self._has_reordering:
-            # AVI carries no times of showing. What the demuxer reports is a guess, which a
-            # damaged picture misleads.
+            # AVI has no presentation times. The demuxer only guesses them, and damaged images
+            # mislead it.
             return stored
         known = [p for p in pts if p is not None]
         if len(known) == len(pts):
             shown = np.empty(len(pts), dtype=np.int64)
             shown[np.argsort(np.array(known, dtype=np.int64), kind="stable")] = np.arange(len(pts))
             if (np.diff(shown) < 0).any():
-                notices.append("pictures are stored in another order than they are shown")
+                notices.append("pictures are not stored in presentation order")
             return shown
         if self._has_reordering:
             notices.append(
-                "the stream may store pictures in another order than they are shown and does not "
-                "say which: times go by stored order"
+                "the stream does not state the presentation order of pictures, which may differ "
+                "from the stored order; times follow the stored order"
             )
         return stored
 
     def _packets(self, index: _Index, wanted: list[bool], ledger: Ledger) -> Iterator[Block]:
-        """Blocks of packets as they are stored."""
+        """Yield blocks of packets as stored."""
         name, coding = self.topics[0].name, CODINGS[self._codec]
         t_ns: list[int] = []
         payloads: list[bytes] = []
@@ -261,7 +262,7 @@ class Video(Closing):
             yield image_block(name, t_ns, payloads, [coding] * len(payloads))
 
     def _usable(self, index: _Index, i: int, size: int, wanted: bool, ledger: Ledger) -> bool:
-        """Book a packet that is not to be given."""
+        """Account for a packet, and return whether it is yielded."""
         name, t_ns = self.topics[0].name, int(index.t_ns[i])
         if index.is_damaged[i]:
             ledger.drop(name, "packet damaged", 1, f"packet {i}", t_ns)
@@ -280,7 +281,7 @@ class Video(Closing):
         return reason is None
 
     def _decoded(self, index: _Index, wanted: list[bool], ledger: Ledger) -> Iterator[Block]:
-        """Blocks of one decoded picture each, for codecs that nobody downstream knows."""
+        """Yield blocks of one decoded image, for codecs that other modules do not support."""
         name = self.topics[0].name
         ledger.notice(f"codec {self._codec}: decoded by the reader")
         shown = set[int]()
@@ -297,9 +298,9 @@ class Video(Closing):
             ledger.drop(name, "picture cannot be decoded", 1, f"packet {i}", at_ns)
 
     def _frames(self, container: InputContainer, packets: int) -> Iterator[tuple[int, VideoFrame]]:
-        """Pictures that can be decoded, each with the number of the packet that it came in.
+        """Yield the decodable images with the indices of their packets.
 
-        Pictures before and after one that cannot be decoded so keep their own times.
+        The indices preserve the times of the images around an undecodable image.
         """
         from av.codec.context import Flags
 
@@ -325,10 +326,12 @@ class Video(Closing):
         elif topic.declared is None and self._times is None and self._duration_s is not None:
             last_s = float(index.t_ns.max(initial=0)) / SECOND_NS
             period_s = last_s / max(len(index.t_ns) - 1, 1)
-            # A whole file ends one period after its last picture's time.
+            # A complete file ends one period after its last image's time.
             if self._duration_s - last_s > 1.6 * period_s:
-                says = f"the container says {self._duration_s:.2f} s, packets end at {last_s:.2f} s"
-                ledger.drop(topic.name, "file is cut or damaged", None, says)
+                detail = (
+                    f"the container has {self._duration_s:.2f} s, packets end at {last_s:.2f} s"
+                )
+                ledger.drop(topic.name, "file is cut or damaged", None, detail)
         ledger.settle(topic.name, "declared by the container, not in its bytes")
 
 
@@ -336,7 +339,7 @@ def open_video(path: Path, limits: Limits) -> Video:
     """Open a video file; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
-        LogFormatError: It is cut or damaged, has no video, or no times.
+        LogFormatError: It is truncated or damaged, has no video, or has no times.
         LogError: It cannot be opened, or the extra ``video`` is not installed.
     """
     if find_spec("av") is None:
@@ -362,7 +365,7 @@ def open_video(path: Path, limits: Limits) -> Video:
 
 def _video_stream(container: InputContainer, path: Path) -> VideoStream:
     for stream in container.streams.video:
-        # None where FFmpeg knows no decoder, against its type.
+        # None if FFmpeg has no decoder, contrary to the type annotation.
         if cast("object", stream.codec_context) is not None:
             return stream
     raise LogFormatError(
@@ -371,7 +374,7 @@ def _video_stream(container: InputContainer, path: Path) -> VideoStream:
 
 
 def _duration_s(container: InputContainer) -> float | None:
-    """How long the container says it is, where that speaks of the video alone."""
+    """Return the duration that the container states, if it applies to the video stream."""
     import av
 
     if container.duration is None or len(container.streams) != 1:
@@ -380,7 +383,7 @@ def _duration_s(container: InputContainer) -> float | None:
 
 
 def _demuxed(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Packets until the end or the damage; the first pass has already reported the latter."""
+    """Yield packets until the end or the first damage, which the first pass has reported."""
     try:
         yield from container.demux(stream)
     except _failures():
@@ -388,7 +391,7 @@ def _demuxed(container: InputContainer, stream: VideoStream) -> Iterator[Packet[
 
 
 def _annex_b(stream: VideoStream) -> BitStreamFilterContext | None:
-    """A filter to Annex B, where the stream is stored with lengths (``avcC``, ``hvcC``)."""
+    """Return a filter to Annex B if the stream is stored with lengths (``avcC``, ``hvcC``)."""
     from av.bitstream import BitStreamFilterContext
 
     extra = stream.codec_context.extradata
@@ -414,13 +417,13 @@ def _raw_block(topic: str, t_ns: int, frame: VideoFrame) -> Block:
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """What FFmpeg's binding raises on damaged input; an empty file is an ``OSError``."""
+    """Return the exceptions that PyAV raises for damaged input; ``OSError`` for an empty file."""
     import av
 
     return av.FFmpegError, ValueError, OSError
 
 
 def _words(error: BaseException) -> str:
-    """FFmpeg's reason without its error number and our file object."""
+    """Return FFmpeg's message without its error number and the file object."""
     text = getattr(error, "strerror", None) or str(error)
     return str(text).replace("\n", " ")[:200]

@@ -1,1 +1,1 @@
-"""A first vehicle file: what a log shows of the car, each choice with its reason."""
+"""Draft of a vehicle file from a log: chosen signals, each with the reason for the choice."""

@@ -1,8 +1,8 @@
-"""Whether signals that should say the same do, and what is wrong with one that does not.
+"""Consistency checks between signals that measure the same motion.
 
-A signal is judged by others that measure the same: a speed by GNSS or the other wheels, a yaw rate
-by the course over ground, the steering wheel and the difference of the rear wheels, each with the
-error that is to be expected of it. One that contradicts is never proposed.
+A speed is compared with GNSS or the other wheels. A yaw rate is compared with the course over
+ground, the steering wheel and the difference of the rear wheels. Each comparison allows for the
+expected error of its reference. A contradicting signal is never proposed.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ TRACK_M: Final = 1.55
 STEERING_RATIO: Final = 15.0
 WHEELBASE_M: Final = 2.7
 GYRO_BIAS_RADPS: Final = 1.0 * DEGREE
-"""A constant error that a car's gyro may have; ``fit odometry`` takes it off."""
+"""Maximum plausible bias of a car's gyro; ``fit odometry`` removes it."""
 STEERING_OFF_RAD: Final = 4.0 * DEGREE
-"""A steering wheel may be so far off its middle on a straight road (crowned, side wind)."""
+"""Maximum plausible steering offset on a straight road (crowned road, side wind)."""
 TYRES_DIFFER: Final = 0.005
-"""Radii of the left and right wheels may differ by such a part."""
+"""Maximum plausible relative difference between the radii of the left and right wheels."""
 TURNS: Final = 3.0 * DEGREE
-"""A reference that turns by less within all windows says nothing about sign and scale."""
+"""Minimum turn of a reference, in any window, that determines the sign and scale."""
 FOLLOWS: Final = 0.7
 MIN_WINDOWS: Final = 5
 SURE_WINDOWS: Final = 15
-"""In so many windows signals do not follow each other by chance, however little the car turns."""
+"""Number of windows for which a correlation is significant, however little the car turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turning:
-    """Something that turns with the car, to judge a yaw rate by.
+    """A reference for the turns of the car.
 
     Attributes:
-        name: What it is.
-        turned_rad: Shape (windows,): turned within each; NaN where unknown.
-        off_radps: Shape (windows,): how far its rate may be off, all drive long.
-        has_scale: Whether its scale is known.
+        name: Name of the reference in facts.
+        turned_rad: Shape (windows,): turn within each window; NaN where unknown.
+        off_radps: Shape (windows,): plausible constant error of its rate.
+        has_scale: True if its scale is known.
     """
 
     name: str
@@ -59,15 +59,15 @@ class Turning:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What was found out about one signal.
+    """Result of the consistency checks of a signal.
 
     Attributes:
-        facts: What it shows, for the comment beside it.
-        wrong: Why it must not be used; empty where nothing speaks against it.
-        agrees_with: How many others it was found to agree with.
-        error: How far it is off them, to rank by.
-        sign: -1 where it is positive to the right.
-        is_judged: False where the log shows too little to judge it by.
+        facts: Observations, for the comment next to the signal.
+        wrong: Reasons against its use; empty if there is no contradiction.
+        agrees_with: Number of references that it agrees with.
+        error: Deviation from the references, used for ranking.
+        sign: -1 if it is positive to the right, else 1.
+        is_judged: False if the log contains too little data for a comparison.
     """
 
     facts: tuple[str, ...]
@@ -79,20 +79,20 @@ class Verdict:
 
     @property
     def rank(self) -> tuple[int, float]:
-        """Smaller is better."""
+        """Sort key; smaller is better."""
         return -self.agrees_with, self.error
 
 
 def judge_speed(
     series: Series, reference: Series | None, grid: Grid, radius_known: bool
 ) -> Verdict:
-    """A speed, or a wheel's rate of turning if its radius is not known, by a reference.
+    """Check a speed, or a wheel's angular rate if its radius is unknown, against a reference.
 
     Args:
-        series: Of the signal.
-        reference: A speed from elsewhere, m/s; None if unknown.
-        grid: The times to compare at.
-        radius_known: The series is in m/s, so that its scale is judged, too.
+        series: Readings of the signal.
+        reference: An independent speed, m/s; None if unknown.
+        grid: The times of the comparison.
+        radius_known: True if the series is in m/s, so that its scale is checked too.
     """
     low, high = float(series.values.min()), float(series.values.max())
     unit = "m/s" if radius_known else "rad/s"
@@ -105,7 +105,7 @@ def judge_speed(
     measured, true = series.at(grid), reference.at(grid)
     both = np.isfinite(measured) & np.isfinite(true)
     if both.sum() < 50 or float(np.abs(true[both]).max()) < MOVING_MPS:
-        return Verdict((*facts, f"hardly moves or is not there together with {reference.name}"))
+        return Verdict((*facts, f"too little motion in common with {reference.name}"))
     measured, true = np.abs(measured[both]), np.abs(true[both])
     if not measured.any():
         return Verdict(tuple(facts), (f"is 0 while {reference.name} moves",))
@@ -123,7 +123,7 @@ def judge_speed(
 
 
 def spread_mps(wheels: Sequence[Series], grid: Grid) -> float:
-    """How far wheels lie from their mean, root mean square; NaN where they are not together."""
+    """Return the RMS deviation of the wheels from their mean; NaN without common times."""
     stacked = np.stack([one.at(grid) for one in wheels])
     together = np.isfinite(stacked).all(axis=0)
     if not together.any():
@@ -133,7 +133,7 @@ def spread_mps(wheels: Sequence[Series], grid: Grid) -> float:
 
 
 def of_course(track: Track, grid: Grid) -> Turning | None:
-    """The course over ground; None where the car was too slow for one."""
+    """Return the course over ground as a reference; None if the car was too slow."""
     if track.course is None:
         return None
     turned = np.diff(track.course.at(grid)[:: grid.steps])
@@ -141,7 +141,7 @@ def of_course(track: Track, grid: Grid) -> Turning | None:
 
 
 def of_wheels(left: Series, right: Series, grid: Grid) -> Turning:
-    """The difference of two wheels of one axle, with a usual track width."""
+    """Return the difference of an axle's wheels as a reference, with a typical track width."""
     rate = (right.at(grid) - left.at(grid)) / TRACK_M
     speed = 0.5 * (right.at(grid) + left.at(grid))
     off = TYRES_DIFFER * np.abs(grid.mean(speed)) / TRACK_M
@@ -149,7 +149,7 @@ def of_wheels(left: Series, right: Series, grid: Grid) -> Turning:
 
 
 def of_steering(angle: Series, sign: int, speed: Series, grid: Grid) -> Turning:
-    """Speed times the steering angle, with a usual ratio and wheel base."""
+    """Return the steering angle as a reference, with a typical steering ratio and wheelbase."""
     v = speed.at(grid)
     rate = sign * v * np.tan(np.clip(angle.at(grid) / STEERING_RATIO, -1.0, 1.0)) / WHEELBASE_M
     off = np.abs(grid.mean(v)) * STEERING_OFF_RAD / STEERING_RATIO / WHEELBASE_M
@@ -157,7 +157,7 @@ def of_steering(angle: Series, sign: int, speed: Series, grid: Grid) -> Turning:
 
 
 def of_rate(rate: Series, sign: int, grid: Grid) -> Turning:
-    """A yaw rate that was itself found to agree."""
+    """Return a yaw rate that agrees with other references as a reference."""
     off = np.full(grid.windows, GYRO_BIAS_RADPS)
     return Turning(f"the yaw rate of {rate.name}", sign * rate.turned(grid), off)
 
@@ -165,15 +165,15 @@ def of_rate(rate: Series, sign: int, grid: Grid) -> Turning:
 def judge_yaw_rate(
     series: Series, references: Sequence[Turning], speed: Series | None, grid: Grid
 ) -> Verdict:
-    """A yaw rate by all that turns with the car.
+    """Check a yaw rate against references.
 
     Args:
-        series: Of the signal, rad/s.
-        references: The best first.
-        speed: Of the car, m/s, to find out when it stands.
-        grid: The times to compare at.
+        series: Readings of the signal, rad/s.
+        references: References, best first.
+        speed: Speed of the car, m/s, to detect when it is stationary.
+        grid: The times of the comparison.
     """
-    found = _first_look(series, MAX_YAW_RATE_RADPS, "deg/s")
+    found = _range_verdict(series, MAX_YAW_RATE_RADPS, "deg/s")
     if found.wrong:
         return found
     if speed is not None and (bias := _bias(series, speed, grid)) is not None:
@@ -187,17 +187,17 @@ def judge_yaw_rate(
 def judge_steering(
     series: Series, references: Sequence[Turning], speed: Series | None, grid: Grid
 ) -> Verdict:
-    """A steering angle by all that turns with the car; the ratio of the steering is not known."""
-    found = _first_look(series, MAX_STEERING_RAD, "deg")
+    """Check a steering angle of unknown steering ratio against references."""
+    found = _range_verdict(series, MAX_STEERING_RAD, "deg")
     if found.wrong or speed is None:
         return found
     as_turn = of_steering(series, 1, speed, grid)
     scaleless = [replace(one, has_scale=False) for one in references]
-    # A steering wheel off its middle is not a contradiction; what it must do is follow the turns.
+    # An offset of the steering wheel is not a contradiction; only the turns must correlate.
     return _judged(found, as_turn.turned_rad, scaleless, math.inf)
 
 
-def _first_look(series: Series, limit_rad: float, unit: str) -> Verdict:
+def _range_verdict(series: Series, limit_rad: float, unit: str) -> Verdict:
     low, high = float(series.values.min()) / DEGREE, float(series.values.max()) / DEGREE
     facts = (f"{series.rate_hz:.3g} Hz", f"{low:.1f} to {high:.1f} {unit}")
     if max(abs(low), abs(high)) * DEGREE > limit_rad:
@@ -208,7 +208,7 @@ def _first_look(series: Series, limit_rad: float, unit: str) -> Verdict:
 
 
 def _bias(series: Series, speed: Series, grid: Grid) -> float | None:
-    """Mean rate while the car stands for two seconds or more."""
+    """Return the mean rate while the car is stationary for two seconds or more."""
     stands = grid.windows_where(np.abs(speed.at(grid)) < STANDING_MPS)
     turned = series.turned(grid)[stands]
     turned = turned[np.isfinite(turned)]

@@ -1,4 +1,4 @@
-"""What a first vehicle file says of the camera, and of all that no log can show."""
+"""The camera section of a drafted vehicle file, and the sections that no log can fill."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 
 
 class Intrinsics(NamedTuple):
-    """Of a camera, in pixels, and where they are from."""
+    """Intrinsics of a camera in pixels, and their source."""
 
     focal_px: float
     center_px: tuple[float, float]
@@ -20,22 +20,22 @@ class Intrinsics(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """A number of the mounting, and where it is from."""
+    """A parameter of the mounting, and its source."""
 
     value: float
     source: str
 
 
 class Mounting(NamedTuple):
-    """Where the camera sits, as far as it is known; names are those of the vehicle file.
+    """Mounting of the camera, where known; names are those of the vehicle file.
 
     Attributes:
-        x_m: Ahead of the rear axle.
-        y_m: To its left.
-        z_m: Above the road.
-        pitch_rad: How far its axis points below the horizon.
-        yaw_rad: How far it points to the left.
-        notes: Sentences about what else is known, or why it is not.
+        x_m: Distance ahead of the rear axle.
+        y_m: Distance to the left of the vehicle's middle.
+        z_m: Height above the road.
+        pitch_rad: Angle of the optical axis below the horizon.
+        yaw_rad: Angle of the optical axis to the left.
+        notes: Remarks on known or unknown parameters, one sentence each.
     """
 
     x_m: Measured | None = None
@@ -48,13 +48,13 @@ class Mounting(NamedTuple):
 
 @runtime_checkable
 class KnowsItsCameras(Protocol):
-    """A log whose data set publishes intrinsics beside its streams."""
+    """A log whose data set publishes camera intrinsics."""
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
-        """Focal length and optical center of a camera; None where they are not published.
+        """Return a camera's focal length and optical center; None if they are not published.
 
         Raises:
-            LogFormatError: They are published and cannot be read.
+            LogFormatError: They are published but cannot be read.
         """
         ...
 
@@ -69,17 +69,17 @@ MEASURE: Final = {
 }
 
 AFTER_CAMERA: Final = """\
-# [regions]  # where road is looked for: on the ground, which needs camera.focal_px, z_m and a range
-# kind = "ground"  # or "picture", with a polygon for each side drawn on a picture of:
+# [regions]  # where road is searched: on the ground, which needs camera.focal_px, z_m and a range
+# kind = "ground"  # or "picture", with a polygon for each side, drawn on an image from:
 # crosscue detect LOG --draw 1
 
-# [ranges]  # left out: from motion, where camera.focal_px and odometry are known
+# [ranges]  # default: from motion, where camera.focal_px and odometry are known
 # kind = "curve"  # after: crosscue fit ranges RUN... --truth TRUTH...
 
 # [detectors.yolox-nano]  # after: crosscue model fetch yolox-nano; others: crosscue model list
-# kind = "yolox-nano"  # a network of your own: crosscue model init NET.onnx, then card = "NET.toml"
+# kind = "yolox-nano"  # for your own network: crosscue model init NET.onnx, then card = "NET.toml"
 
-# [cues]  # left out: each detector's own thresholds, see crosscue fit detector
+# [cues]  # default: each detector's own thresholds, see crosscue fit detector
 # stop_sign_score = 0.5
 # traffic_light_score = 0.5
 # [cars]
@@ -88,7 +88,7 @@ AFTER_CAMERA: Final = """\
 
 
 def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
-    """The section ``[camera]``; nothing for logs without one."""
+    """Yield the lines of the section ``[camera]``; none for logs without a camera."""
     camera = camera_of(logs)
     if camera is None:
         return
@@ -118,7 +118,7 @@ def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
 
 
 def camera_of(logs: Sequence[Log]) -> tuple[Log, str, Intrinsics | None] | None:
-    """The first camera, its topic and its calibration; None for logs without a camera."""
+    """Return the first camera's log, topic and intrinsics; None for logs without a camera."""
     for log in logs:
         for topic in log.topics:
             if role_of(topic) is Role.CAMERA:
@@ -127,7 +127,7 @@ def camera_of(logs: Sequence[Log]) -> tuple[Log, str, Intrinsics | None] | None:
 
 
 def _intrinsics(logs: Sequence[Log], log: Log, camera: str) -> Intrinsics | None:
-    """As the data set publishes them, or of the first calibration message."""
+    """Return the intrinsics published with the data set, else those of the first message."""
     if isinstance(log, KnowsItsCameras) and (published := log.intrinsics(camera)) is not None:
         focal, x, y = published
         return Intrinsics(focal, (x, y), "published with the data set")
@@ -141,7 +141,7 @@ def _intrinsics(logs: Sequence[Log], log: Log, camera: str) -> Intrinsics | None
 
 
 def _of_message(log: Log, name: str) -> Intrinsics | None:
-    """Of the first message of a topic; None where it is not calibrated."""
+    """Return the intrinsics in the first message of a topic; None if it has none."""
     topic = next(topic for topic in log.topics if topic.name == name)
     ledger = Ledger(name_of(log))
     decode = decoder_for(topic) if topic.encoding != "columns" else None

@@ -1,6 +1,6 @@
-"""Which signals of a CAN database could be a wheel's speed, the yaw rate or the steering angle.
+"""Candidate signals of a CAN database for wheel speed, yaw rate and steering angle.
 
-Names and units only propose; what the log shows of each decides (``agreement``).
+Candidates are proposed by name and unit. Their readings decide which are used (``agreement``).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ REQUESTS: Final = frozenset(
     | {"DES", "DESIRED", "DSRD", "DEMAND", "DMD", "SETPOINT", "SETPT", "SP", "SET", "SOLL"}
     | {"WANTED", "LIMIT", "LIM", "LKA", "LKAS"}
 )
-"""Words in the name of a signal that asks for something and measures nothing."""
+"""Words in the names of requests, which are not measurements."""
 OTHERS: Final = frozenset({"TRAILER", "TRLR", "OFFSET", "OFFST", "ACCURACY", "LEAD"})
-"""Words in the name of a signal about something else than the car, or about another signal."""
+"""Words in the names of signals about other objects or about another signal."""
 WHEELS: Final = {
     "front_left": ("FL", "LF", "FRONTLEFT", "LEFTFRONT", "VL"),
     "front_right": ("FR", "RF", "FRONTRIGHT", "RIGHTFRONT", "VR"),
     "rear_left": ("RL", "LR", "REARLEFT", "LEFTREAR", "HL"),
     "rear_right": ("RR", "REARRIGHT", "RIGHTREAR", "HR"),
 }
-"""Words that say which wheel; the last of each are German."""
+"""Words that identify a wheel; the last ones of each wheel are German."""
 OF_WHEELS: Final = ("WHEEL", "WHL", "WH", "RAD", "RADGESCHW")
 OF_SPEED: Final = ("SPEED", "SPD", "VELOCITY", "VEL", "GESCHW", "V")
 OF_YAW: Final = ("YAW", "GIER", "GIERRATE", "YR")
@@ -49,7 +49,7 @@ OF_GNSS: Final = ("GPS", "GNSS")
 
 
 class Kind(Enum):
-    """What a signal could be."""
+    """The possible meaning of a signal."""
 
     WHEEL = "wheel speed"
     SPEED = "speed of the car"
@@ -60,16 +60,16 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A signal that could be something that odometry needs.
+    """A signal that may be an input of odometry.
 
     Attributes:
-        message: As the database spells it, with its identifier where several have that name.
-        signal: Likewise.
-        kind: What it could be.
-        unit: As the database spells it; empty where it says nothing.
-        scale: From its unit to SI; 1 for rad/s of a wheel, whose radius is not known.
-        wheel: Which wheel, a key of ``WHEELS``; empty for other kinds.
-        stem: Name without the words that say which wheel: the same for wheels that belong together.
+        message: Message name in the database, with its identifier if the name is ambiguous.
+        signal: Signal name in the database.
+        kind: Possible meaning.
+        unit: Unit in the database; empty if unspecified.
+        scale: Factor from its unit to SI; 1 for a wheel in rad/s, whose radius is unknown.
+        wheel: Key of ``WHEELS``; empty for other kinds.
+        stem: Name without the words that identify the wheel, equal for wheels that belong together.
     """
 
     message: str
@@ -82,12 +82,12 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """As a vehicle file has it."""
+        """Name in a vehicle file."""
         return f"{self.message}.{self.signal}"
 
     @property
     def is_turning(self) -> bool:
-        """Is it a wheel's rate of turning, so that its speed needs a radius?"""
+        """True for a wheel's angular rate, whose conversion to a speed needs a radius."""
         return self.kind is Kind.WHEEL and _unit(self.unit) in _TURNING
 
 
@@ -95,7 +95,7 @@ _TURNING: Final = frozenset({"rad/s", "radians/second", "rad/sec"})
 
 
 def candidates(messages: Sequence[CanMessage]) -> Iterator[Candidate]:
-    """Every signal that could be something, by its name and unit; requests are left out."""
+    """Yield the candidate signals by name and unit, without requests."""
     for message in messages:
         for signal in message.signals:
             found = _candidate(message, signal)
@@ -135,7 +135,7 @@ def _unit(text: str) -> str:
 
 
 def _mentions(words: Collection[str], wanted: Sequence[str]) -> bool:
-    """Whether a word is one of these, or begins with a longer one of them."""
+    """Return whether a word equals one of these, or begins with a longer one of them."""
     return any(
         word == one or (len(one) > 3 and word.startswith(one)) for word in words for one in wanted
     )
@@ -152,5 +152,5 @@ def _without(words: Sequence[str], those: Sequence[str]) -> list[str]:
 
 
 def _words(name: str) -> list[str]:
-    """Of a name in capitals, in camel case or with underscores."""
+    """Split a name in capitals, in camel case or with underscores into words."""
     return [word.upper() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]

@@ -1,4 +1,4 @@
-"""Which signals a first vehicle file names: the best that contradict nothing, and the others."""
+"""Choice of the signals for a drafted vehicle file: the best signals without contradictions."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from .observed import Bus, Observed
 from .series import Grid, Series
 
 USUAL_RADIUS_M: Final = 0.32
-"""Of a car's wheel, to decide whether it moves where nothing shows the true one."""
+"""Typical wheel radius, used to detect motion where the true radius is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """One signal, or an inertial unit's, with what was found out about it.
+    """A candidate signal, of a bus or of an inertial unit, with its verdict.
 
     Attributes:
-        name: As the vehicle file has it; the topic of an inertial unit.
-        bus: Topic of its bus; empty for a topic of its own.
+        name: Name in the vehicle file, or the topic of an inertial unit.
+        bus: Topic of its bus; empty for an inertial unit.
         series: Its readings.
-        verdict: What the log shows.
+        verdict: Result of the comparison with other signals.
     """
 
     name: str
@@ -49,15 +49,15 @@ class Choice:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WheelSet:
-    """Wheels that belong together.
+    """Wheel signals that belong together.
 
     Attributes:
         bus: Topic of their bus.
         wheels: Signals by wheel, a key of ``WHEELS``.
-        series: Readings, alike.
-        verdict: What the log shows, of all of them.
-        radius_m: Where they turn in rad/s: the radius that fits the reference; else None.
-        is_turning: Whether they are in rad/s.
+        series: Readings by wheel.
+        verdict: Combined result of the comparison with other signals.
+        radius_m: For signals in rad/s, the radius that fits the reference; else None.
+        is_turning: True if the signals are in rad/s.
     """
 
     bus: str
@@ -69,12 +69,12 @@ class WheelSet:
 
     @property
     def has_axle(self) -> bool:
-        """Are the two rear wheels among them, which odometry needs?"""
+        """True if both rear wheels, which odometry needs, are included."""
         return {"rear_left", "rear_right"} <= self.wheels.keys()
 
     @property
     def speed(self) -> Series:
-        """Mean of the rear wheels, m/s."""
+        """Mean speed of the rear wheels, m/s."""
         left, right = self.series["rear_left"], self.series["rear_right"]
         scale = (self.radius_m or USUAL_RADIUS_M) if self.is_turning else 1.0
         other = np.interp(left.t_ns, right.t_ns, right.values)
@@ -83,15 +83,15 @@ class WheelSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choices:
-    """What was chosen, the best of each kind first.
+    """Candidate signals of each kind, best first.
 
     Attributes:
-        wheels: Sets of wheels.
-        speeds: Speeds of the car, for one without wheel speeds.
-        yaw_rates: CAN signals and inertial units.
-        steering: CAN signals.
-        reference: What speeds were compared with; empty for nothing.
-        speed: The best speed of the car there is, m/s.
+        wheels: Sets of wheel speeds.
+        speeds: Vehicle speeds, for a car without wheel speeds.
+        yaw_rates: CAN signals and inertial units with yaw rates.
+        steering: CAN signals with steering angles.
+        reference: Name of the reference for speeds; empty if none exists.
+        speed: The best available speed of the car, m/s.
     """
 
     wheels: tuple[WheelSet, ...]
@@ -102,7 +102,7 @@ class Choices:
     speed: Series | None
 
     def is_chosen(self, choice: Choice | WheelSet) -> bool:
-        """Is it the best of its kind, with nothing against it?"""
+        """Return whether it is the best of its kind and free of contradictions."""
         of_kind: Sequence[Choice | WheelSet] = next(
             kind
             for kind in (self.wheels, self.speeds, self.yaw_rates, self.steering)
@@ -112,7 +112,7 @@ class Choices:
 
 
 def choose(seen: Observed) -> Choices:
-    """Judge every candidate by the others."""
+    """Compare every candidate with the others and rank them."""
     grid = Grid.over(seen.start_ns, seen.end_ns)
     reference = _reference_speed(seen, grid)
     wheels = sorted(_wheel_sets(seen, reference, grid), key=_wheel_rank)
@@ -133,8 +133,8 @@ def choose(seen: Observed) -> Choices:
         )
         turnings.append(of_wheels(left, right, grid))
     yaw_rates = _yaw_rates(seen, turnings, speed, grid)
-    # An inertial unit's axes are those of its type; a CAN signal nobody confirms may have any sign,
-    # and two of them that agree with each other may both be wrong.
+    # The message type defines an inertial unit's axes. An unconfirmed CAN signal may have any sign,
+    # and two of them may agree although both are wrong.
     by_rate = [
         of_rate(one.series, one.verdict.sign, grid)
         for one in yaw_rates[:1]
@@ -164,7 +164,7 @@ def choose(seen: Observed) -> Choices:
 
 
 def _reference_speed(seen: Observed, grid: Grid) -> Series | None:
-    """GNSS, else the median of all that could be a speed in m/s."""
+    """Return the GNSS speed, else the median of all candidate speeds in m/s."""
     for track in seen.tracks:
         if np.isfinite(track.speed.at(grid)).sum() > 50:
             return replace(track.speed, name=f"GNSS {track.speed.name}")
@@ -196,19 +196,19 @@ def _wheel_sets(seen: Observed, reference: Series | None, grid: Grid) -> Iterato
     for (bus_name, _, is_turning), group in groups.items():
         readings = {wheel: group[wheel][1] for wheel in WHEELS if wheel in group}
         verdicts = [judge_speed(one, reference, grid, not is_turning) for one in readings.values()]
-        verdict, radius_m = _of_all(verdicts, readings, reference, grid, is_turning)
+        verdict, radius_m = _combined(verdicts, readings, reference, grid, is_turning)
         names = {wheel: group[wheel][0] for wheel in readings}
         yield WheelSet(bus_name, names, readings, verdict, radius_m, is_turning)
 
 
-def _of_all(
+def _combined(
     verdicts: Sequence[Verdict],
     series: dict[str, Series],
     reference: Series | None,
     grid: Grid,
     is_turning: bool,
 ) -> tuple[Verdict, float | None]:
-    """One verdict on a set: the worst wheel's, and how well the wheels agree."""
+    """Return the worst wheel's verdict, with the spread of the wheels, and the fitted radius."""
     worst = max(verdicts, key=lambda one: (len(one.wrong), one.rank))
     facts = [*worst.facts]
     radius_m = None
@@ -218,7 +218,7 @@ def _of_all(
         spread = spread_mps(list(series.values()), grid)
         if math.isfinite(spread):
             unit = "rad/s" if is_turning else "m/s"
-            facts.append(f"the {len(series)} wheels lie {spread:.2g} {unit} from their mean")
+            facts.append(f"the {len(series)} wheels deviate {spread:.2g} {unit} from their mean")
     return replace(worst, facts=tuple(facts)), radius_m
 
 
@@ -260,7 +260,7 @@ def _ranked(choices: Iterator[Choice]) -> tuple[Choice, ...]:
 
 
 def bus_of(buses: Sequence[Bus], choices: Choices) -> str:
-    """The bus that ``can.bus`` names: of the wheels, else the one best known."""
+    """Return the bus for ``can.bus``: that of the wheels, else the one with most known messages."""
     if choices.wheels and choices.is_chosen(choices.wheels[0]):
         return choices.wheels[0].bus
     return buses[0].topic

@@ -1,4 +1,4 @@
-"""What the first minutes of a drive hold: its CAN buses and all that shows how the car moved."""
+"""Observations from the first minutes of a drive: CAN buses and signals of the car's motion."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ if TYPE_CHECKING:
     from crosscue.replay.can.database import CanDatabase
     from crosscue.replay.can.decode import BusDecoder
 
-LOOKED_AT_NS: Final = 300_000_000_000
-"""Five minutes hold some bends and stops, and are read in seconds."""
+OBSERVED_NS: Final = 300_000_000_000
+"""Observed time: five minutes contain some bends and stops, and are read in seconds."""
 MOBILEYE_MESSAGES: Final = 4
-"""So many of its messages, the status among them, make a bus a Mobileye's: identifiers of others
-coincide, but not with their lengths and in such number."""
+"""Minimum number of its messages, including the status, that identify a Mobileye's bus.
+
+Identifiers of other devices may coincide, but not with these lengths and in this number."""
 
 
 @dataclass(slots=True, eq=False)
@@ -42,11 +43,11 @@ class Bus:
     """One CAN bus of the drive.
 
     Attributes:
-        topic: Its name.
-        frames: How many were examined.
-        ids: Identifiers seen, each with whether it is extended, and their frames' lengths.
-        known: How many of them the database holds.
-        signals: Readings of every signal that could be something, in SI units.
+        topic: Name of the topic.
+        frames: Number of frames examined.
+        ids: Payload lengths by identifier and the flag for extended identifiers.
+        known: Number of these identifiers in the database.
+        signals: Candidate signals with their readings in SI units.
     """
 
     topic: str
@@ -57,7 +58,7 @@ class Bus:
 
     @property
     def mobileye(self) -> tuple[str, ...]:
-        """Names of a Mobileye's messages on it; empty where it is not a Mobileye's bus."""
+        """Names of a Mobileye's messages on the bus; empty if it is not a Mobileye's bus."""
         from crosscue.replay.base import LENGTH_UNKNOWN
         from crosscue.replay.mobileye.layout import layout
 
@@ -73,15 +74,15 @@ class Bus:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """What was seen of a drive.
+    """Observations from a drive.
 
     Attributes:
-        buses: Those of which the database knows most first.
-        tracks: Speed and course over ground, of every topic that reports them.
-        yaw_rates: Of inertial units and odometry, by topic.
-        speeds: Of wheel-speed and odometry topics, by topic.
-        start_ns: Earliest time seen.
-        end_ns: Latest one.
+        buses: CAN buses, those with most known identifiers first.
+        tracks: Speed and course over ground of every topic that reports them.
+        yaw_rates: Yaw rates of inertial units and odometry, by topic.
+        speeds: Speeds of wheel-speed and odometry topics, by topic.
+        start_ns: Earliest time observed.
+        end_ns: Latest time observed.
     """
 
     buses: tuple[Bus, ...]
@@ -92,7 +93,7 @@ class Observed:
     end_ns: int
 
     def of_kind(self, kind: Kind) -> list[tuple[Bus, Candidate, Series]]:
-        """Every signal of a kind with the bus that carries it."""
+        """Return the candidate signals of a kind with their buses."""
         return [
             (bus, candidate, series)
             for bus in self.buses
@@ -105,7 +106,7 @@ _MOTION: Final = (Role.GNSS, Role.IMU, Role.ODOMETRY, Role.WHEELS)
 
 
 def observe(logs: Sequence[Log], database: CanDatabase | None) -> Observed:
-    """Read the first minutes of every log; what is damaged there is warned of."""
+    """Read the first minutes of every log, and warn of losses in them."""
     found = _Collected(database)
     for log in logs:
         roles = {
@@ -135,14 +136,14 @@ def _read(log: Log, roles: Mapping[str, Role], found: _Collected) -> None:
         decode = decoders[block.topic]
         shown = decode(block, ledger) if decode is not None else block
         first_ns = int(block.log_ns[0]) if first_ns is None else first_ns
-        if int(block.log_ns[0]) - first_ns > LOOKED_AT_NS:
+        if int(block.log_ns[0]) - first_ns > OBSERVED_NS:
             break
         found.take(shown, roles[block.topic])
     warn_of(ledger)
 
 
 class _Collected:
-    """Readings as they come, until they become series."""
+    """Collects readings from blocks and converts them to series."""
 
     def __init__(self, database: CanDatabase | None) -> None:
         self.buses: dict[str, Bus] = {}
@@ -155,7 +156,7 @@ class _Collected:
         self._last_ns: list[int] = []
 
     def take(self, block: Block, role: Role) -> None:
-        """One block of one topic, decoded."""
+        """Add a decoded block of a topic."""
         if not len(block):
             return
         self._first_ns.append(int(block.log_ns.min()))
@@ -200,7 +201,7 @@ class _Collected:
         self._parts.setdefault((topic, part, column), []).append((t_ns, values))
 
     def result(self) -> Observed:
-        """All that came."""
+        """Return the collected observations."""
         joined = {
             place: (
                 np.concatenate([t_ns for t_ns, _ in parts]),
@@ -233,13 +234,13 @@ class _Collected:
         )
 
     def _span_ns(self) -> tuple[int, int]:
-        """Earliest and latest time; a damaged one may lie years away, and must not count."""
+        """Return the earliest and latest time, without damaged times that may be years away."""
         if not self._first_ns:
             return 0, 0
         middle_ns = sorted(self._first_ns)[len(self._first_ns) // 2]
         return (
-            max(min(self._first_ns), middle_ns - LOOKED_AT_NS),
-            min(max(self._last_ns), middle_ns + LOOKED_AT_NS),
+            max(min(self._first_ns), middle_ns - OBSERVED_NS),
+            min(max(self._last_ns), middle_ns + OBSERVED_NS),
         )
 
 
@@ -272,7 +273,7 @@ def _series(
 
 
 def _track(topic: str, found: _Columns) -> Track | None:
-    """As the topic says it, or by the way between its positions."""
+    """Return the track that a topic reports, or one derived from its positions."""
     if {"speed_mps", "course_rad"} <= found.keys():
         t_ns, speed = found["speed_mps"]
         return Track.of_course(topic, t_ns, speed, found["course_rad"][1])

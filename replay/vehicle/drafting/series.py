@@ -1,7 +1,7 @@
-"""Signals as series of time and value, and the two ways in which they are compared.
+"""Time series of signals, and the common time grid on which they are compared.
 
-Speeds are compared at common times, and yaw rates by how far they turn within a few seconds: a
-GNSS course is too rough to be differentiated.
+Speeds are compared at common times. Yaw rates are compared by their integral over a few seconds,
+because a GNSS course is too noisy to be differentiated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Int64s: TypeAlias = NDArray[np.int64]
 STEP_S: Final = 0.1
 WINDOW_S: Final = 2.0
 MAX_GAP_S: Final = 1.5
-"""Longer silences of a signal are not bridged; a GNSS fix may come once a second."""
+"""Maximum gap that is interpolated; GNSS fixes may be one second apart."""
 EARTH_RADIUS_M: Final = 6_371_000.0
 
 
@@ -28,9 +28,9 @@ class Series:
     """N readings of one signal in SI units.
 
     Attributes:
-        name: What it is called in the vehicle file's comments.
-        t_ns: Shape (N,), int64, in order.
-        values: Shape (N,).
+        name: Name in the vehicle file's comments.
+        t_ns: Shape (N,), int64: times, ascending.
+        values: Shape (N,): readings.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Series:
 
     @classmethod
     def of(cls, name: str, t_ns: Int64s, values: Floats) -> Series:
-        """Readings in any order; those that are not numbers are left out."""
+        """Sort readings by time and omit those that are not finite."""
         keep = np.isfinite(values)
         order = np.argsort(t_ns[keep], kind="stable")
         return cls(name, t_ns[keep][order], np.asarray(values, np.float64)[keep][order])
@@ -49,13 +49,13 @@ class Series:
 
     @property
     def rate_hz(self) -> float:
-        """Readings a second, by the median time between them; 0 for fewer than two."""
+        """Readings per second, from the median interval; 0 for fewer than two readings."""
         steps_s = np.diff(self.t_ns) * 1e-9
         steps_s = steps_s[steps_s > 0.0]
         return float(1.0 / np.median(steps_s)) if len(steps_s) else 0.0
 
     def at(self, grid: Grid) -> Floats:
-        """Values at the grid's times, linear between readings; NaN where they are far apart."""
+        """Interpolate the values at the grid's times; NaN inside longer gaps."""
         if len(self) < 2:
             return np.full(len(grid.t_ns), np.nan)
         values = np.interp(grid.t_ns, self.t_ns, self.values)
@@ -65,11 +65,11 @@ class Series:
         return np.where(is_near & is_inside, values, np.nan)
 
     def turned(self, grid: Grid) -> Floats:
-        """Of a rate: how far it turns within each window, rad; NaN where it is silent."""
+        """Integrate an angular rate over each window, rad; NaN where readings are missing."""
         rate = self.at(grid)
         if not np.isfinite(rate).any():
             return np.full(grid.windows, np.nan)
-        # Between the grid's times, too: a gyro's noise averages out instead of being sampled.
+        # Readings between the grid's times are included, so that a gyro's noise averages out.
         area = np.concatenate(
             [
                 [0.0],
@@ -83,38 +83,38 @@ class Series:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Common times, every ``STEP_S``, in whole windows of ``WINDOW_S``.
+    """Common times, ``STEP_S`` apart, divided into windows of ``WINDOW_S``.
 
     Attributes:
-        t_ns: Shape (N,), int64.
+        t_ns: Shape (N,), int64: the times.
     """
 
     t_ns: Int64s
 
     @classmethod
     def over(cls, start_ns: int, end_ns: int) -> Grid:
-        """As many whole windows as fit."""
+        """Create a grid of as many complete windows as fit between two times."""
         step_ns, steps = round(STEP_S * 1e9), round(WINDOW_S / STEP_S)
         windows = max((end_ns - start_ns) // (step_ns * steps), 0)
         return cls(start_ns + np.arange(windows * steps + 1, dtype=np.int64) * step_ns)
 
     @property
     def steps(self) -> int:
-        """Of a window."""
+        """Number of steps in a window."""
         return round(WINDOW_S / STEP_S)
 
     @property
     def windows(self) -> int:
-        """How many."""
+        """Number of windows."""
         return (len(self.t_ns) - 1) // self.steps
 
     @property
     def edges_ns(self) -> Int64s:
-        """Where windows begin and end, shape (windows + 1,)."""
+        """Edges of the windows, shape (windows + 1,)."""
         return self.t_ns[:: self.steps]
 
     def windows_where(self, is_so: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """In which windows something holds throughout, both edges included."""
+        """Return a mask of the windows in which ``is_so`` is true throughout, edges included."""
         whole: NDArray[np.bool_] = (
             is_so[:-1].reshape(self.windows, self.steps).all(axis=1)
             & is_so[self.steps :: self.steps]
@@ -122,17 +122,17 @@ class Grid:
         return whole
 
     def mean(self, values: Floats) -> Floats:
-        """Of each window."""
+        """Return the mean of each window."""
         return np.asarray(values[:-1].reshape(self.windows, self.steps).mean(axis=1), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Speed and course over ground, as GNSS reports them.
+    """Speed and course over ground from GNSS.
 
     Attributes:
-        speed: m/s.
-        course: rad from east, counter-clockwise and continuous.
+        speed: Speed, m/s.
+        course: Course, rad from east, counter-clockwise and unwrapped.
     """
 
     speed: Series
@@ -142,7 +142,7 @@ class Track:
     def of_positions(
         cls, name: str, t_ns: Int64s, latitude_deg: Floats, longitude_deg: Floats
     ) -> Track | None:
-        """By the way from one fix to one about a second later; None for too few fixes."""
+        """Derive a track from fixes about one second apart; None for too few fixes."""
         keep = np.isfinite(latitude_deg) & np.isfinite(longitude_deg)
         t_ns, lat, lon = t_ns[keep], latitude_deg[keep], longitude_deg[keep]
         later = np.searchsorted(t_ns, t_ns + 900_000_000)
@@ -158,13 +158,13 @@ class Track:
 
     @classmethod
     def of_velocity(cls, name: str, t_ns: Int64s, east_mps: Floats, north_mps: Floats) -> Track:
-        """From the velocity over ground."""
+        """Derive a track from velocities over ground."""
         course = np.arctan2(north_mps, east_mps)
         return cls.of_course(name, t_ns, np.hypot(east_mps, north_mps), course)
 
     @classmethod
     def of_course(cls, name: str, t_ns: Int64s, speed_mps: Floats, course_rad: Floats) -> Track:
-        """As reported; a course counts only where the car surely moves."""
+        """Create a track from reported values, with courses only where the car clearly moves."""
         moves = np.isfinite(course_rad) & (speed_mps > 3.0)
         course = Series.of(name, t_ns[moves], np.unwrap(course_rad[moves]))
         speed = Series.of(name, t_ns, np.asarray(speed_mps, np.float64))

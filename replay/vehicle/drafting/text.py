@@ -1,4 +1,4 @@
-"""The text of a first vehicle file: what was chosen, each choice with its reason beside it."""
+"""The text of a drafted vehicle file, with the reason for each choice in a comment."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ DEVICES: Final = (
     (Role.ODOMETRY, "odometry"),
 )
 LISTED: Final = 6
-"""So many signals that were not chosen are listed with their reasons."""
+"""Maximum number of rejected signals that are listed with their reasons."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Examined:
-    """A drive's logs with what was found in them.
+    """A drive's logs with the signals found in them.
 
     Attributes:
-        logs: Open.
-        databases: Files that describe the buses.
-        database: What they hold; None for no files.
-        seen: Buses and motion.
-        choices: The signals chosen.
-        left_out: Files that contradict the others, each with what.
+        logs: Open logs.
+        databases: Paths of the files that describe the buses.
+        database: The combined database; None without files.
+        seen: Observed buses and motion.
+        choices: The chosen signals.
+        left_out: Files that contradict the others, each with the contradiction.
     """
 
     logs: Sequence[Log]
@@ -53,22 +53,22 @@ class Examined:
 
 
 def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
-    """Read the first minutes of a drive and judge its signals.
+    """Read the first minutes of a drive and choose its signals.
 
     Args:
         logs: Open logs of one drive.
         dbc: Files that describe its buses.
 
     Raises:
-        EmptyResultError: No topic of the logs plays any role.
+        EmptyResultError: No topic of the logs has a role.
         SchemaError: A DBC file cannot be read.
     """
     topics = [topic for log in logs for topic in log.topics]
     if all(role_of(topic) is None for topic in topics):
         names = ", ".join(f"{topic.name} ({topic.type_name})" for topic in topics) or "none"
         raise EmptyResultError(
-            f"{', '.join(map(name_of, logs))}: no topic plays a role in a vehicle file; there are: "
-            f"{names}; give a log with a CAN bus, camera, compass or inertial unit"
+            f"{', '.join(map(name_of, logs))}: no topic has a role in a vehicle file; there are: "
+            f"{names}; expected a log with a CAN bus, camera, compass or inertial unit"
         )
     if not dbc:
         seen = observe(logs, None)
@@ -81,10 +81,11 @@ def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
 def _agreeing(
     logs: Sequence[Log], dbc: Sequence[Path]
 ) -> tuple[Sequence[Path], CanDatabase, Sequence[tuple[Path, str]]]:
-    """Files that do not contradict one another, what they hold, and those left out, with why.
+    """Return the consistent files, their combined database, and the other files with the reason.
 
-    Each bus of a car has files of its own, which may use one identifier for different messages.
-    A file that shows the wheels' speeds comes first, then the one that describes most of a bus.
+    Each bus of a car has its own files, and two files may use the same identifier for different
+    messages. Files with wheel speeds take precedence, then files that describe most messages of a
+    bus.
 
     Raises:
         SchemaError: A single file cannot be read, or contradicts itself.
@@ -116,18 +117,18 @@ def _agreeing(
 
 
 def draft(examined: Examined, folder: Path, mounting: Mounting) -> str:
-    """The text of a first vehicle file.
+    """Return the text of a drafted vehicle file.
 
     Args:
-        examined: What the logs hold.
-        folder: Where the file will lie; DBC paths are written relative to it where possible.
-        mounting: Where the camera sits, as far as it is known.
+        examined: The logs and the signals found in them.
+        folder: Folder of the file; DBC paths are written relative to it where possible.
+        mounting: Mounting of the camera, where known.
     """
     logs, choices, buses = examined.logs, examined.choices, examined.seen.buses
     lines = [
-        "# A first vehicle file, made from what the log holds. Check every line against the car:",
-        "# what could not be seen in the log stands here as a comment or with its default.",
-        "# To see it on a picture: crosscue vehicle check LOG --vehicle THIS_FILE -o check.html",
+        "# A draft of a vehicle file, generated from the log. Check every line against the car.",
+        "# Settings that the log does not determine are comments or have their defaults.",
+        "# To see it on an image: crosscue vehicle check LOG --vehicle THIS_FILE -o check.html",
         "version = 1",
         'name = "unnamed"',
         "",
@@ -154,11 +155,11 @@ def _topic_lines(logs: Sequence[Log], choices: Choices) -> Iterator[str]:
         if len(names) > 1:
             chosen.append(f"{key} = {_quoted(names[0])}  # or: {', '.join(names[1:])}")
         elif names:
-            chosen.append(f"# {key} = {_quoted(names[0])}  # found without naming it")
+            chosen.append(f"# {key} = {_quoted(names[0])}  # found automatically")
         if role is Role.IMU:
             units = [one for one in choices.yaw_rates if one.name in names]
             chosen += [
-                line for one in units for line in _comment(f"{one.name}: {_says(one.verdict)}")
+                line for one in units for line in _comment(f"{one.name}: {_as_text(one.verdict)}")
             ]
     if chosen:
         yield from ("[topics]", *chosen, "")
@@ -178,11 +179,11 @@ def _can_lines(examined: Examined, folder: Path) -> Iterator[str]:
         is_mobileye = "; a Mobileye's" if bus.mobileye else ""
         yield f"# {bus.topic}: {len(bus.ids)} identifiers{of_it}{is_mobileye}"
     if database is None:
-        yield from ("# dbc = [...]  # give the files with --dbc to have signals looked up", "")
+        yield from ("# dbc = [...]  # pass the files with --dbc to search them for signals", "")
         return
     yield f"dbc = [{', '.join(_quoted(_relative(path, folder)) for path in examined.databases)}]"
     for path, why in examined.left_out:
-        yield from _comment(f"left out, a file of another bus: {path.name}: {why}")
+        yield from _comment(f"omitted, a file of another bus: {path.name}: {why}")
     yield ""
     yield from _wheel_lines(choices, main)
     yield from _angle_lines("yaw_rate", choices.yaw_rates, main)
@@ -196,9 +197,9 @@ def _wheel_lines(choices: Choices, main: str) -> Iterator[str]:
     else:
         is_sure = best.verdict.is_judged
         yield "[can.wheel_speeds]"
-        yield from _comment(_says(best.verdict))
+        yield from _comment(_as_text(best.verdict))
         if not is_sure:
-            yield "# Chosen by name and unit alone: nothing in the log confirms the speed."
+            yield "# Chosen only by name and unit: nothing in the log confirms the speed."
         if best.bus != main:
             yield f"bus = {_quoted(best.bus)}"
         for wheel in WHEELS:
@@ -218,10 +219,10 @@ def _wheel_lines(choices: Choices, main: str) -> Iterator[str]:
 
 def _without_wheels(choices: Choices) -> Iterator[str]:
     speed = next((one for one in choices.speeds if not one.verdict.wrong), None)
-    yield "# No signal looks like a wheel speed; name them under [can.wheel_speeds]."
+    yield "# No signal seems to be a wheel speed; name the signals under [can.wheel_speeds]."
     if speed is None:
         return
-    yield from _comment(f"The car's own speed instead, of no axle: {_says(speed.verdict)}")
+    yield from _comment(f"The vehicle speed instead, of no axle: {_as_text(speed.verdict)}")
     yield "# [can.wheel_speeds]"
     if speed.bus:
         yield f"# bus = {_quoted(speed.bus)}"
@@ -230,21 +231,21 @@ def _without_wheels(choices: Choices) -> Iterator[str]:
 
 
 def _angle_lines(key: str, found: Sequence[Choice], main: str) -> Iterator[str]:
-    """A section for the best signal; none where an inertial unit's topic is better."""
+    """Yield the section of the best signal, unless an inertial unit's topic is better."""
     if not any(one.bus for one in found):
         return
     best = found[0]
     if best.verdict.wrong:
         yield f"# [can.{key}]: no signal that agrees with the others."
     elif not best.bus:
-        yield from _comment(f"[can.{key}]: left out, {best.name} agrees better, see [topics]")
+        yield from _comment(f"[can.{key}]: omitted, {best.name} agrees better, see [topics]")
     else:
         is_shown = best.verdict.agrees_with > 0
         mark = "" if is_shown else "# "
         if not is_shown:
-            yield "# The drive is too straight to show its sign; counter-clockwise is positive."
+            yield "# The drive is too straight to show its sign; positive is counter-clockwise."
         yield f"{mark}[can.{key}]"
-        yield from _comment(_says(best.verdict))
+        yield from _comment(_as_text(best.verdict))
         if best.bus != main:
             yield f"{mark}bus = {_quoted(best.bus)}"
         yield f"{mark}signal = {_quoted(best.name)}"
@@ -262,11 +263,11 @@ def _not_chosen(others: Iterator[tuple[str, str, Verdict]]) -> Iterator[str]:
             yield "# and more"
             return
         where = f" on {bus}" if bus else ""
-        yield from _comment(f"not chosen: {name}{where}: {_says(verdict)}")
+        yield from _comment(f"not chosen: {name}{where}: {_as_text(verdict)}")
 
 
 def _comment(text: str) -> Iterator[str]:
-    """As lines of a comment."""
+    """Wrap a text into comment lines."""
     yield from textwrap.wrap(
         text,
         99,
@@ -277,8 +278,8 @@ def _comment(text: str) -> Iterator[str]:
     )
 
 
-def _says(verdict: Verdict) -> str:
-    """What the log shows of a signal, in one line."""
+def _as_text(verdict: Verdict) -> str:
+    """Describe a verdict in one line."""
     wrong = f"WRONG: {', '.join(verdict.wrong)}; " if verdict.wrong else ""
     return wrong + ", ".join(verdict.facts)
 
@@ -292,7 +293,7 @@ def _mobileye_lines(logs: Sequence[Log], buses: Sequence[Bus]) -> Iterator[str]:
             yield f"# or: {bus.topic}"
         yield f"bus = {_quoted(on_bus[0].topic)}  # sends: {', '.join(on_bus[0].mobileye)}"
     elif topics:
-        yield f"# [mobileye]  # its messages are found without naming them: {', '.join(topics[:4])}"
+        yield f"# [mobileye]  # its messages are found automatically: {', '.join(topics[:4])}"
     else:
         yield "# [mobileye]  # none of the buses is a Mobileye's"
         yield '# bus = ""'

@@ -133,7 +133,7 @@ def test_a_constant_rate_is_reported(tmp_path: Path) -> None:
     blocks, ledger = read(path)
 
     assert [t for b in blocks for t in b.log_ns.tolist()] == [100_000_000 * i for i in range(N)]
-    assert "times are made up from a constant rate of 10 Hz, from 0 on" in ledger.notices
+    assert "times are computed from a constant rate of 10 Hz, from 0 on" in ledger.notices
 
 
 @pytest.mark.parametrize(("lines", "lost", "skipped"), [(N + 3, 3, 0), (N - 3, 3, 0)])

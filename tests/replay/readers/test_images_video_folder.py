@@ -90,7 +90,9 @@ def test_a_number_left_out_is_a_gap_not_a_shift(tmp_path: Path) -> None:
     assert [t for t, _ in shades(blocks)] == [0.5, 1.5, 3.5, 4.5]
     assert ledger.topic("front").dropped == {"a time without its picture": 1}
     assert ledger.details[0].t_ns == 5 * S // 2
-    assert ledger.notices == ["front: 1 numbers are missing in the file names; times go by number"]
+    assert ledger.notices == [
+        "front: 1 numbers are missing in the file names; times are paired by number"
+    ]
 
 
 def test_counts_that_differ_without_a_reason_are_never_zipped_in_silence(tmp_path: Path) -> None:
@@ -113,7 +115,7 @@ def test_gaps_in_numbers_with_as_many_times_are_reported(tmp_path: Path) -> None
     blocks, ledger = read(folder)
 
     assert len(shades(blocks)) == 5
-    assert "leave out 1" in ledger.notices[0]
+    assert "1 numbers are missing" in ledger.notices[0]
 
 
 def test_a_constant_rate_is_reported_and_keeps_gaps(tmp_path: Path) -> None:
@@ -123,7 +125,7 @@ def test_a_constant_rate_is_reported_and_keeps_gaps(tmp_path: Path) -> None:
     blocks, ledger = read(folder)
 
     assert [t for t, _ in shades(blocks)] == [0.0, 0.5, 1.0, 2.0]
-    assert "made up from a constant rate of 2 Hz" in ledger.notices[0]
+    assert "computed from a constant rate of 2 Hz" in ledger.notices[0]
     assert ledger.topic("front").declared is None
 
 

@@ -149,7 +149,7 @@ def test_the_file_of_another_bus_is_left_out_with_why(
     assert examined.databases == [dbc]
     text = draft(examined, tmp_path, Mounting())
     assert 'dbc = ["car.dbc"]' in text
-    assert "# left out, a file of another bus: radar.dbc: " in text
+    assert "# omitted, a file of another bus: radar.dbc: " in text
     assert "0x064" in text
     assert parse(text, "the draft").can.wheel_speeds is not None
     assert examine([log], [dbc]).left_out == ()
