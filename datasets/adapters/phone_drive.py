@@ -133,7 +133,7 @@ class Drive(CameraDrive):
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """All streams, in order of each one's first time; see ``Log.read``."""
-        ledger.integrity = "not checkable: no checksums, and a missing line cannot be seen"
+        ledger.integrity = "not checkable: no checksums, and a missing line cannot be detected"
         yield from super().read(ledger, selection)
 
 

@@ -217,7 +217,7 @@ WITHOUT_COUNTER: Final = {
     "asc": "ASC",
     "phone-drive": "smartphone driving data set",
 }
-"""Formats in which a row taken out cannot be seen, and what people call them."""
+"""Formats in which a removed row cannot be detected, with their names in the docs."""
 
 
 def test_every_format_counts_its_rows_or_is_named() -> None:
@@ -252,7 +252,7 @@ def test_a_format_without_a_counter_says_so(name: str, tmp_path: Path) -> None:
     ledger = read(log)[1]
 
     assert ledger.is_whole
-    assert "a missing line cannot be seen" in ledger.integrity
+    assert "a missing line cannot be detected" in ledger.integrity
     (row,) = (line for line in DOCS.read_text().splitlines() if "no usable count" in line)
     assert WITHOUT_COUNTER[name] in row.partition("no usable count")[0]
 

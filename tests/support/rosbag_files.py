@@ -164,7 +164,7 @@ def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) 
     if not strange:
         return "reported" if was_reported else "SILENT LOSS"
     if _only_payloads_differ(reading.rows, truth, strange, path.suffix == ".db3"):
-        assert "cannot be seen" in ledger.integrity
+        assert "cannot be detected" in ledger.integrity
         return "undetectable"
     return "wrong, reported" if was_reported else "SILENT WRONG"
 

@@ -1,1 +1,1 @@
-"""CAN logs as text: candump, ASC, TRC, BUSMASTER."""
+"""Readers of CAN logs in text form: candump, ASC, TRC and BUSMASTER."""

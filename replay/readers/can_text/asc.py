@@ -1,16 +1,17 @@
-"""Vector ASC logs: ``0.019968 1  64  Rx   d 4 64 00 00 00``.
+"""Reader of Vector ASC logs: ``0.019968 1  64  Rx   d 4 64 00 00 00``.
 
-CAN and CAN FD lines, remote and error frames; other events (statistics, status, J1939TP, LIN, ...)
-are counted as no frames. Times count from the header's date. The date has no time zone and is
-taken as UTC, with a notice, whatever the machine's own zone. ``timestamps relative`` times, each
-counted from the line before, are summed up over all lines that have one.
+It reads CAN and CAN FD frames, remote frames and error frames. Other events (statistics, status,
+J1939TP, LIN, ...) are counted as lines without a frame. Times are relative to the header's date.
+The date has no time zone and is read as UTC, with a notice, regardless of the machine's time zone.
+``timestamps relative`` times, which are relative to the previous line, are summed over all lines
+that have one.
 
-``Statistic`` lines count data, remote and error frames of a channel. No public description says
-over which time, and a logging filter takes frames out of the log but not out of these counts: they
-prove nothing about the log's lines and are not used.
+``Statistic`` lines count the data, remote and error frames of a channel. They are not used: no
+public description states their time range, and a logging filter removes frames from the log but not
+from these counts.
 
-The format has no checksum. A line holds its length, so a cut one is seen; ``End TriggerBlock``
-says that the writer came to its end.
+The format has no checksum. Each line contains its length, so a truncated line is detected.
+``End TriggerBlock`` shows that the writer finished the file.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from .spaced import (
     NOTHING_FAST,
     Spaced,
     is_bus_name,
-    is_way,
+    is_direction,
     joined_fast,
     payload_stop,
     spaced_frames,
@@ -68,7 +69,7 @@ _MONTHS: Final = {
     "jan": 1, "feb": 2, "mar": 3, "mär": 3, "mrz": 3, "apr": 4, "may": 5, "mai": 5, "jun": 6,
     "jul": 7, "aug": 8, "sep": 9, "oct": 10, "okt": 10, "nov": 11, "dec": 12, "dez": 12,
 }  # fmt: skip
-"""English and German, which is what the writing tools are set to."""
+"""English and German, the languages that the writing tools use."""
 _HEADER_DATE: Final = re.compile(r"date\s+(.*)", re.IGNORECASE)
 _HEADER_BASE: Final = re.compile(
     r"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?\s*", re.IGNORECASE
@@ -89,7 +90,7 @@ _ERROR: Final = re.compile(r"(\S+)\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _FD_ERROR: Final = re.compile(r"CANFD\s+(\S+)\s+[RT]x\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _SECOND: Final = re.compile(r"\d[.,]\d{1,9}\s+(?:CANFD\s+)?\S+\s(?:.*\s)?[RT]x\s")
 _STEP_MAX_NS: Final = 86_400 * NANOS
-"""Longest step from line to line; a longer one is damage."""
+"""Maximum time between two lines; a longer one is damage."""
 _IDENTIFIER: Final = re.compile(r"([0-9A-Fa-f]{1,10})([xX]?)")
 _TWO_HEX: Final = re.compile(r"[0-9A-Fa-f]{2}")
 NOT_UNDERSTOOD: Final = "line not understood"
@@ -103,7 +104,7 @@ def open_asc(path: Path, limits: Limits) -> Log:
     """Open an ASC log.
 
     Raises:
-        LogFormatError: Its beginning holds neither a header nor any line of this format.
+        LogFormatError: The start of the file has neither a header nor a line of this format.
     """
     head = head_of(path)
     return TextCanLog(path, limits, lambda: Asc(head))
@@ -115,12 +116,12 @@ class Asc(Dialect):
     format = "asc"
     says = "Vector ASC log"
     integrity = (
-        "ASC text has no checksums and no usable counts (its Statistic lines count what was on the "
-        "bus, over a time that they do not state): a changed digit or a missing line cannot be seen"
+        "ASC text has no checksums and no usable counts (its Statistic lines count frames of the "
+        "bus over an unknown time): a changed digit or a missing line cannot be detected"
     )
 
     def __init__(self, head: bytes) -> None:
-        """Read base, time mode and date from the file's head."""
+        """Read the number base, the time mode and the date from the start of the file."""
         self._base, self._is_relative, self._start_ns = 16, False, 0
         self._has_date = self._has_header = False
         self._last_ns = 0
@@ -136,7 +137,7 @@ class Asc(Dialect):
                 break
 
     def fast(self, lines: Lines) -> Fast:
-        """Data frames in hexadecimal, CAN FD included."""
+        """Parse data frames in hexadecimal, including CAN FD."""
         if self._base != 16:
             return NOTHING_FAST
         line = _single(lines, clean_lines(lines))
@@ -154,7 +155,7 @@ class Asc(Dialect):
         return joined_fast([part for part in parts if len(part.rows)])
 
     def slow(self, line: bytes) -> Outcome:
-        """Headers, events, remote and error frames, decimal logs."""
+        """Parse headers, events, remote frames, error frames and decimal logs."""
         text = line.decode("latin-1")
         if found := _TIMED.fullmatch(text):
             seconds = int(found[1])
@@ -167,7 +168,7 @@ class Asc(Dialect):
         return self._header(text)
 
     def last(self, line: bytes) -> Outcome:
-        """Complete when it holds as many bytes as its length says."""
+        """Accept the line if it has as many bytes as its length states."""
         outcome = self.slow(line)
         may_be_cut = isinstance(outcome, Frame) and (self._base == 10 or outcome.kind == REMOTE)
         if outcome is None or may_be_cut or isinstance(outcome, Other):
@@ -175,7 +176,7 @@ class Asc(Dialect):
         return outcome
 
     def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
-        """Add the date, and the times so far when each counts from the one before."""
+        """Add the date, and sum up times that are relative to the previous line."""
         out = np.empty_like(t_ns)
         begin = 0
         for i, mark in marks:
@@ -187,13 +188,13 @@ class Asc(Dialect):
         return out
 
     def unended(self, head: bytes, tail: bytes) -> str:
-        """An ``End TriggerBlock`` after the last beginning of one."""
+        """Check for an ``End TriggerBlock`` after the last start of a block."""
         begins = max(head.lower().rfind(_BEGIN_WORDS), tail.lower().rfind(_BEGIN_WORDS))
         is_open = tail.lower().rfind(_END_WORDS) <= tail.lower().rfind(_BEGIN_WORDS)
         return NOT_ENDED if begins >= 0 and is_open else ""
 
     def finish(self, ledger: Ledger) -> None:
-        """Say what the clock rests on, and whether the writer came to its end."""
+        """Report the basis of the clock, and whether the writer finished the file."""
         if self._has_date:
             ledger.notice("the log states no time zone; its start date is read as UTC")
         else:
@@ -203,11 +204,11 @@ class Asc(Dialect):
         if self._other_dates:
             ledger.notice("a trigger block states another date than the header, which is used")
         if self._is_relative and not ledger.is_whole:
-            ledger.notice("times are relative to the line before: each lost line shifts later ones")
+            ledger.notice("times are relative to the previous line: a lost line shifts later ones")
         if self._block == _BEGINS:
             ledger.drop("", NOT_ENDED, None)
         elif not self._block and not self._has_events:
-            ledger.drop("", "a header and nothing after it: the log may be cut", None)
+            ledger.drop("", "a header without any frame: the log may be cut", None)
 
     def _stretch(self, t_ns: Int64s) -> Int64s:
         self._has_events |= len(t_ns) > 0
@@ -239,7 +240,7 @@ class Asc(Dialect):
             base = 10 if found[1].lower() == "dec" else 16
             is_relative = (found[2] or "").lower() == "relative"
             is_same = (base, is_relative) == (self._base, self._is_relative)
-            return Mark(stops="" if is_same else "another 'base' line begins inside the file")
+            return Mark(stops="" if is_same else "a different 'base' line inside the file")
         return Damage(NOT_UNDERSTOOD)
 
     def _timed(self, t_ns: int, rest: str) -> Outcome:
@@ -306,7 +307,7 @@ class Asc(Dialect):
         return (value, is_extended) if is_valid else None
 
     def _payload(self, words: list[str], length: int, is_last: bool = True) -> bytes | None:
-        """The first ``length`` words as bytes, unless there are more of them or fewer."""
+        """Convert ``length`` words to bytes; None if there are fewer, or more with ``is_last``."""
         if len(words) < length:
             return None
         if self._base == 10:
@@ -348,32 +349,32 @@ def _date_ns(text: str) -> int | None:
 
 
 def _single(lines: Lines, line: Int64s) -> Int64s:
-    """Without the lines that hold ``Rx`` or ``Tx`` twice, as two lines run together do."""
+    """Remove lines with two ``Rx`` or ``Tx``, which are two lines joined by damage."""
     begin, end = int(lines.start[0]), int(lines.stop[-1])
     text = lines.buffer[begin:end]
-    # "R" and "T" differ in two bits, which are masked out.
-    is_way = (text[1:] == ord("x")) & ((text[:-1] & 0xF9) == (ord("R") & ord("T")))
-    at = np.flatnonzero(is_way) + begin
+    # "R" and "T" differ in two bits, which are masked.
+    is_direction = (text[1:] == ord("x")) & ((text[:-1] & 0xF9) == (ord("R") & ord("T")))
+    at = np.flatnonzero(is_direction) + begin
     first = np.searchsorted(at, lines.start[line])
     twice = np.append(at, [end, end])[np.minimum(first + 1, len(at))] < lines.stop[line]
     return line[~twice] if bool(twice.any()) else line
 
 
 def _is_fd(lines: Lines, word: Field) -> Bools:
-    """``CANFD``."""
+    """Return whether each word is ``CANFD``."""
     found: Bools = (lines.words[word.start] & np.uint64(0xFFFFFFFFFF)) == _CANFD
     found &= word.size == 5
     return found
 
 
 def _classic(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bools) -> Fast:
-    """``time bus id Rx d 8`` and the bytes, with no further byte after the last one."""
+    """Parse ``time bus id Rx d 8`` and the bytes, with no further byte after the last one."""
     if not bool(ok.any()):
         return NOTHING_FAST
     _, bus, identifier, way, letter, code = head
     length = nibble(lines.buffer[code.start])
     ok = ok & (lines.buffer[letter.start] == ord("d")) & (letter.size == 1)
-    ok &= is_way(lines, way) & (length <= 8) & (code.size == 1)
+    ok &= is_direction(lines, way) & (length <= 8) & (code.size == 1)
     limit = lines.stop[line]
     payload = skip_gap(lines, code.stop, limit)
     no_fd = np.zeros(len(line), np.bool_)
@@ -383,7 +384,7 @@ def _classic(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bo
 
 
 def _fd(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bools) -> Fast:
-    """``time CANFD bus Rx id [name] brs esi code count`` and the bytes."""
+    """Parse ``time CANFD bus Rx id [name] brs esi code count`` and the bytes."""
     keep = np.flatnonzero(ok)
     if not len(keep):
         return NOTHING_FAST
@@ -394,8 +395,8 @@ def _fd(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bools) 
     switch, state, code, count, rest = next_fields(lines, start, limit, 5)
     length_code = nibble(lines.buffer[code.start])
     length, ok = decimal(lines.words, count.stop, count.size)
-    ok &= _is_flag(lines, switch) & _is_flag(lines, state) & is_way(lines, way)
-    # A count of 0 with another code is a remote frame.
+    ok &= _is_flag(lines, switch) & _is_flag(lines, state) & is_direction(lines, way)
+    # A count of 0 with a different code is a remote frame.
     ok &= (code.size == 1) & (length == FD_LENGTHS[length_code & 15]) & (length_code < 16)
     length = np.where(ok, length, 0)
     is_fd = np.ones(len(line), np.bool_)
@@ -412,7 +413,7 @@ def _spaced(
     payload: Int64s,
     is_fd: Bools,
 ) -> Spaced:
-    """With the ``x`` of a 29-bit identifier taken off."""
+    """Return the fields, with the ``x`` of 29-bit identifiers removed."""
     is_extended: Bools = (lines.buffer[identifier.stop - 1] | 0x20) == ord("x")
     digits = Field(identifier.start, identifier.stop - is_extended)
     return Spaced(line, bus, digits, is_extended, length, payload, is_fd)

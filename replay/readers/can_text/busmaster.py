@@ -1,7 +1,7 @@
-"""BUSMASTER logs: ``22:20:14:992 Rx 0 0000021A s 8 FE 36 12 FE 69 05 07 AD``.
+"""Reader of BUSMASTER logs: ``22:20:14:992 Rx 0 0000021A s 8 FE 36 12 FE 69 05 07 AD``.
 
-Times are times of day and begin again at midnight; the date and the time mode are in the
-header. The file states no time zone, so its clock is taken as UTC, with a notice.
+Times are times of day, which restart at midnight. The date and the time mode are in the header. The
+file states no time zone, so its clock is read as UTC, with a notice.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from crosscue.replay.base import DATA, REMOTE, Int64s, Ledger
 from .dialect import Damage, Dialect, Fast, Frame, Mark, Other, Outcome
 from .digits import NANOS, TIME_MAX_NS, Bools, decimal, within_range
 from .lines import Lines, clean_lines, next_fields, skip_gap
-from .spaced import NOTHING_FAST, Spaced, is_way, payload_stop, spaced_frames
+from .spaced import NOTHING_FAST, Spaced, is_direction, payload_stop, spaced_frames
 
 BUSMASTER_HEAD: Final = b"***BUSMASTER"
 DAY_NS: Final = 86_400 * NANOS
@@ -40,11 +40,11 @@ class Busmaster(Dialect):
     says = "BUSMASTER log"
     integrity = (
         "BUSMASTER text has no checksums or counts: a changed digit or a missing line cannot be "
-        "seen"
+        "detected"
     )
 
     def __init__(self, head: bytes) -> None:
-        """Read how times and numbers are written from the file's head."""
+        """Read the time mode and the number base from the start of the file."""
         self._base = 10 if b"***DEC***" in head else 16
         self._is_relative = b"***RELATIVE MODE***" in head
         self._is_clock = b"***SYSTEM MODE***" in head
@@ -56,7 +56,7 @@ class Busmaster(Dialect):
             self._begin(start_ns)
 
     def fast(self, lines: Lines) -> Fast:
-        """Data frames in hexadecimal."""
+        """Parse data frames in hexadecimal."""
         line = clean_lines(lines)
         if self._base != 16 or not len(line):
             return NOTHING_FAST
@@ -68,7 +68,7 @@ class Busmaster(Dialect):
         length = buffer[code.start].astype(np.int64) - ord("0")
         kind = buffer[letter.start]
         ok = (length >= 0) & (length <= 8) & (code.size == 1) & (letter.size == 1)
-        ok &= ((kind == ord("s")) | (kind == ord("x"))) & is_way(lines, way)
+        ok &= ((kind == ord("s")) | (kind == ord("x"))) & is_direction(lines, way)
         t_ns, time_ok = _time_of_day(lines, time.start, time.stop)
         no_fd = np.zeros(len(line), np.bool_)
         at = Spaced(
@@ -78,7 +78,7 @@ class Busmaster(Dialect):
         return spaced_frames(lines, at, t_ns, ok & time_ok)
 
     def slow(self, line: bytes) -> Outcome:
-        """Header lines, remote frames, decimal logs."""
+        """Parse header lines, remote frames and decimal logs."""
         line = line.rstrip()
         if line.startswith(b"***"):
             return self._header(line)
@@ -89,14 +89,14 @@ class Busmaster(Dialect):
         return Damage("line is not a BUSMASTER frame") if line else None
 
     def last(self, line: bytes) -> Outcome:
-        """Complete when it holds as many bytes as its length says, in hexadecimal."""
+        """Accept the line if it has as many bytes as its length states, in hexadecimal."""
         outcome = self.slow(line)
         if isinstance(outcome, Frame) and outcome.kind == DATA and self._base == 16:
             return outcome
         return Damage("last line has no line end, may be cut") if line.strip() else None
 
     def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
-        """Add the date, a day at every midnight, or the times so far."""
+        """Add the date and a day at every midnight, or sum up relative times."""
         out = t_ns.copy()
         begin = 0
         for i, mark in marks:
@@ -109,7 +109,7 @@ class Busmaster(Dialect):
         return out
 
     def finish(self, ledger: Ledger) -> None:
-        """Say what the clock rests on."""
+        """Report the basis of the clock."""
         if self._is_dated:
             ledger.notice("the log states no time zone; its start date and times are read as UTC")
         else:
@@ -144,7 +144,7 @@ class Busmaster(Dialect):
         if found := _START.fullmatch(line):
             return Mark(origin_ns=_start_of(found))
         if (b"***DEC***" in line) != (self._base == 10) and line in (b"***DEC***", b"***HEX***"):
-            return Mark(stops="another number base begins inside the file")
+            return Mark(stops="a different number base inside the file")
         return Mark()
 
     def _frame(self, found: re.Match[bytes]) -> Outcome:
@@ -179,7 +179,7 @@ def _fraction_ns(digits: bytes) -> int:
 
 
 def _time_of_day(lines: Lines, start: Int64s, stop: Int64s) -> tuple[Int64s, Bools]:
-    """``HH:MM:SS:fff`` with one to nine decimals, as nanoseconds of the day."""
+    """Convert ``HH:MM:SS:fff`` with one to nine decimals to nanoseconds of the day."""
     two = np.full(len(start), 2)
     parts = [decimal(lines.words, start + k, two) for k in (2, 5, 8)]
     fraction, ok = decimal(lines.words, stop, stop - start - 9)

@@ -1,12 +1,12 @@
-"""candump logs: ``(1436509052.249713) can0 123#DEADBEEF``, one frame a line, times in seconds.
+"""Reader of candump logs: ``(1436509052.249713) can0 123#DEADBEEF``, one frame per line.
 
-Also read: CAN FD (``123##1DEADBEEF``), remote (``123#R4``), error frames, a trailing direction
-``R`` or ``T``, the raw DLC suffix ``_9``, and candump's own screen format with times
-(`` (1436509052.249713)  can0  123   [4]  DE AD BE EF``). A BUSMASTER log, which has the same
-suffix, is passed on to its reader.
+It also reads CAN FD (``123##1DEADBEEF``), remote (``123#R4``) and error frames, a trailing
+direction ``R`` or ``T``, the raw DLC suffix ``_9``, and candump's screen format with times
+(`` (1436509052.249713)  can0  123   [4]  DE AD BE EF``). BUSMASTER logs, which have the same
+suffix, are passed to their reader.
 
-The format has no checksum, no count and no length in its lines. So a last line without a line end
-is lost, and so is a line followed by one that does not begin as a line must: both may be cut.
+The format has no checksum, no count and no length in its lines. A last line without a line end is
+therefore dropped, and so is a line followed by one with an invalid start: both may be truncated.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _FIVE_BYTES: Final = np.uint64(40)
 ERROR_FLAG: Final = 0x20000000
 NOT_A_FRAME: Final = "line is not a candump frame"
 _TIME_WIDTHS: Final = 12
-"""How many different lengths of the time field one chunk may mix before lines go one by one."""
+"""Maximum number of different lengths of the time field in a chunk for the fast parser."""
 IS_INTERFACE: Final = re.compile(rb"[A-Za-z0-9_.:@-]{1,16}")
 
 _TIME: Final = rb"\((\d+)\.(\d+)\)"
@@ -70,7 +70,7 @@ def open_candump(path: Path, limits: Limits) -> Log:
     """Open a candump log, or a BUSMASTER log.
 
     Raises:
-        LogFormatError: It is neither, or candump's screen output without usable times.
+        LogFormatError: The file is neither, or is candump's screen output without usable times.
     """
     head = head_of(path)
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(BUSMASTER_HEAD):
@@ -93,17 +93,17 @@ def _refuse_without_times(path: Path, head: bytes) -> None:
 
 
 class Candump(Dialect):
-    """Log lines of candump, can-utils and python-can."""
+    """One pass over a log of candump, can-utils or python-can."""
 
     format = "candump"
     says = "candump log"
     integrity = (
         "candump text has no checksums, lengths or counts: a changed digit or a missing line "
-        "cannot be seen"
+        "cannot be detected"
     )
 
     def fast(self, lines: Lines) -> Fast:
-        """Data frames, CAN FD frames included, as ``candump -l`` spells them."""
+        """Parse data frames, including CAN FD, in the format of ``candump -l``."""
         shape = _shaped(lines)
         buffer, words, hash_ = lines.buffer, lines.words, shape.hash_
         t_ns, ok = seconds_ns(buffer, words, lines.start[shape.line] + 1, shape.close)
@@ -137,7 +137,7 @@ class Candump(Dialect):
         return Fast(picked(ok, shape.line, bus, t_ns, frames), names)
 
     def slow(self, line: bytes) -> Outcome:
-        """Remote frames, the screen format, and everything unusual."""
+        """Parse remote frames, the screen format and other unusual lines."""
         if found := _LOG_LINE.fullmatch(line):
             return _frame_of_log_line(found)
         if found := _SCREEN_LINE.fullmatch(line):
@@ -150,13 +150,13 @@ class Candump(Dialect):
         return Damage(NOT_A_FRAME, taints=not line.startswith(b"("))
 
     def last(self, line: bytes) -> Outcome:
-        """Nobody can know whether its payload is cut."""
+        """Reject the line, because a truncated payload cannot be detected."""
         return Damage("last line has no line end, may be cut") if line.strip() else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shaped:
-    """Lines with brackets, blanks and ``#`` where a frame has them; fields of shape (N,)."""
+    """Lines with brackets, blanks and ``#`` at the positions of a frame; fields of shape (N,)."""
 
     line: Int64s
     close: Int64s
@@ -199,7 +199,7 @@ def _shaped(lines: Lines) -> _Shaped:
 
 
 def _first_hash(lines: Lines) -> tuple[Int64s, Int64s]:
-    """The lines that hold a ``#`` far enough from their start, and where their first one is."""
+    """Return the lines with a ``#`` far enough from their start, and the first one's position."""
     begin, end = int(lines.start[0]), int(lines.stop[-1])
     found = np.flatnonzero(lines.buffer[begin:end] == HASH) + begin
     if len(found) != len(lines):
@@ -213,7 +213,10 @@ def _first_hash(lines: Lines) -> tuple[Int64s, Int64s]:
 
 
 def _closing_bracket(lines: Lines, start: Int64s) -> Int64s:
-    """Where each line's first ``)`` is, or its start; lines of one log agree on the distance."""
+    """Return the position of each line's first ``)``, else its start.
+
+    The position within a line is nearly constant in a log.
+    """
     close = start.copy()
     open_ = np.arange(len(start))
     for _ in range(_TIME_WIDTHS):
@@ -238,7 +241,7 @@ def _has_direction(lines: Lines, stop: Int64s) -> Bools:
 
 
 def _time_ns(found: re.Match[bytes]) -> int | None:
-    """Groups 1 and 2 as nanoseconds; finer digits are cut off, None when out of range."""
+    """Convert groups 1 and 2 to nanoseconds, without finer digits; None if out of range."""
     seconds, decimals = found[1], found[2]
     if len(seconds) > 10 or int(seconds) > SECONDS_MAX or len(decimals) > 30:
         return None
@@ -274,7 +277,7 @@ def _frame(
     if identifier > (0x3FFFFFFF if is_long else 0x7FF):
         return Damage("identifier out of range")
     if len(payload) > 64 or not (IS_FD_LENGTH[len(payload)] if is_fd else len(payload) <= 8):
-        return Damage("no frame has that many bytes")
+        return Damage("invalid number of payload bytes")
     is_error = bool(identifier & ERROR_FLAG)
     return Frame(
         bus.decode("ascii"),

@@ -1,9 +1,9 @@
-"""Reading CAN logs that are text: whole chunks in columns, odd lines one by one, none dropped.
+"""Base reader of CAN logs in text form: columnar parsing of chunks, and single lines where needed.
 
-A ``Dialect`` knows one format. Its ``fast`` takes the lines of a chunk that follow the common
-pattern, as columns; every other line that is not blank goes through ``slow``, which says what it
-is: a frame, a line that is not a frame, a mark such as a header, or damage. So each line ends up
-used, skipped or lost.
+A ``Dialect`` parses one format. Its ``fast`` method parses all lines of a chunk that follow the
+common pattern, as columns. Every other line that is not blank is parsed by ``slow``, which
+classifies it as a frame, a line without a frame, a mark such as a header, or damage. Each line is
+thus used, skipped or dropped.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from .lines import Lines, Overlong, Tail, lines_of
 
 HEAD_BYTES: Final = 64 << 10
 LINE_MAX: Final = 8192
-"""Longest line that ``slow`` is asked about."""
+"""Maximum length of a line that is parsed by ``slow``."""
 _CONTROL: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXCERPT: Final = 60
 _DOS_END: Final = b"\x1a"
 
 
 class Frame(NamedTuple):
-    """One frame from an odd line; ``t_ns`` as the line spells it, before ``Dialect.clock``."""
+    """A frame parsed by ``slow``; ``t_ns`` is the time in the line, before ``Dialect.clock``."""
 
     bus: str
     t_ns: int
@@ -64,11 +64,11 @@ class Frame(NamedTuple):
     payload: bytes = b""
     is_fd: bool = False
     number: int | None = None
-    """The message number that the writer gave it, in formats that have them."""
+    """The writer's message number, in formats that have them."""
 
 
 class Other(NamedTuple):
-    """A good line that is not a frame: counted by its reason, and by its bus if it has one."""
+    """A valid line without a frame, counted by its reason and by its bus if it has one."""
 
     reason: str
     t_ns: int | None = None
@@ -77,9 +77,9 @@ class Other(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """A line that cannot be read.
+    """A line that cannot be parsed.
 
-    ``taints`` says that the line before may have been cut off by the same damage.
+    With ``taints``, the same damage may have truncated the previous line.
     """
 
     reason: str
@@ -87,9 +87,12 @@ class Damage(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A header or comment line; ``clock`` gets those that change the meaning of times.
+    """A header or comment line.
 
-    A mark with ``stops`` ends the reading, for the reason it gives; ``tag`` is the dialect's own.
+    Attributes:
+        origin_ns: New origin of the times, for ``Dialect.clock``.
+        stops: Reason to stop reading here, or empty.
+        tag: Value for use by the dialect.
     """
 
     origin_ns: int | None = None
@@ -102,21 +105,21 @@ Outcome: TypeAlias = Frame | Other | Damage | Mark | None
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fast:
-    """What ``Dialect.fast`` found: ``rows.bus`` indexes ``names``, ``rows.place`` is the line."""
+    """Result of ``Dialect.fast``: ``rows.bus`` indexes ``names``, ``rows.place`` is the line."""
 
     rows: FrameRows
     names: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Met:
-    """What a chunk came to, for the counters that a format has; lines count from the chunk's first.
+class ChunkResult:
+    """The parsed lines of a chunk, for formats with counters; lines count from the chunk's first.
 
     Attributes:
-        rows: Its frames, by line.
-        odd: Frames that ``slow`` found, with their lines.
-        others: Lines that are not a frame.
-        damaged: Lines that cannot be read, ascending.
+        rows: Frames, by line.
+        odd: Frames parsed by ``slow``, with their lines and bus numbers.
+        others: Lines without a frame.
+        damaged: Lines that cannot be parsed, ascending.
         marks: Header lines.
         first_number: Number of the chunk's first line in the file.
         done: The line after the chunk's last.
@@ -132,7 +135,7 @@ class Met:
 
 
 class Dialect(ABC):
-    """One text format; holds what a reading pass must remember, so each pass has its own."""
+    """Parser of one text format, with the state of one pass."""
 
     format: ClassVar[str]
     says: ClassVar[str]
@@ -140,44 +143,44 @@ class Dialect(ABC):
 
     @abstractmethod
     def fast(self, lines: Lines) -> Fast:
-        """The lines that follow the common pattern."""
+        """Parse the lines that follow the common pattern."""
 
     @abstractmethod
     def slow(self, line: bytes) -> Outcome:
-        """One line that does not."""
+        """Parse a line that does not follow the common pattern."""
 
     @abstractmethod
     def last(self, line: bytes) -> Outcome:
-        """The last line when it has no line end, so that it may be cut."""
+        """Parse a last line without a line end, which may be truncated."""
 
     def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
-        """Log times from the times that lines spell.
+        """Convert the times in the lines to log times.
 
         Args:
-            place: Line of every time, ascending; all lines with a time, frames or not.
-            t_ns: The times.
-            marks: The marks of this chunk with their lines.
+            place: Line of every time, ascending, with and without frames.
+            t_ns: Times in the lines.
+            marks: Marks of this chunk with their lines.
         """
         del place, marks
         return t_ns
 
-    def check(self, met: Met) -> Int64s:
-        """Hold the format's own counters against a chunk.
+    def check(self, chunk: ChunkResult) -> Int64s:
+        """Check a chunk against the format's own counters.
 
         Returns:
-            Lines, ascending, whose frames the counters contradict: they are not handed on, and
-            ``finish`` reports them.
+            Lines, ascending, whose frames contradict the counters. These frames are not yielded,
+            and ``finish`` reports them.
         """
-        del met
+        del chunk
         return _NO_INTS
 
     def unended(self, head: bytes, tail: bytes) -> str:
-        """What a whole log has and this one lacks, as its first and last bytes show; or empty."""
+        """Describe what the first and last bytes lack compared with a complete log, or empty."""
         del head, tail
         return ""
 
     def finish(self, ledger: Ledger) -> None:
-        """Say what the whole file showed, once it is read."""
+        """Report losses and notices after the complete file has been read."""
         del ledger
 
 
@@ -197,13 +200,12 @@ class TextCanLog(Closing):
     """An open CAN log in text form (``Log``)."""
 
     def __init__(self, path: Path, limits: Limits, dialect: Callable[[], Dialect]) -> None:
-        """Look at the first chunk.
+        """Examine the first chunk.
 
         Raises:
-            LogFormatError: The file is empty, or its first chunk holds lines but no frame, no
-                header and nothing else of this format.
+            LogFormatError: The file is empty, or its first chunk contains no line of this format.
         """
-        del limits  # the chunk size bounds everything here
+        del limits  # the chunk size bounds all memory here
         self._path, self._dialect = path, dialect
         self._names: dict[str, int] = {}
         one = dialect()
@@ -212,7 +214,7 @@ class TextCanLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file."""
         return self._path
 
     @property
@@ -222,16 +224,16 @@ class TextCanLog(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The buses seen so far: those of the first chunk, and after a pass all of them."""
+        """The buses found so far: those in the first chunk, or all buses after a pass."""
         return tuple(bus_topic(name) for name in self._names)
 
     def close(self) -> None:
-        """Nothing stays open between passes."""
+        """Do nothing, because no file stays open between passes."""
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All frames, chunk by chunk; see ``Log.read``."""
+        """Yield all frames, chunk by chunk; see ``Log.read``."""
         keep_memory()
-        scribe = _Scribe(self._dialect(), self._names, ledger)
+        scribe = _ChunkParser(self._dialect(), self._names, ledger)
         size = self._path.stat().st_size
         try:
             for piece in lines_of(self._path):
@@ -240,7 +242,7 @@ class TextCanLog(Closing):
                 if scribe.stopped:
                     break
         except OSError as error:
-            ledger.drop("", "file cannot be read on", None, error.strerror or str(error))
+            ledger.drop("", "reading the file failed", None, error.strerror or str(error))
         for name in self._names:
             ledger.topic(name)
         if self._path.stat().st_size != size:
@@ -249,7 +251,7 @@ class TextCanLog(Closing):
         ledger.integrity = scribe.dialect.integrity
 
     def report_missing(self, ledger: Ledger) -> None:
-        """What the last 64 KiB show; see ``KnowsItsEnd``."""
+        """Report a truncated end, from the last 64 KiB; see ``KnowsItsEnd``."""
         head, dialect = head_of(self._path), self._dialect()
         with self._path.open("rb") as file:
             file.seek(max(0, self._path.stat().st_size - HEAD_BYTES))
@@ -265,63 +267,63 @@ class TextCanLog(Closing):
 
     def _peek(self, dialect: Dialect) -> None:
         ledger = Ledger(str(self._path))
-        scribe = _Scribe(dialect, self._names, ledger)
+        scribe = _ChunkParser(dialect, self._names, ledger)
         for piece in lines_of(self._path, HEAD_BYTES):
             found = len(scribe.rows(piece))
-            if isinstance(piece, Lines) or found or scribe.knows_it:
+            if isinstance(piece, Lines) or found or scribe.is_recognised:
                 break
-        if not self._names and not scribe.knows_it:
+        if not self._names and not scribe.is_recognised:
             why = next((d.detail for d in ledger.drops()), "it is empty")
             raise LogFormatError(
-                f"{self._path}: no frame of a {dialect.says} in its beginning ({why}); "
-                "check that it is one, and whole"
+                f"{self._path}: no frame of a {dialect.says} at its start ({why}); "
+                "check that it is a complete log of this format"
             )
 
 
-class _Scribe:
-    """Turns chunks into rows and writes the rest into the ledger."""
+class _ChunkParser:
+    """Converts chunks to rows and records all other lines in the ledger."""
 
     def __init__(self, dialect: Dialect, names: dict[str, int], ledger: Ledger) -> None:
         self.dialect = dialect
         self.stopped = False
-        self.knows_it = False
+        self.is_recognised = False
         self._names, self._ledger = names, ledger
 
     def rows(self, piece: Lines | Overlong | Tail) -> FrameRows:
-        """The frames of one piece of the file, with log times."""
+        """Parse the frames of a piece of the file, with log times."""
         if isinstance(piece, Lines):
             return self._lines(piece)
         if isinstance(piece, Tail):
             return self._tail(piece)
         detail = f"line {piece.number}: at least {piece.byte_count} bytes without a line end"
-        self._ledger.drop("", "stretch without line ends", None, detail)
+        self._ledger.drop("", "no line end over many bytes", None, detail)
         return NO_ROWS
 
     def _tail(self, tail: Tail) -> FrameRows:
         if tail.text == _DOS_END:
             return NO_ROWS
-        odd = _Odd()
+        odd = _SlowLines()
         outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
         if outcome is None and tail.text.strip():
             outcome = Damage("last line has no line end, may be cut")
         if outcome is None or isinstance(outcome, Frame):
             detail = f"line {tail.number} has no line end"
             self._ledger.drop("", "file may be cut after its last frame", None, detail)
-        self._sort_in(odd, 0, tail.number, tail.text, outcome)
+        self._add(odd, 0, tail.number, tail.text, outcome)
         return self._checked(self._timed(NO_ROWS, odd), odd, tail.number, 1)
 
     def _lines(self, lines: Lines) -> FrameRows:
         fast = self.dialect.fast(lines)
         rows = self._renamed(fast)
-        odd = _Odd()
+        odd = _SlowLines()
         for i in _left_over(lines, rows):
             line = lines.text(i)
-            outcome = self._judged(line)
+            outcome = self._outcome_of(line)
             if isinstance(outcome, Damage) and outcome.taints and i > 0:
                 odd.tainted.append(i - 1)
             if i >= lines.done:
                 break
-            self._sort_in(odd, i, lines.first_number + i, line, outcome)
+            self._add(odd, i, lines.first_number + i, line, outcome)
             if self.stopped:
                 rows = self._timed(rows.take(rows.place < i), odd)
                 return self._checked(rows, odd, lines.first_number, i)
@@ -330,13 +332,13 @@ class _Scribe:
         rows = self._checked(self._timed(rows, odd), odd, lines.first_number, lines.done)
         return self._untainted(rows, odd.tainted, lines)
 
-    def _checked(self, rows: FrameRows, odd: _Odd, first_number: int, done: int) -> FrameRows:
-        """Without the rows that the format's own counters contradict."""
-        met = Met(rows, odd.frames, odd.plain, odd.damaged, odd.marks, first_number, done)
-        refused = self.dialect.check(met)
+    def _checked(self, rows: FrameRows, odd: _SlowLines, first_number: int, done: int) -> FrameRows:
+        """Remove the rows that contradict the format's own counters."""
+        chunk = ChunkResult(rows, odd.frames, odd.plain, odd.damaged, odd.marks, first_number, done)
+        refused = self.dialect.check(chunk)
         return rows.take(~np.isin(rows.place, refused)) if len(refused) else rows
 
-    def _judged(self, line: bytes) -> Outcome:
+    def _outcome_of(self, line: bytes) -> Outcome:
         if len(line) > LINE_MAX:
             return Damage("line too long")
         outcome = self.dialect.slow(line)
@@ -345,26 +347,26 @@ class _Scribe:
             return Damage("control characters in a line", taints)
         return outcome
 
-    def _sort_in(self, odd: _Odd, i: int, number: int, line: bytes, outcome: Outcome) -> None:
+    def _add(self, odd: _SlowLines, i: int, number: int, line: bytes, outcome: Outcome) -> None:
         match outcome:
             case Frame():
                 code = bus_number(outcome.bus, self._names)
                 if code < 0:
                     odd.damaged.append(i)
-                    self._lost("", "more buses than a log can have", number, line)
+                    self._drop("", "more buses than a log can have", number, line)
                 else:
                     odd.frames.append((i, code, outcome))
             case Other():
-                self.knows_it = True
+                self.is_recognised = True
                 odd.others.setdefault((outcome.bus, outcome.reason), []).append(number)
                 odd.plain.append((i, outcome))
                 if outcome.t_ns is not None:
                     odd.times.append((i, outcome.t_ns))
             case Damage():
                 odd.damaged.append(i)
-                self._lost("", outcome.reason, number, line)
+                self._drop("", outcome.reason, number, line)
             case Mark():
-                self.knows_it = True
+                self.is_recognised = True
                 odd.marks.append((i, outcome))
                 if outcome.stops:
                     self.stopped = True
@@ -372,7 +374,7 @@ class _Scribe:
             case None:
                 pass
 
-    def _lost(self, topic: str, reason: str, number: int, line: bytes) -> None:
+    def _drop(self, topic: str, reason: str, number: int, line: bytes) -> None:
         excerpt = line[:_EXCERPT].decode("ascii", "backslashreplace")
         dots = "..." if len(line) > _EXCERPT else ""
         self._ledger.drop(topic, reason, 1, f"line {number}: {excerpt!r}{dots}")
@@ -385,11 +387,11 @@ class _Scribe:
         for k in np.flatnonzero(is_bad).tolist():
             i = int(rows.place[k])
             reason = "followed by a broken line, may be cut"
-            self._lost(names[rows.bus[k]], reason, lines.first_number + i, lines.text(i))
+            self._drop(names[rows.bus[k]], reason, lines.first_number + i, lines.text(i))
         return rows.take(~is_bad)
 
-    def _timed(self, rows: FrameRows, odd: _Odd) -> FrameRows:
-        """Fast and odd rows together, with log times."""
+    def _timed(self, rows: FrameRows, odd: _SlowLines) -> FrameRows:
+        """Merge the rows of ``fast`` and ``slow``, with log times."""
         for (bus, reason), numbers in odd.others.items():
             topic = bus and bus_name(bus)
             self._ledger.find(topic, len(numbers))
@@ -421,7 +423,7 @@ class _Scribe:
 
 
 def _left_over(lines: Lines, rows: FrameRows) -> list[int]:
-    """The lines that are neither blank nor among ``rows``."""
+    """Return the lines that are neither blank nor in ``rows``."""
     if len(rows) == len(lines):
         return []
     is_odd = lines.stop > lines.start
@@ -430,8 +432,8 @@ def _left_over(lines: Lines, rows: FrameRows) -> list[int]:
     return left
 
 
-class _Odd:
-    """What the odd lines of one chunk came to."""
+class _SlowLines:
+    """The lines of a chunk that were parsed by ``slow``."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[int, int, Frame]] = []
@@ -469,17 +471,17 @@ _FRAME_LIKE: Final = re.compile(
 
 
 def comment(text: str) -> Outcome:
-    """A comment line, unless damage may have joined a frame's line to it."""
+    """Parse a comment line, to which damage may have joined the line of a frame."""
     if _FRAME_LIKE.search(text):
         return Other("comment that holds a frame")
     return None
 
 
 def head_of(path: Path) -> bytes:
-    """The first 64 KiB, as a format's header needs them.
+    """Read the first 64 KiB of a file, which contain its header.
 
     Raises:
-        LogFormatError: It is empty, compressed or UTF-16, with what to do about it.
+        LogFormatError: The file is empty, compressed or UTF-16; the message states the remedy.
     """
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
@@ -499,10 +501,10 @@ def head_of(path: Path) -> bytes:
 def payloads(
     lines: Lines, start: Int64s, length: Int64s, is_fd: Bools, gap: int | None
 ) -> tuple[Bytes, Bools]:
-    """Payload bytes of frames written as hexadecimal pairs, with ``gap`` between them or nothing.
+    """Parse payloads in hexadecimal, with the character ``gap`` or nothing between the bytes.
 
     Returns:
-        Bytes of shape (N, 8), or (N, 64) when a frame is CAN FD, and whether all were readable.
+        Bytes of shape (N, 8), or (N, 64) if a frame is CAN FD, and a mask of the valid payloads.
     """
     if gap is None:
         payload, ok = payload8(lines.words, start, length)
@@ -517,6 +519,6 @@ def payloads(
 
 
 def picked(keep: Bools, place: Int64s, bus: Int64s, t_ns: Int64s, frames: CanFrames) -> FrameRows:
-    """The rows that passed every check of ``fast``."""
+    """Return the rows that passed every check of ``fast``."""
     rows = FrameRows(place, bus, t_ns, frames)
     return rows if bool(keep.all()) else rows.take(keep)

@@ -1,11 +1,11 @@
-"""Text to numbers for many fields at once: eight characters of a field are one 64-bit word.
+"""Conversion of many text fields to numbers at once, with eight characters per 64-bit word.
 
-A field is a range of one buffer. Its characters are fetched as unaligned little-endian words, the
-ones outside the field replaced by ``0``, and all fields are then checked and converted with a
-dozen integer operations on the column of words ("SIMD within a register", Knuth TAOCP 7.1.3).
-Nothing passes through floating point, so decimal times come out exact.
+A field is a range of one buffer. Its characters are read as unaligned little-endian words, and
+characters outside the field are replaced by ``0``. A dozen integer operations on the column of
+words then check and convert all fields ("SIMD within a register", Knuth TAOCP 7.1.3). No floating
+point is used, so decimal times are exact.
 
-The buffer must hold ``FRONT`` bytes before the first field and ``BACK`` bytes after the last.
+The buffer must have ``FRONT`` bytes before the first field and ``BACK`` bytes after the last.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ FRONT: Final = 32
 BACK: Final = 256
 NANOS: Final = 1_000_000_000
 TIME_MAX_NS: Final = 1 << 62
-"""The year 2116. A start and an offset within it add up without overflow."""
+"""Maximum time, in the year 2116. The sum of a start and an offset below it does not overflow."""
 SECONDS_MAX: Final = TIME_MAX_NS // NANOS - 1
 
 
 def within_range(start_ns: int) -> int | None:
-    """A start time unless it is absurd, as a damaged one may be."""
+    """Return a start time, or None if it is implausible, as damaged ones are."""
     return start_ns if abs(start_ns) <= TIME_MAX_NS else None
 
 
@@ -48,7 +48,7 @@ _POWER: Final = np.array([10**k for k in range(10)], np.int64)
 
 
 def words_of(buffer: Bytes) -> Words:
-    """Every eight consecutive bytes of ``buffer`` as a word; shape (len - 7,), not copied."""
+    """Return a view of every eight consecutive bytes as a word, shape (len - 7,)."""
     words: Words = np.ndarray((len(buffer) - 7,), np.dtype("<u8"), buffer.data, strides=(1,))
     return words
 
@@ -64,9 +64,9 @@ def _decimal8(word: Words) -> tuple[Words, Bools]:
 
 
 def _nibbles8(word: Words) -> tuple[Words, Bools]:
-    """Eight hexadecimal characters as eight bytes of four bits, and whether all were such.
+    """Convert eight hexadecimal characters to eight nibbles, and return whether all are valid.
 
-    Each nibble is spelled again and compared, which refuses every other byte value.
+    Each nibble is converted back and compared, which rejects every other byte value.
     """
     ones = _u(0x0101010101010101)
     nibble = (word & (ones * _u(15))) + ((word >> _u(6)) & (ones * _u(3))) * _u(9)
@@ -77,7 +77,7 @@ def _nibbles8(word: Words) -> tuple[Words, Bools]:
 
 
 def _filled(word: Words, table: Words, count: Int64s, fewest: int, max_count: int) -> Words:
-    """Each word with only ``count`` of its characters, clipped to 0..8, and ``0`` elsewhere."""
+    """Keep ``count`` characters of each word, clipped to 0..8, and set the others to ``0``."""
     if fewest >= 8:
         return word
     if fewest == max_count:
@@ -89,11 +89,11 @@ def _filled(word: Words, table: Words, count: Int64s, fewest: int, max_count: in
 
 
 def decimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
-    """Unsigned decimal fields of 1 to 16 digits that end before ``stop``.
+    """Convert unsigned decimal fields of 1 to 16 digits that end before ``stop``.
 
     Returns:
-        Values, shape (N,), int64, and whether each field was all digits; a value that is not ok
-        means nothing.
+        Values, shape (N,), int64, and a mask of the fields that are all digits. Values of other
+        fields are undefined.
     """
     if not len(count):
         return np.zeros(0, np.int64), np.zeros(0, np.bool_)
@@ -104,7 +104,7 @@ def decimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
     if max_count > 8:
         word = _filled(words[stop - 16], _KEEP_LAST, count - 8, fewest - 8, max_count - 8)
         if bool((word == word[0]).all()):
-            word = word[:1]  # the leading digits of times are mostly all the same
+            word = word[:1]  # the leading digits of times are usually all equal
         high, high_ok = _decimal8(word)
         value = value + high * _u(100_000_000)
         ok &= high_ok
@@ -112,7 +112,7 @@ def decimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
 
 
 def hexadecimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bools]:
-    """Hexadecimal fields of 1 to 8 digits that end before ``stop``, as ``decimal``."""
+    """Convert hexadecimal fields of 1 to 8 digits that end before ``stop``; see ``decimal``."""
     if not len(count):
         return np.zeros(0, np.int64), np.zeros(0, np.bool_)
     fewest, max_count = int(count.min()), int(count.max())
@@ -122,7 +122,7 @@ def hexadecimal(words: Words, stop: Int64s, count: Int64s) -> tuple[Int64s, Bool
 
 
 def _packed(nibble: Words) -> Words:
-    """Eight nibbles as four bytes, the first two nibbles in the lowest byte."""
+    """Pack eight nibbles into four bytes, the first two nibbles in the lowest byte."""
     pair = ((nibble << _u(4)) | (nibble >> _u(8))) & _u(0x00FF00FF00FF00FF)
     pair = (pair | (pair >> _u(8))) & _u(0x0000FFFF0000FFFF)
     return (pair | (pair >> _u(16))) & _u(0xFFFFFFFF)
@@ -131,16 +131,16 @@ def _packed(nibble: Words) -> Words:
 def seconds_ns(
     buffer: Bytes, words: Words, start: Int64s, stop: Int64s, *, marked: bool = True
 ) -> tuple[Int64s, Bools]:
-    """Decimal numbers such as ``12.000345`` or ``12,000345``, times 10**9, exactly.
+    """Convert decimal numbers such as ``12.000345`` or ``12,000345`` to 10**-9 units, exactly.
 
-    One to nine digits after the mark and one to ten before it; anything else is not ok.
+    Numbers have one to ten digits before the mark and one to nine after it; others are invalid.
 
     Args:
-        buffer: What ``words`` is a view of.
-        words: From ``words_of``.
+        buffer: The characters.
+        words: View of ``buffer`` from ``words_of``.
         start: Shape (N,): first character of each number.
-        stop: Shape (N,): one past its last.
-        marked: Refuse numbers without a decimal mark.
+        stop: Shape (N,): one past its last character.
+        marked: Reject numbers without a decimal mark.
     """
     places = _places(buffer, start, stop)
     fraction, fraction_ok = decimal(words, stop, places)
@@ -154,7 +154,7 @@ def seconds_ns(
 
 
 def _places(buffer: Bytes, start: Int64s, stop: Int64s) -> Int64s:
-    """How many decimals each number has; nearly always all have as many as the first one."""
+    """Return the number of decimals of each number; usually all have as many as the first."""
     first = _first_places(buffer, start, stop)
     places = np.full(len(stop), first, np.int64)
     here = _has_mark(buffer, start, stop, first)
@@ -185,10 +185,10 @@ def _first_places(buffer: Bytes, start: Int64s, stop: Int64s) -> int:
 
 
 def payload8(words: Words, start: Int64s, length: Int64s) -> tuple[Bytes, Bools]:
-    """Up to eight bytes written as hexadecimal digits without spaces (``DEADBEEF``).
+    """Convert up to eight bytes in hexadecimal without spaces (``DEADBEEF``).
 
     Returns:
-        Bytes, shape (N, 8), zero from ``length`` on, and whether all digits were such.
+        Bytes, shape (N, 8), zero from ``length`` on, and a mask of the valid payloads.
     """
     if not len(length):
         return np.zeros((0, 8), np.uint8), np.zeros(0, np.bool_)
@@ -207,7 +207,7 @@ _GAPS: Final = np.array([0, 0xFF0000, 0xFF0000FF0000], np.uint64)
 
 
 def spaced8(words: Words, start: Int64s, length: Int64s, gap: int) -> tuple[Bytes, Bools]:
-    """Up to eight bytes with one character ``gap`` between them (``DE AD BE EF``)."""
+    """Convert up to eight bytes with one character ``gap`` between them (``DE AD BE EF``)."""
     gaps = _u(gap) * _u(0x010000010000)
     ok = length <= 8
     halves = []
@@ -236,18 +236,22 @@ for _value, _digits in enumerate(zip(b"0123456789abcdef", b"0123456789ABCDEF", s
 
 
 def is_hex(characters: Bytes) -> Bools:
-    """Which characters are hexadecimal digits."""
+    """Return a mask of the hexadecimal digits."""
     found: Bools = _NIBBLE[characters] < 0x80
     return found
 
 
 def nibble(characters: Bytes) -> Int64s:
-    """The value of each hexadecimal digit; 128 for any other character."""
+    """Return the value of each hexadecimal digit; 128 for any other character."""
     return _NIBBLE[characters].astype(np.int64)
 
 
 def payload64(buffer: Bytes, start: Int64s, length: Int64s, gap: int | None) -> tuple[Bytes, Bools]:
-    """Up to 64 bytes, with the character ``gap`` between them or nothing; shape (N, 64)."""
+    """Convert up to 64 bytes, with the character ``gap`` or nothing between them.
+
+    Returns:
+        Bytes, shape (N, 64), and a mask of the valid payloads.
+    """
     step = 2 if gap is None else 3
     text = sliding_window_view(buffer, 64 * step)[start].reshape(-1, 64, step)
     high, low = _NIBBLE[text[:, :, 0]], _NIBBLE[text[:, :, 1]]
@@ -260,15 +264,15 @@ def payload64(buffer: Bytes, start: Int64s, length: Int64s, gap: int | None) -> 
 
 
 LABEL_MAX: Final = 16
-"""Longest name, in bytes, that ``labels`` can tell apart."""
+"""Maximum length, in bytes, of the names that ``labels`` distinguishes."""
 _NAMES_MAX: Final = 64
 
 
 def labels(words: Words, start: Int64s, count: Int64s) -> tuple[Int64s, tuple[bytes, ...]]:
-    """Number the different names among fields of 1 to 16 bytes, in order of appearance.
+    """Number the distinct names in fields of 1 to 16 bytes, in order of appearance.
 
     Returns:
-        Shape (N,): which name each field holds, or -1 beyond 64 different names; and the names.
+        Shape (N,): index of each field's name, or -1 beyond 64 distinct names; and the names.
     """
     if not len(start):
         return np.zeros(0, np.int64), ()

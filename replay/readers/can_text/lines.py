@@ -1,4 +1,4 @@
-"""A text file as chunks of whole lines, with the ranges of lines, and of their words."""
+"""Division of a text file into chunks of complete lines, and of lines into words."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _LAST_PRINTABLE: Final = 126
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lines:
-    """The whole lines of one chunk; valid until the next chunk is asked for.
+    """The complete lines of one chunk; valid until the next chunk is read.
 
     Attributes:
         buffer: The chunk with ``FRONT`` bytes before it and ``BACK`` after it.
         words: ``words_of(buffer)``.
         start: Shape (N,), int64: first character of each line.
-        stop: Shape (N,), int64: one past its last character; line ends are left out.
+        stop: Shape (N,), int64: one past its last character, without the line end.
         first_number: Number of the first line in the file, counted from 1.
-        done: How many lines are to be taken from here; one fewer than there are when the last one
-            is only to be examined, since it comes again as the first of the next chunk.
+        done: Number of lines to use. The last line of a chunk may be for examination only, because
+            it is repeated as the first line of the next chunk.
     """
 
     buffer: Bytes
@@ -49,17 +49,17 @@ class Lines:
         return len(self.start)
 
     def text(self, i: int) -> bytes:
-        """Line ``i`` without its end."""
+        """Return line ``i`` without its line end."""
         return self.buffer[int(self.start[i]) : int(self.stop[i])].tobytes()
 
 
 @dataclass(frozen=True, slots=True)
 class Overlong:
-    """A stretch without a line end that no line of a CAN log can be.
+    """A range without a line end that is too long for a line of a CAN log.
 
     Attributes:
         number: Line number.
-        byte_count: How long it is at least.
+        byte_count: Minimum length in bytes.
     """
 
     number: int
@@ -68,7 +68,7 @@ class Overlong:
 
 @dataclass(frozen=True, slots=True)
 class Tail:
-    """What follows the last line end, not empty.
+    """The characters after the last line end, not empty.
 
     Attributes:
         number: Line number.
@@ -80,10 +80,10 @@ class Tail:
 
 
 def lines_of(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Lines | Overlong | Tail]:
-    """The file's lines in order, then what follows the last line end.
+    """Yield the file's lines in order, then the characters after the last line end.
 
-    The last whole line of a chunk comes again as the first of the next one, so that every line is
-    given together with the one after it; memory is one chunk whatever the file holds.
+    The last complete line of a chunk is repeated as the first line of the next chunk, so that every
+    line is available together with the following one. Memory is bounded by one chunk.
 
     Raises:
         OSError: The file cannot be opened or read.
@@ -125,7 +125,7 @@ def lines_of(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Lines | Ove
 
 
 def _fill(file: FileIO, buffer: Bytes, begin: int, end: int) -> tuple[int, bool]:
-    """Read until ``end`` or the file's end: where the bytes stop, and whether it is the file's."""
+    """Read until ``end`` or the file's end; return the end, and whether it is the file's end."""
     while begin < end:
         got = file.readinto(buffer[begin:end].data) or 0
         if not got:
@@ -149,18 +149,18 @@ def _lines(buffer: Bytes, words: Words, newline: Int64s, number: int, done: int)
 
 
 class Field(NamedTuple):
-    """One word of each of N lines, as ranges; empty, at the line's end, where none exists."""
+    """One word of each of N lines, as ranges; an empty range at the line's end if missing."""
 
     start: Int64s
     stop: Int64s
 
     @property
     def size(self) -> Int64s:
-        """Characters of each word."""
+        """Number of characters of each word."""
         return self.stop - self.start
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Field:
-        """The words picked by ``index``."""
+        """Return the selected words."""
         return Field(self.start[index], self.stop[index])
 
 
@@ -171,21 +171,20 @@ _TO_HIGH: Final = _ONES * np.uint64(0x80 - 0x21)
 _SEVEN: Final = np.uint64(7)
 _FIFTY_SIX: Final = np.uint64(56)
 _PLACES: Final = np.uint64(0x0001020304050607)
-"""Times ``1 << 8 * k``, its highest byte is ``k``."""
+"""Multiplier that maps ``1 << 8 * k`` to a word with the highest byte ``k``."""
 _TO_BITS: Final = np.uint64(0x0102040810204080)
-"""Times eight bytes of 0 or 1, its highest byte holds those bits, the first one lowest."""
+"""Multiplier that packs eight bytes of 0 or 1 into the highest byte, the first byte lowest."""
 _BITMAP_WORDS: Final = 6
 _IN_BITMAP: Final = np.uint64((1 << 8 * _BITMAP_WORDS) - 1)
 _STEPS_MAX: Final = 64
 
 
 def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[Field]:
-    """The next ``count`` words of lines, from ``at`` on and before ``limit``.
+    """Find the next ``count`` words of lines, from ``at`` on and before ``limit``.
 
-    One bit for each of the next characters says whether it belongs to a word; words are then found
-    in that number with the lowest-bit tricks of Warren, Hacker's Delight, 2-1. Anything up to the
-    blank counts as a gap, so lines with other control characters must be kept out, by
-    ``clean_lines``.
+    A bitmap marks which of the next characters belong to a word. Words are found in the bitmap with
+    the lowest-bit operations of Warren, Hacker's Delight, 2-1. All characters up to the blank count
+    as gaps, so lines with other control characters must be excluded first, with ``clean_lines``.
     """
     inside = _bitmap(lines.words, at)
     fields = []
@@ -207,7 +206,7 @@ def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[Fie
 
 
 def _bitmap(words: Words, at: Int64s) -> Words:
-    """Bit k says whether character ``at + k`` is not a gap, for the next 48 characters."""
+    """Return a bitmap in which bit k is set if character ``at + k`` (k < 48) is not a gap."""
     bits = np.zeros(len(at), np.uint64)
     for k in range(_BITMAP_WORDS):
         eight = ((_word_bits(words[at + 8 * k]) >> _SEVEN) * _TO_BITS) >> _FIFTY_SIX
@@ -216,23 +215,23 @@ def _bitmap(words: Words, at: Int64s) -> Words:
 
 
 def skip_gap(lines: Lines, at: Int64s, limit: Int64s) -> Int64s:
-    """Where the next word begins, or ``limit``."""
+    """Return the start of the next word, or ``limit``."""
     return _seek(lines.words, at, limit, _word_bits)
 
 
 def _word_bits(word: Words) -> Words:
-    """The high bit of every character that is not a gap."""
+    """Set the high bit of every character that is not a gap."""
     bits: Words = (((word & ~_HIGHS) + _TO_HIGH) | word) & _HIGHS
     return bits
 
 
 def _gap_bits(word: Words) -> Words:
-    """The high bit of every character that is a gap."""
+    """Set the high bit of every character that is a gap."""
     return _word_bits(word) ^ _HIGHS
 
 
 def _seek(words: Words, at: Int64s, limit: Int64s, bits_of: Callable[[Words], Words]) -> Int64s:
-    """The first place from ``at`` on that ``bits_of`` marks, or ``limit``."""
+    """Return the first position from ``at`` on that ``bits_of`` marks, or ``limit``."""
     bits = bits_of(words[at])
     found: Int64s = at + _index(bits & (~bits + _ONE))
     open_ = np.flatnonzero(bits == 0)
@@ -248,13 +247,13 @@ def _seek(words: Words, at: Int64s, limit: Int64s, bits_of: Callable[[Words], Wo
 
 
 def _index(bit: Words) -> Int64s:
-    """Which character's high bit this is; 0 for none."""
+    """Return the index of the character whose high bit is set; 0 for none."""
     index: Int64s = (((bit >> _SEVEN) * _PLACES) >> _FIFTY_SIX).view(np.int64)
     return index
 
 
 def clean_lines(lines: Lines) -> Int64s:
-    """Indexes of the lines that are not empty and hold only printable ASCII and tabs."""
+    """Return the indices of the non-empty lines with only printable ASCII and tabs."""
     begin, end = int(lines.start[0]), int(lines.stop[-1]) + 1
     text = lines.buffer[begin:end]
     dirty = (text > _LAST_PRINTABLE) | ((text < SPACE) & ((text < TAB) | (text > RETURN)))

@@ -1,8 +1,9 @@
-"""Message numbers that a writer puts before every row: which of them no row carries.
+"""Detection of missing rows by the message numbers that a recorder writes before every row.
 
-A recorder numbers its rows 1, 2, 3, ... so a number that is missing is a row that is missing. Rows
-may stand out of order, so a gap is closed again by a row that brings its number later. A row whose
-number differs while its two neighbors' numbers leave room for exactly that row is a damaged row.
+A recorder numbers its rows 1, 2, 3, ..., so a missing number is a missing row. Rows may be out of
+order, so a later row with a missing number closes the gap again. A row is damaged if its number
+does not follow its predecessor's and its two neighbors' numbers leave exactly one number between
+them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ MISSING: Final = "message numbers missing"
 MISFIT: Final = "message number does not fit between its neighbors"
 GO_BACK: Final = "message numbers repeat or go back"
 _GAPS_KEPT: Final = 8
-"""Latest gaps that a later row may still close; rows change places with near ones only."""
+"""Number of latest gaps that a later row may close; only nearby rows are out of order."""
 _PLACES_KEPT: Final = 5
 
 
@@ -27,7 +28,7 @@ class MessageNumbers:
     """The message numbers of one pass over a log, in stored order."""
 
     def __init__(self) -> None:
-        """Nothing met yet."""
+        """Start without any rows."""
         self._last, self._highest = 0, 0
         self._gaps: list[tuple[int, int]] = []
         self._missing = self._backward = self._misfits = self._damaged = 0
@@ -37,17 +38,17 @@ class MessageNumbers:
         self._misfit_places: list[str] = []
 
     def begin(self) -> None:
-        """A header begins a recording whose numbers start again."""
+        """Start a new recording, whose numbers restart."""
         self._settle_gaps()
         self._last = self._highest = self._damaged = 0
         self._is_fresh = True
 
     def misfits(self, number: Int64s, following: int) -> Bools:
-        """Which rows carry a number that their neighbors contradict, shape (N,).
+        """Return a mask of the rows whose number contradicts their neighbors, shape (N,).
 
         Args:
-            number: Shape (N,): of consecutive rows.
-            following: Number of the row after them; -1 if not known.
+            number: Shape (N,): numbers of consecutive rows.
+            following: Number of the row after them; -1 if unknown.
         """
         before = np.concatenate(([self._last], number[:-1]))
         after = np.append(number[1:], following)
@@ -55,18 +56,18 @@ class MessageNumbers:
         return found
 
     def misfit(self, number: int, line: int) -> None:
-        """A row that is not handed on, because of its number."""
+        """Record a row that is dropped because of its number."""
         self._misfits += 1
         _note(self._misfit_places, f"line {line}: {number}")
 
     def follow(self, number: Int64s, line: Int64s, damaged: Int64s, first_line: int) -> None:
-        """Take the numbers of consecutive good rows.
+        """Process the numbers of consecutive valid rows.
 
         Args:
-            number: Shape (N,).
+            number: Shape (N,): the numbers.
             line: Shape (N,), ascending: their lines, counted from the chunk's first.
-            damaged: Lines that could not be read, ascending; reported on their own. Each may be the
-                row that a gap lacks, which is then not reported a second time.
+            damaged: Unreadable lines, ascending, which are reported separately. Each may be the
+                missing row of a gap, which is then not reported again.
             first_line: Number of the chunk's first line in the file.
         """
         if not len(number):
@@ -74,7 +75,7 @@ class MessageNumbers:
             return
         starts = np.concatenate(([0], np.flatnonzero(np.diff(number) != 1) + 1))
         stops = np.append(starts[1:], len(number))
-        # What was unreadable within a run carried no number: the run lacks none.
+        # An unreadable line within a run had no number, because the run has no gap.
         bad = np.searchsorted(damaged, line[starts])
         bad[1:] -= np.searchsorted(damaged, line[starts[1:] - 1])
         bad[0] += self._damaged
@@ -85,7 +86,7 @@ class MessageNumbers:
         self._damaged = len(damaged) - int(np.searchsorted(damaged, line[-1]))
 
     def settle(self, ledger: Ledger) -> None:
-        """Report what is missing, once everything is read."""
+        """Report the missing rows, after the complete file has been read."""
         self._settle_gaps()
         ledger.drop("", MISFIT, self._misfits, _listed(self._misfit_places, self._misfits))
         more = f"first {_PLACES_KEPT} gaps: " if len(self._places) == _PLACES_KEPT else ""
@@ -95,7 +96,7 @@ class MessageNumbers:
             ledger.drop("", GO_BACK, None, f"{self._backward} times: {detail}")
 
     def _run(self, first: int, last: int, line: int, damaged: int) -> None:
-        """Rows numbered ``first`` to ``last`` without a gap, after ``damaged`` unreadable ones."""
+        """Process rows ``first`` to ``last`` without a gap, after ``damaged`` unreadable lines."""
         if self._is_fresh and first == 0:  # some writers count from zero
             self._highest = -1
         self._is_fresh = False
@@ -105,14 +106,14 @@ class MessageNumbers:
         elif not self._fill(first, last):
             self._backward += 1
             _note(self._back_places, f"line {line}: {first} after {self._last}")
-            # Another recording begins, or a part comes again: what lies between is unknown.
+            # A new recording starts, or a part is repeated: the rows between are unknown.
             self._settle_gaps()
             self._highest = last
         self._highest = max(self._highest, last)
         self._last = last
 
     def _gap(self, start: int, stop: int, line: int, damaged: int) -> None:
-        """No row was met with the numbers ``start`` to ``stop - 1``."""
+        """Record that the numbers ``start`` to ``stop - 1`` are missing."""
         start += min(damaged, stop - start)
         if start == stop:
             return
@@ -124,7 +125,7 @@ class MessageNumbers:
             self._missing += stop - start
 
     def _fill(self, first: int, last: int) -> bool:
-        """Close the gap that the run is in; False where a number of it was met before."""
+        """Close the gap that contains the run; return False if one of its numbers is repeated."""
         for k, (start, stop) in enumerate(self._gaps):
             if start <= first < stop:
                 rest = [(start, first), (last + 1, stop)]

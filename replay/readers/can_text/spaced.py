@@ -1,4 +1,4 @@
-"""Frames whose bytes are words of their own, as ASC, TRC and BUSMASTER logs write them."""
+"""Frames whose bytes are separated by blanks, as in ASC, TRC and BUSMASTER logs."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .lines import SPACE, Field, Lines
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spaced:
-    """Where the fields of N data frames lie; all arrays have shape (N,).
+    """Positions of the fields of N data frames; all arrays have shape (N,).
 
     Attributes:
-        line: Which line.
-        bus: The word that names the bus; None when the format has one bus only.
+        line: Index of the line.
+        bus: The word that names the bus; None if the format has only one bus.
         identifier: The hexadecimal digits of the identifier.
-        is_extended: 29-bit identifier.
-        length: Payload bytes, 0 to 64.
-        payload: First character of the payload; means nothing for a length of 0.
-        is_fd: CAN FD.
+        is_extended: True for 29-bit identifiers.
+        length: Number of payload bytes, 0 to 64.
+        payload: First character of the payload; undefined for a length of 0.
+        is_fd: True for CAN FD.
     """
 
     line: Int64s
@@ -43,13 +43,13 @@ NOTHING_FAST: Final = Fast(NO_ROWS, ())
 
 
 def spaced_frames(lines: Lines, at: Spaced, t_ns: Int64s, ok: Bools) -> Fast:
-    """The frames at these places that hold up: digits, gaps, ranges, names.
+    """Return the frames at these positions with valid digits, gaps, ranges and names.
 
     Args:
         lines: The chunk.
-        at: Where the fields lie.
+        at: Positions of the fields.
         t_ns: Shape (N,): times.
-        ok: Shape (N,): what is known to be right so far.
+        ok: Shape (N,): mask of the frames that are valid so far.
     """
     if not len(at.line):
         return NOTHING_FAST
@@ -78,17 +78,17 @@ def spaced_frames(lines: Lines, at: Spaced, t_ns: Int64s, ok: Bools) -> Fast:
 
 
 def payload_stop(at: Spaced) -> Int64s:
-    """One past the last payload digit, where a gap must be."""
+    """Return the position after the last payload digit, where a gap is required."""
     return at.payload + np.maximum(3 * at.length - 1, 0)
 
 
 def is_bus_name(spelled: bytes) -> bool:
-    """Printable ASCII, as all bus names are."""
+    """Return whether a bus name is printable ASCII, as all bus names are."""
     return bool(spelled) and all(SPACE < c < 127 for c in spelled)
 
 
-def is_way(lines: Lines, word: Field) -> Bools:
-    """``Rx`` or ``Tx``."""
+def is_direction(lines: Lines, word: Field) -> Bools:
+    """Return whether each word is ``Rx`` or ``Tx``."""
     letter = lines.buffer[word.start]
     found: Bools = (letter == ord("R")) | (letter == ord("T"))
     found &= (lines.buffer[word.start + 1] == ord("x")) & (word.size == 2)
@@ -96,7 +96,7 @@ def is_way(lines: Lines, word: Field) -> Bools:
 
 
 def joined_fast(parts: Sequence[Fast]) -> Fast:
-    """All frames of one chunk by line; each part has its own bus names."""
+    """Merge the frames of a chunk by line; each part has its own bus names."""
     rows = NO_ROWS
     names: tuple[str, ...] = ()
     for part in parts:

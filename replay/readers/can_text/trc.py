@@ -1,10 +1,11 @@
-"""PEAK TRC logs, versions 1.0 to 1.3, 2.0 and 2.1: ``1)  1.6  Rx  0480  2  C2 08``.
+"""Reader of PEAK TRC logs, versions 1.0 to 1.3, 2.0 and 2.1: ``1)  1.6  Rx  0480  2  C2 08``.
 
-Times are milliseconds since ``$STARTTIME``, which counts days since 30 December 1899 on a clock
-whose time zone the file does not state; it is taken as UTC, with a notice.
+Times are milliseconds since ``$STARTTIME``, which counts days since 30 December 1899. The file
+states no time zone, so the start time is read as UTC, with a notice.
 
-The format has no checksum and no count. A line holds its length, so a cut one is seen, and its
-message number, so a missing one is: all but those after the last line.
+The format has no checksum and no count. Each line contains its length, so a truncated line is
+detected. Each line contains its message number, so missing lines are detected, except after the
+last line.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from crosscue.replay.base import DATA, ERROR, REMOTE, Int64s, Ledger, Limits, Lo
 from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH
 
 from .dialect import (
+    ChunkResult,
     Damage,
     Dialect,
     Fast,
     Frame,
     Mark,
-    Met,
     Other,
     Outcome,
     TextCanLog,
@@ -35,7 +36,7 @@ from .dialect import (
 from .digits import NANOS, SECONDS_MAX, Bools, decimal, seconds_ns, within_range
 from .lines import Field, Lines, clean_lines, next_fields, skip_gap
 from .message_numbers import MessageNumbers
-from .spaced import NOTHING_FAST, Spaced, is_bus_name, is_way, payload_stop, spaced_frames
+from .spaced import NOTHING_FAST, Spaced, is_bus_name, is_direction, payload_stop, spaced_frames
 
 _COLUMNS_OF: Final = {
     "1.0": "NOIlD",
@@ -65,8 +66,8 @@ def open_trc(path: Path, limits: Limits) -> Log:
     """Open a TRC log.
 
     Raises:
-        LogFormatError: Its beginning holds neither a header nor any line of this format, or its
-            version or columns are not known.
+        LogFormatError: The start of the file has neither a header nor a line of this format, or
+            the version or the columns are unknown.
     """
     head = head_of(path)
     version, columns = _layout(head, path)
@@ -99,12 +100,12 @@ class Trc(Dialect):
     format = "trc"
     says = "PEAK TRC log"
     integrity = (
-        "message numbers followed, so that only rows after the last one could be missing unseen; "
-        "TRC text has no checksums: a changed digit cannot be seen"
+        "message numbers checked, so that only missing rows after the last one are not detected; "
+        "TRC text has no checksums: a changed digit cannot be detected"
     )
 
     def __init__(self, version: str, columns: str) -> None:
-        """Columns are the letters of ``$COLUMNS``, those of old versions put alike."""
+        """Create a parser; ``columns`` are the letters of ``$COLUMNS``, or their equivalent."""
         self._version, self._columns = version, columns
         self._is_old = version in _COLUMNS_OF
         self._start_ns = 0
@@ -113,7 +114,7 @@ class Trc(Dialect):
         self._fast_numbers = NOTHING_FAST.rows.place, NOTHING_FAST.rows.place
 
     def fast(self, lines: Lines) -> Fast:
-        """Data frames, CAN FD included."""
+        """Parse data frames, including CAN FD."""
         line = clean_lines(lines)
         line = line[lines.buffer[lines.start[line]] != ord(";")]
         self._fast_numbers = line[:0], line[:0]
@@ -128,7 +129,7 @@ class Trc(Dialect):
         identifier = by["I"]
         ok &= type_ok & length_ok & ((identifier.size == 4) | (identifier.size == 8))
         if "d" in by:
-            ok &= is_way(lines, by["d"])
+            ok &= is_direction(lines, by["d"])
         if "R" in by:
             reserved = by["R"]
             ok &= (reserved.size == 1) & (lines.buffer[reserved.start] == ord("-"))
@@ -143,7 +144,7 @@ class Trc(Dialect):
         return spaced_frames(lines, at, t_ns, ok)
 
     def slow(self, line: bytes) -> Outcome:
-        """Header lines, remote and error frames, status lines."""
+        """Parse header lines, remote frames, error frames and status lines."""
         line = line.strip().removeprefix(b"\xef\xbb\xbf")
         if not line:
             return None
@@ -165,14 +166,14 @@ class Trc(Dialect):
         return outcome
 
     def last(self, line: bytes) -> Outcome:
-        """Complete when it holds as many bytes as its length says."""
+        """Accept the line if it has as many bytes as its length states."""
         outcome = self.slow(line)
         if isinstance(outcome, Frame | Damage):
             return outcome
         return Damage("last line has no line end, may be cut") if line.strip() else None
 
     def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
-        """Add the start time that stands before each line."""
+        """Add the last start time before each line."""
         out = np.empty_like(t_ns)
         begin = 0
         for i, mark in marks:
@@ -183,39 +184,39 @@ class Trc(Dialect):
         out[begin:] = t_ns[begin:] + self._start_ns
         return out
 
-    def check(self, met: Met) -> Int64s:
-        """Follow the message numbers, recording by recording."""
+    def check(self, chunk: ChunkResult) -> Int64s:
+        """Check the message numbers of each recording in the file."""
         if "N" not in self._columns:
-            return met.rows.place[:0]
-        place, number = self._numbered(met)
+            return chunk.rows.place[:0]
+        place, number = self._numbered(chunk)
         at, values = self._fast_numbers
-        k = int(np.searchsorted(at, met.done))
-        following = int(values[k]) if k < len(at) and at[k] == met.done else -1
+        k = int(np.searchsorted(at, chunk.done))
+        following = int(values[k]) if k < len(at) and at[k] == chunk.done else -1
         is_misfit = self._numbers.misfits(number, following)
         for i in np.flatnonzero(is_misfit).tolist():
-            self._numbers.misfit(int(number[i]), met.first_number + int(place[i]))
+            self._numbers.misfit(int(number[i]), chunk.first_number + int(place[i]))
         refused = place[is_misfit]
-        damaged = np.union1d(np.array(met.damaged, np.int64), refused)
+        damaged = np.union1d(np.array(chunk.damaged, np.int64), refused)
         place, number = place[~is_misfit], number[~is_misfit]
         begin = 0
-        for end in [*(i for i, mark in met.marks if mark.origin_ns is not None), met.done]:
+        for end in [*(i for i, mark in chunk.marks if mark.origin_ns is not None), chunk.done]:
             here = slice(*np.searchsorted(place, (begin, end)).tolist())
             bad = damaged[slice(*np.searchsorted(damaged, (begin, end)).tolist())]
-            self._numbers.follow(number[here], place[here], bad, met.first_number)
-            if end != met.done:
+            self._numbers.follow(number[here], place[here], bad, chunk.first_number)
+            if end != chunk.done:
                 self._numbers.begin()
             begin = end
         self._fast_numbers = place[:0], place[:0]
         return refused
 
-    def _numbered(self, met: Met) -> tuple[Int64s, Int64s]:
-        """The good lines of a chunk and their message numbers."""
-        odd = [(i, frame.number) for i, _, frame in met.odd]
-        odd += [(i, other.number) for i, other in met.others]
+    def _numbered(self, chunk: ChunkResult) -> tuple[Int64s, Int64s]:
+        """Return the valid lines of a chunk and their message numbers."""
+        odd = [(i, frame.number) for i, _, frame in chunk.odd]
+        odd += [(i, other.number) for i, other in chunk.others]
         at, values = self._fast_numbers
         known = {i: number for i, number in odd if number is not None}
-        is_fast = ~np.isin(met.rows.place, list(known)) if known else slice(None)
-        fast = met.rows.place[is_fast]
+        is_fast = ~np.isin(chunk.rows.place, list(known)) if known else slice(None)
+        fast = chunk.rows.place[is_fast]
         if not known:
             return fast, values[np.searchsorted(at, fast)]
         place = np.concatenate((fast, np.array(list(known), np.int64)))
@@ -226,7 +227,7 @@ class Trc(Dialect):
         return place[order], number[order]
 
     def finish(self, ledger: Ledger) -> None:
-        """Say what the clock rests on, and which message numbers are missing."""
+        """Report the basis of the clock and the missing message numbers."""
         self._numbers.settle(ledger)
         if self._is_dated:
             ledger.notice("the log states no time zone; its start time is read as UTC")
@@ -234,11 +235,11 @@ class Trc(Dialect):
             ledger.notice("the log has no $STARTTIME; times count from 1970-01-01")
 
     def _kinds(self, lines: Lines, word: Field | None, count: int) -> tuple[Bools, Bools]:
-        """Which lines are CAN FD, and which are data frames at all."""
+        """Return masks of the CAN FD frames and of the data frames."""
         if word is None:
             return np.zeros(count, np.bool_), np.ones(count, np.bool_)
         if self._is_old:
-            return np.zeros(count, np.bool_), is_way(lines, word)
+            return np.zeros(count, np.bool_), is_direction(lines, word)
         two = lines.words[word.start] & np.uint64(0xFFFF)
         is_type = [two == int.from_bytes(one.encode(), "little") for one in _DATA_TYPES]
         is_fd = np.logical_or.reduce(is_type[1:])
@@ -249,10 +250,10 @@ class Trc(Dialect):
             return Mark(_start_ns(found))
         if found := _VERSION.fullmatch(line):
             is_same = found[1].decode("ascii") == self._version
-            return Mark(stops="" if is_same else "another version begins inside the file")
+            return Mark(stops="" if is_same else "a different version inside the file")
         if found := _COLUMNS.fullmatch(line):
             is_same = found[1].decode("ascii").replace(",", "") == self._columns
-            return Mark(stops="" if is_same else "other columns begin inside the file")
+            return Mark(stops="" if is_same else "different columns inside the file")
         return comment(line.decode("latin-1"))
 
     def _outcome(self, t_ns: int, by: dict[str, str], rest: list[str]) -> Outcome:
@@ -287,7 +288,7 @@ class Trc(Dialect):
 
 
 def _number(lines: Lines, word: Field, is_old: bool) -> tuple[Int64s, Bools]:
-    """Digits, and a bracket after them in old versions."""
+    """Parse message numbers, which are followed by a bracket in old versions."""
     stop = word.stop - is_old
     number, ok = decimal(lines.words, stop, stop - word.start)
     if is_old:
@@ -296,7 +297,7 @@ def _number(lines: Lines, word: Field, is_old: bool) -> tuple[Int64s, Bools]:
 
 
 def _offsets_ns(lines: Lines, time: Field) -> tuple[Int64s, Bools]:
-    """Milliseconds as nanoseconds; whole ones may have no decimal mark."""
+    """Convert milliseconds to nanoseconds; integers may have no decimal mark."""
     scaled, ok = seconds_ns(lines.buffer, lines.words, time.start, time.stop, marked=False)
     return scaled // 1000, ok
 
@@ -304,7 +305,7 @@ def _offsets_ns(lines: Lines, time: Field) -> tuple[Int64s, Bools]:
 def _lengths(
     lines: Lines, code: Field | None, count: Field | None, is_fd: Bools
 ) -> tuple[Int64s, Bools]:
-    """Payload bytes from the length or else the length code."""
+    """Return the number of payload bytes from the length, else from the length code."""
     word = count or code
     if word is None:
         raise ValueError("columns: expected L or l, got neither")

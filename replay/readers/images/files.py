@@ -29,7 +29,7 @@ from crosscue.replay.seal.touched import Touched, open_noted
 
 from .damage import CHECKED, damage_of
 
-_DETAILS_TOLD: Final = 20
+_NAMES_SHOWN: Final = 20
 
 
 def list_pictures(folder: Path) -> list[Path]:
@@ -178,4 +178,4 @@ def _note_check(ledger: Ledger, check: str) -> None:
 
 
 def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:_DETAILS_TOLD]) + (", ..." if len(names) > _DETAILS_TOLD else "")
+    return ", ".join(names[:_NAMES_SHOWN]) + (", ..." if len(names) > _NAMES_SHOWN else "")

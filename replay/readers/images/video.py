@@ -119,7 +119,7 @@ class Video(Closing):
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Yield the packets in stored order; see ``Log.read`` and the module's docstring."""
         (topic,) = self.topics
-        ledger.integrity = "video packets carry no checksum: a changed picture cannot be seen"
+        ledger.integrity = "video packets carry no checksum: a changed picture cannot be detected"
         if self.path.suffix.lower() in WITHOUT_TIMES:
             ledger.integrity += ", nor a missing end except by the time file's lines"
         ledger.declare(topic.name, topic.declared)

@@ -136,7 +136,7 @@ class _Checked:
         if self.loose:
             said.append(
                 f"{self.loose} messages outside chunks carry no checksum: a changed byte in them "
-                "cannot be seen"
+                "cannot be detected"
             )
         if self.left:
             read = self.bz2 + self.lz4 + self.unchecked

@@ -286,7 +286,8 @@ class _Pass:
         ledger, scan = self._ledger, self._scan
         is_part = self._in_time_by_index is not None
         ledger.integrity = (
-            "SQLite has no checksums: a changed payload byte, length or topic number cannot be seen"
+            "SQLite has no checksums: a changed payload byte, length or topic number cannot be "
+            "detected"
         )
         self._declare(is_doubtful=bool(problems or scan.holes or scan.disordered))
         if is_part and self._in_time_by_index != self._in_time:

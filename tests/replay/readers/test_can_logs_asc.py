@@ -171,7 +171,7 @@ def test_another_header_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + other + LINE))
 
     assert len(found["can/1"]) == 1
-    assert ledger.topic("").dropped_unknown == ["another 'base' line begins inside the file"]
+    assert ledger.topic("").dropped_unknown == ["a different 'base' line inside the file"]
 
 
 def test_two_logs_in_one_file_keep_their_dates(tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ def test_another_version_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + V2 + LINE_2))
 
     assert len(found["can/1"]) == 1
-    assert ledger.topic("").dropped_unknown == ["another version begins inside the file"]
+    assert ledger.topic("").dropped_unknown == ["a different version inside the file"]
 
 
 def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
