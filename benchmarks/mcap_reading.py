@@ -204,7 +204,7 @@ def bare(path: Path, is_checked: bool = False) -> int:
     segment = find_segments(file, path, TopicBook(DEFAULT_LIMITS), DEFAULT_LIMITS)[0]
     inflater = zstandard.ZstdDecompressor()
     walk = Walk(
-        file, segment.begin, segment.end, segment.rail(file, DEFAULT_LIMITS), DEFAULT_LIMITS
+        file, segment.begin, segment.end, segment.known_chunks(file, DEFAULT_LIMITS), DEFAULT_LIMITS
     )
     for item in walk:
         if isinstance(item, Chunk) and item.head is not None:

@@ -22,7 +22,7 @@ from support.mcap_files import (
     schema,
 )
 
-UNCOVERED = ("no checksum covers", "checksum is wrong", "carries no checksums")
+UNCOVERED = ("no checksum covers", "checksum is wrong", "has no checksums")
 """What the account says where a changed byte need not show."""
 TOPICS = ("/imu", "/can", "/camera")
 

@@ -353,8 +353,8 @@ def _single(lines: Lines, line: Int64s) -> Int64s:
     begin, end = int(lines.start[0]), int(lines.stop[-1])
     text = lines.buffer[begin:end]
     # "R" and "T" differ in two bits, which are masked.
-    is_direction = (text[1:] == ord("x")) & ((text[:-1] & 0xF9) == (ord("R") & ord("T")))
-    at = np.flatnonzero(is_direction) + begin
+    is_mark = (text[1:] == ord("x")) & ((text[:-1] & 0xF9) == (ord("R") & ord("T")))
+    at = np.flatnonzero(is_mark) + begin
     first = np.searchsorted(at, lines.start[line])
     twice = np.append(at, [end, end])[np.minimum(first + 1, len(at))] < lines.stop[line]
     return line[~twice] if bool(twice.any()) else line

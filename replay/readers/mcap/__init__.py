@@ -1,1 +1,1 @@
-"""MCAP."""
+"""Reader of MCAP recordings."""

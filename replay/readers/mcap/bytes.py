@@ -1,4 +1,4 @@
-"""A file's bytes by position, read (never mapped) so that a shrinking file is a short read."""
+"""Random access to a file's bytes by reading, so that a shrinking file causes only a short read."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ WINDOW: Final = 64 << 10
 PIECE: Final = 1 << 20
 STEP: Final = 256 << 10
 KEPT: Final = 8
-"""Buffers kept for use again ..."""
+"""Maximum number of buffers kept for reuse."""
 KEPT_BYTES: Final = 8 << 20
-"""... unless they are larger than this."""
+"""Maximum size of a buffer that is kept for reuse."""
 
 
 class Buffers:
-    """Memory that is used again once nothing refers to it any more.
+    """A pool of buffers that are reused when nothing else refers to them.
 
-    Fresh memory costs as much as reading into it. An array handed out is used again when the only
-    references to it left are those here: every view of it holds one.
+    Allocating memory takes as long as reading into it. A buffer is reused when the pool has the
+    only reference to it; every view of the buffer is a reference too.
     """
 
     def __init__(self) -> None:
@@ -39,12 +39,12 @@ class Buffers:
         self._owned: list[NDArray[np.uint8]] = []
 
     def take(self, size: int) -> NDArray[np.uint8]:
-        """An array of shape (size,) with any content; safe from any thread."""
+        """Return an array of shape (size,) with undefined contents; thread-safe."""
         with self._lock:
             best: int | None = None
             for i in range(len(self._owned)):
                 has = len(self._owned[i])
-                # Two: the list's reference and the argument's.
+                # Two references: the list's and the argument's.
                 if has < size or getrefcount(self._owned[i]) != 2:
                     continue
                 if best is None or has < len(self._owned[best]):
@@ -58,7 +58,7 @@ class Buffers:
 
 
 class ByteFile:
-    """An open file. ``peek`` is for one thread; ``read`` and ``crc`` are for any."""
+    """An open file. ``read`` and ``crc`` are thread-safe; ``peek`` is not."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -70,7 +70,7 @@ class ByteFile:
         self.buffers = Buffers()
 
     def peek(self, at: int, size: int) -> memoryview:
-        """Up to ``size`` bytes at ``at``, from a window that is read ahead; shorter at the end.
+        """Return up to ``size`` bytes at ``at`` from a read-ahead window; fewer at the end.
 
         Raises:
             BrokenRecordError: The disk reports an error.
@@ -78,7 +78,7 @@ class ByteFile:
         return self.window(at, size)[:size]
 
     def window(self, at: int, min_bytes: int) -> memoryview:
-        """What is at hand from ``at`` on: at least ``min_bytes`` bytes, less only at the end."""
+        """Return available bytes from ``at`` on: at least ``min_bytes``, fewer only at the end."""
         begin = at - self._window_at
         if begin < 0 or begin + min_bytes > len(self._window):
             self._window = self._pread(at, max(min_bytes, WINDOW))
@@ -86,7 +86,7 @@ class ByteFile:
         return memoryview(self._window)[begin:]
 
     def read(self, at: int, size: int) -> NDArray[np.uint8]:
-        """Up to ``size`` bytes at ``at``, as an array of its own, shape (size,) or less at the end.
+        """Read up to ``size`` bytes at ``at`` into a separate array; shorter at the file's end.
 
         Raises:
             BrokenRecordError: The disk reports an error.
@@ -94,7 +94,7 @@ class ByteFile:
         return self.read_into(at, self.buffers.take(max(0, min(size, self.size - at))))
 
     def read_into(self, at: int, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The bytes at ``at``, written into ``array``; fewer than it has at the end.
+        """Read the bytes at ``at`` into ``array``; fewer than its size at the file's end.
 
         Raises:
             BrokenRecordError: The disk reports an error.
@@ -104,7 +104,7 @@ class ByteFile:
             try:
                 step = os.preadv(self._file.fileno(), [view[done:]], at + done)
             except OSError as error:
-                raise BrokenRecordError(f"the disk says: {error.strerror}") from None
+                raise BrokenRecordError(f"reading failed: {error.strerror}") from None
             if not step:
                 break
             done += step
@@ -112,7 +112,7 @@ class ByteFile:
         return array[:done]
 
     def crc(self, begin: int, end: int, stop: Event | None = None) -> int | None:
-        """CRC-32 of the bytes from ``begin`` to ``end``; None if they cannot all be read."""
+        """Return the CRC-32 of the bytes from ``begin`` to ``end``; None if some are unreadable."""
         value, at = 0, begin
         while at < end:
             if stop is not None and stop.is_set():
@@ -127,25 +127,25 @@ class ByteFile:
         return value
 
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """These ranges, sorted, are going to be read: nothing to do for a file on a disk."""
+        """Announce sorted ranges that are going to be read; a local file ignores them."""
 
     def close(self) -> None:
-        """Release the file; later reads raise ValueError."""
+        """Close the file; later reads raise ``ValueError``."""
         self._file.close()
 
     def _pread(self, at: int, size: int) -> bytes:
-        if at >= self.size:  # also where a damaged length leads, beyond what a file can hold
+        if at >= self.size:  # a damaged length may even lead beyond the maximum file size
             return b""
         try:
             found = os.pread(self._file.fileno(), size, at)
         except OSError as error:
-            raise BrokenRecordError(f"the disk says: {error.strerror}") from None
+            raise BrokenRecordError(f"reading failed: {error.strerror}") from None
         self.touched.add(self._path, at, len(found))
         return found
 
 
 class RangedByteFile(ByteFile):
-    """The same of a remote object, of which only what is read is fetched."""
+    """A remote object, of which only the bytes read are fetched."""
 
     def __init__(self, ranged: RangedFile) -> None:
         self._ranged = ranged
@@ -154,21 +154,21 @@ class RangedByteFile(ByteFile):
         self.buffers = Buffers()
 
     def window(self, at: int, min_bytes: int) -> memoryview:
-        """What is at hand from ``at`` on: at least ``min_bytes`` bytes, less only at the end."""
+        """Return available bytes from ``at`` on: at least ``min_bytes``, fewer only at the end."""
         return self._ranged.at_least(at, min_bytes)
 
     def read_into(self, at: int, array: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The bytes at ``at``, written into ``array``; fewer than it has at the end."""
+        """Read the bytes at ``at`` into ``array``; fewer than its size at the file's end."""
         found = self._ranged.at_least(at, len(array))[: len(array)]
         array[: len(found)] = np.frombuffer(found, dtype=np.uint8)
         return array[: len(found)]
 
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """These ranges, sorted, are going to be read, and may be fetched in larger pieces."""
+        """Announce sorted ranges that are going to be read, so that larger pieces are fetched."""
         self._ranged.expect(ranges)
 
     def close(self) -> None:
-        """Release the connection."""
+        """Close the connection."""
         self._ranged.close()
 
     def _pread(self, at: int, size: int) -> bytes:

@@ -1,8 +1,8 @@
-"""From channels to topics.
+"""Mapping of channels to topics.
 
-Channels of one name, message type and encoding are one topic, whatever their numbers. Where one
-name is used with different types or encodings, the first seen keeps the name and the others become
-topics of their own, called ``name#2``, ``name#3`` and so on, with a notice.
+Channels with the same name, message type and encoding are one topic, whatever their numbers. If a
+name is used with different types or encodings, the first one keeps the name. The others become
+separate topics ``name#2``, ``name#3`` and so on, with a notice.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from crosscue.replay.readers.mcap.chunks.rows import Definition
 from .records import CHANNEL, Channel, Schema, read_channel, read_schema
 
 UNKNOWN: Final = ""
-"""The topic of messages whose channel nobody declares."""
+"""Topic of messages whose channel is not declared."""
 UNNAMED: Final = "(unnamed)"
-"""What a topic with an empty name is called."""
+"""Name of a topic whose stored name is empty."""
 
 
 class TopicBook:
-    """All topics of a log, in the order in which they came to light; it only grows."""
+    """All topics of a log, in order of their discovery; topics are only added."""
 
     def __init__(self, limits: Limits) -> None:
         self.topics: list[Topic] = []
@@ -35,7 +35,7 @@ class TopicBook:
         self._variants: Counter[str] = Counter()
 
     def name(self, channel: Channel, schema: Schema | None) -> str:
-        """The name of the topic that ``channel`` belongs to; a new one is entered."""
+        """Return the name of the topic of ``channel``, and add a new topic if necessary."""
         topic = self._topic(channel, schema)
         if topic not in self._names:
             self._names[topic] = name = self._free_name(topic)
@@ -55,7 +55,7 @@ class TopicBook:
         if len(text) > self._limits.schema_bytes:
             self._report(
                 f"{called}: its schema has {len(text)} bytes, the limit is "
-                f"{self._limits.schema_bytes}; messages are given without it"
+                f"{self._limits.schema_bytes}; messages are read without it"
             )
             text = b""
         return Topic(
@@ -74,7 +74,7 @@ class TopicBook:
             name = f"{topic.name}#{self._variants[topic.name] + 1}"
         if name != topic.name:
             what = topic.type_name or topic.encoding or "no type"
-            self._report(f"{topic.name} has several message types; {what} is given as {name}")
+            self._report(f"{topic.name} has several message types; {what} becomes {name}")
         return name
 
     def _report(self, sentence: str) -> None:
@@ -82,7 +82,7 @@ class TopicBook:
 
 
 class Declarations:
-    """The schemas and channels in force at one place of one file."""
+    """The schemas and channels that are valid at a position of a file."""
 
     def __init__(
         self, book: TopicBook, schemas: Iterable[Schema] = (), channels: Iterable[Channel] = ()
@@ -96,25 +96,25 @@ class Declarations:
 
     @property
     def schemas(self) -> tuple[Schema, ...]:
-        """The schemas in force."""
+        """The valid schemas."""
         return tuple(self._schemas.values())
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """The channels in force."""
+        """The valid channels."""
         return tuple(self._channels.values())
 
     @property
     def complete(self) -> frozenset[int]:
-        """Numbers of the channels declared together with their schema."""
+        """Numbers of the channels whose schema is declared too."""
         known = self._schemas.keys() | {0}
         return frozenset(c.id for c in self._channels.values() if c.schema_id in known)
 
     def changed_by(self, found: Definition) -> bool:
-        """Would ``found`` give another meaning to a number that already has one?
+        """Return whether ``found`` changes the meaning of a declared number.
 
         Raises:
-            BrokenRecordError: It is not a schema or channel.
+            BrokenRecordError: It is not a valid schema or channel.
         """
         if (found.opcode, found.content) in self._seen:
             return False
@@ -125,10 +125,10 @@ class Declarations:
         return self._schemas.get(schema.id, schema) != schema
 
     def declare(self, found: Definition) -> None:
-        """From here on ``found`` holds.
+        """Declare a schema or channel from here on.
 
         Raises:
-            BrokenRecordError: It is not a schema or channel.
+            BrokenRecordError: It is not a valid schema or channel.
         """
         key = (found.opcode, found.content)
         if key in self._seen:
@@ -147,19 +147,19 @@ class Declarations:
                     c.id for c in self._channels.values() if c.schema_id == schema.id
                 }
                 self._seen.clear()
-            if schema.id:  # the format has readers ignore number 0
+            if schema.id:  # the format requires readers to ignore number 0
                 self._schemas[schema.id] = schema
         self._seen.add(key)
 
     def declare_missing(self, channel: Channel, schema: Schema | None) -> None:
-        """Take a channel and its schema from a summary, unless the data section had them."""
+        """Declare a channel and its schema from a summary, unless the data section has them."""
         self._names.clear()
         self._channels.setdefault(channel.id, channel)
         if schema is not None:
             self._schemas.setdefault(schema.id, schema)
 
     def topic(self, channel_id: int) -> str:
-        """The topic of a channel, ``UNKNOWN`` if nobody declares it."""
+        """Return the topic of a channel; ``UNKNOWN`` if it is not declared."""
         if channel_id not in self._names:
             channel = self._channels.get(channel_id)
             if channel is None:
@@ -169,6 +169,6 @@ class Declarations:
         return self._names[channel_id]
 
     def topics(self) -> Iterator[tuple[int, str]]:
-        """Every declared channel by number, with its topic."""
+        """Yield the number and the topic of every declared channel."""
         for channel_id in sorted(self._channels):
             yield channel_id, self.topic(channel_id)

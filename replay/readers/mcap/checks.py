@@ -1,4 +1,4 @@
-"""What was verified in one pass, and how to say it."""
+"""Counts of the checks of one pass, and their report."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from crosscue.replay.base import Ledger
 
 @dataclass(slots=True)
 class Tally:
-    """How often something happened, and the first case in words."""
+    """Number of cases, with a description of the first one."""
 
     count: int = 0
     first: str = ""
 
     def add(self, case: str) -> None:
-        """Once more."""
+        """Count a case."""
         self.count += 1
         self.first = self.first or case
 
@@ -43,21 +43,24 @@ class Checks:
     ignored: Tally = field(default_factory=Tally)
 
     def report(self, ledger: Ledger) -> None:
-        """Say it in the ledger."""
+        """Report the checks in the ledger."""
         ledger.integrity = self._integrity()
         if self.chunks_bare and self.chunks_right:
             ledger.notice(
-                f"{self.chunks_bare} of {self.chunks} chunks carry no checksum while others do"
+                f"{self.chunks_bare} of {self.chunks} chunks have no checksum, unlike the others"
             )
         for tally, sentence in (
-            (self.bad_indexes, "message indexes that do not fit their chunks, which were scanned"),
+            (
+                self.bad_indexes,
+                "message indexes that do not match their chunks; these were scanned",
+            ),
             (
                 self.bad_heads,
                 "chunks that match their checksum but not what the file states about them",
             ),
             (self.bad_attachments, "attachments that do not match their checksum"),
             (self.bad_definitions, "schemas or channels that cannot be read or contradict"),
-            (self.ignored, "records of unknown kinds, passed over"),
+            (self.ignored, "records of unknown kinds, ignored"),
         ):
             if tally.count:
                 ledger.notice(f"{tally.count} {sentence}; the first: {tally.first}")
@@ -80,7 +83,7 @@ class Checks:
         if self.chunks_bare or self.rows_bare:
             what = [_many(self.chunks_bare, "chunk")] if self.chunks_bare else []
             bare = _many(self.rows_bare, "message")
-            what += [f"{bare} outside whole chunks"] if self.rows_bare else []
+            what += [f"{bare} outside complete chunks"] if self.rows_bare else []
             parts.append(f"no checksum covers {' and '.join(what)}")
         if self.chunks_unread:
             verb = "was" if read == 1 else "were"
@@ -94,7 +97,7 @@ class Checks:
             parts.append("the data section's checksum was not compared, which takes every byte")
         if self.sections_wrong:
             parts.append("the data section's checksum is wrong")
-        return "; ".join(parts) or "the file carries no checksums"
+        return "; ".join(parts) or "the file has no checksums"
 
 
 def _many(count: int, noun: str) -> str:

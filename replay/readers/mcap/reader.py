@@ -1,16 +1,16 @@
-"""MCAP recordings, read from their bytes.
+"""Reader of MCAP recordings.
 
-The file's own records are the truth and its indexes only hints: the data section is walked record
-by record, each chunk is decompressed to at most the size it declares and verified, and only then
-are its messages given, as ranges of the chunk's bytes. Nothing is made per message. A chunk's
-checksum is also the unit of loss: where it is wrong, nothing of the chunk is given. Where only the
-data section's checksum covers messages and is wrong, one of them may hold changed bytes and nobody
-can know which: those that are structurally sound are given, and the account is not whole. Behind
-damaged bytes reading goes on at the next chunk that proves itself, or at the next records that are
-plausible in a row.
+The reader relies on the file's records and uses its indexes only as hints. It walks through the
+data section record by record. It decompresses each chunk to at most the declared size, verifies it,
+and only then yields its messages, as ranges of the chunk's bytes and without an object per message.
 
-Channels become topics as ``mcap_topics`` says. A publish time that is not an int64 counts as not
-available and becomes the log time, as the format writes it.
+If a chunk's checksum is wrong, all its messages are dropped. If only the data section's checksum
+covers messages and is wrong, the changed message cannot be identified. The reader then yields the
+structurally sound messages, and the account is incomplete. After damaged bytes, reading continues
+at the next verified chunk or at the next plausible consecutive records.
+
+``channels`` maps channels to topics. A publish time that does not fit into an int64 counts as not
+available and is replaced by the log time, as the format specifies.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from .window import find_window
 
 HEADER_GUESS: Final = 64
 SUMMARY_GUESS: Final = 64 << 10
-"""Bytes at the end of a remote file that are fetched at once."""
+"""Number of bytes at the end of a remote file that are fetched at once."""
 
 
 class McapLog(Closing):
     """An open MCAP file; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits, file: ByteFile | None = None) -> None:
-        """Find the topics.
+        """Open the file and find its topics.
 
         Args:
-            path: Where it is.
-            limits: Sizes above which nothing is read.
-            file: Its bytes, if they do not come from ``path``.
+            path: Path of the file.
+            limits: Maximum sizes that are read.
+            file: The file's bytes, if they are not read from ``path``.
 
         Raises:
-            LogFormatError: Not MCAP, or no readable record in it.
-            OSError: It cannot be opened.
+            LogFormatError: The file is not MCAP, or has no readable record.
+            OSError: The file cannot be opened.
         """
         self._path = path
         self._limits = limits
@@ -63,7 +63,7 @@ class McapLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file."""
         return self._path
 
     @property
@@ -73,23 +73,23 @@ class McapLog(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """From the summary, or from the data section where the summary does not report."""
+        """Topics in the summary, or in the data section if the summary lacks them."""
         declared = declared_counts(self._segments, self._book)
         return tuple(replace(t, declared=declared.get(t.name)) for t in self._book.topics)
 
     @property
     def touched(self) -> Touched:
-        """Which bytes were read, for a seal."""
+        """Record of the bytes read, for a seal."""
         return self._file.touched
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """Its messages in stored order: a block per topic and a few chunks; see ``Log.read``."""
+        """Yield the messages, one block per topic for every few chunks; see ``Log.read``."""
         yield from read_segments(
             self._file, self._segments, self._book, self._limits, ledger, selection
         )
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Recordings in it without an end; see ``KnowsItsEnd``."""
+        """Report recordings without an end; see ``KnowsItsEnd``."""
         for segment in self._segments:
             if segment.after:
                 ledger.drop("", INCOMPLETE, None, segment.after)
@@ -99,29 +99,29 @@ class McapLog(Closing):
 
     @property
     def beginning(self) -> Selection:
-        """The times of the first chunk."""
+        """Return a selection of the times of the first chunk."""
         summary = self._segments[0].summary
         if summary is None or not len(summary.chunks):
             return EVERYTHING
         return Selection(None, int(summary.chunks.start[0]), int(summary.chunks.end[0]) + 1)
 
     def needs_whole(self, selection: Selection) -> str:
-        """Why reading this part takes all bytes of the file; empty if the index leads to it."""
+        """Return why this part needs the complete file; empty if the index locates it."""
         segment = self._segments[0]
         if selection == EVERYTHING:
             return "all of it was requested"
         if len(self._segments) > 1 or not segment.has_end:
-            return "it has no summary that can be used"
+            return "it has no usable summary"
         found = find_window(segment, segment.declarations(self._book), selection)
         return found if isinstance(found, str) else ""
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file."""
         self._file.close()
 
 
 def declared_counts(segments: tuple[Segment, ...], book: TopicBook) -> dict[str, int]:
-    """Messages by topic as the statistics say; empty unless every recording in the file counts."""
+    """Return the statistics' message counts by topic; empty if a recording has no counts."""
     counts: Counter[str] = Counter()
     for segment in segments:
         summary = segment.summary
@@ -136,19 +136,19 @@ def open_mcap(path: Path, limits: Limits) -> McapLog:
     """Open an MCAP file.
 
     Raises:
-        LogFormatError: Not MCAP, or no readable record in it.
-        OSError: It cannot be opened.
+        LogFormatError: The file is not MCAP, or has no readable record.
+        OSError: The file cannot be opened.
     """
     return McapLog(path, limits)
 
 
 def open_ranged(name: Path, ranged: RangedFile, limits: Limits) -> McapLog | None:
-    """Open a remote MCAP file by its summary; None if its summary is not enough to know it.
+    """Open a remote MCAP file by its summary; None if the summary is insufficient.
 
     Args:
-        name: What it is called.
-        ranged: Its bytes.
-        limits: Sizes above which nothing is read.
+        name: Path that stands for the file.
+        ranged: The file's bytes.
+        limits: Maximum sizes that are read.
     """
     file = RangedByteFile(ranged)
     file.window(0, HEADER_GUESS)

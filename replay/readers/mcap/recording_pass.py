@@ -1,4 +1,4 @@
-"""One pass over a recording: blocks out, and the account of every message."""
+"""One pass over an MCAP recording: blocks, and the account of every message."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Block, Bytes, Ledger, Limits, Selection
-from crosscue.replay.readers.mcap.chunks.blocks import Giver
+from crosscue.replay.readers.mcap.chunks.blocks import BlockBuilder
 from crosscue.replay.readers.mcap.chunks.load import Load, Loader, Stretch
 from crosscue.replay.readers.mcap.chunks.rows import (
     NEVER_IN_A_CHUNK,
@@ -51,19 +51,19 @@ DAMAGED_SECTION: Final = "the data section does not match its checksum"
 MISSING: Final = "declared by the format, not in its bytes"
 INCOMPLETE: Final = "the file does not end as it should"
 CUT: Final = "the file is cut"
-BEFORE_A_GAP: Final = "leads into damaged bytes"
+BEFORE_A_GAP: Final = "extends into damaged bytes"
 DETAILS_JOINED: Final = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Something that may have held messages.
+    """A damaged part that may have contained messages.
 
     Attributes:
-        reason: Short, as in the ledger.
-        detail: Where and why.
-        t_ns: When, if known.
-        counts: By channel number, what it held if only its index can be believed.
+        reason: Short reason, as in the ledger.
+        detail: Place and cause.
+        t_ns: Log time, if known.
+        counts: Number of messages by channel number, if a trusted index states it.
     """
 
     reason: str
@@ -80,10 +80,10 @@ def read_segments(
     ledger: Ledger,
     selection: Selection,
 ) -> Iterator[Block]:
-    """All blocks of a file; afterwards the ledger is settled."""
+    """Yield all blocks of a file, then settle the ledger."""
     checks = Checks()
     if len(segments) > 1:
-        ledger.notice(f"the file holds {len(segments)} recordings in a row; all are read")
+        ledger.notice(f"the file contains {len(segments)} consecutive recordings; all are read")
     declared: Counter[str] | None = Counter()
     for segment in segments:
         where = "" if len(segments) == 1 else f"recording at byte {segment.base}: "
@@ -106,7 +106,7 @@ def read_segments(
 
 
 class SegmentPass:
-    """Reads one recording of a file once."""
+    """One pass over a recording of a file."""
 
     def __init__(
         self,
@@ -139,16 +139,16 @@ class SegmentPass:
         self._attachments: list[tuple[int, int, Future[int | None]]] = []
         self._waiting: list[tuple[Stretch, Rows]] = []
         self._declarations = segment.declarations(book)
-        self._giver = Giver(ledger, selection, limits, self._declarations)
+        self._builder = BlockBuilder(ledger, selection, limits, self._declarations)
         self._search = Resync(file, segment.end, segment.has_end, (), self._plausible())
 
     def blocks(self) -> Iterator[Block]:
-        """Its blocks."""
+        """Yield the blocks of the recording."""
         segment = self._segment
         for notice in segment.notices:
             self._notice(notice)
         if segment.has_end and segment.summary is None:
-            self._notice("it has no summary that can be used; topics were found by reading")
+            self._notice("it has no usable summary; topics were found by reading")
         self._checks.summaries_right += self._summary.is_verified
         window = self._window()
         if window is not None:
@@ -162,37 +162,37 @@ class SegmentPass:
         self._finish_checks()
 
     def _window(self) -> Window | None:
-        """Where the selection lies, if the index can be trusted; else the reason is reported."""
+        """Locate the selection by the index; if it cannot be trusted, report the reason."""
         if not self._may_skip or not self._segment.has_end:
             return None
         found = find_window(self._segment, self._declarations, self._selection)
         if isinstance(found, Window):
             return found
-        self._notice(f"the requested part was found by walking through the file: {found}")
+        self._notice(f"the requested part was found by reading the complete file: {found}")
         return None
 
     def _windowed(self, window: Window) -> Iterator[Block]:
-        """Blocks of the chunks that the index names, and of whatever is outside chunks."""
+        """Yield blocks of the indexed chunks in the window, and of all records outside chunks."""
         if self._segment.data_crc:
-            # Only all bytes together have this checksum.
+            # This checksum covers all bytes of the section.
             self._checks.sections_unread += 1
             self._segment = replace(self._segment, data_crc=0)
         self._inside = window
         self._file.expect(window.ranges())
         yield from self._walked(window.items(self._file, self._limits))
         self._inside = None
-        held = self._giver.met + self._giver.dropped
+        held = self._builder.met + self._builder.dropped
         doubt = self._doubt or ("it has damage" if self._damages else "")
         rest = window.rest(self._summary, held)
         if doubt or rest is None:
-            doubt = doubt or "it does not add up with the statistics"
-            self._notice(f"the index was not trusted after all ({doubt}); every chunk was examined")
+            doubt = doubt or "it contradicts the statistics"
+            self._notice(f"the index proved unreliable ({doubt}); every chunk was examined")
             yield from self._walked(window.others(self._file, self._limits))
             return
         self._checks.chunks += window.left
         self._checks.chunks_unread += window.left
         for channel_id, count in rest.items():
-            self._giver.pass_over_counted(channel_id, count)
+            self._builder.skip_counted(channel_id, count)
 
     def _walked(self, walk: Iterator[Item]) -> Iterator[Block]:
         items = self._loader.ahead(walk, self._is_wanted)
@@ -206,18 +206,18 @@ class SegmentPass:
 
     def _walk(self) -> Walk:
         segment = self._segment
-        rail = segment.rail(self._file, self._limits)
+        known = segment.known_chunks(self._file, self._limits)
         return Walk(
             self._file,
             segment.begin,
             segment.end,
-            rail,
+            known,
             self._limits,
             self._plausible(),
         )
 
     def _plausible(self) -> Plausible:
-        """What messages must look like to be trusted behind damaged bytes."""
+        """Return the criteria for messages after damaged bytes."""
         statistics = self._summary.statistics
         channels = [channel.id for channel in self._segment.channels]
         if statistics is None or not statistics.message_count:
@@ -225,7 +225,7 @@ class SegmentPass:
         return Plausible(channels, (statistics.start, statistics.end))
 
     def _is_wanted(self, chunk: Chunk) -> bool:
-        """Must the chunk be read? Only a chunk whose indexes all agree may be passed over."""
+        """Return whether the chunk must be read, as chunks with inconsistent indexes must."""
         index, head = chunk.index, chunk.head
         if not self._may_skip or index is None or head is None or not chunk.messages:
             return True
@@ -239,54 +239,54 @@ class SegmentPass:
             return True
         if max(int(m.entries["log"].max()) for m in filled) != head.end:
             return True
-        return any(self._giver.wants(m) for m in filled)
+        return any(self._builder.wants(m) for m in filled)
 
     def _chunk(self, chunk: Chunk, load: Load | None) -> Iterator[Block]:
         self._checks.chunks += 1
         if self._inside is not None and not _is_as_indexed(chunk):
-            self._doubt = self._doubt or f"it does not fit the chunk at byte {chunk.at}"
-        if load is None and not any(self._giver.wants(m) for m in chunk.messages):
+            self._doubt = self._doubt or f"it does not match the chunk at byte {chunk.at}"
+        if load is None and not any(self._builder.wants(m) for m in chunk.messages):
             self._checks.chunks_unread += 1
             for index in chunk.messages:
-                self._giver.pass_over(index)
+                self._builder.skip_unread(index)
             return
         try:
             stretch = self._stretch(chunk, load)
             records = stretch.records
             rows = self._cut_rows(chunk, records) if chunk.is_cut else self._rows(chunk, records)
         except BrokenRecordError as error:
-            yield from self._give_waiting()
-            self._lose_chunk(chunk, str(error))
+            yield from self._waiting_blocks()
+            self._drop_chunk(chunk, str(error))
             return
         if rows.groups and not rows.definitions and load is not None:
             self._waiting.append((stretch, rows))
             if load.is_last:
-                yield from self._give_waiting()
+                yield from self._waiting_blocks()
             return
-        yield from self._give_waiting()
-        yield from self._giver.give(rows, self._checks, chunk.at)
+        yield from self._waiting_blocks()
+        yield from self._builder.build(rows, self._checks, chunk.at)
 
     def _stretch(self, chunk: Chunk, load: Load | None) -> Stretch:
         if load is not None:
             return load.stretch()
-        # Not wanted when examined first, wanted now: a channel was given another meaning.
+        # The chunk is selected only now, because a channel has been declared again.
         records = self._loader.load(chunk)
         return Stretch(records, 0, len(records))
 
-    def _give_waiting(self) -> Iterator[Block]:
-        """The messages of chunks of one group, which are given together."""
+    def _waiting_blocks(self) -> Iterator[Block]:
+        """Yield the collected messages of the chunks of one group."""
         if not self._waiting:
             return
         whole = self._waiting[0][0].whole
         rows = join(whole, [(rows, stretch.begin) for stretch, rows in self._waiting])
         self._waiting.clear()
-        yield from self._giver.give(rows, self._checks, 0)
+        yield from self._builder.build(rows, self._checks, 0)
 
     def _rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
-        """The messages of a chunk, all that can be checked being checked.
+        """Parse the messages of a chunk with all possible checks.
 
         Raises:
-            BrokenRecordError: Something is wrong, or there are too many.
+            BrokenRecordError: A check failed, or there are too many messages.
         """
         max_records = self._limits.records_per_chunk
         if sum(len(index.entries) for index in chunk.messages) > max_records:
@@ -297,24 +297,24 @@ class SegmentPass:
                 self._checks.bad_indexes.add(f"that of the chunk at byte {chunk.at}")
             rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, max_records)
             if rows.end != len(buffer):
-                raise BrokenRecordError(f"its records break off at {rows.end} of {len(buffer)}")
-        self._vouch(chunk, rows)
+                raise BrokenRecordError(f"its records end at byte {rows.end} of {len(buffer)}")
+        self._count_verification(chunk, rows)
         return rows
 
-    def _vouch(self, chunk: Chunk, rows: Rows) -> None:
-        """Count who vouches for a chunk's bytes.
+    def _count_verification(self, chunk: Chunk, rows: Rows) -> None:
+        """Count the kind of verification of a chunk's bytes.
 
         Raises:
-            BrokenRecordError: Nobody does, and something speaks against them.
+            BrokenRecordError: The chunk has no verification, and is inconsistent.
         """
         head = chunk.head
         assert head is not None, "a chunk with rows has a head"
         doubt = chunk.differs
         if not doubt and (head.start or head.end):
             if not len(rows):
-                doubt = "it declares a time span and holds no message"
+                doubt = "it declares a time range but has no message"
             elif np.minimum.reduce(rows.log) < head.start or np.maximum.reduce(rows.log) > head.end:
-                doubt = "its messages lie outside the time span it declares"
+                doubt = "its messages are outside its declared time range"
         if head.crc or (self._segment.data_crc and self._section_is_right()):
             self._checks.chunks_right += 1
             if doubt:
@@ -337,14 +337,14 @@ class SegmentPass:
             Damage(
                 CUT,
                 f"the chunk at byte {chunk.at} ends after {has} of {head.body_size} bytes; of its "
-                f"beginning {len(rows)} messages are given, which no checksum covers",
+                f"start {len(rows)} messages are read, which no checksum covers",
                 head.start if head.start < 1 << 63 else None,
             )
         )
         self._checks.rows_bare += len(rows)
         return rows
 
-    def _lose_chunk(self, chunk: Chunk, why: str) -> None:
+    def _drop_chunk(self, chunk: Chunk, why: str) -> None:
         source = chunk.index or chunk.head
         t_ns = None if source is None or source.start >= 1 << 63 else source.start
         span = "" if source is None else f"; log times {source.start} to {source.end}"
@@ -352,18 +352,18 @@ class SegmentPass:
         reason = CUT if chunk.is_cut else DAMAGED_CHUNK
         counts = {m.channel_id: len(m.entries) for m in chunk.messages if len(m.entries)}
         for channel_id, count in counts.items():
-            self._giver.lose_of_channel(channel_id, reason, count, detail, t_ns)
+            self._builder.drop_of_channel(channel_id, reason, count, detail, t_ns)
         held = chunk.index.channels if chunk.index is not None else frozenset[int]()
         if not counts or chunk.index_fault or not held <= counts.keys():
             self._damages.append(Damage(reason, detail, t_ns))
 
     def _run(self, run: Run, gap: Gap | None) -> Iterator[Block]:
-        """Messages, schemas and channels outside chunks, up to a gap that may reach into them."""
+        """Yield the messages of a run outside chunks, up to a gap that may overlap it."""
         rows = run.rows
         if gap is not None:
             rows = self._before_gap(run, gap)
         if self._segment.data_crc and self._section_is_right():
-            yield from self._giver.give(rows, self._checks, run.at)
+            yield from self._builder.build(rows, self._checks, run.at)
             return
         for at, part in self._parts(run.at, rows):
             sound = self._plausible_rows(part, at)
@@ -371,10 +371,10 @@ class SegmentPass:
                 self._rows_doubted += len(sound)
             else:
                 self._checks.rows_bare += len(sound)
-            yield from self._giver.give(sound, self._checks, at)
+            yield from self._builder.build(sound, self._checks, at)
 
     def _parts(self, at: int, rows: Rows) -> Iterator[tuple[int, Rows]]:
-        """A run in parts, without messages whose damaged lengths take in those behind them."""
+        """Split a run at messages whose damaged lengths include the following records."""
         self._search.plausible.learn(rows)
         while (found := self._search.swallowed(at, rows)) is not None:
             i, begin = found
@@ -382,8 +382,8 @@ class SegmentPass:
             if not self._is_some_missing():
                 self._report_suspicion(place)
                 break
-            detail = f"{place}: its length takes in the records behind it"
-            self._giver.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
+            detail = f"{place}: its length includes the following records"
+            self._builder.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
             definitions = [one for one in rows.definitions if one.at < begin]
             yield at, replace(rows.take(slice(i)), definitions=definitions)
             at, buffer = at + begin, rows.buffer[begin : rows.end]
@@ -391,10 +391,10 @@ class SegmentPass:
         yield at, rows
 
     def _is_some_missing(self) -> bool:
-        """Are fewer messages outside chunks than there must be? Walks once more to know."""
+        """Return whether messages outside chunks are missing, by another walk over the file."""
         statistics = self._summary.statistics
         if statistics is None:
-            return bool(self._segment.data_crc)  # which is wrong: something is damaged
+            return bool(self._segment.data_crc)  # the checksum is wrong: something is damaged
         if self._is_short is None:
             count, has_chunks = 0, False
             for item in self._walk():
@@ -405,13 +405,13 @@ class SegmentPass:
 
     def _report_suspicion(self, place: str) -> None:
         if self._summary.statistics is None and not self._segment.data_crc:
-            detail = f"{place}: it ends in what look like other records of this recording"
+            detail = f"{place}: its end seems to consist of other records of this recording"
             self._damages.append(Damage(DAMAGED_RECORD, detail))
 
     def _plausible_rows(self, rows: Rows, at: int) -> Rows:
-        """Of messages that no right checksum covers, those that agree with the statistics.
+        """Select the messages without a valid checksum that agree with the statistics.
 
-        Statistics that do not fit most of them are wrong themselves.
+        Statistics that contradict most of the messages are considered wrong.
         """
         plausible = self._plausible()
         if not plausible.is_declared:
@@ -424,26 +424,26 @@ class SegmentPass:
                 f"{self._where}bytes {at + int(rows.offset[i])} to {at + int(rows.stop[i])}: log "
                 f"time {int(rows.log[i])} or channel {int(rows.channel[i])} contradicts the summary"
             )
-            self._giver.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
+            self._builder.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
         return rows if good.all() else rows.take(np.flatnonzero(good))
 
     def _before_gap(self, run: Run, gap: Gap) -> Rows:
-        """The messages of a run that lie before a gap; the others are dropped."""
+        """Return the messages of a run before a gap, and drop the others."""
         end = min(gap.at - run.at, run.rows.end)
         count = int(np.searchsorted(run.rows.offset, end))
         detail = f"{self._where}bytes {gap.at} to {gap.to}: {gap.why}"
-        self._giver.drop(run.rows.take(slice(count, None)), BEFORE_A_GAP, detail)
+        self._builder.drop(run.rows.take(slice(count, None)), BEFORE_A_GAP, detail)
         definitions = [found for found in run.rows.definitions if found.at < end]
         return replace(run.rows.take(slice(count)), definitions=definitions, end=end)
 
     def _section_is_right(self) -> bool:
-        """Does the data section match its checksum? Waits until that is known."""
+        """Wait for the checksum of the data section, and return whether it matches."""
         if self._section is None:
             self._section = self._loader.section_crc(self._segment)
         return self._section.result() == self._segment.data_crc
 
     def _note(self, item: Item | None) -> None:
-        """Account for what holds no messages that could be given."""
+        """Account for an item without readable messages."""
         match item:
             case Attachment() if self._inside is not None:
                 self._checks.attachments += 1
@@ -453,13 +453,13 @@ class SegmentPass:
                     Damage(DAMAGED_RECORD, f"{self._where}bytes {at} to {to}: {why}")
                 )
             case Stray(at, index):
-                detail = f"{self._where}message index at byte {at}: no chunk stands before it"
+                detail = f"{self._where}message index at byte {at}: no chunk precedes it"
                 counts = {index.channel_id: len(index.entries)}
                 self._damages.append(Damage(DAMAGED_CHUNK, detail, None, counts))
             case End(at, how):
                 self._end(at, how)
             case Oversized(at, size, channel_id, log):
-                self._giver.pass_over_large(channel_id, log, size, at)
+                self._builder.skip_oversized(channel_id, log, size, at)
             case Ignored(at, opcode):
                 self._checks.ignored.add(f"kind {opcode:#04x} at byte {at}")
             case Attachment(at, crc_at, crc):
@@ -472,7 +472,7 @@ class SegmentPass:
 
     def _end(self, at: int, how: How) -> None:
         if how is How.CUT:
-            detail = f"{self._where}the record at byte {at} goes beyond the end of the file"
+            detail = f"{self._where}the record at byte {at} extends beyond the end of the file"
             self._damages.append(Damage(CUT, detail))
         elif how is How.BARE:
             detail = f"{self._where}it ends at byte {at} without a data end record and a footer"
@@ -497,7 +497,7 @@ class SegmentPass:
             self._report_doubt()
 
     def _report_doubt(self) -> None:
-        """The data section is damaged, and its checksum cannot say where."""
+        """Report that the data section is damaged in an unknown place."""
         segment = self._segment
         if not self._rows_doubted:
             self._notice(
@@ -507,19 +507,19 @@ class SegmentPass:
             return
         detail = (
             f"{self._where}bytes {segment.base} to {segment.end} do not match their checksum; "
-            f"{self._rows_doubted} messages there are covered by no other and were read, and which "
-            "of them hold changed bytes cannot be known"
+            f"{self._rows_doubted} messages there have no other checksum and were read; which of "
+            "them have changed bytes is unknown"
         )
         self._ledger.drop("", DAMAGED_SECTION, None, detail)
 
     def settle(self) -> Counter[str] | None:
-        """Compare with the statistics, and report what is lost; declared counts by topic."""
+        """Compare with the statistics and report losses; return the declared counts by topic."""
         statistics = self._summary.statistics
         if statistics is None:
             for damage in self._damages:
                 self._report(damage)
             return None
-        met = self._giver.met + self._giver.dropped
+        met = self._builder.met + self._builder.dropped
         if self._summary.counts_channels:
             missing = Counter(statistics.by_channel) - met
         else:
@@ -527,7 +527,7 @@ class SegmentPass:
         for damage in self._damages:
             ending = "" if missing.total() else "; by the statistics no message is missing"
             self._notice(f"{damage.reason}: {damage.detail}{ending}")
-        self._lose_missing(missing, statistics.message_count)
+        self._drop_missing(missing, statistics.message_count)
         if self._declarations.redefined or not self._summary.counts_channels:
             return None
         declared: Counter[str] = Counter()
@@ -535,20 +535,20 @@ class SegmentPass:
             declared[topic] += statistics.by_channel.get(channel_id, 0)
         return declared
 
-    def _lose_missing(self, missing: Counter[int], declared: int) -> None:
+    def _drop_missing(self, missing: Counter[int], declared: int) -> None:
         reason = self._damages[0].reason if self._damages else MISSING
         details = [damage.detail for damage in self._damages[:DETAILS_JOINED]]
         detail = "; ".join(details) or f"the statistics declare {declared} messages in all"
         t_ns = self._damages[0].t_ns if self._damages else None
         for channel_id, count in sorted(missing.items()):
             known = self._ledger.claim(self._declarations.topic(channel_id), count)
-            self._giver.lose_of_channel(channel_id, reason, count - known, detail, t_ns)
+            self._builder.drop_of_channel(channel_id, reason, count - known, detail, t_ns)
 
     def _report(self, damage: Damage) -> None:
         if not damage.counts:
             self._ledger.drop("", damage.reason, None, damage.detail, damage.t_ns)
         for channel_id, count in damage.counts.items():
-            self._giver.lose_of_channel(
+            self._builder.drop_of_channel(
                 channel_id, damage.reason, count, damage.detail, damage.t_ns
             )
 
@@ -557,7 +557,7 @@ class SegmentPass:
 
 
 def _is_as_indexed(chunk: Chunk) -> bool:
-    """Does the summary say of the chunk what the chunk and its message indexes say?"""
+    """Return whether the chunk and its message indexes agree with the summary."""
     index = chunk.index
     if index is None or chunk.fault or chunk.differs:
         return False

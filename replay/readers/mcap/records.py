@@ -1,8 +1,8 @@
-r"""MCAP records as plain values, for the few that a reader must take apart one by one.
+r"""Types and parsers of single MCAP records.
 
-Field names and layouts are those of the MCAP specification, version 0. A string that is not UTF-8
-is kept with its bad bytes written as ``\xNN``, so that it can be printed. Records may be longer
-than their fields (the format may grow); a record shorter than its fields is broken.
+Field names and layouts are those of the MCAP specification, version 0. In a string that is not
+UTF-8, invalid bytes are replaced by ``\xNN``, so that it can be printed. Records may be longer than
+their fields (the format may be extended); a record shorter than its fields is broken.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ SUMMARY_OFFSET: Final = 0x0E
 DATA_END: Final = 0x0F
 
 PREFIX: Final = struct.Struct("<BQ")
-"""What every record begins with: operation code, length of the content."""
+"""Header of every record: operation code and length of the content."""
 FOOTER_SIZE: Final = PREFIX.size + 20
 DATA_END_SIZE: Final = PREFIX.size + 4
 CONVERTED_FROM: Final = "crosscue.converted_from"
-"""In a channel's metadata: ``Topic.converted_from``."""
+"""Key of ``Topic.converted_from`` in a channel's metadata."""
 COMPRESSIONS: Final = frozenset({"", "lz4", "zstd"})
 
 MESSAGE_HEAD: Final = np.dtype(
@@ -53,32 +53,32 @@ MESSAGE_HEAD: Final = np.dtype(
         ("publish", "<u8"),
     ]
 )
-"""The first 31 bytes of a message record, as they are in the file."""
+"""The first 31 bytes of a message record, as in the file."""
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 CHUNK_FIXED: Final = 40
 MAX_HEAD: Final = PREFIX.size + CHUNK_FIXED + 32
-"""Bytes of a chunk record's content, besides its compression's name and its records."""
+"""Maximum size of a chunk record before its compressed records."""
 
 
 class BrokenRecordError(LogFormatError):
-    """A record's content does not fit its own lengths; readers turn it into a reported loss."""
+    """A record's content contradicts its own lengths; readers report it as a loss."""
 
 
 class Fields:
-    """Takes the fields of one record's content from front to back."""
+    """Parses the fields of a record's content in order."""
 
     def __init__(self, content: bytes | memoryview) -> None:
         self.content = content
         self.at = 0
 
     def take(self, size: int) -> memoryview:
-        """The next ``size`` bytes.
+        """Return the next ``size`` bytes.
 
         Raises:
-            BrokenRecordError: There are fewer.
+            BrokenRecordError: Fewer bytes are left.
         """
         end = self.at + size
         if end > len(self.content):
@@ -90,11 +90,11 @@ class Fields:
         return taken
 
     def number(self, size: int) -> int:
-        """The next unsigned integer of ``size`` bytes."""
+        """Return the next unsigned integer of ``size`` bytes."""
         return int.from_bytes(self.take(size), "little")
 
     def text(self) -> str:
-        """The next length-prefixed string."""
+        """Return the next length-prefixed string."""
         return bytes(self.take(self.number(4))).decode("utf-8", "backslashreplace")
 
 
@@ -110,7 +110,7 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A stream of messages; of its free-form metadata only what ``convert`` writes is kept."""
+    """A stream of messages, with only the metadata entry that ``convert`` writes."""
 
     id: int
     schema_id: int
@@ -121,16 +121,16 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """What a chunk record says before its records.
+    """The fields of a chunk record before its records.
 
     Attributes:
-        start: Earliest log time in it, nanoseconds, as stored (unsigned).
-        end: Latest log time in it.
-        size: Bytes of its records once decompressed.
-        crc: CRC-32 of those bytes, 0 for none.
-        compression: ``""``, ``lz4``, ``zstd`` or something this reader does not know.
-        body_at: Bytes from the start of the content to the (compressed) records.
-        body_size: Bytes of the (compressed) records.
+        start: Earliest log time in nanoseconds, as stored (unsigned).
+        end: Latest log time.
+        size: Size of the decompressed records in bytes.
+        crc: CRC-32 of the decompressed records, 0 for none.
+        compression: ``""``, ``lz4``, ``zstd`` or an unsupported name.
+        body_at: Offset of the (compressed) records in the content.
+        body_size: Size of the (compressed) records in bytes.
     """
 
     start: int
@@ -144,7 +144,7 @@ class ChunkHead:
 
 @dataclass(frozen=True, slots=True)
 class ChunkIndex:
-    """What the summary says of one chunk; offsets are those of the file, counted from its start."""
+    """The entry of a chunk in the summary; offsets count from the file's start."""
 
     start: int
     end: int
@@ -159,7 +159,7 @@ class ChunkIndex:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessageIndex:
-    """Log times and offsets of one channel's messages within a chunk; shape (N,), INDEX_ENTRY."""
+    """Log times and offsets of a channel's messages within a chunk, shape (N,), INDEX_ENTRY."""
 
     channel_id: int
     entries: NDArray[np.void]
@@ -167,9 +167,9 @@ class MessageIndex:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Counts of a whole file; ``by_channel`` is empty where the writer did not count.
+    """Counts of a complete file; ``by_channel`` is empty if the writer did not count.
 
-    ``start`` and ``end`` are its first and last log time, 0 where there is no message.
+    ``start`` and ``end`` are the first and last log time, 0 without messages.
     """
 
     message_count: int
@@ -181,7 +181,7 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class Footer:
-    """Where the summary lies, counted from the file's start; 0 for none."""
+    """Offsets of the summary from the file's start; 0 for none."""
 
     summary_at: int
     summary_offset_at: int
@@ -189,21 +189,21 @@ class Footer:
 
 
 def read_schema(content: bytes | memoryview) -> Schema:
-    """A Schema record."""
+    """Parse a Schema record."""
     fields = Fields(content)
     schema_id, name, encoding = fields.number(2), fields.text(), fields.text()
     return Schema(schema_id, name, encoding, bytes(fields.take(fields.number(4))))
 
 
 def read_channel(content: bytes | memoryview) -> Channel:
-    """A Channel record."""
+    """Parse a Channel record."""
     fields = Fields(content)
     channel = Channel(fields.number(2), fields.number(2), fields.text(), fields.text())
     return replace(channel, converted_from=_converted_from(fields.take(fields.number(4))))
 
 
 def _converted_from(metadata: bytes | memoryview) -> str:
-    """The one entry that is ours; metadata that cannot be understood is nobody's fault."""
+    """Return the entry that crosscue writes; invalid metadata is ignored."""
     key = CONVERTED_FROM.encode()
     if key not in bytes(metadata):
         return ""
@@ -218,15 +218,13 @@ def _converted_from(metadata: bytes | memoryview) -> str:
 
 
 def read_chunk_head(content: bytes | memoryview) -> ChunkHead:
-    """The first fields of a Chunk record; ``content`` may end right after them.
+    """Parse the first fields of a Chunk record; ``content`` may end right after them.
 
     Raises:
-        BrokenRecordError: Also for a compression name of more than 32 bytes.
+        BrokenRecordError: A field is incomplete, or the compression name exceeds 32 bytes.
     """
     if len(content) < CHUNK_FIXED:
-        raise BrokenRecordError(
-            f"a chunk's fields need {CHUNK_FIXED} bytes, here are {len(content)}"
-        )
+        raise BrokenRecordError(f"a chunk's fields need {CHUNK_FIXED} bytes, found {len(content)}")
     start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(content)
     body_at = CHUNK_FIXED + name_length
     if name_length > 32 or body_at > len(content):
@@ -238,18 +236,18 @@ def read_chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def read_message_index(content: bytes | memoryview) -> MessageIndex:
-    """A MessageIndex record."""
+    """Parse a MessageIndex record."""
     if len(content) < _INDEX_HEAD.size:
         raise BrokenRecordError(f"a message index of {len(content)} bytes")
     channel_id, size = _INDEX_HEAD.unpack_from(content)
     if size % INDEX_ENTRY.itemsize or _INDEX_HEAD.size + size > len(content):
-        raise BrokenRecordError(f"a message index of {size} bytes does not fit")
+        raise BrokenRecordError(f"a message index of {size} bytes does not match its record")
     count = size // INDEX_ENTRY.itemsize
     return MessageIndex(channel_id, np.frombuffer(content, INDEX_ENTRY, count, _INDEX_HEAD.size))
 
 
 def read_statistics(content: bytes | memoryview) -> Statistics:
-    """A Statistics record."""
+    """Parse a Statistics record."""
     fields = Fields(content)
     message_count = fields.number(8)
     fields.take(2 + 4 + 4 + 4)
@@ -257,14 +255,14 @@ def read_statistics(content: bytes | memoryview) -> Statistics:
     start, end = fields.number(8), fields.number(8)
     size = fields.number(4)
     if size % 10:
-        raise BrokenRecordError(f"a map of {size} bytes is no whole number of entries")
+        raise BrokenRecordError(f"a map of {size} bytes ends inside an entry")
     pairs = np.frombuffer(fields.take(size), dtype=np.dtype([("id", "<u2"), ("n", "<u8")]))
     by_channel = dict(zip(pairs["id"].tolist(), pairs["n"].tolist(), strict=True))
     return Statistics(message_count, chunk_count, by_channel, start, end)
 
 
 def read_footer(content: bytes | memoryview) -> Footer:
-    """A Footer record."""
+    """Parse a Footer record."""
     fields = Fields(content)
     return Footer(fields.number(8), fields.number(8), fields.number(4))
 
@@ -280,12 +278,12 @@ def check_metadata(content: bytes | memoryview) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heads:
-    """What N message records say before their messages, in columns of shape (N,).
+    """Header fields of N message records, in columns of shape (N,).
 
     Attributes:
         opcode: Operation code, uint8.
-        size: Bytes of the content, int64; its two highest bytes are those in ``number``.
-        number: Channel number in the upper half, uint32; the lower half is zero in a sane record.
+        size: Size of the content in bytes, int64; its two highest bytes are in ``number``.
+        number: Channel number in the upper half, uint32; the lower half is zero in valid records.
         channel: Channel number, uint16.
         sequence: The sender's counter, uint32.
         log: Log time, uint64.
@@ -309,12 +307,12 @@ _BEHIND_A_BYTE: Final = np.dtype(
         "itemsize": 32,
     }
 )
-"""A message record's head and the byte before it, which brings every field to its alignment; a
-length's upper two bytes and the channel number are read as one."""
+"""Header of a message record and the byte before it, so that every field is aligned; the length's
+upper two bytes and the channel number are one field."""
 
 
 def heads_at(buffer: Bytes, offsets: NDArray[np.int64]) -> Heads:
-    """The message heads at ``offsets``, gathered in one step.
+    """Gather the message headers at ``offsets`` in one step.
 
     Args:
         buffer: Shape (B,), contiguous.
@@ -325,7 +323,7 @@ def heads_at(buffer: Bytes, offsets: NDArray[np.int64]) -> Heads:
         buffer = np.concatenate((buffer, np.zeros(width, np.uint8)))
     every = np.ndarray((len(buffer) - width + 1,), f"V{width}", buffer, strides=(1,))
     raw = every[np.maximum(offsets - 1, 0)]
-    at_zero = (offsets == 0).nonzero()[0]  # no byte stands before these
+    at_zero = (offsets == 0).nonzero()[0]  # these have no preceding byte
     if len(at_zero):
         raw.view(np.uint8).reshape(-1, width)[at_zero, 1:] = buffer[: width - 1]
     fields = raw.view(_BEHIND_A_BYTE)

@@ -1,7 +1,7 @@
-"""Where the parts of an MCAP file lie, and what its summary says.
+"""The recordings in an MCAP file, and their summaries.
 
-A file is one segment, or several when recordings were joined with ``cat``. The footer at the end of
-the file leads to the summary; where it does not, the file is walked from its beginning.
+A file is one segment, or several if recordings were joined with ``cat``. The footer at the end of
+the file locates the summary. If it does not, the file is searched from its start.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from crosscue.replay.files.checksum import crc32
 from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, run_of, table_of
 from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
-from crosscue.replay.readers.mcap.damage.find import find_bytes, proved_head
+from crosscue.replay.readers.mcap.damage.find import find_bytes, verified_head
 
 from .bytes import PIECE, ByteFile
 from .channels import Declarations, TopicBook
@@ -57,11 +57,11 @@ class Summary:
     """A summary section.
 
     Attributes:
-        schemas: By number.
-        channels: By number.
+        schemas: Schemas by number.
+        channels: Channels by number.
         statistics: Counts, or None.
-        chunks: By offset from the beginning of the whole file, as the index says.
-        is_verified: Its checksum is there and right.
+        chunks: Index entries of chunks by offset from the file's start.
+        is_verified: True if it has a checksum and matches it.
     """
 
     schemas: Mapping[int, Schema] = field(default_factory=dict)
@@ -72,19 +72,19 @@ class Summary:
 
     @property
     def counts_channels(self) -> bool:
-        """Do its statistics count by channel?"""
+        """True if its statistics have counts by channel."""
         counted = self.statistics
         return counted is not None and (bool(counted.by_channel) or not counted.message_count)
 
     @property
     def mentioned(self) -> frozenset[int]:
-        """Channels that its counts or indexes mention."""
+        """Numbers of the channels in its counts or indexes."""
         found = frozenset(np.unique(self.chunks.channel).tolist())
         return found if self.statistics is None else found | self.statistics.by_channel.keys()
 
     @property
     def names_all(self) -> bool:
-        """Does it declare, with its schema, every channel that is mentioned anywhere?"""
+        """True if it declares every mentioned channel, with its schema."""
         if not self.channels:
             return self.statistics is not None and not self.statistics.message_count
         known = self.schemas.keys() | {0}
@@ -97,17 +97,17 @@ class Segment:
     """One recording within a file.
 
     Attributes:
-        base: Where its magic bytes stand.
-        begin: Its first record after the header.
-        end: Its data end record if ``has_end``, else the end of the file.
-        has_end: Its data section is closed.
+        base: Offset of its magic bytes.
+        begin: Offset of the first record after the header.
+        end: Offset of its data end record if ``has_end``, else the end of the file.
+        has_end: True if its data section is closed.
         data_crc: CRC-32 of the bytes from ``base`` to ``end``, 0 for none.
-        summary: What its summary says, or None.
-        schemas: All that became known before reading.
-        channels: The same.
-        notices: What is to be said about it.
-        after: What is wrong behind its messages, so that nobody knows what the file once held;
-            empty if nothing is.
+        summary: Its summary, or None.
+        schemas: All schemas known before reading.
+        channels: All channels known before reading.
+        notices: Remarks on the recording.
+        after: Damage after its messages, because of which the file's original contents are
+            unknown; empty for none.
     """
 
     base: int
@@ -122,11 +122,11 @@ class Segment:
     after: str = ""
 
     def declarations(self, book: TopicBook) -> Declarations:
-        """What was known before reading."""
+        """Return the schemas and channels known before reading."""
         return Declarations(book, self.schemas, self.channels)
 
-    def rail(self, file: ByteFile, limits: Limits) -> Mapping[int, ChunkIndex] | None:
-        """The chunks known, for a walk; None where not even the end is known."""
+    def known_chunks(self, file: ByteFile, limits: Limits) -> Mapping[int, ChunkIndex] | None:
+        """Return the known chunks, for a walk; None if not even the end is known."""
         if not self.has_end:
             return None
         if self.summary is None:
@@ -138,16 +138,16 @@ class Segment:
 def find_segments(
     file: ByteFile, path: Path, book: TopicBook, limits: Limits
 ) -> tuple[Segment, ...]:
-    """The recordings in a file; their topics are entered into ``book``.
+    """Find the recordings in a file, and add their topics to ``book``.
 
     Raises:
-        LogFormatError: Not MCAP, or no readable record in it.
+        LogFormatError: The file is not MCAP, or has no readable record.
     """
     if not file.size:
         raise LogFormatError(f"{path}: an empty file; nothing was recorded, or the copy failed")
     if bytes(file.peek(0, len(MAGIC))) != MAGIC:
         raise LogFormatError(
-            f"{path}: does not begin like MCAP (89 4d 43 41 50 30 0d 0a); check the file type"
+            f"{path}: not an MCAP file (it starts without 89 4d 43 41 50 30 0d 0a); check the file"
         )
     segment = _by_footer(file, limits)
     if segment is not None and segment.summary is not None and segment.summary.names_all:
@@ -159,19 +159,19 @@ def find_segments(
     )
     if not book.topics and not segments[0].has_end and not _has_header(file, 0):
         raise LogFormatError(
-            f"{path}: not one readable record after the first 8 bytes; the file was cut"
+            f"{path}: no readable record after the first 8 bytes; the file was cut"
         )
     return segments
 
 
 def has_whole_summary(file: ByteFile, limits: Limits) -> bool:
-    """Does the file end in a summary that names every channel there is?"""
+    """Return whether the file ends with a summary that declares every channel."""
     segment = _by_footer(file, limits) if file.size else None
     return segment is not None and segment.summary is not None and segment.summary.names_all
 
 
 def _by_footer(file: ByteFile, limits: Limits) -> Segment | None:
-    """The only segment, if the footer and the summary before it are as they should be."""
+    """Return the only segment, if the footer and the summary before it are valid."""
     footer_at = file.size - FOOTER_SIZE - len(MAGIC)
     if footer_at < len(MAGIC) + DATA_END_SIZE:
         return None
@@ -194,7 +194,7 @@ def _by_footer(file: ByteFile, limits: Limits) -> Segment | None:
 
 
 def _data_end(file: ByteFile, at: int) -> int | None:
-    """The checksum in the data end record at ``at``; None if there is no such record."""
+    """Return the checksum in the data end record at ``at``; None if it is not one."""
     raw = bytes(file.peek(at, DATA_END_SIZE))
     if len(raw) < DATA_END_SIZE:
         return None
@@ -209,7 +209,7 @@ def _has_header(file: ByteFile, base: int) -> bool:
 
 
 def _begin(file: ByteFile, base: int) -> int:
-    """The first record after the header; right after the magic if the header is broken."""
+    """Return the offset after the header, or after the magic bytes if the header is broken."""
     at = base + len(MAGIC)
     raw = file.peek(at, PREFIX.size)
     if len(raw) < PREFIX.size:
@@ -222,10 +222,10 @@ def _begin(file: ByteFile, base: int) -> int:
 def _read_summary(
     file: ByteFile, base: int, begin: int, footer_at: int, crc: int, limits: Limits
 ) -> Summary:
-    """The summary between ``begin`` and the footer.
+    """Read the summary between ``begin`` and the footer.
 
     Raises:
-        BrokenRecordError: Its checksum is wrong, its records do not fit, or it is too large.
+        BrokenRecordError: Its checksum is wrong, its records are invalid, or it is too large.
     """
     if footer_at - begin > limits.chunk_bytes:
         raise BrokenRecordError(f"a summary of {footer_at - begin} bytes")
@@ -246,11 +246,11 @@ def _parse_summary(records: bytes, base: int) -> Summary:
     view, at = memoryview(records), 0
     while at < len(records):
         if at + PREFIX.size > len(records):
-            raise BrokenRecordError("the summary ends within a record")
+            raise BrokenRecordError("the summary ends inside a record")
         opcode, length = PREFIX.unpack_from(records, at)
         content = view[at + PREFIX.size : at + PREFIX.size + length]
         if len(content) < length or not opcode:
-            raise BrokenRecordError("the summary's records do not fit")
+            raise BrokenRecordError("the summary's records have wrong lengths")
         if opcode == SCHEMA:
             schema = read_schema(content)
             schemas[schema.id] = schema
@@ -273,12 +273,12 @@ def _parse_summary(records: bytes, base: int) -> Summary:
 def _confirmed(
     file: ByteFile, chunks: Mapping[int, ChunkIndex], limits: Limits
 ) -> dict[int, ChunkIndex]:
-    """Of an index without checksum, the entries that a chunk's own length or checksum confirms."""
+    """Select the entries of an index without checksum that the chunks themselves confirm."""
     confirmed: dict[int, ChunkIndex] = {}
     for at, index in chunks.items():
         raw = file.peek(at, PREFIX.size)
         is_chunk = bytes(raw) == PREFIX.pack(CHUNK, max(index.length - PREFIX.size, 0))
-        if is_chunk or proved_head(file, index, limits) is not None:
+        if is_chunk or verified_head(file, index, limits) is not None:
             confirmed[at] = replace(index, index_length=0)
     return confirmed
 
@@ -288,22 +288,22 @@ def _declared(summary: Summary) -> tuple[list[Schema], list[Channel]]:
 
 
 def _enter(segment: Segment, declarations: Declarations) -> Segment:
-    """The segment with what is declared; all topics entered in the order of channel numbers."""
+    """Return the segment with the declarations, and add its topics by channel number."""
     for _ in declarations.topics():
         pass
     return replace(segment, schemas=declarations.schemas, channels=declarations.channels)
 
 
 def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
-    """A segment whose summary does not name all channels: find them in its data section."""
-    walk = Walk(file, segment.begin, segment.end, segment.rail(file, limits), limits)
+    """Find channels in the data section that the summary does not declare."""
+    walk = Walk(file, segment.begin, segment.end, segment.known_chunks(file, limits), limits)
     declarations = Declarations(book, *_declared(segment.summary or Summary()))
     _collect(file, walk, declarations, limits)
     return _enter(segment, declarations)
 
 
 def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, ...]:
-    """All segments, found by walking over the file's outer records."""
+    """Find all segments by walking over the file's outer records."""
     segments: list[Segment] = []
     base = 0
     while base < file.size:
@@ -320,7 +320,7 @@ def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, .
             break
         if bytes(file.peek(after, len(MAGIC))) != MAGIC:
             if _is_filled(file, after):
-                left = f"{file.size - after} bytes from byte {after} on are no MCAP recording"
+                left = f"{file.size - after} bytes from byte {after} on are not an MCAP recording"
                 segments[-1] = replace(segments[-1], after=left)
             break
         base = after
@@ -328,7 +328,7 @@ def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, .
 
 
 def _collect(file: ByteFile, walk: Walk, declarations: Declarations, limits: Limits) -> End:
-    """Walk to the end, taking the definitions met; chunks are read only where one is new."""
+    """Walk to the end and collect definitions; chunks are read only if they may have new ones."""
     for item in walk:
         if isinstance(item, End):
             return item
@@ -345,7 +345,7 @@ def _is_known(chunk: Chunk, declarations: Declarations) -> bool:
 
 
 def _definitions_in(file: ByteFile, chunk: Chunk, limits: Limits) -> list[Definition]:
-    """Schemas and channels of a chunk; none if it cannot be read."""
+    """Return the schemas and channels of a chunk; empty if it cannot be read."""
     head = chunk.head
     if head is None or chunk.fault or max(head.size, head.body_size) > limits.chunk_bytes:
         return []
@@ -366,18 +366,18 @@ def _take(declarations: Declarations, definitions: Sequence[Definition]) -> None
     for definition in definitions:
         try:
             if declarations.changed_by(definition):
-                list(declarations.topics())  # enters what now gets another meaning
+                list(declarations.topics())  # adds the topics before their numbers are redefined
             declarations.declare(definition)
         except BrokenRecordError:
-            continue  # reported when it is met again in reading
+            continue  # reported when it is read again
 
 
 def _close(
     file: ByteFile, base: int, begin: int, end: End, limits: Limits
 ) -> tuple[Segment, int | None]:
-    """A segment whose data section ends at ``end``, and where the next might begin."""
+    """Return a segment whose data section ends at ``end``, and the possible start of the next."""
     if end.how not in (How.DATA_END, How.FOOTER):
-        after = end.at if end.how is How.TOLD and end.at < file.size else None
+        after = end.at if end.how is How.REPORTED and end.at < file.size else None
         return Segment(base, begin, after or file.size, has_end=False), after
     data_crc = _data_end(file, end.at) or 0
     summary_at = end.at + (DATA_END_SIZE if end.how is How.DATA_END else 0)
@@ -385,11 +385,11 @@ def _close(
     footer_at = _footer_after(file, summary_at)
     if footer_at is None:
         if bytes(file.peek(file.size - len(MAGIC), len(MAGIC))) != MAGIC:
-            return replace(segment, after="the file ends within its summary"), None
-        notice = "the file is damaged within its summary, which is not used"
+            return replace(segment, after="the file ends inside its summary"), None
+        notice = "the file is damaged inside its summary, which is not used"
         following = find_bytes(file, summary_at, file.size, MAGIC + bytes([HEADER]))
         hidden = None if following else find_bytes(file, summary_at, file.size, DATA_END_PREFIX)
-        left = f"another recording, damaged at its beginning, ends at byte {hidden}"
+        left = f"another recording, damaged at its start, ends at byte {hidden}"
         return replace(segment, notices=(notice,), after=left if hidden else ""), following
     summary: Summary | None = None
     notices: list[str] = []
@@ -402,7 +402,7 @@ def _close(
     after = footer_at + FOOTER_SIZE
     left = ""
     if after + len(MAGIC) > file.size:
-        left = "the file ends within its last bytes"
+        left = "the file ends inside the closing magic bytes"
     elif bytes(file.peek(after, len(MAGIC))) != MAGIC:
         notices.append("it does not end with the magic bytes of MCAP")
     segment = replace(segment, summary=summary, notices=tuple(notices), after=left)
@@ -410,7 +410,7 @@ def _close(
 
 
 def _footer_after(file: ByteFile, at: int) -> int | None:
-    """Where the footer stands that ends the summary beginning at ``at``, if it can be reached."""
+    """Return the offset of the footer after the summary at ``at``, if it can be reached."""
     while True:
         raw = file.peek(at, PREFIX.size)
         if len(raw) < PREFIX.size:
@@ -428,7 +428,7 @@ def _footer_after(file: ByteFile, at: int) -> int | None:
 
 
 def _is_filled(file: ByteFile, at: int) -> bool:
-    """Is anything but zeros there from ``at`` to the end? Some recorders reserve space ahead."""
+    """Return whether a byte after ``at`` is not zero; some recorders reserve space with zeros."""
     while at < file.size:
         window = file.window(at, PIECE)
         if not len(window) or any(window):

@@ -1,9 +1,9 @@
-"""From record to record through one data section, without looking into chunks.
+"""Walk over the records of a data section, without reading the chunks' contents.
 
-The bytes lead; a chunk index from the summary serves as a rail: where a record's length cannot be
-right, the walk goes on at the next chunk that the summary knows; without a rail, at the next chunk
-that proves itself by its checksum (``mcap_find``). Where records stand outside chunks, it goes on
-at the next of them that are plausible in a row (``mcap_resync``).
+The walk follows the records' lengths. If a length cannot be right, the walk continues at the next
+chunk in the summary's index; without an index, at the next chunk that its checksum verifies
+(``damage.find``). If there are records outside chunks, it continues at the next plausible
+consecutive records (``damage.resync``).
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ import numpy as np
 
 from crosscue.replay.base import Bytes, Limits
 from crosscue.replay.readers.mcap.chunks.rows import Rows, opcodes, rows_by_scan
-from crosscue.replay.readers.mcap.damage.find import REPAIRED, find_chunk, is_doubtful, proved_head
+from crosscue.replay.readers.mcap.damage.find import (
+    REPAIRED,
+    find_chunk,
+    is_doubtful,
+    verified_head,
+)
 from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync, is_exact
 
 from .bytes import ByteFile
@@ -52,26 +57,26 @@ from .records import (
 )
 
 RUN_BYTES: Final = 4 << 20
-"""Most bytes outside chunks taken at once, unless one record is larger."""
+"""Maximum number of bytes outside chunks read at once, unless one record is larger."""
 STOPS_A_RUN: Final = ~opcodes(SCHEMA, CHANNEL, MESSAGE)
 SMALL: Final = 1 << 20
-"""Records that are checked whole (metadata and the like) are not read beyond this."""
+"""Maximum size of records that are checked completely (metadata and similar)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """A chunk, not yet read, and the message indexes that follow it.
+    """A chunk that is not yet read, with the message indexes that follow it.
 
     Attributes:
-        at: Where its record begins.
-        body_at: Where its (compressed) records begin.
-        head: What it says of itself; None if that cannot be read.
-        index: What the summary says of it; None if it says nothing.
-        fault: Why it cannot be read; empty if it may be tried.
-        differs: How head and summary disagree; empty if they do not.
-        is_cut: The file ends within it.
-        messages: Its message indexes, as far as they can be read.
-        index_fault: What is wrong with its message indexes; empty if nothing.
+        at: Offset of the record.
+        body_at: Offset of its (compressed) records.
+        head: Its header; None if it cannot be read.
+        index: Its entry in the summary, or None.
+        fault: Reason why it cannot be read; empty if it is probably readable.
+        differs: Differences between header and summary; empty if they agree.
+        is_cut: True if the file ends inside it.
+        messages: Its readable message indexes.
+        index_fault: Problem of its message indexes; empty for none.
     """
 
     at: int
@@ -95,7 +100,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Oversized:
-    """A message outside chunks that is over the limit and was not read."""
+    """A message outside chunks that exceeds the size limit and was not read."""
 
     at: int
     size: int
@@ -105,7 +110,7 @@ class Oversized:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """An attachment; ``crc`` (0 for none) stands at ``crc_at``, covering the content before it."""
+    """An attachment; ``crc`` (0 for none) is stored at ``crc_at`` and covers the content before."""
 
     at: int
     crc_at: int
@@ -114,7 +119,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Ignored:
-    """A record of a kind that a reader must pass over."""
+    """A record of a kind that a reader must ignore."""
 
     at: int
     opcode: int
@@ -122,7 +127,7 @@ class Ignored:
 
 @dataclass(frozen=True, slots=True)
 class Stray:
-    """A message index that follows no chunk: the chunk before it cannot be recognised."""
+    """A message index without a chunk before it, because the chunk cannot be recognised."""
 
     at: int
     index: MessageIndex
@@ -132,7 +137,7 @@ class Stray:
 class Gap:
     """Bytes from ``at`` to ``to`` that cannot be read as records.
 
-    A run before it may reach beyond ``at``: what of it begins there or later cannot be trusted.
+    A run before it may extend beyond ``at``. Its records from ``at`` on cannot be trusted.
     """
 
     at: int
@@ -141,18 +146,18 @@ class Gap:
 
 
 class How(Enum):
-    """How a data section ends."""
+    """The kind of end of a data section."""
 
-    DATA_END = "as it should"
+    DATA_END = "with a data end record"
     FOOTER = "with a footer, without a data end record"
     CUT = "in the middle of a record"
     BARE = "without a data end record"
-    TOLD = "within the chunk or gap just given"
+    REPORTED = "inside the previous chunk or gap"
 
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """The data section ends here."""
+    """The end of a data section."""
 
     at: int
     how: How
@@ -173,16 +178,16 @@ class Walk:
         limits: Limits,
         plausible: Plausible | None = None,
     ) -> None:
-        """A walk from ``begin``.
+        """Prepare a walk from ``begin``.
 
         Args:
             file: The bytes.
-            begin: First record after the header.
-            end: Where the data end record stands; if ``chunks`` is None, where the file ends or
-                another recording begins.
-            chunks: By offset, what a trusted summary says; None where no end is known.
-            limits: Sizes above which nothing is read.
-            plausible: What is known of messages outside chunks before the walk.
+            begin: Offset of the first record after the header.
+            end: Offset of the data end record. If ``chunks`` is None, the end of the file or the
+                start of another recording.
+            chunks: Entries of a trusted summary by offset; None if no end is known.
+            limits: Maximum sizes that are read.
+            plausible: Criteria for messages outside chunks, known before the walk.
         """
         self._file = file
         self._at = begin
@@ -199,7 +204,7 @@ class Walk:
         self._has_bare = not self._known
 
     def __iter__(self) -> Iterator[Item]:
-        """The items in the order of the file."""
+        """Yield the items in the order of the file."""
         while self._at < self._end:
             before = self._at
             try:
@@ -213,11 +218,11 @@ class Walk:
                 return
             since = item.at if isinstance(item, Gap) else before
             assert self._at > since or self._is_over, "a walk must go forward"
-        how = How.DATA_END if self._has_end else How.TOLD if self._is_over else How.BARE
+        how = How.DATA_END if self._has_end else How.REPORTED if self._is_over else How.BARE
         yield End(self._end, how)
 
     def _bound(self, at: int) -> int:
-        """First place after ``at`` where something else is known to begin."""
+        """Return the first known start of another item after ``at``."""
         after = bisect_right(self._known, at)
         return self._known[after] if after < len(self._known) else self._end
 
@@ -248,7 +253,7 @@ class Walk:
         return bytes(self._file.peek(self._at + FOOTER_SIZE, len(MAGIC))) == MAGIC
 
     def _gap(self, why: str) -> Item:
-        """What begins here is no record; go on where something is known to begin."""
+        """Skip bytes that are not a record, up to the next known or verified item."""
         at, bound = self._at, self._bound(self._at)
         since, record = self._next_record(at, bound)
         if bound < self._end:
@@ -265,7 +270,7 @@ class Walk:
         return Gap(since, self._at, why)
 
     def _next_record(self, at: int, bound: int) -> tuple[int, int | None]:
-        """Where records outside chunks stop being trustworthy, and where they are so again."""
+        """Return where records outside chunks become untrustworthy, and where they resume."""
         if not self._has_bare:
             return at, None
         since = at
@@ -273,7 +278,7 @@ class Walk:
             since = self._before.at + self._resync.last_trusted(self._before.rows)
         head = self._file.peek(at, PREFIX.size)
         if len(head) == PREFIX.size:
-            # Only its kind may be damaged: then its own length leads on.
+            # Only its kind may be damaged; its length then leads to the next record.
             after = at + PREFIX.size + PREFIX.unpack(head)[1]
             if after < bound and self._resync.continues(after):
                 return since, after
@@ -287,7 +292,7 @@ class Walk:
     def _overlong(self, opcode: int, length: int, bound: int) -> Item:
         is_cut = not self._has_end and bound == self._end and opcode in _KINDS
         if not is_cut or self._next_record(self._at, bound)[1] is not None:
-            return self._gap(f"a record (kind {opcode:#04x}) of {length} bytes does not fit")
+            return self._gap(f"a record (kind {opcode:#04x}) of {length} bytes is too long")
         return End(self._at, How.CUT)
 
     def _other(self, opcode: int, length: int) -> Item | None:
@@ -303,7 +308,7 @@ class Walk:
                 check_metadata(self._whole(length))
             item = None
         elif opcode in (0, HEADER, FOOTER, DATA_END):
-            raise BrokenRecordError(f"a record of kind {opcode:#04x} has no place here")
+            raise BrokenRecordError(f"a record of kind {opcode:#04x} is not allowed here")
         elif (hidden := self._hidden_chunk(opcode, length)) is not None:
             return hidden
         else:
@@ -314,7 +319,7 @@ class Walk:
         return item
 
     def _is_unknown_kind(self, at: int, length: int) -> bool:
-        """Is a record of an unknown kind really one, and not a damaged message or its content?"""
+        """Return whether a record of an unknown kind is genuine, and not a damaged message."""
         if self._resync.is_message(at, length):
             return False
         return self._before is None or self._resync.continues(at + PREFIX.size + length, 1)
@@ -328,17 +333,17 @@ class Walk:
         return content
 
     def _attachment_crc_at(self, after: int) -> int:
-        """Where the checksum of the attachment that begins here stands."""
+        """Return the offset of the checksum of the attachment that starts here."""
         at = self._at + PREFIX.size + 16
         for width in (4, 4, 8):
             raw = self._file.peek(at, width)
             at += width + int.from_bytes(raw, "little")
             if len(raw) < width or at + 4 > after:
-                raise BrokenRecordError("an attachment does not fit its own length")
+                raise BrokenRecordError("an attachment contradicts its own length")
         return at
 
     def _hidden_chunk(self, opcode: int, length: int) -> Item | None:
-        """A record of an unknown kind that is built like a chunk is a chunk with a damaged kind."""
+        """Treat a record of an unknown kind with the structure of a chunk as a chunk."""
         raw = self._file.peek(self._at + PREFIX.size, CHUNK_FIXED + 32)
         try:
             head = read_chunk_head(raw)
@@ -369,10 +374,10 @@ class Walk:
         return self._before
 
     def _without_hidden(self, at: int, rows: Rows) -> Rows:
-        """A run up to the first message in it whose kind was damaged to that of a definition.
+        """Cut a run before the first message whose kind was damaged to that of a definition.
 
         Raises:
-            BrokenRecordError: It begins with one.
+            BrokenRecordError: The run starts with such a message.
         """
         for found in rows.definitions:
             if not self._resync.is_message(at + found.at, len(found.content)) or is_exact(found):
@@ -408,7 +413,7 @@ class Walk:
         except BrokenRecordError as error:
             head, why = None, str(error)
         if index is not None and is_doubtful(opcode == CHUNK, head, index):
-            repaired = proved_head(self._file, index, self._limits)
+            repaired = verified_head(self._file, index, self._limits)
             if repaired is not None:
                 return self._repaired(index, repaired, bound)
         if head is None:
@@ -417,7 +422,7 @@ class Walk:
         inner_end = body_at + head.body_size
         fault = ""
         if opcode != CHUNK:
-            fault = f"its record says kind {opcode:#04x}"
+            fault = f"its record has the kind {opcode:#04x}"
         elif head.compression not in COMPRESSIONS:
             fault = f"compression {head.compression!r} is unknown (known: none, lz4, zstd)"
         if index is not None:
@@ -426,23 +431,23 @@ class Walk:
         elif outer_end <= bound:
             end, differs = outer_end, ""
         elif inner_end <= bound and head.crc:
-            end, differs = inner_end, f"its record says {length} bytes"
+            end, differs = inner_end, f"its record states {length} bytes"
         elif not self._has_end and bound == self._end and outer_end == inner_end:
             self._at, self._is_over = self._end, True
             return Chunk(at, body_at, head, None, fault, is_cut=True)
         else:
-            raise BrokenRecordError(f"a chunk of {length} bytes does not fit")
+            raise BrokenRecordError(f"a chunk of {length} bytes is too long")
         if inner_end < end and not differs:
             differs = f"{end - inner_end} bytes follow its records"
         if inner_end > end and not fault:
             fault = f"declares {head.body_size} bytes of records, has {max(0, end - body_at)}"
         messages, index_fault = self._message_indexes(end, index)
-        # Records found by searching behind damage would be those of an uncompressed chunk.
+        # A search for records after damage would find those inside an uncompressed chunk.
         self._has_bare &= self._before is not None
         return Chunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
 
     def _repaired(self, index: ChunkIndex, head: ChunkHead, bound: int) -> Chunk:
-        """A chunk read by its entry in the summary."""
+        """Return a chunk that is read by its entry in the summary."""
         at = self._at
         messages, index_fault = self._message_indexes(min(at + index.length, bound), index)
         self._has_bare &= self._before is not None
@@ -462,7 +467,7 @@ class Walk:
     def _message_indexes(
         self, at: int, index: ChunkIndex | None
     ) -> tuple[tuple[MessageIndex, ...], str]:
-        """The message indexes from ``at`` on; leaves the walk behind them."""
+        """Read the message indexes from ``at`` on, and move the walk to their end."""
         bound = self._bound(self._at)
         reported_end = min(at + index.index_length, bound) if index is not None else at
         found: list[MessageIndex] = []
@@ -488,7 +493,7 @@ class Walk:
 
 
 def _differences(head: ChunkHead, index: ChunkIndex, length: int) -> str:
-    """In which fields a chunk and the summary's index of it disagree; empty if in none."""
+    """Describe the fields in which a chunk and its entry in the summary differ, or empty."""
     pairs = (
         ("length", length, index.length),
         ("start time", head.start, index.start),
@@ -498,7 +503,7 @@ def _differences(head: ChunkHead, index: ChunkIndex, length: int) -> str:
         ("compression", head.compression, index.compression),
     )
     return ", ".join(
-        f"{name} {said!r} (the summary says {reported!r})"
+        f"{name} {said!r} (the summary states {reported!r})"
         for name, said, reported in pairs
         if said != reported
     )

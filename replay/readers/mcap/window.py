@@ -1,10 +1,12 @@
-"""Which bytes of a recording hold a part of it, by the summary's index of chunks alone.
+"""Location of a selected part of a recording by the summary's index of chunks.
 
-A summary with a checksum, whose counts add up and whose chunks lie side by side, is trusted: chunks
-outside the time asked for, or without a topic asked for, are not touched. What is between the
-chunks it names is walked through, so that messages outside chunks are found. A summary without a
-checksum is trusted for times only, where its chunks follow each other in time: a wrong time then
-stands out, or is that of a chunk next to those asked for, which are examined too.
+A summary is trusted if it has a checksum, its counts add up and its chunks do not overlap. Chunks
+outside the selected time range, or without a selected topic, are then not read. The bytes between
+the indexed chunks are always read, so that messages outside chunks are found.
+
+A summary without a checksum is trusted only for times, and only if its chunks are in order of time.
+A wrong time then violates this order, or belongs to a chunk next to the selected ones. These
+neighbors are therefore read too.
 """
 
 from __future__ import annotations
@@ -30,13 +32,13 @@ LATEST: Final = np.uint64((1 << 63) - 1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """Where a part of a recording lies.
+    """The location of a part of a recording.
 
     Attributes:
-        chunks: All chunks there are.
-        is_read: Shape (N,), bool: of these, the ones that may hold what was requested.
-        begin: Where the recording's first record stands.
-        end: Where its data section ends.
+        chunks: All chunks of the recording.
+        is_read: Shape (N,), bool: mask of the chunks that may contain selected messages.
+        begin: Offset of the recording's first record.
+        end: End of its data section.
     """
 
     chunks: ChunkTable
@@ -46,11 +48,11 @@ class Window:
 
     @property
     def left(self) -> int:
-        """How many chunks are not read."""
+        """Number of chunks that are not read."""
         return int(np.count_nonzero(~self.is_read))
 
     def ranges(self) -> list[tuple[int, int]]:
-        """What must be walked through: everything but the chunks that are not read."""
+        """Return the ranges to read: everything except the skipped chunks."""
         out = ~self.is_read
         begin = np.concatenate(([self.begin], self.chunks.after[out]))
         end = np.concatenate((self.chunks.at[out], [self.end]))
@@ -58,12 +60,12 @@ class Window:
         return list(zip(begin[filled].tolist(), end[filled].tolist(), strict=True))
 
     def items(self, file: ByteFile, limits: Limits) -> Iterator[Item]:
-        """What is in those ranges, in the order of the file."""
+        """Yield the items in these ranges, in the order of the file."""
         for begin, end in self.ranges():
             yield from self._walk(begin, end, file, limits)
 
     def others(self, file: ByteFile, limits: Limits) -> Iterator[Item]:
-        """The chunks left out, in the order of the file."""
+        """Yield the items of the skipped chunks, in the order of the file."""
         out = ~self.is_read
         for begin, end in zip(
             self.chunks.at[out].tolist(), self.chunks.after[out].tolist(), strict=True
@@ -72,17 +74,17 @@ class Window:
 
     def _walk(self, begin: int, end: int, file: ByteFile, limits: Limits) -> Iterator[Item]:
         rows = slice(*np.searchsorted(self.chunks.at, (begin, end)).tolist())
-        rail = self.chunks.take(rows)
-        for item in Walk(file, begin, end, rail, limits):
+        known = self.chunks.take(rows)
+        for item in Walk(file, begin, end, known, limits):
             if not isinstance(item, End):
                 yield item
 
     def rest(self, summary: Summary, held: Mapping[int, int]) -> Counter[int] | None:
-        """Messages of each channel in the chunks left out; None if the counts cannot be right.
+        """Count the messages of each channel in the skipped chunks; None if inconsistent.
 
         Args:
-            summary: Has statistics.
-            held: Messages of each channel met or known to be dropped in the chunks read.
+            summary: A summary with statistics.
+            held: Number of messages of each channel found or dropped in the chunks read.
         """
         statistics = summary.statistics
         if statistics is None:
@@ -101,7 +103,7 @@ class Window:
 
 
 def find_window(segment: Segment, declarations: Declarations, selection: Selection) -> Window | str:
-    """Where what is asked for lies, or why the index cannot tell."""
+    """Locate the selected part, or return the reason why the index cannot be used."""
     summary = segment.summary
     if summary is None or not len(summary.chunks):
         return "it has no index of chunks"
@@ -114,44 +116,44 @@ def find_window(segment: Segment, declarations: Declarations, selection: Selecti
         is_asked &= chunks.is_unnamed | chunks.naming(_wanted(declarations, selection))
     else:
         if selection.start_ns is None and selection.end_ns is None:
-            return "its index of chunks carries no checksum"
+            return "its index of chunks has no checksum"
         if not (_is_rising(chunks.start) and _is_rising(chunks.end)):
-            return "its index of chunks carries no checksum, and is not in order of time"
+            return "its index of chunks has no checksum, and is not in order of time"
         is_asked = _with_neighbours(is_asked)
     return Window(chunks, is_asked, segment.begin, segment.end)
 
 
 def _doubt(segment: Segment, summary: Summary) -> str:
-    """What is wrong with the index as a whole; empty if nothing is."""
+    """Return the problem of the index; empty for none."""
     statistics, chunks = summary.statistics, summary.chunks
     if statistics is None or not summary.counts_channels:
         return "it has no counts by topic"
     if statistics.chunk_count != len(chunks):
-        return f"its index names {len(chunks)} chunks, its statistics {statistics.chunk_count}"
+        return f"its index has {len(chunks)} chunks, its statistics {statistics.chunk_count}"
     if sum(statistics.by_channel.values()) != statistics.message_count:
         return "its counts by topic do not add up"
     if not (chunks.is_tiled and chunks.at[0] >= segment.begin and chunks.after[-1] <= segment.end):
-        return "the chunks in its index overlap, or lie beyond its data section"
+        return "the chunks in its index overlap, or are beyond its data section"
     if not summary.is_verified and (chunks.after[:-1] < chunks.at[1:]).any():
-        return "its index of chunks carries no checksum, and leaves gaps"
+        return "its index of chunks has no checksum, and has gaps"
     return ""
 
 
 def _in_time(chunks: ChunkTable, selection: Selection) -> NDArray[np.bool_]:
-    """Which chunks may hold messages of the time asked for, or with impossible times."""
+    """Return a mask of the chunks that may contain selected or impossible times."""
     asked = np.ones(len(chunks), dtype=np.bool_)
     if selection.start_ns is not None:
         asked &= chunks.end >= np.uint64(min(max(selection.start_ns, 0), 1 << 63))
     if selection.end_ns is not None:
         asked &= chunks.start < np.uint64(min(max(selection.end_ns, 0), 1 << 63))
     is_odd = (chunks.start > chunks.end) | (chunks.end > LATEST)
-    # Some writers leave the times of a chunk at 0.
+    # Some writers do not set the times of a chunk.
     is_odd |= (chunks.start == 0) & (chunks.end == 0)
     return np.logical_or(asked, is_odd)
 
 
 def _wanted(declarations: Declarations, selection: Selection) -> NDArray[np.bool_]:
-    """Shape (65536,): which channel numbers are asked for."""
+    """Return a mask of the selected channel numbers, shape (65536,)."""
     wanted = np.zeros(1 << 16, dtype=np.bool_)
     for channel_id, topic in declarations.topics():
         wanted[channel_id] = selection.wants(topic)
@@ -163,7 +165,7 @@ def _is_rising(times: NDArray[np.uint64]) -> bool:
 
 
 def _with_neighbours(asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """And the chunk before the first, and the one after the last."""
+    """Add the chunk before the first selected one, and the chunk after the last."""
     wider = asked.copy()
     wider[:-1] |= asked[1:]
     wider[1:] |= asked[:-1]

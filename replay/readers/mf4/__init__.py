@@ -1,1 +1,1 @@
-"""ASAM MDF 4."""
+"""Reader of ASAM MDF 4 logs."""

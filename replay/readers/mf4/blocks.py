@@ -1,7 +1,7 @@
-"""The block structure of ASAM MDF 4 files: every link and size checked before it is followed.
+"""Parser of the block structure of ASAM MDF 4 files, with checks of every link and size.
 
-Read here instead of through asammdf, which trusts a damaged file's sizes and offsets: it asks for
-terabytes, and reports a cut data block as a shorter one.
+The library asammdf is not used because it trusts a damaged file's sizes and offsets: it allocates
+terabytes, and reports a truncated data block as a shorter one.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ _LINKS_MAX: Final = 100_000
 _BLOCK_MAX: Final = 1 << 20
 _TEXT_MAX: Final = 1 << 16
 _CHAIN_MAX: Final = 200_000
-"""Most blocks in one chain of links; a longer one runs in a circle."""
+"""Maximum number of blocks in a chain of links; a longer chain is circular."""
 _WINDOW: Final = 1 << 16
-"""Loggers write the blocks that describe a file close together; they are read at once."""
+"""Number of bytes read at once, because loggers write descriptive blocks close together."""
 _TX: Final = re.compile(rb"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 _DATA: Final = (b"##DT", b"##SD", b"##RD")
 
@@ -37,16 +37,16 @@ LAST_REDUCED_LENGTH: Final = 0x08
 LAST_DATA_LIST: Final = 0x10
 VARIABLE_BYTES: Final = 0x20
 VARIABLE_OFFSETS: Final = 0x40
-"""What the logger of an unfinalized file did not come to write."""
+"""Flags of an unfinalized file for the parts that the logger did not write."""
 
 
 class BrokenBlockError(Exception):
-    """A block does not lie in the file or is not what its link promises."""
+    """A block is outside the file or not of the kind that its link requires."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawBlock:
-    """One block: links and the bytes after them."""
+    """A block: its links, and the bytes after them."""
 
     links: tuple[int, ...]
     body: bytes
@@ -54,13 +54,13 @@ class RawBlock:
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """How raw values become physical ones.
+    """Conversion from raw to physical values.
 
     Attributes:
         type: 0 none, 1 linear, 2 rational, 4 table with interpolation, 5 table, 6 table of ranges;
             others are not applied.
-        values: Its parameters.
-        unit: Of the physical value.
+        values: Parameters of the conversion.
+        unit: Unit of the physical value.
     """
 
     type: int = 0
@@ -70,7 +70,7 @@ class Conversion:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One channel of a group; offsets are within the record, after the record identifier."""
+    """A channel of a group; offsets count within the record, after the record identifier."""
 
     name: str
     type: int
@@ -89,17 +89,17 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """One channel group.
+    """A channel group.
 
     Attributes:
-        name: Acquisition name, or that of its source, or empty.
-        record_id: Identifier in front of its records in unsorted data.
-        records: How many the file declares.
-        flags: Bit 0 holds variable-length values, bit 1 is bus traffic, bit 3 has a remote master.
-        value_bytes: Of each record.
-        invalid_bytes: Bytes with invalidation bits after the values.
-        channels: All channels, those of structures included.
-        at: Where its block lies, which links to it name.
+        name: Acquisition name, or the name of its source, or empty.
+        record_id: Identifier before its records in unsorted data.
+        records: Number of records that the file declares.
+        flags: Bit 0: variable-length values; bit 1: bus traffic; bit 3: remote master.
+        value_bytes: Number of value bytes of each record.
+        invalid_bytes: Number of bytes with invalidation bits after the values.
+        channels: All channels, including those of structures.
+        at: Offset of its block, to which links refer.
     """
 
     name: str
@@ -113,13 +113,13 @@ class Group:
 
     @property
     def record_bytes(self) -> int:
-        """Bytes of each record without its identifier."""
+        """Size of each record in bytes, without its identifier."""
         return self.value_bytes + self.invalid_bytes
 
 
 @dataclass(frozen=True, slots=True)
 class DataGroup:
-    """Groups whose records share one stretch of data."""
+    """Groups whose records share a data stream."""
 
     id_bytes: int
     data: int
@@ -128,16 +128,16 @@ class DataGroup:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """One stored stretch of data.
+    """A stored part of a data stream.
 
     Attributes:
-        start: Where it begins in the stream that all stretches behind one link make up.
-        size: Bytes of the stream.
-        at: Where its content begins in the file.
-        stored: Bytes of it there.
-        method: Of compression, as stored; -1 for none.
-        parameter: Of that method: columns of transposed records.
-        damage: Why it cannot be read.
+        start: Offset in the stream, which consists of all stretches of a data link.
+        size: Size in the stream in bytes.
+        at: Offset of its content in the file.
+        stored: Size in the file in bytes.
+        method: Compression method, as stored; -1 for none.
+        parameter: Parameter of the method: number of columns of transposed records.
+        damage: Reason why it cannot be read, or empty.
     """
 
     start: int
@@ -154,11 +154,11 @@ class Header:
     """Identification and header block.
 
     Attributes:
-        version: As written, ``4.11``.
-        is_finalized: The recorder came to write all counts and lengths.
-        unfinished: Its flags for what is missing.
+        version: Version as stored, such as ``4.11``.
+        is_finalized: True if the recorder wrote all counts and lengths.
+        unfinished: Flags of the missing parts.
         start_ns: Start of the measurement.
-        is_local: The start is in local time of an unknown zone.
+        is_local: True if the start is in local time of an unknown zone.
         first_group: Link to the first data group.
     """
 
@@ -171,14 +171,14 @@ class Header:
 
 
 class Blocks:
-    """Blocks of an open file."""
+    """Reads the blocks of an open file."""
 
     def __init__(
         self, file: BinaryIO, size: int, limits: Limits, note: Callable[[int, int], None]
     ) -> None:
-        """Blocks of ``file``; ``note`` is called with start and size of what is read of it.
+        """Wrap ``file``; ``note`` is called with the start and size of every range read.
 
-        The heads of data blocks are not noted: all are read, whatever part is asked for.
+        The headers of data blocks are not noted, because all are read for any selection.
         """
         self._file, self.size, self._limits, self._note = file, size, limits, note
         self._linked: set[int] = set()
@@ -186,10 +186,10 @@ class Blocks:
         self._texts: dict[int, str] = {}
 
     def header(self, path: str) -> Header:
-        """Read identification and header.
+        """Read the identification and the header.
 
         Raises:
-            LogFormatError: It is no MDF 4 file, or its header is damaged.
+            LogFormatError: The file is not MDF 4, or its header is damaged.
         """
         self._file.seek(0)
         self._note(0, 64)
@@ -198,7 +198,7 @@ class Blocks:
         if not head:
             raise LogFormatError(f"{path}: empty file; expected MDF 4, check how it was copied")
         if name not in (b"MDF     ", b"UnFinMF ") or len(head) < 64:
-            raise LogFormatError(f"{path}: no MDF file (begins with {name!r}); expected 'MDF'")
+            raise LogFormatError(f"{path}: not an MDF file (starts with {name!r}); expected 'MDF'")
         if not version.startswith("4."):
             raise LogFormatError(f"{path}: MDF version {version!r}; expected 4.x, convert it first")
         try:
@@ -211,22 +211,22 @@ class Blocks:
         is_finalized = name == b"MDF     "
         unfinished, custom = (0, 0) if is_finalized else struct.unpack_from("<HH", head, 60)
         if custom:
-            # What a maker's own flags stand for is unknown: no counter is to be trusted.
+            # The meaning of a vendor's own flags is unknown, so no counter is trusted.
             unfinished |= CYCLE_COUNTERS | LAST_DATA_LENGTH
         is_local = bool(time_flags & 1)
         return Header(version, is_finalized, unfinished, start_ns, is_local, block.links[0])
 
     def block(self, at: int, kind: bytes, links: int, body: int) -> RawBlock:
-        """The block at ``at``.
+        """Read the block at ``at``.
 
         Args:
             at: Byte offset.
-            kind: ``##DG`` and the like.
-            links: Fewest links it must have.
-            body: Fewest bytes after them.
+            kind: Block type, such as ``##DG``.
+            links: Minimum number of links.
+            body: Minimum number of bytes after the links.
 
         Raises:
-            BrokenBlockError: It is not there, not of this kind, or not as large.
+            BrokenBlockError: The block is missing, of another type, or too small.
         """
         found, length, count = self._head(at)
         if found != kind:
@@ -241,7 +241,7 @@ class Blocks:
         return RawBlock(found_links, raw[8 * count :])
 
     def data_groups(self, first: int, unfinished: int) -> Iterator[DataGroup]:
-        """All data groups; channels of groups that are known to hold nothing are not read.
+        """Yield all data groups; the channels of empty groups are not read.
 
         Raises:
             BrokenBlockError: The chain is damaged from here on.
@@ -255,11 +255,11 @@ class Blocks:
             yield DataGroup(block.body[0], block.links[2], groups)
 
     def stretches(self, link: int, unfinished: int) -> Iterator[Stretch]:
-        """The stored stretches behind a data link, in order; their heads are read, no content.
+        """Yield the stretches of a data link in order, by reading only their headers.
 
         Args:
-            link: To a data block or a list of them.
-            unfinished: The file's flags for what its logger never wrote.
+            link: Link to a data block or a list of data blocks.
+            unfinished: The file's flags of missing parts.
 
         Raises:
             BrokenBlockError: The chain of blocks is damaged from here on.
@@ -267,7 +267,7 @@ class Blocks:
         start, addresses = 0, iter(self._data_blocks(link, unfinished))
         at = next(addresses, None)
         while at is not None:
-            # The blocks before a broken link come out before its error does.
+            # The blocks before a broken link are yielded before the error is raised.
             try:
                 after, error = next(addresses, None), None
             except BrokenBlockError as broken:
@@ -282,7 +282,7 @@ class Blocks:
             at = after
 
     def read(self, at: int, count: int) -> bytes:
-        """Bytes of the file."""
+        """Read bytes of the file."""
         self._note(at, count)
         self._file.seek(at)
         return self._file.read(count)
@@ -307,7 +307,7 @@ class Blocks:
                 yield from self._unlinked(found[-1] if found else place, missing)
 
     def _unlinked(self, at: int, count: int) -> Iterator[int]:
-        """Data blocks that follow the one at ``at`` and that their list never named."""
+        """Yield data blocks after the one at ``at`` that are missing in their list."""
         for _ in range(count):
             at = -(-(at + self._head(at)[1]) // 8) * 8
             if at + HEAD_BYTES > self.size or self._head(at)[0] not in (*_DATA, b"##DZ"):
@@ -331,7 +331,7 @@ class Blocks:
             yield Stretch(start + there, end - content - there, content, 0, damage=damage)
 
     def _following(self, at: int) -> int:
-        """Where the next block begins that anything links to; the file's end without one."""
+        """Return the start of the next linked block, or the file's end."""
         return min((link for link in self._linked if link > at), default=self.size)
 
     def _compressed(self, at: int, start: int) -> Stretch:
@@ -357,7 +357,7 @@ class Blocks:
         return kind, length, count
 
     def _near(self, at: int, count: int) -> bytes:
-        """Bytes of the file, kept for the next block: those that describe a file lie together."""
+        """Read bytes through a window, because descriptive blocks are close together."""
         start = at - self._window_at
         if start < 0 or start + count > len(self._window):
             start = at % _WINDOW
@@ -375,20 +375,20 @@ class Blocks:
         seen: set[int] = set()
         while at:
             if at in seen or len(seen) > _CHAIN_MAX:
-                raise BrokenBlockError(f"{kind.decode()} blocks run in a circle at byte {at}")
+                raise BrokenBlockError(f"{kind.decode()} blocks form a circle at byte {at}")
             seen.add(at)
             block = self.block(at, kind, links, body)
             yield at, block
             at = block.links[0]
 
     def _has_data(self, link: int) -> bool:
-        """Loggers declare kinds of frames that never come; their data blocks are empty."""
+        """Return whether a link has data; the data blocks of unused frame kinds are empty."""
         if not link:
             return False
         try:
             kind, length, _ = self._head(link)
         except BrokenBlockError:
-            return True  # whoever reads the data says so
+            return True  # reading the data reports the damage
         return kind not in _DATA or length != HEAD_BYTES
 
     def _group(self, block: RawBlock, at: int, may_hold: bool) -> Group:
@@ -445,7 +445,7 @@ class Blocks:
         return self._text(block.links[0]) or self._text(block.links[1])
 
     def _text(self, at: int) -> str:
-        """A text block, or the text inside an XML one; nothing in it is parsed as XML."""
+        """Return the text of a text block or of an XML block, without an XML parser."""
         if not at:
             return ""
         if at not in self._texts:

@@ -1,8 +1,8 @@
-"""ASAM MDF 4 logs: bus logging groups as CAN frames, other channel groups as tables.
+"""Reader of ASAM MDF 4 logs: bus logging groups as CAN frames, other channel groups as tables.
 
-Channels come out as physical values where their conversion is numeric (linear, rational, table);
-formulas and texts are not evaluated. A topic's rows come group by group, as the file holds them.
-Attachments are never opened. Compressed blocks carry a checksum, which is verified.
+Channels with a numeric conversion (linear, rational, table) are converted to physical values.
+Formulas and texts are not evaluated. A topic's rows are yielded group by group, as stored.
+Attachments are never opened. Compressed blocks have a checksum, which is verified.
 """
 
 from __future__ import annotations
@@ -69,16 +69,16 @@ from .variable import GroupValues, StoredValues, VariableValues
 _NAMES_SHOWN: Final = 5
 _PEEK_ROWS: Final = 4096
 _CHUNK_BYTES: Final = 1 << 16
-"""Bytes of records that are read or left out together when a span of time is asked for."""
+"""Size of the units of records that are read or skipped when a time range is selected."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """One channel group that can be read, or the reason why not.
+    """A channel group, with its layout or the reason why it cannot be read.
 
     Attributes:
-        index: Its place among the groups of its data.
-        declared: Records that the file says it has, or None where nobody wrote that.
+        index: Index among the groups of its data stream.
+        declared: Number of records that the file declares, or None if it was not written.
     """
 
     index: int
@@ -92,7 +92,7 @@ class _Source:
 
 @dataclass(slots=True, eq=False)
 class _Account:
-    """What became of one group's records so far."""
+    """Counts of a group's records so far."""
 
     met: int = 0
     dropped: int = 0
@@ -105,12 +105,12 @@ class _UnreadableError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stored:
-    """Groups that share one stream of data.
+    """Groups that share one data stream.
 
     Attributes:
-        unsorted: The records of all of them, where they are mixed.
-        sources: The groups, those left out that hold nothing but values of others.
-        values: Where the payloads of a source lie, by its index, if not in its records.
+        unsorted: The records of all groups, if they are mixed.
+        sources: The groups, except those that only contain values of other groups.
+        values: Payloads of a source that are not in its records, by the source's index.
     """
 
     stream: Stream
@@ -123,7 +123,7 @@ def open_mf4(path: Path, limits: Limits) -> Log:
     """Open an MDF 4 log.
 
     Raises:
-        LogFormatError: It is no MDF 4 file, or its header or all of its groups are damaged.
+        LogFormatError: The file is not MDF 4, or its header or all its groups are damaged.
     """
     return Mf4Log(path, limits)
 
@@ -132,10 +132,10 @@ class Mf4Log(Closing):
     """An open MDF 4 log (``Log``)."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
-        """Read the structure, and the first records of bus groups for the names of buses.
+        """Read the structure, and the first records of bus groups to find the buses' names.
 
         Raises:
-            LogFormatError: It is no MDF 4 file, or its header or all of its groups are damaged.
+            LogFormatError: The file is not MDF 4, or its header or all its groups are damaged.
         """
         self._path, self._limits = path, limits
         keep_memory()
@@ -157,7 +157,7 @@ class Mf4Log(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file."""
         return self._path
 
     @property
@@ -167,7 +167,7 @@ class Mf4Log(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Tables, and the buses seen so far: those of first records, after a pass all of them."""
+        """Tables, and the buses found so far: in the first records, or all after a pass."""
         tables = tuple(
             Topic(s.topic, "crosscue/Table", "columns", declared=s.declared)
             for s in self._sources()
@@ -180,7 +180,7 @@ class Mf4Log(Closing):
         self._file.close()
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All rows, group by group; see ``Log.read``."""
+        """Yield all rows, group by group; see ``Log.read``."""
         for topic in self.topics:
             ledger.declare(topic.name, topic.declared)
         self._say(ledger)
@@ -198,7 +198,7 @@ class Mf4Log(Closing):
         self._close_account(accounts.values(), ledger)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Blocks that are damaged or beyond the file's end, and records; see ``KnowsItsEnd``."""
+        """Report damaged blocks, and data beyond the file's end; see ``KnowsItsEnd``."""
         if self._broken:
             ledger.drop("", "structure damaged", None, self._broken)
         for stored in self._stored:
@@ -210,7 +210,7 @@ class Mf4Log(Closing):
                     there = stored.stream.size // size if size else 0
                     _settle(source, _Account(met=min(there, source.declared or 0)), ledger)
         if not self._header.is_finalized:
-            ledger.notice("not finalized by the logger; only reading it shows whether it is cut")
+            ledger.notice("not finalized by the logger; only reading it can detect a cut")
 
     def _sources(self) -> Iterator[_Source]:
         return (source for stored in self._stored for source in stored.sources)
@@ -243,7 +243,7 @@ class Mf4Log(Closing):
         ledger: Ledger,
         selection: Selection,
     ) -> Iterator[Block]:
-        """The records of unsorted data: all groups piece by piece, frames in stored order."""
+        """Yield the records of unsorted data piece by piece, with frames in stored order."""
         last = None
         for k, piece in data.pieces():
             last = piece
@@ -270,7 +270,7 @@ class Mf4Log(Closing):
         accounts: Mapping[_Source, _Account],
         ledger: Ledger,
     ) -> None:
-        """Account for what a damaged end of unsorted data held."""
+        """Account for the records in a damaged end of unsorted data."""
         if all(source.declared is not None for source in stored.sources):
             for source in stored.sources:
                 missing = max((source.declared or 0) - accounts[source].met, 0)
@@ -283,7 +283,7 @@ class Mf4Log(Closing):
             ledger.drop("", "damaged data", 1, last.damage)
 
     def _is_missed(self, stored: _Stored, group: int) -> bool:
-        """Was a frame dropped already because its payload is the value that the end cuts?"""
+        """Return whether a frame was already dropped because its payload is truncated."""
         return any(
             isinstance(one, GroupValues) and one.group == group and one.first_missed is not None
             for one in stored.values.values()
@@ -292,7 +292,7 @@ class Mf4Log(Closing):
     def _by_time(
         self, accounts: Mapping[_Source, _Account], ledger: Ledger, selection: Selection
     ) -> Iterator[Block]:
-        """The frames of all groups that have their data to themselves, merged by time."""
+        """Yield the frames of all groups with separate data streams, merged by time."""
         streams = [
             self._alone_frames(stored, source, accounts[source], ledger, selection)
             for stored in self._stored
@@ -322,7 +322,7 @@ class Mf4Log(Closing):
         ledger: Ledger,
         selection: Selection,
     ) -> Iterator[Block]:
-        """The rows of a group that has its data to itself and holds no frames."""
+        """Yield the rows of a group without frames that has a separate data stream."""
         if source.refusal or not selection.wants(source.topic):
             size = source.group.record_bytes
             there = stored.stream.size // size if size else 0
@@ -342,7 +342,7 @@ class Mf4Log(Closing):
             yield from self._table(source, records, ledger, selection)
 
     def _leave_out(self, source: _Source, count: int, ledger: Ledger) -> None:
-        """Account for rows that are not read: of a kind that is not, or not asked for."""
+        """Account for rows that are unsupported or not selected."""
         if source.refusal and source.can and source.can.is_needed:
             ledger.drop("", source.refusal, count, source.group.name)
             return
@@ -358,7 +358,7 @@ class Mf4Log(Closing):
         ledger: Ledger,
         selection: Selection,
     ) -> Iterator[Records]:
-        """Records of sorted data; those that cannot be read are accounted for here."""
+        """Yield records of sorted data, and account for unreadable ones."""
         first, stop = self._span(stored, source, selection)
         if stop is not None:
             unread = stored.stream.size // source.group.record_bytes - (stop - first)
@@ -381,9 +381,9 @@ class Mf4Log(Closing):
     def _span(
         self, stored: _Stored, source: _Source, selection: Selection
     ) -> tuple[int, int | None]:
-        """The records that may be in the span of time asked for; all of them without a stop.
+        """Return the range of records that may be selected; stop is None for all.
 
-        The first records of chunks are examined by bisection: MDF demands that times ascend.
+        The first records of chunks are found by bisection, because times ascend in MDF.
         """
         size, start_ns, end_ns = source.group.record_bytes, selection.start_ns, selection.end_ns
         if not size or (start_ns is None and end_ns is None) or stored.stream.broken:
@@ -440,7 +440,7 @@ class Mf4Log(Closing):
         yield from blocks_by_bus(rows, tuple(self._buses), ledger, selection)
 
     def _named(self, rows: FrameRows, ledger: Ledger) -> FrameRows:
-        """With places among the names of buses instead of channel numbers."""
+        """Replace channel numbers by indices of bus names."""
         if not len(rows):
             return rows
         low, high = int(rows.bus.min()), int(rows.bus.max())
@@ -512,8 +512,8 @@ class Mf4Log(Closing):
             elif channel.unit:
                 units[name] = channel.unit
         for names, what in (
-            (left_out, "are no single numbers and are left out"),
-            (unconverted, "have a conversion that is not evaluated; raw values are given"),
+            (left_out, "are not single numbers and are omitted"),
+            (unconverted, "have an unsupported conversion; raw values are used"),
         ):
             if names:
                 some = ", ".join(names[:_NAMES_SHOWN]) + (
@@ -583,7 +583,7 @@ class Mf4Log(Closing):
         can = can_layout(group)
         refusal = _refusal(group, master, can)
         topic = ""
-        # A group of mixed data that declares nothing may still turn out to hold something.
+        # A group of mixed data that declares no records may still have some.
         if can is None and not refusal:
             topic = _free(group.name or "group", names)
             names[topic] = np.zeros(0)
@@ -591,10 +591,10 @@ class Mf4Log(Closing):
 
 
 def _first_from(t_ns: int, count: int, time_ns: Callable[[int], int]) -> int:
-    """The first of ``count`` chunks that begins at ``t_ns`` or later.
+    """Return the first of ``count`` chunks that starts at ``t_ns`` or later.
 
-    Guesses by interpolation, since a look into a chunk may cost to inflate it; every other step
-    halves what is left, so that a log with pauses costs no more than twice a bisection.
+    The search interpolates, because examining a chunk may require its decompression. Every second
+    step is a bisection, so that a log with pauses takes at most twice the steps of a bisection.
     """
     low, high = 0, count - 1
     if time_ns(low) >= t_ns:
@@ -617,7 +617,7 @@ def _first_from(t_ns: int, count: int, time_ns: Callable[[int], int]) -> int:
 
 
 def _settle(source: _Source, account: _Account, ledger: Ledger) -> None:
-    """Compare what was met with what the file declares."""
+    """Compare the records found with the declared number."""
     if source.declared is None:
         return
     missing = source.declared - account.met - account.dropped
@@ -630,7 +630,7 @@ def _settle(source: _Source, account: _Account, ledger: Ledger) -> None:
 
 
 def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str:
-    """Why a group cannot be read; empty when it can."""
+    """Return the reason why a group cannot be read; empty if it can."""
     if group.flags & REMOTE_MASTER:
         return "column-oriented storage, not supported"
     if master is None:
@@ -640,7 +640,7 @@ def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str
     if can is None:
         names = {channel.name for channel in group.channels}
         if any(name.startswith(("LIN_", "ETH_", "FLX_", "MOST_", "K_LINE_")) for name in names):
-            return "bus that is no CAN"
+            return "bus that is not CAN"
         has_numbers = any(_is_column(c, group) for c in group.channels if c is not master)
         return "" if has_numbers else "group without numbers"
     return can.refusal
@@ -651,7 +651,7 @@ def _is_column(channel: Channel, group: Group) -> bool:
 
 
 def _free(name: str, taken: dict[str, NDArray[np.generic]]) -> str:
-    """``name``, or with the first number that makes it new."""
+    """Return ``name``, with a number appended if it is already used."""
     if name not in taken:
         return name
     number = 2

@@ -1,7 +1,7 @@
-"""Records of MDF 4 channel groups, in chunks, out of sorted or unsorted data.
+"""Reading of the records of MDF 4 channel groups, from sorted or unsorted data.
 
-Sorted data are records of one group, all of one size. Unsorted data are records of several groups
-one after the other, each behind its group's identifier; some are values of variable length that
+Sorted data contain the records of one group, which have equal sizes. Unsorted data contain records
+of several groups, each after its group's identifier. Some of them are variable-length values that
 belong to a record of another group.
 """
 
@@ -23,29 +23,29 @@ from .stream import Stream
 
 _WALK_BYTES: Final = 1 << 20
 _KEPT: Final = 3
-"""Walked pieces that are kept: values are near the records that they belong to."""
+"""Number of parsed pieces kept in memory, because values are close to their records."""
 PATIENCE: Final = 3_000_000
-"""Records that the plain loop may take before Numba is worth its import."""
+"""Number of records parsed by the plain loop before Numba is imported."""
 PADDING: Final = 64
-"""Bytes after those of a piece, so that every value in it can be examined with that width."""
+"""Padding after a piece in bytes, so that every value can be read with this width."""
 LAST_CUT: Final = "last record is cut"
 _FEW: Final = 16
-"""Records that make a run."""
+"""Minimum number of records in a run."""
 _MANY: Final = 500
-"""Records in a run after which the next one is looked for at once."""
+"""Number of records in a run after which the next run is searched at once."""
 _LENGTH: Final = struct.Struct("<L")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Records:
-    """Consecutive records of one group, or a stretch that cannot be read.
+    """Consecutive records of one group, or an unreadable stretch.
 
     Attributes:
         rows: Shape (N, record bytes).
-        first: Index of the first one in its group.
-        place: Shape (N,): ascending, comparable among the groups of one data group.
-        damage: What is wrong, where nothing can be read.
-        dropped: Records that are known to be dropped by it.
+        first: Index of the first record in its group.
+        place: Shape (N,): ascending places, comparable among the groups of one data group.
+        damage: Reason why the stretch is unreadable, or empty.
+        dropped: Number of records known to be dropped.
     """
 
     rows: Bytes
@@ -62,7 +62,7 @@ _NO_PLACE: Final = np.zeros(0, np.int64)
 def sorted_records(
     stream: Stream, group: Group, first: int = 0, stop: int | None = None
 ) -> Iterator[Records]:
-    """Records ``first`` to ``stop`` of a group that has its data to itself."""
+    """Yield the records ``first`` to ``stop`` of a group with a separate data stream."""
     size = group.record_bytes
     if not size:
         return
@@ -81,7 +81,7 @@ def sorted_records(
         if hole is None:
             yield _damaged(done, f"{group.name}: {LAST_CUT}", 1)
             break
-        # The next record that begins after the stretch is the first one to be whole again.
+        # The next record that starts after the stretch is the first complete one.
         following = -(-hole.stop // size)
         yield _damaged(done, hole.damage, following - done)
         done = following
@@ -95,15 +95,15 @@ def _damaged(first: int, damage: str, dropped: int) -> Records:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Walked:
-    """Whole records of unsorted data, one after the other.
+    """Consecutive complete records of unsorted data.
 
     Attributes:
-        content: Their bytes and ``PADDING`` more, shape (B,).
-        base: Where those begin in the stream.
+        content: Shape (B,): bytes of the records, and ``PADDING`` more.
+        base: Offset of the bytes in the stream.
         group: Shape (N,): index of each record's group.
-        start: Shape (N,): where its values begin in ``content``.
-        damage: Why nothing can be read after them; empty where all ends as it should.
-        cut: Index of the group of a record that the end cuts, -1 for none or an unknown one.
+        start: Shape (N,): start of each record's values in ``content``.
+        damage: Reason why the following bytes are unreadable, or empty.
+        cut: Index of the group of a truncated last record, -1 for none or unknown.
     """
 
     content: Bytes
@@ -116,7 +116,7 @@ class Walked:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """What came before a piece: its place, and each group's records and value bytes."""
+    """Totals before a piece: its place, and each group's records and value bytes."""
 
     at: int
     records: Int64s
@@ -128,13 +128,13 @@ class Values:
     """Variable-length values of one group in one piece.
 
     Attributes:
-        offset: Shape (N,), ascending: where each begins among all of its group, as the records
-            that it belongs to spell it.
-        end: Where the first one after them begins.
-        first: Index of the first one in its group.
-        start: Shape (N,): where it begins in ``content``.
-        length: Shape (N,).
-        content: Shape (B,).
+        offset: Shape (N,), ascending: offset of each value among all values of its group, as
+            referenced by records.
+        end: Offset of the next value after these.
+        first: Index of the first value in its group.
+        start: Shape (N,): start of each value in ``content``.
+        length: Shape (N,): length of each value.
+        content: Shape (B,): bytes of the piece.
     """
 
     offset: Int64s
@@ -146,19 +146,19 @@ class Values:
 
 
 class UnsortedData:
-    """Records of several groups in one stream, found piece by piece.
+    """Records of several groups in one stream, parsed piece by piece.
 
-    Where a piece begins is kept once it is known, so that values of variable length can be looked
-    for away from the records that point at them, in bounded memory.
+    The start of every known piece is kept. Variable-length values far from the records that refer
+    to them can thus be found in bounded memory.
     """
 
     def __init__(self, stream: Stream, data: DataGroup, max_record: int) -> None:
-        """Nothing is read yet.
+        """Prepare a stream for parsing.
 
         Args:
             stream: The data.
-            data: The groups in it.
-            max_record: Bytes above which a record's size is damage.
+            data: The groups in the stream.
+            max_record: Maximum plausible size of a record in bytes.
         """
         self.stream, self.data, self._max = stream, data, max_record
         self._finder = _Finder(data)
@@ -168,14 +168,14 @@ class UnsortedData:
         self._kept: dict[int, Walked] = {}
 
     def pieces(self) -> Iterator[tuple[int, Walked]]:
-        """All of it, in order, numbered."""
+        """Yield all pieces in order, with their numbers."""
         k = 0
         while (piece := self.piece(k)) is not None:
             yield k, piece
             k += 1
 
     def piece(self, k: int) -> Walked | None:
-        """Piece ``k``, or None after the last one."""
+        """Return piece ``k``, or None after the last one."""
         while k >= len(self._states) and not self._is_complete:
             self.piece(len(self._states) - 1)
         if k >= len(self._states):
@@ -187,14 +187,14 @@ class UnsortedData:
         return self._kept[k]
 
     def rows(self, k: int, group: int) -> Records:
-        """The records of one group in piece ``k``."""
+        """Return the records of one group in piece ``k``."""
         piece = self._known(k)
         start = piece.start[piece.group == group]
         rows = _gathered(piece.content, start, self.data.groups[group].record_bytes)
         return Records(rows, int(self._states[k].records[group]), start + piece.base)
 
     def values(self, k: int, group: int) -> Values:
-        """The variable-length values of one group in piece ``k``."""
+        """Return the variable-length values of one group in piece ``k``."""
         piece, before = self._known(k), self._states[k]
         start = piece.start[piece.group == group]
         length = _lengths(piece.content, start)
@@ -204,7 +204,7 @@ class UnsortedData:
         return Values(after - (length + 4), end, first, start, length, piece.content)
 
     def piece_of(self, group: int, key: int, by_order: bool) -> int:
-        """The piece that holds a value if any does, by offset or by index; -1 for none."""
+        """Return the piece that contains a value, by its offset or index; -1 if none does."""
         while True:
             low, high = 0, len(self._states)
             while low < high:
@@ -261,7 +261,7 @@ class UnsortedData:
         left = self.stream.size - at
         where = f"byte {at} of the data, {left} bytes before its end"
         if unknown == -2:
-            return f"a record of over {self._max} bytes at {where}", -1
+            return f"a record of more than {self._max} bytes at {where}", -1
         if unknown >= 0:
             return f"unknown record identifier {unknown} at {where}", -1
         hole = self.stream.hole(at, self.stream.size)
@@ -273,7 +273,7 @@ class UnsortedData:
 
 
 class _Finder:
-    """Finds records in a buffer; remembers how much the plain loop has done."""
+    """Finds records in a buffer; switches to Numba after many records."""
 
     def __init__(self, data: DataGroup) -> None:
         self._id_bytes = data.id_bytes
@@ -287,17 +287,17 @@ class _Finder:
         self._done = 0
 
     def group_of(self, content: bytes) -> int:
-        """The group whose record begins here, -1 where that is unknown."""
+        """Return the group of the record that starts here, -1 if unknown."""
         if len(content) < self._id_bytes:
             return -1
         return self._index.get(int.from_bytes(content[: self._id_bytes], "little"), -1)
 
     def __call__(self, content: bytes) -> tuple[Int64s, Int64s, int, int]:
-        """Groups and value starts of the whole records.
+        """Find the complete records.
 
         Returns:
-            Groups, starts, where the first record begins that is not whole, and its identifier
-            where that belongs to no group, else -1.
+            Groups, starts of the values, start of the first incomplete record, and its identifier
+            if it belongs to no group, else -1.
         """
         if "numba" in sys.modules or self._done + len(content) // 20 > PATIENCE:
             return self._compiled(content)
@@ -331,7 +331,7 @@ class _Finder:
             at = start + size
             if len(groups) > patience:
                 run = self._run(content, groups, starts, at)
-                # Looking for a run costs as much as some hundred records of this loop.
+                # The search for a run takes as long as some hundred records of this loop.
                 is_worth_it = run is not None and len(run[0]) > _MANY
                 patience = _FEW if is_worth_it else min(2 * patience, PATIENCE)
                 if run:
@@ -344,10 +344,10 @@ class _Finder:
     def _run(
         self, content: bytes, groups: Sequence[int], starts: Sequence[int], at: int
     ) -> tuple[Int64s, Int64s, int] | None:
-        """The records from ``at`` on that repeat the last one or the last two.
+        """Find the records from ``at`` on that repeat the pattern of the last one or two.
 
-        Loggers write long runs of frames of one kind, each perhaps with a payload of one length:
-        there all identifiers and lengths are compared at once.
+        Loggers write long runs of frames of one kind, often with payloads of equal length. In such
+        runs, all identifiers and lengths are compared at once.
         """
         for period in (1, 2):
             kinds = np.array(groups[-period:], np.int64)
@@ -402,7 +402,7 @@ def _walker() -> _Walker:
 
 
 def _lengths(content: Bytes, start: Int64s) -> Int64s:
-    """The lengths in front of variable-length values."""
+    """Return the lengths stored before variable-length values."""
     if not len(start):
         return np.zeros(0, np.int64)
     shape = (len(content) - 3,)

@@ -1,4 +1,4 @@
-"""The loop of ``mf4_records``, compiled; importing this module imports Numba."""
+"""The loop over records of ``records``, compiled; importing this module imports Numba."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _walk(
 def _compile() -> object:
     try:
         return numba.njit(cache=True, nogil=True)(_walk)
-    except RuntimeError:  # no folder that may be written to for the cache
+    except RuntimeError:  # no writable cache folder
         return numba.njit(nogil=True)(_walk)
 
 

@@ -1,4 +1,4 @@
-"""The bytes behind an MDF 4 data link, as one stream that can be read at any place."""
+"""Random access to the data of an MDF 4 data link as one stream of bytes."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from .blocks import Blocks, BrokenBlockError, Stretch
 
 _DAMAGED: Final = cast("type[Exception]", isal_zlib.error)
 _KEPT: Final = 3
-"""Inflated blocks that are kept; a record may begin in one and end in the next."""
+"""Number of decompressed blocks kept, because a record may extend over two blocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hole:
-    """A stretch of a stream that cannot be read."""
+    """An unreadable part of a stream."""
 
     stop: int
     damage: str
 
 
 class Stream:
-    """All bytes behind one data link, whatever blocks they are stored in.
+    """All bytes of one data link, independent of their division into blocks.
 
     Attributes:
-        size: Bytes it must have, those included that cannot be read.
-        broken: Why nobody can know what follows; empty where the chain of blocks ends as it should.
+        size: Declared size in bytes, including unreadable parts.
+        broken: Reason why the following data are unknown; empty if the chain of blocks is intact.
     """
 
     def __init__(self, blocks: Blocks, link: int, unfinished: int) -> None:
-        """Find the blocks; reads their heads."""
+        """Find the blocks by reading their headers."""
         self._blocks = blocks
         self._stretches: list[Stretch] = []
         self.broken = ""
@@ -51,7 +51,7 @@ class Stream:
 
     @property
     def missing(self) -> str:
-        """What is damaged or beyond the file's end, known without reading; empty if nothing is."""
+        """Describe damage that is known without reading the data; empty for none."""
         for k, one in enumerate(self._stretches):
             if k in self._damage:
                 return self._damage[k]
@@ -60,7 +60,7 @@ class Stream:
         return self.broken
 
     def read(self, start: int, count: int) -> bytes:
-        """The bytes from ``start`` on: ``count``, or fewer up to damage or the stream's end."""
+        """Read ``count`` bytes from ``start`` on, or fewer up to damage or the stream's end."""
         parts: list[bytes] = []
         k, end = max(bisect_right(self._starts, start) - 1, 0), min(start + count, self.size)
         while start < end:
@@ -73,7 +73,7 @@ class Stream:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def hole(self, start: int, stop: int) -> Hole | None:
-        """The first damaged stretch known to be in these bytes."""
+        """Return the first known unreadable part in these bytes."""
         for k in range(max(bisect_right(self._starts, start) - 1, 0), len(self._stretches)):
             one = self._stretches[k]
             if one.start >= stop:
@@ -108,7 +108,7 @@ class Stream:
 
 
 def _inflated(one: Stretch, stored: bytes) -> tuple[bytes, str]:
-    """Content of a compressed block, or what is wrong with it."""
+    """Decompress a block; return its content, or empty bytes and the problem."""
     if one.method not in (0, 1):
         return b"", f"has the unknown method {one.method}"
     inflater = isal_zlib.decompressobj()
@@ -117,13 +117,13 @@ def _inflated(one: Stretch, stored: bytes) -> tuple[bytes, str]:
     except _DAMAGED:
         return b"", "fails its checksum"
     if not inflater.eof or len(content) != one.size:
-        gave = f"more than {one.size}" if len(content) > one.size else str(len(content))
-        return b"", f"is cut or damaged: inflates to {gave} bytes, declares {one.size}"
+        found = f"more than {one.size}" if len(content) > one.size else str(len(content))
+        return b"", f"is cut or damaged: inflates to {found} bytes, declares {one.size}"
     return (_transposed(content, one.parameter) if one.method == 1 else content), ""
 
 
 def _transposed(content: bytes, columns: int) -> bytes:
-    """Undo the column-wise order in which compressed records may be stored."""
+    """Undo the transposition of compressed records."""
     if columns < 2 or columns > len(content):
         return content
     rows = len(content) // columns

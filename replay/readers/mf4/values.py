@@ -1,4 +1,4 @@
-"""Values of MDF 4 channels, out of whole columns of records."""
+"""Values of MDF 4 channels, computed from columns of records."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ HAS_INVALID_BIT = 2
 
 
 def is_numeric(channel: Channel, value_bytes: int) -> bool:
-    """Can ``raw`` read it?"""
+    """Return whether ``raw`` supports a channel."""
     if channel.type in (VIRTUAL_MASTER, VIRTUAL):
         return True
     end = channel.byte_offset + (channel.bit_offset + channel.bit_count + 7) // 8
@@ -24,19 +24,19 @@ def is_numeric(channel: Channel, value_bytes: int) -> bool:
 
 
 def is_plain(channel: Channel) -> bool:
-    """Is its raw value an unsigned little-endian number in the record?"""
+    """Return whether a channel's raw value is an unsigned little-endian number in the record."""
     return channel.type not in (VIRTUAL_MASTER, VIRTUAL) and channel.data_type == 0
 
 
 class Words:
-    """Records as 64-bit words: what several channels take their bits from is loaded once."""
+    """Records as 64-bit words, which are loaded once for all channels that share them."""
 
     def __init__(self, records: NDArray[np.uint8], first: int = 0) -> None:
-        """Nothing is loaded yet.
+        """Wrap records; words are loaded on demand.
 
         Args:
             records: Shape (N, record bytes).
-            first: Index of the first one in its group, which is what virtual channels count.
+            first: Index of the first record in its group, for virtual channels.
         """
         self.records, self.first = np.ascontiguousarray(records), first
         self._loaded: dict[int, NDArray[np.uint64]] = {}
@@ -45,7 +45,7 @@ class Words:
         return len(self.records)
 
     def bits(self, byte: int, bit: int, count: int) -> NDArray[np.uint64]:
-        """Little-endian numbers of ``count`` bits, 64 at most, from bit ``bit`` of ``byte`` on."""
+        """Read little-endian numbers of up to 64 bits from bit ``bit`` of ``byte`` on."""
         size = self.records.shape[1]
         at = byte - byte % 8
         if byte * 8 + bit + count > at * 8 + 64:
@@ -68,11 +68,11 @@ class Words:
         view: NDArray[np.uint64] = np.ndarray(
             (len(self.records),), np.dtype("<u8"), self.records.data, at, (size,)
         )
-        return view.astype(np.uint64)  # copied: the words are aligned from here on
+        return view.astype(np.uint64)  # a copy, which is aligned
 
 
 def raw(channel: Channel, words: Words) -> NDArray[np.generic]:
-    """Stored values of a channel that ``is_numeric``; a virtual one stores the record's index."""
+    """Return the stored values of a numeric channel; the record's index for a virtual channel."""
     if channel.type in (VIRTUAL_MASTER, VIRTUAL):
         return np.arange(words.first, words.first + len(words), dtype=np.int64)
     count = (channel.bit_offset + channel.bit_count + 7) // 8
@@ -94,7 +94,7 @@ def raw(channel: Channel, words: Words) -> NDArray[np.generic]:
 
 
 def physical(conversion: Conversion, values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Converted values; unchanged for conversions that are not applied."""
+    """Return the converted values; unchanged for unsupported conversions."""
     p = conversion.values
     if conversion.type == 1 and len(p) >= 2:
         if p[0] == 0.0 and p[1] == 1.0:
@@ -123,7 +123,7 @@ def physical(conversion: Conversion, values: NDArray[np.generic]) -> NDArray[np.
 
 
 def _nearest(keys: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.intp]:
-    """The place of the key next to each value; of two at the same distance the lower one."""
+    """Return the index of the key nearest to each value; of two equally near keys, the lower."""
     above = np.clip(np.searchsorted(keys, x), 1, max(len(keys) - 1, 1))
     above = np.minimum(above, len(keys) - 1)
     below = np.maximum(above - 1, 0)
@@ -131,26 +131,26 @@ def _nearest(keys: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.in
 
 
 def _of_ranges(p: tuple[float, ...], values: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Value range to value: lower and upper bound and result of each, then the default."""
+    """Convert by a table of lower bound, upper bound and result, followed by the default."""
     low, high, target = (np.array(p[k : 3 * (len(p) // 3) : 3]) for k in range(3))
     x = values.astype(np.float64)
     found = np.full(len(x), p[-1])
     for k in range(len(low)):
-        # The upper bound of a range belongs to it for whole numbers only.
+        # The upper bound is inclusive only for integers.
         inside = (x >= low[k]) & ((x <= high[k]) if values.dtype.kind in "iu" else (x < high[k]))
         found[inside] = target[k]
     return found
 
 
 def is_applied(conversion: Conversion) -> bool:
-    """Does ``physical`` know this conversion?"""
+    """Return whether ``physical`` supports this conversion."""
     return conversion.type in (0, 1, 2, 4, 5, 6)
 
 
 def invalid(
     channel: Channel, records: NDArray[np.uint8], value_bytes: int
 ) -> NDArray[np.bool_] | None:
-    """Which values the recorder marked as invalid; None for none."""
+    """Return a mask of the values marked as invalid by the recorder; None for none."""
     if channel.flags & ALL_INVALID:
         return np.ones(len(records), np.bool_)
     at = value_bytes + channel.invalid_bit // 8
@@ -161,10 +161,10 @@ def invalid(
 
 
 def times_ns(channel: Channel, values: NDArray[np.generic]) -> NDArray[np.int64] | None:
-    """Master values as nanoseconds since the start, exact where stored as whole steps of them.
+    """Convert master values to nanoseconds since the start, exactly if stored as integer steps.
 
     Returns:
-        Shape (N,); None when one of them is not a time (not finite, or over 200 years).
+        Shape (N,); None if a value is not a valid time (not finite, or over 200 years).
     """
     conversion = channel.conversion
     offset, factor = 0.0, 1.0
@@ -184,9 +184,9 @@ def times_ns(channel: Channel, values: NDArray[np.generic]) -> NDArray[np.int64]
         return values.astype(np.int64) * whole
     with np.errstate(over="ignore", invalid="ignore"):
         seconds = values.astype(np.float64, copy=False)
-        # One product where it can be exact: counts of nanoseconds stored as floating point.
+        # A single product, which is exact for nanosecond counts stored as floating point.
         nanos = np.rint(seconds * step if offset == 0.0 else (seconds * factor + offset) * 1e9)
-        # Comparisons with what is not a number are false.
+        # Comparisons with NaN are false.
         if len(nanos) and not (nanos.max() < float(1 << 62) and nanos.min() > -float(1 << 62)):
             return None
     return nanos.astype(np.int64)

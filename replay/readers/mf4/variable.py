@@ -1,4 +1,4 @@
-"""Values of variable length, which MDF 4 stores away from the records that point at them."""
+"""Variable-length values, which MDF 4 stores separately from the records that refer to them."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 _SPAN: Final = 4 << 20
 _WINDOWS_MAX: Final = 64
-"""Stretches of ``_SPAN`` bytes that the values of one block of records may be in."""
+"""Maximum number of windows of ``_SPAN`` bytes with the values of one block of records."""
 
 
 class VariableValues(Protocol):
-    """Values of one channel by what its records hold."""
+    """Values of one channel, found by the references in its records."""
 
     def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
-        """The values of N records.
+        """Read the values of N records.
 
         Args:
-            key: Shape (N,): what the records hold, negative for impossible ones.
+            key: Shape (N,): references in the records, negative for impossible ones.
             first: Index of the first record in its group.
-            width: Bytes wanted of each, 8 or 64.
+            width: Number of bytes to read of each value, 8 or 64.
 
         Returns:
-            Shape (N, width): their first bytes, then anything; shape (N,): their lengths, -1 for
-            values that are not there or cannot be read.
+            Shape (N, width): first bytes of the values, undefined after their ends. Shape (N,):
+            lengths of the values, -1 for missing or unreadable ones.
         """
         ...
 
 
 class StoredValues:
-    """Values in a data block of their own, each behind its length, found by their offset."""
+    """Values in a separate data block, each after its length, found by their offsets."""
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
@@ -64,19 +64,20 @@ class StoredValues:
 
 
 class GroupValues:
-    """Values that are records of a group of their own in the same unsorted data."""
+    """Values that are records of a separate group in the same unsorted data."""
 
     def __init__(self, data: UnsortedData, group: int, by_order: bool) -> None:
-        """Nothing is read yet.
+        """Prepare reading the values of a group.
 
         Args:
-            data: Where they are.
-            group: Index of their group.
-            by_order: The records' offsets were never written: the n-th value is the n-th record's.
+            data: The unsorted data.
+            group: Index of the values' group.
+            by_order: True if the records' offsets were not written, so that the n-th value belongs
+                to the n-th record.
         """
         self._data, self.group, self._by_order = data, group, by_order
         self.first_missed: int | None = None
-        """Offset or index of the first value beyond the last one there is, if any was wanted."""
+        """Offset or index of the first requested value after the last existing one, if any."""
 
     def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
         """As ``VariableValues`` says."""
@@ -98,7 +99,7 @@ class GroupValues:
             start, found = values.start[at], values.length[at]
             payload[rows] = windowed(values.content, width, start)
             length[rows] = found
-            # What this piece should hold and does not is nowhere.
+            # A value that is missing in its piece does not exist.
             left = left[~is_here & (mine >= end)]
             if len(left) and self._data.piece(k + 1) is None:
                 missed = int(key[left].min())
@@ -113,7 +114,7 @@ def _nothing(count: int, width: int) -> tuple[Bytes, Int64s]:
 
 
 def _windows(key: Int64s) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
-    """First and last offset of the rows whose values are near each other, and those rows."""
+    """Yield groups of rows with nearby values: first offset, last offset, and the rows."""
     rows = np.flatnonzero(key >= 0)
     if not len(rows):
         return
@@ -132,12 +133,12 @@ def _windows(key: Int64s) -> Iterator[tuple[int, int, NDArray[np.intp]]]:
 def _take(
     content: bytes, place: Int64s, rows: NDArray[np.intp], payload: Bytes, length: Int64s
 ) -> None:
-    """Fill in the values that lie whole in ``content``, at ``place``."""
+    """Copy the values that are completely in ``content``, at ``place``."""
     size, width = len(content), payload.shape[1]
     if len(place) and (place.min() < 0 or place.max() + 4 > size):
         inside = (place >= 0) & (place + 4 <= size)
         place, rows = place[inside], rows[inside]
-    # One look at length and value together: the places are at odd bytes, which makes each dear.
+    # Length and value are read together, because unaligned reads are slow.
     kind = np.dtype([("length", "<u4"), ("value", "<u8", (width // 8,))])
     padded = content + bytes(kind.itemsize)
     near: NDArray[np.void] = np.ndarray((size,), f"V{kind.itemsize}", padded, strides=(1,))
@@ -156,7 +157,7 @@ def _take(
 
 
 def windowed(buffer: Bytes, width: int, place: Int64s) -> Bytes:
-    """Shape (N, width): the ``width`` bytes, 8 or 64, from each place on."""
+    """Return ``width`` (8 or 64) bytes from each place on, shape (N, width)."""
     if width == 8:
         shape = (len(buffer) - 7,)
         words: NDArray[np.uint64] = np.ndarray(shape, np.dtype("<u8"), buffer.data, strides=(1,))

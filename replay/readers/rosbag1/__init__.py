@@ -1,1 +1,1 @@
-"""ROS 1 bags."""
+"""Reader of ROS 1 bags."""

@@ -1,4 +1,4 @@
-"""One pass over a ROS 1 bag: blocks out, every message accounted for."""
+"""One pass over a ROS 1 bag: blocks, and the account of every message."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from .records import (
 from .window import BagWindow, find_bag_window
 
 BATCH_BYTES: Final = BLOCK_BYTES // 2
-"""Chunks are copied into buffers of this size, unless one is larger.
+"""Size of the buffers into which chunks are copied, unless a chunk is larger.
 
-NumPy asks the kernel for huge pages from 4 MiB on; a buffer of its own for each chunk costs more in
-page faults than the copy.
+NumPy requests huge pages from 4 MiB on. Separate buffers for all chunks would take more time for
+page faults than the copies take.
 """
 
 DAMAGED_RECORD: Final = "damaged record"
@@ -54,7 +54,7 @@ TWO_RECORDS: Final = "the records of a connection differ"
 
 
 class Roster:
-    """Which connection carries which topic; grows when a chunk brings a new one."""
+    """Topics by connection; new connections are added when a chunk declares them."""
 
     def __init__(self, contents: Contents) -> None:
         self._contents = contents
@@ -64,7 +64,7 @@ class Roster:
             self.add(contents.connections[number])
 
     def add(self, connection: Connection) -> None:
-        """Take in a connection; the first one of a topic decides its type."""
+        """Add a connection; the first connection of a topic determines its type."""
         self._contents.connections[connection.conn] = connection
         if connection.topic in self._topics:
             return
@@ -79,7 +79,7 @@ class Roster:
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """All topics known so far, with the counts that the index section declares."""
+        """Return all topics known so far, with the counts declared in the index section."""
         counts = self._declared()
         return tuple(
             Topic(t.name, t.type_name, t.encoding, t.schema, t.schema_encoding, counts.get(t.name))
@@ -87,18 +87,18 @@ class Roster:
         )
 
     def topic_of(self, conn: int) -> str:
-        """Topic of a connection; empty if unknown."""
+        """Return the topic of a connection; empty if unknown."""
         connection = self._contents.connections.get(conn)
         return connection.topic if connection is not None else ""
 
     def fits_topic(self, conn: int) -> bool:
-        """Has the connection the type that its topic was first met with?"""
+        """Return whether a connection has the type of its topic's first connection."""
         connection = self._contents.connections[conn]
         first = self._first[connection.topic]
         return (connection.type_name, connection.md5sum) == (first.type_name, first.md5sum)
 
     def knows(self, conn: int) -> bool:
-        """Was there a record of this connection?"""
+        """Return whether a connection has a record."""
         return conn in self._contents.connections
 
     def _declared(self) -> dict[str, int]:
@@ -113,7 +113,7 @@ class Roster:
 
 @dataclass(slots=True)
 class _Checked:
-    """How many chunks could be checked, by how, and how many messages are outside chunks."""
+    """Numbers of checked chunks by kind of checksum, and of messages outside chunks."""
 
     bz2: int = 0
     lz4: int = 0
@@ -122,7 +122,7 @@ class _Checked:
     loose: int = 0
 
     def words(self) -> str:
-        """The sentence for ``Ledger.integrity``."""
+        """Return the sentence for ``Ledger.integrity``."""
         said = [
             f"{name} checksums verified in {count} chunks"
             for name, count in (("bz2", self.bz2), ("lz4", self.lz4))
@@ -130,12 +130,12 @@ class _Checked:
         ]
         if self.unchecked:
             said.append(
-                f"{self.unchecked} chunks carry no checksum: a changed payload byte in them cannot "
+                f"{self.unchecked} chunks have no checksum: a changed payload byte in them cannot "
                 "be seen"
             )
         if self.loose:
             said.append(
-                f"{self.loose} messages outside chunks carry no checksum: a changed byte in them "
+                f"{self.loose} messages outside chunks have no checksum: a changed byte in them "
                 "cannot be detected"
             )
         if self.left:
@@ -150,7 +150,7 @@ class _Checked:
 
 @dataclass(slots=True)
 class _Batch:
-    """Rows of several chunks waiting to become blocks."""
+    """Rows of several chunks, collected for the next blocks."""
 
     buffer: Bytes | None = None
     conn: list[Int64s] = field(default_factory=list)
@@ -161,11 +161,11 @@ class _Batch:
     count: int = 0
 
     def has_room(self, raw: bytes) -> bool:
-        """Can ``raw`` be added? An empty batch takes any size."""
+        """Return whether ``raw`` can be added; an empty batch accepts any size."""
         return not self.size or (self.size + len(raw) <= BATCH_BYTES and self.count < BLOCK_ROWS)
 
     def add(self, raw: bytes, rows: ChunkRows) -> None:
-        """Add a chunk for which there is room."""
+        """Add a chunk for which ``has_room`` is true."""
         content = np.frombuffer(raw, dtype=np.uint8)
         if self.buffer is None:
             is_large = len(raw) > BATCH_BYTES
@@ -210,10 +210,10 @@ class Pass:
         self._checked = _Checked()
 
     def blocks(self, index_at: int) -> Iterator[Block]:
-        """Everything, in stored order.
+        """Yield all blocks in stored order.
 
         Args:
-            index_at: Where the bag header says that the index section begins, or 0.
+            index_at: Offset of the index section in the bag header, or 0.
         """
         for topic in self._roster.topics:
             self._ledger.declare(topic.name, topic.declared)
@@ -230,14 +230,14 @@ class Pass:
             else:
                 yield from self._windowed(window, index_at)
         except OSError as error:
-            self._ledger.drop("", "file cannot be read on", None, str(error.strerror or error))
+            self._ledger.drop("", "reading the file failed", None, str(error.strerror or error))
         yield from self._flush()
         for name in [t.name for t in self._roster.topics]:
             self._ledger.settle(name)
         self._ledger.integrity = self._checked.words()
 
     def _window(self, index_at: int) -> BagWindow | None:
-        """Where the selection lies, if the index can be trusted; else the reason is reported."""
+        """Locate the selection by the index; if it cannot be trusted, report the reason."""
         if self._selection == EVERYTHING:
             return None
         found = find_bag_window(
@@ -245,11 +245,11 @@ class Pass:
         )
         if isinstance(found, BagWindow):
             return found
-        self._ledger.notice(f"the requested part was found by walking through the bag: {found}")
+        self._ledger.notice(f"the requested part was found by reading the complete bag: {found}")
         return None
 
     def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
-        """Blocks of the chunks that the index names; the others are examined if it is wrong."""
+        """Yield blocks of the indexed chunks; if the index is wrong, examine the others too."""
         self._inside = window
         self._file.expect(window.ranges())
         connections = self._contents.connections
@@ -257,7 +257,7 @@ class Pass:
         self._inside = None
         if self._doubt:
             self._ledger.notice(
-                f"the index was not trusted after all ({self._doubt}); every chunk was examined"
+                f"the index proved unreliable ({self._doubt}); every chunk was examined"
             )
             others = window.units(self._file, self._limits, connections, is_read=False)
             yield from self._taken(others, index_at)
@@ -285,7 +285,7 @@ class Pass:
         self._settle_owed()
 
     def _pass_over(self, info: ChunkInfo, asked: Selection) -> None:
-        """Account for a chunk's messages, none of which is asked for, without reading them."""
+        """Account for a chunk of unselected messages without reading them."""
         for conn, count in info.counts.items():
             name = self._roster.topic_of(conn)
             self._ledger.find(name, count)
@@ -293,7 +293,7 @@ class Pass:
             self._ledger.skip(name, reason, count)
 
     def _record(self, record: Record) -> tuple[bytes, ChunkRows] | None:
-        """Take in a record outside chunks; a message as a chunk of its own."""
+        """Process a record outside chunks; return a message as a separate chunk."""
         if record.op == MESSAGE:
             self._checked.loose += 1
             conn_number = record.u32(b"conn")
@@ -357,7 +357,7 @@ class Pass:
             and self._contents.is_complete
             and (within or not self._checked.loose)
         ):
-            # Messages of a chunk without its head may be found behind the gap one by one.
+            # The messages of a chunk without its header may be found singly after the gap.
             self._owed_by = gap.at, gap.stop
             for info in within:
                 self._owed.update(info.counts)
@@ -368,22 +368,22 @@ class Pass:
             self._ledger.drop("", reason, None, where)
 
     def _settle_owed(self) -> None:
-        """Account for what a gap hid, once all that could be found behind it was met."""
+        """Account for the messages hidden by a gap, after reading the messages that follow it."""
         if self._owed_by is not None:
             self._lose(self._owed, DAMAGED_RECORD, "bytes {} to {}".format(*self._owed_by))
         self._owed, self._owed_by = Counter(), None
 
     def _lose(self, missing: Counter[int], reason: str, detail: str) -> None:
-        """Account for a known number of rows by connection; none at all is only a notice."""
+        """Account for a known number of rows by connection; add a notice if it is zero."""
         for conn, count in missing.items():
             self._ledger.drop(self._roster.topic_of(conn), reason, max(count, 0), detail)
         if not any(count > 0 for count in missing.values()):
             self._ledger.notice(f"{reason}, no message lost: {detail}")
 
     def _chunk(self, unit: ChunkUnit) -> tuple[bytes, ChunkRows] | None:
-        """The records of a chunk and the messages in them, accounted for."""
+        """Return the records of a chunk and their messages, and account for them."""
         if self._inside is not None and not self._is_as_indexed(unit):
-            self._doubt = self._doubt or f"it does not fit the chunk at byte {unit.record.at}"
+            self._doubt = self._doubt or f"it does not match the chunk at byte {unit.record.at}"
         if self._is_skipped(unit):
             return None
         size = unit.record.u32(b"size")
@@ -407,7 +407,7 @@ class Pass:
         return inflated.raw, self._of_known(rows, where)
 
     def _say_if_misframed(self, unit: ChunkUnit, inflated: Inflated, where: str) -> None:
-        """Its own length was wrong: say so, and account for bytes between it and what follows."""
+        """Report a wrong length of a chunk, and account for the bytes after its content."""
         if unit.record.end != unit.stored_stop:
             self._ledger.notice(f"the length of the {where} is damaged; its content was found")
         if inflated.unused and not unit.is_framed:
@@ -415,7 +415,7 @@ class Pass:
             self._ledger.drop("", DAMAGED_RECORD, None, f"bytes {begin} to {unit.stored_stop}")
 
     def _of_known(self, rows: ChunkRows, where: str) -> ChunkRows:
-        """Without messages of connections that no record describes; these are dropped."""
+        """Drop the messages of connections without a record, and return the others."""
         unknown = [conn for conn in rows.counts() if not self._roster.knows(conn)]
         for conn in unknown:
             count = rows.counts()[conn]
@@ -438,12 +438,12 @@ class Pass:
             self._short(unit, found, rows.fault, where + inside + sizes)
             return
         if unit.entries is not None and unit.entries.counts() != found:
-            self._ledger.notice(f"the index behind the {where} is damaged; it was not used")
+            self._ledger.notice(f"the index after the {where} is damaged; it was not used")
             if not inflated.is_checked:
                 self._lose(Counter(unit.entries.counts()) - found, "listed in the index", where)
 
     def _short(self, unit: ChunkUnit, found: Counter[int], reason: str, detail: str) -> None:
-        """Account for what a damaged chunk must have held beyond what was found in it."""
+        """Account for the messages that a damaged chunk must have had, beyond those found."""
         expected: Counter[int] = Counter()
         info = self._contents.infos.get(unit.record.at)
         if info is not None:
@@ -456,7 +456,7 @@ class Pass:
             self._ledger.drop("", reason, None, detail)
 
     def _is_as_indexed(self, unit: ChunkUnit) -> bool:
-        """Do the index section and the index records behind the chunk say the same of it?"""
+        """Return whether the index section agrees with the index records after the chunk."""
         info, entries = self._contents.infos.get(unit.record.at), unit.entries
         if info is None or entries is None or not len(entries) or not unit.is_framed:
             return False
@@ -464,7 +464,7 @@ class Pass:
         return (*span, entries.counts()) == (info.start_ns, info.end_ns, info.counts)
 
     def _is_skipped(self, unit: ChunkUnit) -> bool:
-        """Leave the chunk compressed if both of its indexes agree that nothing in it is wanted."""
+        """Skip a chunk if both of its indexes agree that none of its messages is selected."""
         asked = self._selection
         info = self._contents.infos.get(unit.record.at)
         if info is None or not self._is_as_indexed(unit):
@@ -506,7 +506,7 @@ class Pass:
 
 
 def _looked_up(conn: Int64s, place: dict[int, int]) -> Int64s:
-    """``place`` of each connection number, -1 for those that have none."""
+    """Return ``place`` of each connection number, -1 if missing."""
     numbers = np.array(sorted(place), dtype=np.int64)
     if not len(numbers):
         return np.full(len(conn), -1, dtype=np.int64)

@@ -1,8 +1,8 @@
-"""One chunk of a ROS 1 bag: inflate it within bounds and find the messages in it, as columns.
+"""Decompression of a chunk of a ROS 1 bag within limits, and columns of its messages.
 
-The chunk's own bytes decide. The index records behind a chunk serve to find its messages without a
-step per message, and are believed only if the messages then tile the chunk exactly and say the same
-connection and time themselves. Where the bytes are damaged, the index shows where to go on.
+The reader relies on the chunk's bytes. The index records after a chunk locate its messages without
+a step per message. They are trusted only if the messages fill the chunk exactly and have the same
+connections and times. After damaged bytes, the index locates the next message.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ TOO_LARGE: Final = "chunk over the size limit"
 TOO_MANY: Final = "more records in a chunk than the limit"
 
 _HEADER: Final = 38
-"""Length of a message record's header: op, conn and time, in any order."""
+"""Length of a message record's header with op, conn and time, in any order."""
 _HEAD: Final = 4 + _HEADER + 4
 _U32 = struct.Struct("<I")
 _FIRST_RUN: Final = 16
 _IN_A_ROW: Final = 3
-"""Plausible messages in a row that are believed behind damaged bytes without an index."""
+"""Number of consecutive plausible messages accepted after damaged bytes without an index."""
 _DAY_NS: Final = 86_400 * 10**9
 _LONGEST_RUN: Final = 65_536
 
 
 @dataclass(frozen=True, slots=True)
 class Inflated:
-    """What came out of a chunk's stored bytes.
+    """The decompressed contents of a chunk.
 
     Attributes:
         raw: The records.
-        is_checked: A checksum over all of ``raw`` was verified.
-        fault: Why ``raw`` is not the whole chunk, or empty.
-        sizes: What was declared and what came out, where they differ; else empty.
-        unused: Stored bytes behind the end of the compressed content.
+        is_checked: True if a checksum over all of ``raw`` was verified.
+        fault: Reason why ``raw`` is not the complete chunk, or empty.
+        sizes: The declared and the actual size, if they differ; else empty.
+        unused: Stored bytes after the end of the compressed content.
     """
 
     raw: bytes
@@ -71,13 +71,13 @@ class Inflated:
 
 
 def inflate(compression: bytes, stored: bytes, size: int, is_framed: bool) -> Inflated:
-    """The records of a chunk, never more than ``size`` bytes of them.
+    """Decompress at most ``size`` bytes of a chunk's records.
 
     Args:
-        compression: As the chunk's header says it.
-        stored: The chunk's body; runs on into later bytes where its length is not known.
-        size: Inflated size that the header declares; the caller has held it to the limit.
-        is_framed: ``stored`` is exactly the body.
+        compression: Compression in the chunk's header.
+        stored: The chunk's body, followed by later bytes if its length is unknown.
+        size: Decompressed size in the header, which the caller has checked against the limit.
+        is_framed: True if ``stored`` is exactly the body.
     """
     if compression == b"none":
         raw = stored if is_framed else stored[:size]
@@ -125,12 +125,12 @@ class ChunkRows:
 
     Attributes:
         conn: Shape (N,), int64: connection of each message.
-        log_ns: Shape (N,), int64.
-        start: Shape (N,), int64: first payload byte.
-        stop: Shape (N,), int64: one past the last.
-        connections: Connection records met.
-        fault: Why there may have been more, or empty.
-        fault_at: Where in the inflated chunk the fault was met, or -1.
+        log_ns: Shape (N,), int64: log times.
+        start: Shape (N,), int64: offset of the first payload byte.
+        stop: Shape (N,), int64: offset one past the last payload byte.
+        connections: Connection records in the chunk.
+        fault: Reason why there may have been more messages, or empty.
+        fault_at: Offset of the fault in the decompressed chunk, or -1.
     """
 
     conn: Int64s
@@ -142,22 +142,22 @@ class ChunkRows:
     fault_at: int = -1
 
     def counts(self) -> dict[int, int]:
-        """Messages by connection."""
+        """Return the number of messages by connection."""
         return tally(self.conn)
 
     def take(self, keep: NDArray[np.bool_]) -> ChunkRows:
-        """Some of the messages, and all else."""
+        """Return the selected messages, with all other attributes."""
         columns = (self.conn[keep], self.log_ns[keep], self.start[keep], self.stop[keep])
         return ChunkRows(*columns, self.connections, self.fault, self.fault_at)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """Where one writer puts the fields of a message record's header.
+    """One writer's order of the fields in a message record's header.
 
     Attributes:
-        head: Shape (46,), uint8: a head of that layout.
-        is_fixed: Shape (46,), bool: bytes equal in all heads of the layout.
+        head: Shape (46,), uint8: a header of that layout.
+        is_fixed: Shape (46,), bool: mask of the bytes that are equal in all such headers.
         conn: Offset of the connection number.
         time: Offset of the time.
     """
@@ -190,7 +190,7 @@ def _layout_of(head: bytes) -> _Layout | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Heads:
-    """Columns read from message heads at given offsets; ``fits`` says where they are heads."""
+    """Columns of the message headers at given offsets; ``fits`` marks the valid headers."""
 
     fits: NDArray[np.bool_]
     conn: Int64s
@@ -213,13 +213,13 @@ def _u32(heads: Bytes, at: int) -> Int64s:
 def read_chunk(
     inflated: Inflated, entries: Entries | None, largest: int, max_records: int
 ) -> ChunkRows:
-    """The messages of an inflated chunk.
+    """Find the messages of a decompressed chunk.
 
     Args:
-        inflated: Its records.
-        entries: What the index records behind it say, or None where none exists.
-        largest: Most bytes of a message definition.
-        max_records: Most records to take from one chunk.
+        inflated: Records of the chunk.
+        entries: Index records after the chunk, or None.
+        largest: Maximum size of a message definition in bytes.
+        max_records: Maximum number of records in a chunk.
     """
     if entries is not None and len(entries) and not inflated.fault:
         rows = _by_index(inflated.raw, entries, largest)
@@ -229,7 +229,7 @@ def read_chunk(
 
 
 def _by_index(raw: bytes, entries: Entries, largest: int) -> ChunkRows | None:
-    """Rows at the index's offsets if they and connection records tile ``raw`` exactly."""
+    """Return the rows at the index's offsets, if they and connection records fill ``raw``."""
     buffer = np.frombuffer(raw, dtype=np.uint8)
     at = entries.offset
     if at[-1] + _HEAD > len(raw):
@@ -268,7 +268,7 @@ def _connections_between(raw: bytes, at: int, stop: int, largest: int) -> list[C
 
 @dataclass(slots=True)
 class _Steps:
-    """Rows gathered in stretches while stepping through a chunk."""
+    """Rows collected while stepping through a chunk."""
 
     at: list[Int64s] = field(default_factory=list)
     conn: list[Int64s] = field(default_factory=list)
@@ -287,7 +287,7 @@ class _Steps:
         self.count += len(at)
 
     def drop_last(self, stop: int) -> None:
-        """Forget the last row if it ends at ``stop``: nothing confirms its length."""
+        """Remove the last row if it ends at ``stop``, because its length is not confirmed."""
         if self.stop and len(self.stop[-1]) and self.stop[-1][-1] == stop:
             for column in (self.at, self.conn, self.log_ns, self.start, self.stop):
                 column[-1] = column[-1][:-1]
@@ -296,7 +296,7 @@ class _Steps:
 def _by_steps(
     inflated: Inflated, entries: Entries | None, largest: int, max_records: int
 ) -> ChunkRows:
-    """Rows found by stepping from record to record, over damage with the index's help."""
+    """Find rows by stepping from record to record; skip damage with the help of the index."""
     raw = inflated.raw
     steps = _Steps()
     at, records, run = 0, 0, _FIRST_RUN
@@ -347,7 +347,7 @@ def _all(parts: list[Int64s]) -> Int64s:
 
 
 def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tuple[int, int]:
-    """Up to ``max_count`` message records of one layout from ``at`` on; their number and end."""
+    """Collect up to ``max_count`` messages of one layout; return their number and end."""
     layout = _layout_of(raw[at : at + _HEAD])
     if layout is None:
         return 0, at
@@ -377,7 +377,7 @@ def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tupl
 
 
 def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:
-    """Take a connection record or an unusual message record; where it ends, or None if damaged."""
+    """Process a connection or an unusual message; return its end, or None if damaged."""
     record = record_at(memoryview(raw), at)
     if record is None or record.end > len(raw):
         return None
@@ -401,7 +401,7 @@ def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:
 
 
 def _next_confirmed(raw: bytes, at: int, entries: Entries | None) -> int | None:
-    """The next offset the index names at which a message says what the index says."""
+    """Return the next indexed offset at which a message agrees with the index."""
     if entries is None:
         return None
     first = int(np.searchsorted(entries.offset, at, side="right"))
@@ -412,9 +412,9 @@ def _next_confirmed(raw: bytes, at: int, entries: Entries | None) -> int | None:
 
 
 def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
-    """Without an index: the next offset at which several messages follow one another.
+    """Return the next offset with several consecutive plausible messages, without an index.
 
-    The message that led to ``at`` may have a damaged length, so the search begins within it.
+    The message that led to ``at`` may have a damaged length, so the search starts inside it.
     """
     begin = at + 1
     if steps.stop and len(steps.stop[-1]) and steps.stop[-1][-1] == at:
@@ -430,7 +430,7 @@ def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
 
 
 def _stands_in_a_row(raw: bytes, at: int, known: set[int], near_ns: int | None) -> bool:
-    """Do ``_IN_A_ROW`` messages of known connections and near times follow, or fewer to the end?"""
+    """Return whether ``_IN_A_ROW`` plausible messages, or fewer up to the end, start at ``at``."""
     for _ in range(_IN_A_ROW):
         if at == len(raw):
             return True
@@ -457,7 +457,7 @@ def _is_confirmed(raw: bytes, entries: Entries, i: int) -> Record | None:
 
 
 def _without_disputed(raw: bytes, rows: ChunkRows, at: Int64s, entries: Entries) -> ChunkRows:
-    """Drop rows that the index contradicts; no checksum says which of the two is right."""
+    """Drop rows that contradict the index, because no checksum decides which is right."""
     if not len(at) or not len(entries):
         return rows
     place = np.minimum(np.searchsorted(entries.offset, at), len(entries) - 1)

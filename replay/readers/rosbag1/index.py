@@ -1,4 +1,4 @@
-"""What a ROS 1 bag holds, learnt from its index section or, without one, by walking its records."""
+"""Contents of a ROS 1 bag, from its index section or from a walk over its records."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _CHUNK_OP: Final = b"\x04\x00\x00\x00op=\x05"
 
 @dataclass(frozen=True, slots=True)
 class ChunkUnit:
-    """A chunk with the index records behind it.
+    """A chunk with the index records after it.
 
     Attributes:
         record: The chunk record.
-        stored_stop: One past the last byte that may belong to its body.
-        is_framed: Its length, or the size of its plain content, leads to another record or to the
-            file's end, so it is right.
-        end: Where the next unit begins.
-        entries: Index records, or None if none exist or they are damaged.
+        stored_stop: Offset one past the last byte that may belong to its body.
+        is_framed: True if its length, or the size of its uncompressed content, is confirmed by a
+            following record or by the file's end.
+        end: Start of the next unit.
+        entries: Index records, or None if they are missing or damaged.
     """
 
     record: Record
@@ -57,8 +57,8 @@ class Gap:
     """Bytes that are not a record.
 
     Attributes:
-        at: First of them.
-        stop: Where reading goes on, or the file's end.
+        at: Offset of the first byte.
+        stop: Offset at which reading resumes, or the file's end.
     """
 
     at: int
@@ -67,13 +67,13 @@ class Gap:
 
 @dataclass(slots=True)
 class Contents:
-    """What is known about a bag before its chunks are inflated.
+    """Contents of a bag known before its chunks are decompressed.
 
     Attributes:
-        connections: By number; the first record met of each.
-        infos: By byte offset of the chunk.
-        is_complete: ``infos`` name every chunk of the file.
-        gaps: Stretches without a readable record, met on a walk; from byte, to byte.
+        connections: The first record of each connection, by number.
+        infos: Chunk infos by the offset of the chunk.
+        is_complete: True if ``infos`` lists every chunk of the file.
+        gaps: Ranges without a readable record, found by a walk: start and end in bytes.
     """
 
     connections: dict[int, Connection] = field(default_factory=dict)
@@ -83,7 +83,7 @@ class Contents:
 
 
 def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:
-    """The index section at ``index_at``; None unless its records fill the file to its end."""
+    """Read the index section at ``index_at``; None unless its records extend to the file's end."""
     contents = Contents(is_complete=True)
     at = index_at
     file = AheadBagFile(file.fd, file.size, file)
@@ -96,7 +96,7 @@ def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:
 
 
 def learn(file: BagFile, record: Record, contents: Contents, largest: int) -> bool:
-    """Take in a connection or chunk info record; False if it is another kind or damaged."""
+    """Add a connection or chunk info record; return False for other or damaged records."""
     if record.size > 2 * largest:
         return False
     body = file.bytes_at(record.body, record.end)
@@ -112,14 +112,14 @@ def learn(file: BagFile, record: Record, contents: Contents, largest: int) -> bo
 def units(
     file: BagFile, first: int, known: list[int], limits: Limits, connections: Collection[int]
 ) -> Iterator[ChunkUnit | Record | Gap]:
-    """Everything in the file in order: chunks with their index, other records, gaps.
+    """Yield the file's contents in order: chunks with their index, other records, gaps.
 
     Args:
         file: The bag.
         first: Byte offset of the first record.
-        known: Sorted byte offsets at which the index says that a chunk begins.
-        limits: Bounds on what an index may hold.
-        connections: Numbers of the connections known so far; may grow.
+        known: Sorted byte offsets of the chunks in the index.
+        limits: Limits on the size of an index.
+        connections: Numbers of the connections known so far; may be extended later.
     """
     at, resync = first, Resync(file, known, connections)
     while at < file.size:
@@ -149,7 +149,7 @@ def _chunk_unit(
         if end < file.size and resync.is_head(end):
             entries, after = _index_records(file, end, limits)
             return ChunkUnit(record, end, True, after, entries)
-    # The records of a plain chunk would be taken for such that are outside of chunks.
+    # The records of an uncompressed chunk would be mistaken for records outside chunks.
     onward = next_chunk(file, record.body, known) if is_plain else resync.next(record.body)
     stop = file.size if onward is None else onward
     if record.end <= stop and record.u32(b"size") == record.size:
@@ -158,7 +158,7 @@ def _chunk_unit(
 
 
 def _index_records(file: BagFile, at: int, limits: Limits) -> tuple[Entries | None, int]:
-    """What the index records from ``at`` on say (None if one is unsound), and their end."""
+    """Read the index records from ``at`` on (None if one is invalid), and return their end."""
     parts: list[tuple[int, bytes]] = []
     listed = 0
     is_sound = True
@@ -176,7 +176,7 @@ def _index_records(file: BagFile, at: int, limits: Limits) -> tuple[Entries | No
 
 
 def next_chunk(file: BagFile, at: int, known: list[int]) -> int | None:
-    """Where the next chunk begins at or after ``at``: as the index says, else by search."""
+    """Return the start of the next chunk at or after ``at``, by the index or by search."""
     for place in known:
         if place >= at and (record := file.record(place)) is not None and record.op == CHUNK:
             return place
@@ -184,7 +184,7 @@ def next_chunk(file: BagFile, at: int, known: list[int]) -> int | None:
 
 
 def _searched_chunk(file: BagFile, at: int) -> int | None:
-    """The first chunk header at or after ``at``, known by its operation field."""
+    """Find the first chunk header at or after ``at`` by its operation field."""
     while at < file.size:
         window = file.bytes_at(at, at + _SEARCHED_AT_ONCE + 256)
         found = -1
@@ -205,7 +205,7 @@ def _heads_chunk(window: bytes, start: int, op_at: int) -> bool:
 
 
 def walk(file: BagFile, first: int, limits: Limits) -> Contents:
-    """What the records say where there is no index section; inflates only for new connections."""
+    """Collect the contents without an index section; decompress only for new connections."""
     contents = Contents()
     chunks: set[int] = set()
     is_whole = True

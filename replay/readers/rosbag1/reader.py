@@ -1,8 +1,8 @@
-"""ROS 1 bags, format 2.0: uncompressed, bz2 and lz4, with an index section or without.
+"""Reader of ROS 1 bags, format 2.0: uncompressed, bz2 and lz4, with or without an index section.
 
-The file's bytes are read from the front to the back; the index section and the index records are
-hints, and report how much a damaged chunk held. Bags of a killed recorder (no index) and
-``.bag.active`` files read like any other.
+The file is read from start to end. The index section and the index records are hints, and show the
+number of messages in a damaged chunk. Bags of a killed recorder (without an index) and
+``.bag.active`` files are read in the same manner.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ class BagLog(Closing):
     """An open ROS 1 bag; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits, file: BagFile | None = None) -> None:
-        """Open the bag and learn its topics.
+        """Open the bag and find its topics.
 
         Args:
-            path: Where it is.
-            limits: Sizes above which nothing is read.
-            file: Its bytes, if they do not come from ``path``.
+            path: Path of the bag.
+            limits: Maximum sizes that are read.
+            file: The bag's bytes, if they are not read from ``path``.
 
         Raises:
-            LogFormatError: No ROS 1 bag of format 2.0, or encrypted, or nothing readable in it.
-            OSError: It cannot be opened.
+            LogFormatError: Not a ROS 1 bag of format 2.0, encrypted, or without readable records.
+            OSError: The file cannot be opened.
         """
         self._path = path
         self._limits = limits
@@ -64,26 +64,26 @@ class BagLog(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file."""
         return self._path
 
     @property
     def format(self) -> str:
-        """``rosbag1``."""
+        """Short name of the format."""
         return "rosbag1"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Topics by connection number; those of a bag without index are found in its chunks."""
+        """Topics by connection number; without an index, they are found in the chunks."""
         return self._roster.topics
 
     @property
     def touched(self) -> Touched:
-        """Which bytes were read, for a seal."""
+        """Record of the bytes read, for a seal."""
         return self._file.touched
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """Blocks of ROS 1 messages, a few chunks at a time; see ``Log.read``."""
+        """Yield blocks of ROS 1 messages, a few chunks at a time; see ``Log.read``."""
         for sentence in self._notices:
             ledger.notice(sentence)
         for reason, detail in self._losses:
@@ -101,7 +101,7 @@ class BagLog(Closing):
         yield from one.blocks(self._index_at)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """What the index or the walk over the records found missing; see ``KnowsItsEnd``."""
+        """Report losses found by the index or by a walk over the records; see ``KnowsItsEnd``."""
         for reason, detail in self._losses:
             ledger.drop("", reason, None, detail)
         for start, stop in () if self._losses else self._contents.gaps:
@@ -111,12 +111,12 @@ class BagLog(Closing):
 
     @property
     def beginning(self) -> Selection:
-        """The times of the first chunk."""
+        """Return a selection of the times of the first chunk."""
         first = self._contents.infos.get(min(self._contents.infos, default=-1))
         return EVERYTHING if first is None else Selection(None, first.start_ns, first.end_ns + 1)
 
     def needs_whole(self, selection: Selection) -> str:
-        """Why reading this part takes all bytes of the file; empty if the index leads to it."""
+        """Return why this part needs the complete file; empty if the index locates it."""
         if selection == EVERYTHING:
             return "all of it was requested"
         found = find_bag_window(
@@ -125,13 +125,13 @@ class BagLog(Closing):
         return found if isinstance(found, str) else ""
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
 
     def _bag_header(self) -> tuple[int, Record | None]:
-        """Where the records begin behind the bag header, and the header if it can be read."""
+        """Return the offset of the first record, and the bag header if it can be read."""
         start = self._file.bytes_at(0, len(MAGIC))
         if start != MAGIC:
             raise LogFormatError(
@@ -140,7 +140,7 @@ class BagLog(Closing):
             )
         record = self._file.whole_record(len(MAGIC))
         if record is None or record.op != BAG_HEADER:
-            self._notices.append("the bag header is damaged; every record was read from the bytes")
+            self._notices.append("the bag header is damaged; the complete file was read")
             return len(MAGIC), None
         encryptor = record.fields.get(b"encryptor", b"")
         if encryptor:
@@ -174,7 +174,7 @@ class BagLog(Closing):
             declared = header.u32(f"{name}_count".encode())
             if declared != len(held):
                 self._notices.append(
-                    f"the bag header says {name}_count {declared}, the index lists {len(held)}; "
+                    f"the bag header states {name}_count {declared}, the index lists {len(held)}; "
                     "the index was used"
                 )
 
@@ -183,12 +183,11 @@ class BagLog(Closing):
             return
         if self._index_at == 0:
             self._notices.append(
-                "no index: the recorder did not close the bag; every record was read from the bytes"
+                "no index: the recorder did not close the bag; the complete file was read"
             )
         elif contents.is_complete or self._index_at <= self._file.size:
             self._notices.append(
-                f"the index at byte {self._index_at} is damaged; every record was read from the "
-                "bytes"
+                f"the index at byte {self._index_at} is damaged; the complete file was read"
             )
         else:
             detail = f"index declared at byte {self._index_at}, file ends at {self._file.size}"
@@ -199,19 +198,19 @@ def open_bag(path: Path, limits: Limits = DEFAULT_LIMITS) -> BagLog:
     """Open a ROS 1 bag.
 
     Raises:
-        LogError: No ROS 1 bag of format 2.0, encrypted, or nothing readable in it.
-        OSError: It cannot be opened.
+        LogError: Not a ROS 1 bag of format 2.0, encrypted, or without readable records.
+        OSError: The file cannot be opened.
     """
     return BagLog(path, limits)
 
 
 def open_ranged(name: Path, ranged: RangedFile, limits: Limits) -> BagLog | None:
-    """Open a remote bag by its index section; None if it has none that can be used.
+    """Open a remote bag by its index section; None if the index is unusable.
 
     Args:
-        name: What it is called.
-        ranged: Its bytes.
-        limits: Sizes above which nothing is read.
+        name: Path that stands for the bag.
+        ranged: The bag's bytes.
+        limits: Maximum sizes that are read.
     """
     file = RangedBagFile(-1, ranged.size, ranged)
     header = file.whole_record(len(MAGIC))

@@ -1,8 +1,8 @@
-"""Records of the ROS 1 bag format 2.0: what frames everything else in the file.
+"""Parser of the records of the ROS 1 bag format 2.0.
 
-A record is ``<u32 header length> <header> <u32 body length> <body>``; a header is a row of
-``<u32 length> name=value``. Nothing here trusts a length: a record that does not fit, or that
-lacks a field its kind must have, is None.
+A record is ``<u32 header length> <header> <u32 body length> <body>``. A header is a sequence of
+``<u32 length> name=value``. No length is trusted: the parsers return None for a record that does
+not fit or lacks a required field.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CHUNK_INFO: Final = 6
 CONNECTION: Final = 7
 
 HEADER_BYTES: Final = 1 << 20
-"""Longest record header taken for one; real ones stay below a kilobyte."""
+"""Maximum plausible length of a record header; real headers are shorter than a kilobyte."""
 
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
@@ -47,14 +47,14 @@ _NEEDED: Final[dict[int, dict[bytes, int | None]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One record's frame.
+    """The header of a record, and the position of its body.
 
     Attributes:
         at: Byte offset of the record.
-        op: Its kind.
-        fields: Header fields as stored; those its kind must have are there and of the right size.
-        body: Byte offset of its body.
-        size: Body bytes declared.
+        op: Kind of the record.
+        fields: Header fields as stored; the required fields exist and have the right sizes.
+        body: Byte offset of the body.
+        size: Declared size of the body in bytes.
     """
 
     at: int
@@ -65,29 +65,29 @@ class Record:
 
     @property
     def end(self) -> int:
-        """One past the record's last byte."""
+        """Offset one past the record's last byte."""
         return self.body + self.size
 
     def u32(self, name: bytes) -> int:
-        """A four-byte field."""
+        """Return a four-byte field."""
         return int(_U32.unpack(self.fields[name])[0])
 
     def u64(self, name: bytes) -> int:
-        """An eight-byte field."""
+        """Return an eight-byte field."""
         return int(_U64.unpack(self.fields[name])[0])
 
     def time_ns(self, name: bytes) -> int:
-        """A field of seconds and nanoseconds."""
+        """Return a field of seconds and nanoseconds in nanoseconds."""
         return time_ns(self.fields[name])
 
 
 def time_ns(raw: bytes) -> int:
-    """Nanoseconds from a stored pair of u32 seconds and nanoseconds."""
+    """Convert a stored pair of u32 seconds and nanoseconds to nanoseconds."""
     return int(_U32.unpack_from(raw, 0)[0]) * 1_000_000_000 + int(_U32.unpack_from(raw, 4)[0])
 
 
 def parse_fields(header: bytes) -> dict[bytes, bytes] | None:
-    """The fields of a record header; None if they do not fill it exactly."""
+    """Parse the fields of a record header; None if they do not fill it exactly."""
     fields: dict[bytes, bytes] = {}
     at = 0
     while at < len(header):
@@ -103,7 +103,7 @@ def parse_fields(header: bytes) -> dict[bytes, bytes] | None:
 
 
 def kind_of(fields: dict[bytes, bytes] | None) -> int | None:
-    """The kind of record that ``fields`` head; None if they head none."""
+    """Return the kind of a record with these header fields; None if they are invalid."""
     if fields is None or len(fields.get(b"op", b"")) != 1:
         return None
     op = fields[b"op"][0]
@@ -117,12 +117,14 @@ def kind_of(fields: dict[bytes, bytes] | None) -> int | None:
 
 
 def record_at(source: bytes | memoryview, at: int, base: int = 0) -> Record | None:
-    """The record at ``at`` of ``source``; None if its header is not one. The body may overrun.
+    """Parse the record at ``at`` of ``source``; None if its header is invalid.
+
+    The body may extend beyond ``source``.
 
     Args:
-        source: Bytes that hold at least the record's header.
-        at: Where in ``source``.
-        base: Added to every offset of the result.
+        source: Bytes with at least the record's header.
+        at: Offset of the record in ``source``.
+        base: Offset that is added to every offset of the result.
     """
     if at + 4 > len(source):
         return None
@@ -139,13 +141,13 @@ def record_at(source: bytes | memoryview, at: int, base: int = 0) -> Record | No
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BagFile:
-    """Positioned reads of an open file; never mapped, since a shrinking map kills the process.
+    """Random access to an open file, without a map because a shrinking map kills the process.
 
     Attributes:
         fd: Open file descriptor.
         size: File size in bytes when it was opened.
-        path: What it is called in ``touched``.
-        touched: Takes note of what is read, for a seal.
+        path: Path of the file in ``touched``.
+        touched: Record of the bytes read, for a seal.
     """
 
     fd: int
@@ -154,7 +156,7 @@ class BagFile:
     touched: Touched = field(default_factory=Touched, kw_only=True)
 
     def bytes_at(self, start: int, stop: int) -> bytes:
-        """Bytes of the file from ``start`` to ``stop``, fewer at its end."""
+        """Read the bytes from ``start`` to ``stop``; fewer at the file's end."""
         parts: list[bytes] = []
         while start < stop and (part := os.pread(self.fd, stop - start, start)):
             parts.append(part)
@@ -163,10 +165,10 @@ class BagFile:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """These ranges, sorted, are going to be read: nothing to do for a file on a disk."""
+        """Announce sorted ranges that are going to be read; a local file ignores them."""
 
     def record(self, at: int) -> Record | None:
-        """The record at byte ``at``; None if none exists or it does not fit into the file."""
+        """Read the record at byte ``at``; None if it is invalid or does not fit into the file."""
         look = self.bytes_at(at, at + _FIRST_LOOK)
         if len(look) >= 4:
             header = int(_U32.unpack_from(look, 0)[0])
@@ -175,41 +177,41 @@ class BagFile:
         return record_at(look, 0, at)
 
     def whole_record(self, at: int) -> Record | None:
-        """The record at byte ``at`` if all of its body is in the file."""
+        """Read the record at byte ``at``; None unless its complete body is in the file."""
         record = self.record(at)
         return record if record is not None and record.end <= self.size else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangedBagFile(BagFile):
-    """The same of a remote object, of which only what is read is fetched."""
+    """A remote bag, of which only the bytes read are fetched."""
 
     ranged: RangedFile
 
     def bytes_at(self, start: int, stop: int) -> bytes:
-        """Bytes of the object from ``start`` to ``stop``, fewer at its end."""
+        """Read the bytes from ``start`` to ``stop``; fewer at the object's end."""
         size = max(0, stop - start)
         return bytes(self.ranged.at_least(start, size)[:size])
 
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
-        """These ranges, sorted, are going to be read, and may be fetched in larger pieces."""
+        """Announce sorted ranges that are going to be read, so that larger pieces are fetched."""
         self.ranged.expect(ranges)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AheadBagFile(BagFile):
-    """The same, read ahead by a MiB, for many small records one after another.
+    """A bag with a read-ahead of a MiB, for many small consecutive records.
 
     Attributes:
-        source: Where the bytes come from.
-        held: Those read last, and where they begin.
+        source: The underlying bag.
+        held: The bytes read last, and their offset.
     """
 
     source: BagFile
     held: list[tuple[int, bytes]] = field(default_factory=list)
 
     def bytes_at(self, start: int, stop: int) -> bytes:
-        """Bytes of the file from ``start`` to ``stop``, fewer at its end."""
+        """Read the bytes from ``start`` to ``stop``; fewer at the file's end."""
         stop = min(stop, self.size)
         for begin, raw in self.held:
             if begin <= start and stop <= begin + len(raw):
@@ -221,15 +223,15 @@ class AheadBagFile(BagFile):
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """One publisher's stream.
+    """The stream of one publisher.
 
     Attributes:
-        conn: Its number in the bag.
+        conn: Number of the connection in the bag.
         topic: Topic under which the messages are stored.
         type_name: ROS 1 message type.
         definition: Full message definition, as stored.
         md5sum: Hash of the definition, as stored.
-        published: Topic under which they were published; another one only if renamed or damaged.
+        published: Topic under which they were published; it differs only if renamed or damaged.
     """
 
     conn: int
@@ -241,7 +243,7 @@ class Connection:
 
 
 def connection_of(record: Record, body: bytes, largest: int) -> Connection | None:
-    """What a connection record says; None if its body is damaged or over ``largest`` bytes."""
+    """Parse a connection record; None if its body is damaged or exceeds ``largest`` bytes."""
     fields = parse_fields(body)
     if fields is None or not {b"type", b"message_definition"} <= fields.keys():
         return None
@@ -264,13 +266,13 @@ def _text(raw: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ChunkInfo:
-    """What the index section says about one chunk.
+    """The entry of a chunk in the index section.
 
     Attributes:
         at: Byte offset of the chunk record.
-        start_ns: First log time in it.
-        end_ns: Last log time in it.
-        counts: Messages by connection.
+        start_ns: First log time in the chunk.
+        end_ns: Last log time in the chunk.
+        counts: Number of messages by connection.
     """
 
     at: int
@@ -280,7 +282,7 @@ class ChunkInfo:
 
 
 def chunk_info_of(record: Record, body: bytes) -> ChunkInfo | None:
-    """What a chunk info record says; None if its body is not what its header says."""
+    """Parse a chunk info record; None if its body contradicts its header."""
     if record.u32(b"ver") != 1 or len(body) != 8 * record.u32(b"count"):
         return None
     pairs = np.frombuffer(body, dtype="<u4").reshape(-1, 2)
@@ -291,12 +293,12 @@ def chunk_info_of(record: Record, body: bytes) -> ChunkInfo | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entries:
-    """What the index records behind one chunk say, sorted by offset.
+    """The index records after one chunk, sorted by offset.
 
     Attributes:
-        offset: Shape (N,), int64: of each message record, from the start of the inflated chunk.
-        conn: Shape (N,), int64.
-        log_ns: Shape (N,), int64.
+        offset: Shape (N,), int64: offset of each message record in the decompressed chunk.
+        conn: Shape (N,), int64: connection of each message.
+        log_ns: Shape (N,), int64: log times.
     """
 
     offset: NDArray[np.int64]
@@ -307,7 +309,7 @@ class Entries:
         return len(self.offset)
 
     def counts(self) -> dict[int, int]:
-        """Messages by connection."""
+        """Return the number of messages by connection."""
         return tally(self.conn)
 
 
@@ -315,7 +317,7 @@ _FEW_NUMBERS: Final = 65_536
 
 
 def tally(conn: NDArray[np.int64]) -> dict[int, int]:
-    """How often each connection number occurs; real ones are small, damaged ones need not be."""
+    """Count the occurrences of each connection number; damaged numbers may be large."""
     if len(conn) and conn.max() < _FEW_NUMBERS:
         counts = np.bincount(conn)
         return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
@@ -327,7 +329,7 @@ _ENTRY: Final = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
 def entries_of(parts: list[tuple[int, bytes]]) -> Entries:
-    """Join index records, given as connection and body."""
+    """Join index records, passed as connection and body."""
     tables: list[NDArray[np.void]] = [np.frombuffer(body, dtype=_ENTRY) for _, body in parts]
     joined = np.concatenate(tables) if tables else np.empty(0, dtype=_ENTRY)
     lengths = [len(table) for table in tables]

@@ -1,9 +1,9 @@
-"""Where the records of a ROS 1 bag go on behind damaged bytes outside its chunks.
+"""Search for readable records of a ROS 1 bag after damaged bytes outside its chunks.
 
-Outside chunks nothing but its own length says where a record ends. A message there is believed if
-it leads to another record, to one whose head is damaged but still recognisable, or to the file's
-end. Behind damage, reading goes on at the next chunk that the index names, or at the first records
-before it that follow one another and are plausible: kinds, sizes, known connections, near times.
+Outside chunks, only a record's own length states its end. A message there is accepted if its end is
+the start of another record, of a record with a damaged but recognisable header, or the file's end.
+After damage, reading resumes at the next indexed chunk, or at earlier consecutive records that are
+plausible by their kinds, sizes, connections and times.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from .records import (
 )
 
 IN_A_ROW: Final = 3
-"""Plausible records in a row that are believed, or fewer up to the file's end."""
+"""Number of consecutive plausible records that are accepted, or fewer up to the file's end."""
 _SEARCHED_AT_ONCE: Final = 4 << 20
 _OP: Final = b"\x04\x00\x00\x00op="
 _BEFORE_OP: Final = 128
 _HEADER_MAX: Final = 256
-"""Longest header of a record to go on at."""
+"""Maximum header length of a record at which reading resumes."""
 _DAY_NS: Final = 86_400 * 10**9
 _FIELD: Final = re.compile(
     rb"(.{4})(op|conn|time|compression|size|ver|count|topic|chunk_pos|start_time|end_time)=",
@@ -38,15 +38,16 @@ _FIELD: Final = re.compile(
 
 
 class Resync:
-    """Judges the records outside chunks and finds the next ones behind damage."""
+    """Checks records outside chunks, and finds the next records after damage."""
 
     def __init__(self, file: BagFile, known: Sequence[int], connections: Collection[int]) -> None:
-        """Nothing is read yet.
+        """Prepare a search.
 
         Args:
             file: The bag.
-            known: Sorted byte offsets at which the index says that a chunk begins.
-            connections: Numbers of the connections met so far; may grow. If empty, any is taken.
+            known: Sorted byte offsets of the chunks in the index.
+            connections: Numbers of the connections found so far; may be extended later. If empty,
+                any number is accepted.
         """
         self._file = file
         self._known = known
@@ -54,7 +55,7 @@ class Resync:
         self._near_ns: int | None = None
 
     def is_believed(self, record: Record) -> bool:
-        """Does a record outside chunks end where its length says?"""
+        """Return whether the length of a record outside chunks is confirmed."""
         if record.end > self._file.size:
             return False
         if record.op != MESSAGE:
@@ -65,7 +66,7 @@ class Resync:
         return is_right
 
     def next(self, at: int) -> int | None:
-        """Where reading goes on at or after ``at``; None if nowhere."""
+        """Return the offset at or after ``at`` at which reading resumes; None if none exists."""
         place = next((k for k in self._known if k >= at and self._is_chunk(k)), None)
         found = self._searched(at, self._file.size if place is None else place)
         return place if found is None else found
@@ -75,13 +76,13 @@ class Resync:
         return record is not None and record.op == CHUNK
 
     def is_head(self, at: int) -> bool:
-        """Does a record begin at ``at``, perhaps with a damaged head?"""
+        """Return whether a record starts at ``at``, possibly with a damaged header."""
         return self._file.record(at) is not None or _was_head(
             self._file.bytes_at(at, at + _HEADER_MAX)
         )
 
     def _searched(self, at: int, stop: int) -> int | None:
-        """The first plausible records from ``at`` on that begin before ``stop``."""
+        """Return the start of the first plausible records from ``at`` on and before ``stop``."""
         while at < stop:
             window = self._file.bytes_at(at, at + _SEARCHED_AT_ONCE + _HEADER_MAX)
             found = -1
@@ -95,7 +96,7 @@ class Resync:
         return None
 
     def _goes_on(self, at: int) -> bool:
-        """Do plausible records in a row begin at ``at``?"""
+        """Return whether consecutive plausible records start at ``at``."""
         near_ns = self._near_ns
         for n in range(IN_A_ROW):
             if at == self._file.size:
@@ -131,7 +132,7 @@ def _heads_record(window: bytes, start: int, op_at: int) -> bool:
 
 
 def _was_head(head: bytes) -> bool:
-    """Are these the first bytes of a record whose header has one damaged field, or length?"""
+    """Return whether these bytes start a record with one damaged header field or length."""
     fields = [
         (found[2], found.start(), found.start() + 4 + int.from_bytes(found[1], "little"))
         for found in _FIELD.finditer(head)

@@ -1,9 +1,9 @@
-"""Which bytes of a ROS 1 bag hold a span of time, by its index section alone.
+"""Location of a time range in a ROS 1 bag by its index section.
 
-The index carries no checksum, so it is trusted only where it cannot well be wrong unseen: it names
-as many chunks as the bag's header, these follow each other in time, and the chunks next to those
-asked for are examined, too. A wrong time then stands out of order, or belongs to a chunk that is
-examined and says something else itself.
+The index has no checksum, so it is trusted only if an error would be detected. It must list as many
+chunks as the bag's header states, and the chunks must be in order of time. The neighbors of the
+selected chunks are examined too. A wrong time then violates the order, or belongs to an examined
+chunk that contradicts it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from .records import BagFile, ChunkInfo, Record
 
 @dataclass(frozen=True, slots=True)
 class BagWindow:
-    """Where a span of time lies.
+    """The location of a time range.
 
     Attributes:
         infos: All chunks, in the order of the file.
-        is_read: For each, whether it may hold messages of that span.
-        index_at: Where the chunks end.
-        is_asked: For each, whether the index says so; the others that are read are neighbors.
+        is_read: True for each chunk that is read: the selected chunks and their neighbors.
+        index_at: End of the chunks.
+        is_asked: True for each chunk that the index places in the time range.
     """
 
     infos: tuple[ChunkInfo, ...]
@@ -36,11 +36,11 @@ class BagWindow:
 
     @property
     def left(self) -> tuple[ChunkInfo, ...]:
-        """The chunks that are not read."""
+        """Chunks that are not read."""
         return self._those(is_read=False)
 
     def ranges(self) -> list[tuple[int, int]]:
-        """Where the chunks asked for and their index records are."""
+        """Return the ranges of the selected chunks and their index records."""
         edges = pairwise([*(info.at for info in self.infos), self.index_at])
         return [edge for edge, asked in zip(edges, self.is_asked, strict=True) if asked]
 
@@ -52,7 +52,7 @@ class BagWindow:
         *,
         is_read: bool = True,
     ) -> Iterator[ChunkUnit | Record | Gap]:
-        """What is in the chunks that are read, or in the others, in the order of the file."""
+        """Yield the units of the chunks that are read, or of the others, in stored order."""
         known = [info.at for info in self.infos]
         after = dict(pairwise([*known, self.index_at]))
         for info in self._those(is_read=is_read):
@@ -69,30 +69,30 @@ class BagWindow:
 def find_bag_window(
     contents: Contents, first: int, index_at: int, chunk_count: int, selection: Selection
 ) -> BagWindow | str:
-    """Where the span of time asked for lies, or why the index cannot tell.
+    """Locate the selected time range, or return the reason why the index cannot be used.
 
     Args:
-        contents: What the index section says.
-        first: Where the bag's first record stands.
-        index_at: Where the index section begins.
-        chunk_count: Chunks as the bag's header counts them.
-        selection: What is asked for.
+        contents: Contents of the index section.
+        first: Offset of the bag's first record.
+        index_at: Offset of the index section.
+        chunk_count: Number of chunks in the bag's header.
+        selection: The selected time range.
     """
     infos = tuple(contents.infos[at] for at in sorted(contents.infos))
     if not contents.is_complete or not infos:
-        return "it has no index of chunks that can be used"
+        return "it has no usable index of chunks"
     if selection.start_ns is None and selection.end_ns is None:
-        return "its index of chunks carries no checksum"
+        return "its index of chunks has no checksum"
     if chunk_count != len(infos):
-        return f"its index names {len(infos)} chunks, its header counts {chunk_count}"
+        return f"its index lists {len(infos)} chunks, its header states {chunk_count}"
     if infos[0].at != first or infos[-1].at >= index_at:
-        return "its index does not begin with its first chunk and end before itself"
+        return "its index does not cover exactly the chunks before it"
     if any(info.start_ns > info.end_ns for info in infos) or any(
         a.start_ns > b.start_ns or a.end_ns > b.end_ns for a, b in pairwise(infos)
     ):
-        return "its index carries no checksum, and its chunks are not in order of time"
+        return "its index has no checksum, and its chunks are not in order of time"
     if not all(info.counts.keys() <= contents.connections.keys() for info in infos):
-        return "its index names connections that it does not describe"
+        return "its index refers to connections that it does not describe"
     asked = [
         (selection.start_ns is None or info.end_ns >= selection.start_ns)
         and (selection.end_ns is None or info.start_ns < selection.end_ns)

@@ -1,1 +1,1 @@
-"""ROS 2 bags: folders and sqlite3 files."""
+"""Readers of ROS 2 bags: folders and sqlite3 files."""

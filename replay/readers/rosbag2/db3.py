@@ -1,8 +1,8 @@
-"""ROS 2 bags in SQLite (.db3): all rows that SQLite can still reach, the rest reported.
+"""Reader of ROS 2 bags in SQLite (.db3): yields all readable rows and reports the others.
 
-SQLite has no checksums. What can be known is checked instead: SQLite's own integrity check, the
-time index against the rows, the types and the order of the rows, the file's length. Rows of a file
-without a fault come straight out of its pages as far as they are plain, all others through SQLite.
+SQLite has no checksums. The reader therefore runs SQLite's own integrity check, and checks the time
+index against the rows, the types and the order of the rows, and the file's length. In an undamaged
+file, common rows are read directly from the pages. All other rows are read through SQLite.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ NOT_A_TIME: Final = "timestamp is not an integer"
 NOT_BYTES: Final = "payload is not a blob"
 OTHER_TYPE: Final = "another message type on the same topic"
 _SMALL: Final = 1 << 16
-DELETED: Final = "row numbers left out"
+DELETED: Final = "row numbers missing"
 INDEX_DIFFERS: Final = "row and time index disagree"
 
 
@@ -53,12 +53,12 @@ class Db3Log(Closing):
     """An open ROS 2 SQLite bag; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
-        """Open it and learn its topics.
+        """Open the file and find its topics.
 
         Raises:
-            LogFormatError: No SQLite file, or none with the tables of a ROS 2 bag.
-            LogError: SQLite cannot open it.
-            OSError: It cannot be read.
+            LogFormatError: Not a SQLite file, or without the tables of a ROS 2 bag.
+            LogError: SQLite cannot open the file.
+            OSError: The file cannot be read.
         """
         self._path = path
         self._limits = limits
@@ -72,22 +72,22 @@ class Db3Log(Closing):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the file."""
         return self._path
 
     @property
     def format(self) -> str:
-        """``rosbag2-sqlite3``."""
+        """Short name of the format."""
         return "rosbag2-sqlite3"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Topics by their number in the file; the format declares no counts."""
+        """Topics in order of their numbers; the format declares no counts."""
         return tuple(self._tables.topics.values())
 
     @property
     def time_range_ns(self) -> tuple[int, int] | None:
-        """First and last timestamp, or None if none exists or SQLite cannot say."""
+        """Return the first and last timestamp; None without rows or if SQLite fails."""
         try:
             query = "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
             first, last = fetched(self._database, query)[0]
@@ -96,24 +96,24 @@ class Db3Log(Closing):
         return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """Blocks of messages in the order of their row ids; see ``Log.read``."""
+        """Yield blocks of messages in the order of their row ids; see ``Log.read``."""
         one = _Pass(self._database, self._tables, self._limits, ledger, selection)
         yield from one.blocks()
         if _stamp(self._path) != self._stamp:
             ledger.drop("", "file changed while it was read", None, "read it again")
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Bytes or committed rows out of SQLite's reach; see ``KnowsItsEnd``."""
+        """Report bytes or committed rows that SQLite cannot read; see ``KnowsItsEnd``."""
         if self._database.damage:
             ledger.drop("", DAMAGED_PAGE, None, self._database.damage)
 
     def close(self) -> None:
-        """Release the file and any temporary copy."""
+        """Close the file and remove any temporary copy."""
         self._database.close()
 
 
 class _Pass:
-    """The state of one ``read``."""
+    """One pass over the rows."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class _Pass:
         self._met = 0
 
     def _numbers_asked(self) -> frozenset[int] | None:
-        """Numbers of the topics asked for, or None for all."""
+        """Return the numbers of the selected topics, or None for all."""
         if self._selection.topics is None:
             return None
         return frozenset(
@@ -148,7 +148,7 @@ class _Pass:
         )
 
     def blocks(self) -> Iterator[Block]:
-        """Everything asked for, and the account of it."""
+        """Yield the selected blocks and account for all rows."""
         keep_memory()
         for sentence in (*self._database.notices, *self._tables.notices):
             self._ledger.notice(sentence)
@@ -166,14 +166,14 @@ class _Pass:
         self._finish(problems)
 
     def _plain_blocks(self) -> Iterator[Block]:
-        """Rows straight out of the pages, as far as they are plain; the scan goes on from there."""
+        """Yield rows directly from the pages, up to the first unusual one."""
         for rows in page_rows(self._database, self._fetched, self._limits):
             self._met += len(rows)
             self._scan = RowScan(self._database, int(rows.ids[-1]) + 1, LAST_ROWID, self._fetched)
             yield from self._grouped(rows.messages, self._placed(rows.topics), rows.times)
 
     def _narrow(self) -> None:
-        """Scan only the row ids between which the times asked for lie, if the index is complete."""
+        """Restrict the scan to the row ids of the selected times, if the index is complete."""
         asked, index = self._selection, self._tables.index
         if index is None or (asked.start_ns is None and asked.end_ns is None):
             return
@@ -197,7 +197,7 @@ class _Pass:
             self._scan = RowScan(self._database, first, last, self._fetched)
 
     def _problems(self) -> str:
-        """What SQLite's integrity check says against the file; empty if nothing."""
+        """Return the problems that SQLite's integrity check finds; empty for none."""
         try:
             said = [str(row[0]) for row in fetched(self._database, "PRAGMA integrity_check(5)")]
         except FAULTS as error:
@@ -237,7 +237,7 @@ class _Pass:
             yield from blocks_of(rows, self._names, self._selection, self._limits, self._ledger)
 
     def _skip_odd(self, row: Row) -> None:
-        """Skip a row that has not the types it must have, by reason."""
+        """Skip a row with values of wrong types, by reason."""
         number, topic, time, payload = row
         if not isinstance(topic, int):
             reason = NO_TOPIC
@@ -255,7 +255,7 @@ class _Pass:
         self._ledger.skip(name, reason, 1, detail)
 
     def _placed(self, numbers: Int64s) -> Int64s:
-        """Place of each row's topic among the names; -1 for rows not to be handed on."""
+        """Return the index of each row's topic name; -1 for rows that are not yielded."""
         if numbers.min() >= 0 and numbers.max() < len(self._places):
             known = self._places[numbers]
             if known.min() >= 0:
@@ -271,7 +271,7 @@ class _Pass:
         return place[which]
 
     def _drop_disputed(self, ids: Int64s, log_ns: Int64s, place: Int64s) -> None:
-        """Give no row whose time the index has otherwise: no checksum says which is right."""
+        """Drop rows that contradict the index, because no checksum decides which time is right."""
         if self._indexed is None or not len(self._indexed[0]):
             return
         listed, times = self._indexed
@@ -282,7 +282,7 @@ class _Pass:
             place[i] = -1
 
     def _finish(self, problems: str) -> None:
-        """Settle with what SQLite counted, and say what was checked."""
+        """Compare with SQLite's counts, and report the checks."""
         ledger, scan = self._ledger, self._scan
         is_part = self._in_time_by_index is not None
         ledger.integrity = (
@@ -317,27 +317,27 @@ class _Pass:
                 ledger.notice(f"{UNSOUND}: {problems}")
 
     def _drop_deleted(self) -> None:
-        """Recorders number rows one by one: a number left out in between is a row taken out."""
+        """Drop rows whose numbers are missing, because recorders number rows consecutively."""
         try:
             query = "SELECT MIN(rowid), MAX(rowid), COUNT(*) FROM messages"
             first, last, count = fetched(self._database, query)[0]
         except FAULTS:
             return
         if count:
-            detail = f"rows {first} to {last}, of which {count} are there"
+            detail = f"rows {first} to {last}, of which {count} exist"
             self._ledger.drop("", DELETED, last - first + 1 - count, detail)
 
     def _missing(self) -> int | None:
-        """Rows that the time index lists beyond those met, or None if it cannot say."""
+        """Return the number of rows in the time index beyond those found; None if unknown."""
         if self._indexed is None or len(self._indexed[0]) <= self._met:
             return None
         return len(self._indexed[0]) - self._met
 
     def _declare(self, *, is_doubtful: bool) -> None:
-        """Say how many rows SQLite counts where that can differ from those met.
+        """Declare the number of rows that SQLite counts, if it may differ from those found.
 
-        Counting by topic goes through the whole table again, so that after a full pass it is only
-        done if something is wrong, or if the time index has another number of rows.
+        Counting by topic reads the complete table again. After a full pass, it is done only if
+        there is a problem, or if the time index has a different number of rows.
         """
         if self._counts is None and (is_doubtful or self._total() != self._met):
             self._counts = self._tables.counts(self._database)
@@ -346,14 +346,14 @@ class _Pass:
                 self._ledger.declare(name, count)
 
     def _total(self) -> int | None:
-        """Rows that SQLite counts, in the smallest index there is."""
+        """Return SQLite's number of rows, which it counts in the smallest index."""
         try:
             return int(fetched(self._database, "SELECT COUNT(*) FROM messages")[0][0])
         except FAULTS:
             return None
 
     def _skip_rest(self) -> None:
-        """Count the rows outside the scan, never fetched, as skipped."""
+        """Count the rows outside the scan, which were not read, as skipped."""
         for name, declared in (self._counts or {}).items():
             if not name:
                 continue
@@ -365,7 +365,7 @@ class _Pass:
 
 
 def _place_table(places: Mapping[int, int]) -> Int64s:
-    """Places by topic number, -1 where none exists; for small numbers, as recorders give them."""
+    """Return places by topic number, -1 if missing, for the small numbers that recorders use."""
     small = {number: at for number, at in places.items() if 0 <= number < _SMALL}
     table = np.full(max(small, default=-1) + 1, -1, dtype=np.int64)
     table[list(small)] = list(small.values())
@@ -374,7 +374,7 @@ def _place_table(places: Mapping[int, int]) -> Int64s:
 
 @contextmanager
 def _lock(database: Database) -> Iterator[bool]:
-    """Keep recorders from writing, as SQLite does while a statement is open; did it succeed?"""
+    """Prevent writing with an open SQLite statement; yield whether that succeeded."""
     try:
         statement = database.connection.execute("SELECT 1 FROM messages")
         is_open = statement.fetchone() is not None
@@ -384,7 +384,7 @@ def _lock(database: Database) -> Iterator[bool]:
     try:
         yield is_open
     finally:
-        # An iterator that was left half-way may outlive the connection.
+        # An unfinished iterator may outlive the connection.
         with suppress(*FAULTS):
             statement.close()
 
@@ -398,7 +398,7 @@ def open_db3(path: Path, limits: Limits = DEFAULT_LIMITS) -> Db3Log:
     """Open a ROS 2 SQLite bag.
 
     Raises:
-        LogError: No ROS 2 bag, damaged in its first pages, or locked.
-        OSError: It cannot be read.
+        LogError: Not a ROS 2 bag, damaged in its first pages, or locked.
+        OSError: The file cannot be read.
     """
     return Db3Log(path, limits)

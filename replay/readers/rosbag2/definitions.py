@@ -1,4 +1,4 @@
-"""Definitions of the standard ROS 2 messages, for recordings that do not carry their own."""
+"""Definitions of the standard ROS 2 messages, for recordings without definitions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 
 @cache
 def known_definition(type_name: str) -> bytes:
-    """The definition of ``type_name`` with those it uses, as ROS 2 Humble has it; else empty."""
+    """Return the ROS 2 Humble definition of ``type_name`` and of the types it uses, or empty."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)

@@ -1,7 +1,8 @@
-"""ROS 2 bag folders: every storage file in them, listed or not, in the order of time.
+"""Reader of ROS 2 bag folders: all storage files, listed or not, in order of time.
 
-``metadata.yaml`` is a hint. What it lists and the folder lacks is dropped with its declared counts,
-and so is what it counts beyond the rows in the files; what the files hold beyond that is a notice.
+``metadata.yaml`` is a hint. Files that it lists but the folder lacks are dropped with their
+declared counts. If it counts more rows than the files have, the difference is dropped. If the files
+have more rows, a notice is added.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from crosscue.replay.base import (
 from .inflate import DAMAGED, inflated
 from .merge import Stream, merged
 from .metadata import SplitHint, read_metadata
-from .split import PACKED, PACKED_DAMAGED, Split, look_into, opened, stored_files
+from .split import PACKED, PACKED_DAMAGED, Split, examined, opened, stored_files
 
 MISSING: Final = "storage file is missing"
 UNREADABLE: Final = "storage file cannot be opened"
@@ -43,10 +44,10 @@ class FolderLog(Closing):
     """An open ROS 2 bag folder; see ``crosscue.replay.base.Log``."""
 
     def __init__(self, path: Path, limits: Limits) -> None:
-        """Find its storage files and learn their topics.
+        """Find the storage files and their topics.
 
         Raises:
-            LogError: Not one storage file can be opened.
+            LogError: No storage file can be opened.
             OSError: The folder cannot be listed.
         """
         self._path = path
@@ -58,32 +59,32 @@ class FolderLog(Closing):
                 f"metadata.yaml: {self._metadata.fault}; the storage files were read without it"
             )
         files = stored_files(path, self._metadata, self._notices)
-        self._splits = [look_into(file, self._metadata, limits) for file in files]
+        self._splits = [examined(file, self._metadata, limits) for file in files]
         if not any(not split.fault for split in self._splits):
             why = "; ".join(split.fault for split in self._splits)
             raise LogError(
                 f"{path}: {why or 'no .db3 or .mcap file in it'}; expected at least one "
-                "storage file that opens"
+                "readable storage file"
             )
         self._topics = _union(self._splits)
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Path of the folder."""
         return self._path
 
     @property
     def format(self) -> str:
-        """``rosbag2``."""
+        """Short name of the format."""
         return "rosbag2"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Topics of all storage files; a count is known where every file with the topic has one."""
+        """Topics of all storage files, with counts if all files with the topic declare one."""
         return tuple(self._topics.values())
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """Blocks of all storage files; where their times overlap, topics are merged by time."""
+        """Yield the blocks of all storage files; files with overlapping times are merged."""
         for sentence in self._notices:
             ledger.notice(sentence)
         for topic in self.topics:
@@ -109,7 +110,7 @@ class FolderLog(Closing):
         )
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Storage files that are missing, cannot be opened or are cut; see ``KnowsItsEnd``."""
+        """Report missing, unreadable and truncated storage files; see ``KnowsItsEnd``."""
         for split in self._splits:
             if split.fault:
                 ledger.drop("", UNREADABLE, None, split.fault)
@@ -119,7 +120,7 @@ class FolderLog(Closing):
             ledger.drop("", MISSING, hint.count, hint.name)
 
     def close(self) -> None:
-        """Nothing stays open between reads."""
+        """Do nothing, because no file stays open between passes."""
 
     def _stream(
         self, split: Split, ledger: Ledger, selection: Selection, stack: ExitStack
@@ -128,7 +129,7 @@ class FolderLog(Closing):
         if fault:
             ledger.drop("", PACKED_DAMAGED, None, fault)
         elif split.path.name.endswith(PACKED):
-            ledger.notice("was unpacked to a temporary file")
+            ledger.notice("was decompressed to a temporary file")
         names = frozenset(topic.name for topic in split.topics)
         odd = frozenset(
             t.name for t in split.topics if t.type_name != self._topics[t.name].type_name
@@ -139,7 +140,7 @@ class FolderLog(Closing):
     def _blocks(
         self, blocks: Iterator[Block], odd: frozenset[str], ledger: Ledger
     ) -> Iterator[Block]:
-        """Blocks with messages decompressed; topics of another type are left out."""
+        """Yield blocks with decompressed messages, without topics of another type."""
         for block in blocks:
             if block.topic in odd:
                 ledger.skip(block.topic, OTHER_TYPE, len(block))
@@ -149,13 +150,13 @@ class FolderLog(Closing):
                 yield from _unpacked(block, self._limits, ledger)
 
     def _absent(self) -> list[SplitHint]:
-        """Storage files that ``metadata.yaml`` lists and the folder lacks."""
+        """Return the storage files in ``metadata.yaml`` that the folder lacks."""
         held = {split.path.name for split in self._splits}
         present = held | {name.removesuffix(PACKED) for name in held} | {n + PACKED for n in held}
         return [hint for hint in self._metadata.splits if hint.name not in present]
 
     def _settle(self, ledger: Ledger) -> None:
-        """Compare with what ``metadata.yaml`` says and account for files that are not there."""
+        """Compare with the counts in ``metadata.yaml``, and account for missing files."""
         metadata = self._metadata
         absent = self._absent()
         shut = [split for split in self._splits if split.fault]
@@ -164,9 +165,9 @@ class FolderLog(Closing):
         ]
         reason = gone[0][1] if gone else BY_METADATA
         detail = ", ".join(name for name, _ in gone)
-        # Rows lost from a known number of nameless ones must not be counted a second time.
+        # Dropped rows of unknown topics must not be counted again.
         is_counted = "" in ledger.accounts and ledger.accounts[""].dropped.total() > 0
-        # As many rows under another name are a renamed topic, not missing rows.
+        # The same number of rows under another name is a renamed topic, not a loss.
         held = sum(account.in_file for account in ledger.accounts.values())
         is_short = not ledger.is_whole or bool(gone) or sum(metadata.counts.values()) > held
         missing: dict[str, int] = {}
@@ -174,11 +175,11 @@ class FolderLog(Closing):
             in_file = ledger.accounts[name].in_file if name in ledger.accounts else 0
             missing[name] = count - in_file
             if missing[name] > 0 and is_short and not is_counted:
-                counted = f"metadata.yaml counts {count} messages, the files hold {in_file}"
+                counted = f"metadata.yaml counts {count} messages, the files contain {in_file}"
                 ledger.drop(name, reason, missing[name], detail or counted)
             elif missing[name]:
                 ledger.notice(
-                    f"{name}: metadata.yaml counts {count} messages, the files hold {in_file}"
+                    f"{name}: metadata.yaml counts {count} messages, the files contain {in_file}"
                 )
         for name, why in gone:
             hint = next((h for h in metadata.splits if h.name == name), None)
@@ -205,7 +206,7 @@ def _union(splits: list[Split]) -> dict[str, Topic]:
 
 
 def _groups(splits: list[Split]) -> list[list[Split]]:
-    """Splits by start time; those whose times overlap in one group, or all if one has no times."""
+    """Group splits with overlapping times, by start time; one group if a split has no times."""
     timed = [split for split in splits if split.range_ns is not None]
     empty = [split for split in splits if split.range_ns is None and not any(_counted(split))]
     if len(timed) + len(empty) < len(splits):
@@ -224,12 +225,12 @@ def _groups(splits: list[Split]) -> list[list[Split]]:
 
 
 def _counted(split: Split) -> list[int]:
-    """Declared counts of its topics, one for an unknown count."""
+    """Return the declared counts of a split's topics, with 1 for an unknown count."""
     return [1 if topic.declared is None else topic.declared for topic in split.topics]
 
 
 def _unpacked(block: Block, limits: Limits, ledger: Ledger) -> Iterator[Block]:
-    """The block with messages that were compressed one by one decompressed."""
+    """Decompress the individually compressed messages of a block."""
     messages = cast("Messages", block.rows)
     for part, plain, damaged in inflated(messages, limits):
         if plain is messages:
@@ -264,7 +265,7 @@ def open_folder(path: Path, limits: Limits = DEFAULT_LIMITS) -> FolderLog:
     """Open a ROS 2 bag folder.
 
     Raises:
-        LogError: Not one storage file in it can be opened.
+        LogError: No storage file can be opened.
         OSError: The folder cannot be listed.
     """
     return FolderLog(path, limits)

@@ -1,4 +1,4 @@
-"""Messages that rosbag2 compressed one by one (zstd), known by their own first bytes."""
+"""Decompression of messages that rosbag2 compressed individually with zstd."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from crosscue.replay.base import BLOCK_BYTES, Bytes, Int64s, Limits, Messages
 
 ZSTD_MAGIC: Final = 0xFD2FB528
-"""As a little-endian number; no CDR message begins so."""
+"""First bytes of a zstd frame as a little-endian number; no CDR message starts with them."""
 
 DAMAGED: Final = "damaged compressed message"
 _WINDOW_BYTES: Final = 1 << 27
 
 
 def is_compressed(buffer: Bytes, start: Int64s, stop: Int64s) -> NDArray[np.bool_]:
-    """Shape (N,): which messages begin as a zstd frame does."""
+    """Return a mask of the messages that start like a zstd frame, shape (N,)."""
     long: NDArray[np.bool_] = stop - start >= 4
     first = np.zeros(len(start), dtype=np.uint32)
     for shift in range(4):
@@ -30,11 +30,11 @@ def is_compressed(buffer: Bytes, start: Int64s, stop: Int64s) -> NDArray[np.bool
 def inflated(
     messages: Messages, limits: Limits
 ) -> Iterator[tuple[slice, Messages, dict[int, str]]]:
-    """Messages with the compressed ones decompressed, a bounded stretch at a time.
+    """Decompress the compressed messages in parts of limited size.
 
     Yields:
-        The stretch of the rows given, its messages, and what is wrong with those that are damaged,
-        by their number within the stretch; their range is empty.
+        The range of rows of a part, its messages, and the problems of damaged messages by their
+        index in the part. Damaged messages have an empty range.
     """
     packed = is_compressed(messages.buffer, messages.start, messages.stop)
     if not packed.any():
@@ -60,7 +60,7 @@ def _joined(parts: list[bytes]) -> Messages:
 
 
 def _one(raw: bytes, limits: Limits) -> tuple[bytes, str]:
-    """The message, or nothing and why; never more than the limits allow is taken."""
+    """Decompress a message within the limits; return it, or empty bytes and the problem."""
     import zstandard
 
     largest, limit = limits.message_bytes, str(limits.message_bytes)
@@ -75,7 +75,7 @@ def _one(raw: bytes, limits: Limits) -> tuple[bytes, str]:
         with stream.stream_reader(raw) as reader:
             found = reader.read(room + 1)
     except (zstandard.ZstdError, MemoryError) as error:
-        return b"", f"{len(raw)} bytes, zstd says: {error}"
+        return b"", f"{len(raw)} bytes, zstd: {error}"
     if len(found) > room:
         said = "" if declared < 0 else f", declares {declared}"
         return b"", f"decompresses to more than {room} bytes{said}; the limit is {limit}"

@@ -1,4 +1,4 @@
-"""Blocks of storage files whose times overlap, merged by time topic by topic."""
+"""Merging of the blocks of storage files with overlapping times, by topic and time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Messages
 
 HELD_BYTES: Final = 16 * BLOCK_BYTES
-"""Payload bytes held back at most; beyond it rows are given before their order is certain."""
+"""Maximum payload bytes held back; beyond it, rows are yielded before their order is certain."""
 
 _EARLIEST: Final = -(2**63)
 _LATEST: Final = 2**63 - 1
@@ -21,11 +21,11 @@ _LATEST: Final = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One storage file's blocks.
+    """The blocks of one storage file.
 
     Attributes:
-        blocks: In stored order: one pass over the topics after another.
-        topics: Names it may give.
+        blocks: Blocks in stored order, in repeated passes over the topics.
+        topics: Names of the topics that may occur.
     """
 
     blocks: Iterator[Block]
@@ -34,12 +34,12 @@ class Stream:
 
 @dataclass(slots=True)
 class _Front:
-    """How far a stream has come.
+    """The progress of a stream.
 
     Attributes:
-        reached_ns: No later row is expected to be earlier than this.
-        latest_ns: Latest row met.
-        met: Topics met in the pass over the topics that goes on.
+        reached_ns: Earliest time expected of the following rows.
+        latest_ns: Latest time so far.
+        met: Topics found in the current pass over the topics.
     """
 
     reached_ns: int = _EARLIEST
@@ -47,7 +47,7 @@ class _Front:
     met: set[str] = field(default_factory=set)
 
     def advance(self, block: Block) -> None:
-        """Take note of a block; a topic that comes again begins a new pass."""
+        """Update the progress with a block; a repeated topic starts a new pass."""
         if block.topic in self.met:
             self.met.clear()
             self.reached_ns = self.latest_ns
@@ -57,7 +57,7 @@ class _Front:
 
 
 def merged(streams: Sequence[Stream]) -> Iterator[Block]:
-    """All blocks; a topic that several streams have comes in the order of log time."""
+    """Yield all blocks; topics that occur in several streams are in order of log time."""
     many = Counter(chain.from_iterable(stream.topics for stream in streams))
     shared = {name for name, count in many.items() if count > 1}
     fronts = {i: _Front() for i in range(len(streams))}
@@ -92,7 +92,7 @@ def _payload_bytes(block: Block) -> int:
 def _parted(
     held: dict[str, list[Block]], until_ns: int
 ) -> tuple[dict[str, list[Block]], list[Block]]:
-    """Rows before ``until_ns`` merged for each topic, and the blocks that remain."""
+    """Merge each topic's rows before ``until_ns``; return the remaining and the merged blocks."""
     remain: dict[str, list[Block]] = {}
     ready: list[Block] = []
     for name, blocks in held.items():
@@ -108,7 +108,7 @@ def _parted(
 
 
 def _in_order(blocks: list[Block]) -> list[Block]:
-    """The rows of ``blocks`` by log time, equal times in the order given."""
+    """Join the rows of ``blocks`` sorted by log time, with a stable order."""
     if len(blocks) < 2:
         return blocks
     times = [block.log_ns for block in blocks]

@@ -1,4 +1,4 @@
-"""What ``metadata.yaml`` says of a ROS 2 bag folder: a hint, never believed against the files."""
+"""Contents of a ROS 2 bag folder's ``metadata.yaml``, which is a hint only."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _BRACKETS: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class SplitHint:
-    """What the metadata state about one storage file.
+    """The metadata of one storage file.
 
     Attributes:
-        name: File name without any folder.
-        count: Messages in it, or None.
+        name: File name without a folder.
+        count: Number of messages, or None.
         range_ns: First and last log time, or None.
     """
 
@@ -30,12 +30,12 @@ class SplitHint:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What the metadata state about the folder.
+    """The metadata of the folder.
 
     Attributes:
-        splits: Storage files in the order listed.
-        counts: Messages by topic.
-        fault: Why it could not be read, or empty.
+        splits: Storage files in the listed order.
+        counts: Number of messages by topic.
+        fault: Reason why the file could not be read, or empty.
     """
 
     splits: tuple[SplitHint, ...] = ()
@@ -44,14 +44,14 @@ class Metadata:
 
 
 def read_metadata(path: Path) -> Metadata:
-    """Read ``metadata.yaml``; one that is missing or unreadable says nothing but why."""
+    """Read ``metadata.yaml``; if it is missing or unreadable, only ``fault`` is set."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
         raw = read_at_most(path, METADATA_BYTES)
         if raw is None or raw.count(b"[") + raw.count(b"{") > _BRACKETS:
-            return Metadata(fault="larger or deeper than any real one")
+            return Metadata(fault="implausibly large or deeply nested")
         said = YAML(typ="base", pure=True).load(raw.decode("utf-8", "backslashreplace"))
     except FileNotFoundError:
         return Metadata(fault="missing")
@@ -96,12 +96,12 @@ def _sequence(about: Mapping[str, Any], name: str) -> list[Any]:
 
 
 def _name(value: object) -> str:
-    """The last part of a path; a folder in it (old bags write one) is never followed."""
+    """Return the last part of a path, because a folder (as in old bags) is never followed."""
     return PurePosixPath(value).name if isinstance(value, str) else ""
 
 
 def _number(value: object) -> int | None:
-    """A count or time as an integer in the range of int64, or None."""
+    """Return a count or time if it is an integer in the range of int64, else None."""
     if not isinstance(value, str) or not value.lstrip("-").isdecimal() or len(value) > 20:
         return None
     number = int(value)

@@ -1,11 +1,11 @@
-"""Rows of a sound ROS 2 SQLite bag straight out of its pages, some hundred pages at a time.
+"""Direct reading of rows from the pages of an undamaged ROS 2 SQLite bag.
 
-Through the standard library every row is four Python objects. A recorder's file is simple, though:
-one table of four columns, rows in the order of their ids, a large payload continued in a chain of
-pages. Only what is plainly so is read here, and only after SQLite found no fault in the file. At
-the first thing that is not (a value of another type, a page that is not as expected), reading ends
-and SQLite reads on from there. Layout as in sections 1.5, 1.6 and 2.1 of SQLite's description of
-its file format.
+The standard library creates four Python objects per row. But a recorder's file has a simple
+structure: one table of four columns, rows in the order of their ids, and large payloads that
+continue in chains of pages. This module reads only files of this structure, several hundred pages
+at a time, after SQLite has found no damage. At the first exception (a value of another type, an
+unexpected page) it stops, and the remaining rows are read through SQLite. Sections 1.5, 1.6 and 2.1
+of SQLite's file format description define the layout.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _COLUMNS: Final = (
     ("timestamp", "INTEGER", 0, 0),
     ("data", "BLOB", 0, 0),
 )
-"""Name, type, place in the primary key and kind of each column of the messages table."""
+"""Name, type, position in the primary key and kind of each column of the messages table."""
 _INTERIOR: Final = 5
 _LEAF: Final = 13
 _LEAF_HEAD: Final = 8
@@ -38,29 +38,29 @@ _INTERIOR_HEAD: Final = 12
 _DEEPEST: Final = 20
 _LOT_BYTES: Final = BLOCK_BYTES // 2
 _CHAIN_BYTES: Final = 1 << 20
-_ROOM: Final = 256
-"""Zeros behind the last page, so that a cell that runs over its page can be examined."""
+_PADDING: Final = 256
+"""Number of zeros after the last page, so that a cell that exceeds its page can be examined."""
 _VARINT_BYTES: Final = 9
 _INTEGER_BYTES: Final = np.array([-1, 1, 2, 3, 4, 6, 8, -1, 0, 0] + [-1] * 246, np.int64)
-"""Size of an integer by its serial type; -1 if the type is not an integer."""
+"""Size of an integer in bytes by its serial type; -1 if the type is not an integer."""
 _ONE: Final = 9
-"""Serial type of the integer 1, which takes no bytes."""
+"""Serial type of the integer 1, which is stored in zero bytes."""
 _FIRST_BLOB: Final = 12
 
 
 class _UnusualError(Exception):
-    """Something that SQLite itself should read."""
+    """An unusual structure, which must be read through SQLite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PageRows:
-    """N rows, their ids ascending.
+    """N rows with ascending ids.
 
     Attributes:
-        ids: Shape (N,), int64.
-        topics: Shape (N,), int64.
-        times: Shape (N,), int64.
-        messages: N payloads; empty for topics not asked for.
+        ids: Shape (N,), int64: row ids.
+        topics: Shape (N,), int64: topic numbers.
+        times: Shape (N,), int64: timestamps.
+        messages: N payloads; empty for unselected topics.
     """
 
     ids: Int64s
@@ -74,16 +74,17 @@ class PageRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cells:
-    """Rows of one lot of leaf pages, as places in its buffer.
+    """Rows of a batch of leaf pages, as positions in its buffer.
 
     Attributes:
-        page: Shape (N,), int64: which page of the lot holds it; ascending.
-        ids: Shape (N,), int64.
-        topics: Shape (N,), int64.
-        times: Shape (N,), int64.
-        start: Shape (N,), int64: where the payload begins.
-        length: Shape (N,), int64: its bytes; 0 for topics not asked for.
-        local: Shape (N,), int64: how many of them stand here; the rest in a chain of pages.
+        page: Shape (N,), int64: index of the page in the batch, ascending.
+        ids: Shape (N,), int64: row ids.
+        topics: Shape (N,), int64: topic numbers.
+        times: Shape (N,), int64: timestamps.
+        start: Shape (N,), int64: offset of the payload.
+        length: Shape (N,), int64: size of the payload in bytes; 0 for unselected topics.
+        local: Shape (N,), int64: number of payload bytes in this page; the others are in a chain
+            of pages.
     """
 
     page: Int64s
@@ -95,7 +96,7 @@ class _Cells:
     local: Int64s
 
     def span(self, first: int, stop: int) -> _Cells:
-        """Rows ``first`` to ``stop``."""
+        """Return the rows ``first`` to ``stop``."""
         columns = (getattr(self, column.name) for column in fields(self))
         return _Cells(*(column[first:stop] for column in columns))
 
@@ -103,14 +104,14 @@ class _Cells:
 def page_rows(
     database: Database, topics: frozenset[int] | None, limits: Limits
 ) -> Iterator[PageRows]:
-    """Rows in the order of their ids, as far as they are plain; none if the file is not.
+    """Yield rows in the order of their ids, up to the first unusual structure.
 
-    A statement must be open in the meantime, whose lock keeps a recorder from writing.
+    A statement must be open meanwhile, because its lock prevents a recorder from writing.
 
     Args:
-        database: One that SQLite found no fault in.
-        topics: Numbers of the topics whose payloads are wanted, or None for all.
-        limits: A longer row is left to SQLite.
+        database: A database in which SQLite found no damage.
+        topics: Numbers of the topics whose payloads are read, or None for all.
+        limits: Longer rows are left to SQLite.
     """
     if database.plain is None:
         return
@@ -123,10 +124,10 @@ def page_rows(
 
 
 def _root(database: Database) -> int:
-    """Number of the first page of the messages table.
+    """Return the number of the first page of the messages table.
 
     Raises:
-        _UnusualError: The table has not the columns that recorders give it.
+        _UnusualError: The table does not have the columns that recorders create.
     """
     try:
         columns = fetched(database, "PRAGMA table_xinfo(messages)")
@@ -163,10 +164,10 @@ class _Pages:
         self._highest = -(2**63)
 
     def rows(self) -> Iterator[PageRows]:
-        """All rows.
+        """Yield all rows.
 
         Raises:
-            _UnusualError: Those from here on SQLite should read.
+            _UnusualError: The following rows must be read through SQLite.
             OSError: The file cannot be read.
         """
         for leaves in self._leaves(self._root, 0):
@@ -175,7 +176,7 @@ class _Pages:
                 yield from self._lot(leaves[first : first + many])
 
     def _leaves(self, page: int, depth: int) -> Iterator[Int64s]:
-        """Numbers of the leaf pages below ``page``, in the order of their rows."""
+        """Yield the numbers of the leaf pages below ``page``, in the order of their rows."""
         content = self._page(page)
         if content[0] == _LEAF:
             yield np.array([page])
@@ -221,11 +222,11 @@ class _Pages:
             raise _UnusualError
 
     def _read(self, leaves: Int64s) -> Bytes:
-        """The pages one after the other, and ``_ROOM``."""
+        """Read the pages into one buffer, followed by the padding."""
         if leaves.min() <= 1 or leaves.max() > self._count:
             raise _UnusualError
-        buffer = np.empty(len(leaves) * self._size + _ROOM, np.uint8)
-        buffer[-_ROOM:] = 0
+        buffer = np.empty(len(leaves) * self._size + _PADDING, np.uint8)
+        buffer[-_PADDING:] = 0
         edges = [0, *(np.flatnonzero(np.diff(leaves) != 1) + 1).tolist(), len(leaves)]
         for first, stop in pairwise(edges):
             target = buffer[first * self._size : stop * self._size]
@@ -237,7 +238,7 @@ class _Pages:
             raise _UnusualError
 
     def _cells(self, buffer: Bytes, pages: int) -> tuple[_Cells, bool]:
-        """The rows up to the first that is not plain, and whether those are all."""
+        """Return the rows up to the first unusual one, and whether these are all."""
         size, usable = self._size, self._usable
         shorts, words = _shifted(buffer, ">u2"), _shifted(buffer, ">i8")
         base = np.arange(pages) * size
@@ -278,19 +279,19 @@ class _Pages:
         return cells.span(0, upto), upto == whole and bool(is_leaf.all())
 
     def _local(self, total: Int64s) -> Int64s:
-        """Bytes of each row that are in its leaf page."""
+        """Return the number of bytes of each row in its leaf page."""
         usable = self._usable
         min_local = (usable - 12) * 32 // 255 - 23
         part = min_local + (total - min_local) % (usable - 4)
         return np.where(total <= usable - 35, total, np.where(part <= usable - 35, part, min_local))
 
     def _ascending(self, cells: _Cells) -> int:
-        """How many rows have ids that ascend, from those before on."""
+        """Return the number of leading rows with ascending ids, relative to earlier rows too."""
         before = np.concatenate(([self._highest], cells.ids[:-1]))
         return _first(~(cells.ids > before)) if len(cells.ids) else 0
 
     def _whole(self, buffer: Bytes, cells: _Cells) -> Iterator[PageRows]:
-        """Rows with the rest of their payloads, in parts of bounded size."""
+        """Yield rows with their complete payloads, in parts of limited size."""
         far = np.where(cells.local < cells.length, cells.length, 0)
         sums = np.cumsum(far)
         first = done = 0
@@ -320,7 +321,7 @@ class _Pages:
         return PageRows(cells.ids, cells.topics, cells.times, messages)
 
     def _follow(self, page: int, target: Bytes) -> None:
-        """Fill ``target`` from a chain of pages, which mostly follow each other in the file."""
+        """Fill ``target`` from a chain of pages, which are mostly consecutive in the file."""
         room, done = self._usable - 4, 0
         while done < len(target):
             count = min(-(-(len(target) - done) // room), self._run, self._count + 1 - page)
@@ -343,7 +344,7 @@ class _Pages:
             raise _UnusualError
 
     def _last(self, page: int, target: Bytes) -> int:
-        """Fill ``target`` from one page; which page is said to follow."""
+        """Fill ``target`` from one page, and return the number of the next page."""
         content = os.pread(self._file, self._size, (page - 1) * self._size)
         if len(content) < self._size:
             raise _UnusualError
@@ -352,18 +353,18 @@ class _Pages:
 
 
 def _shifted(buffer: Bytes, kind: str) -> NDArray[np.integer]:
-    """The number that begins at each byte."""
+    """Return a view of the numbers that start at each byte."""
     width = np.dtype(kind).itemsize
     return np.ndarray((len(buffer) - width + 1,), kind, buffer, 0, (1,))
 
 
 def _first(marked: NDArray[np.bool_]) -> int:
-    """Place of the first one marked, or how many there are."""
+    """Return the index of the first True, or the length if all are False."""
     return int(marked.argmax()) if marked.any() else len(marked)
 
 
 def _varint(buffer: Bytes, at: Int64s) -> tuple[Int64s, Int64s]:
-    """SQLite's numbers of variable length, and the places behind them."""
+    """Parse SQLite's variable-length integers, and return them and their ends."""
     byte = buffer[at]
     value, at = (byte & 0x7F).astype(np.int64), at + 1
     more = np.flatnonzero(byte & 0x80)
@@ -383,7 +384,7 @@ def _varint(buffer: Bytes, at: Int64s) -> tuple[Int64s, Int64s]:
 def _integers(
     words: NDArray[np.integer], end: Int64s, size: Int64s, serial: NDArray[np.uint8]
 ) -> Int64s:
-    """Signed integers of up to eight bytes that end at ``end``."""
+    """Parse signed integers of up to eight bytes that end at ``end``."""
     shift = 8 * (8 - np.clip(size, 1, 8))
     value = words[np.maximum(end - 8, 0)].astype(np.int64)
     value = (value << shift) >> shift

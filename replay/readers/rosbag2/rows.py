@@ -1,4 +1,4 @@
-"""Rows of a ROS 2 SQLite bag, in columns of bounded size, around damaged pages."""
+"""Reading of the rows of a ROS 2 SQLite bag through SQLite, with damaged pages skipped."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _ROWID: Final = itemgetter(0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowColumns:
-    """N rows with the types they must have, and those without.
+    """Columns of N rows with correct types, and the rows with other types.
 
     Attributes:
-        ids: Shape (N,), int64.
-        topics: Shape (N,), int64.
-        times: Shape (N,), int64.
-        length: Shape (N,), int64: of each payload.
-        payloads: All payloads, one after the other.
-        odd: Rows of other types.
+        ids: Shape (N,), int64: row ids.
+        topics: Shape (N,), int64: topic numbers.
+        times: Shape (N,), int64: timestamps.
+        length: Shape (N,), int64: size of each payload in bytes.
+        payloads: All payloads, concatenated.
+        odd: Rows with other types.
     """
 
     ids: Int64s
@@ -49,22 +49,22 @@ class RowColumns:
 
 
 Row: TypeAlias = tuple[int, Any, Any, Any]
-"""Row id, topic id, timestamp and payload; a file may hold any type in the last three."""
+"""Row id, topic id, timestamp and payload; a file may have any type in the last three."""
 
 
 @dataclass(slots=True)
 class RowScan:
-    """One pass over the rows from ``first`` to ``last``, both included.
+    """One pass over the rows from ``first`` to ``last``, both inclusive.
 
     Attributes:
-        database: Where from.
+        database: The database.
         first: First row id.
         last: Last row id.
-        topics: Numbers of the topics whose payloads are fetched, or None for all; the others' are
+        topics: Numbers of the topics whose payloads are read, or None for all; other payloads are
             empty.
-        holes: Which rows could not be read, in words.
-        disordered: Rows left out because their id does not ascend: a page met twice, or an id
-            changed.
+        holes: Descriptions of the unreadable rows.
+        disordered: Number of rows omitted because their ids do not ascend: a repeated page, or a
+            changed id.
     """
 
     database: Database
@@ -76,7 +76,7 @@ class RowScan:
     _highest: int = FIRST_ROWID
 
     def batches(self) -> Iterator[RowColumns]:
-        """Rows in the order of their ids; on damage, on from the next row that can be reached."""
+        """Yield rows in the order of their ids; after damage, resume at the next readable row."""
         at, is_careful = self.first, False
         while at <= self.last:
             try:
@@ -97,7 +97,7 @@ class RowScan:
                 at, is_careful = onward, False
 
     def _blocks(self, at: int, is_careful: bool) -> Iterator[RowColumns]:
-        """Rows from ``at`` on; what was fetched before an error comes before it is raised."""
+        """Yield rows from ``at`` on; rows read before an error are yielded before it is raised."""
         parts: list[RowColumns] = []
         size = count = 0
         try:
@@ -118,7 +118,7 @@ class RowScan:
             yield _joined(parts)
 
     def _fetches(self, at: int, is_careful: bool) -> Iterator[RowColumns]:
-        """Few rows at a time, which are still in the processor's cache when they are copied."""
+        """Yield few rows at a time, so that they are copied from the processor's cache."""
         cursor = self.database.connection.execute(self._query(), (at, self.last))
         largest, room = 1, 1 if is_careful else _FIRST_FETCH
         while rows := cursor.fetchmany(room):
@@ -128,11 +128,11 @@ class RowScan:
             if not is_careful:
                 largest = max(largest, int(part.length.max(initial=0)))
                 mean = max(len(part.payloads) // max(len(part), 1), 1)
-                # Never many large ones, as far as those before show.
+                # Fewer rows if the previous ones were large.
                 room = max(1, min(_LARGEST_FETCH, _PART_BYTES // mean, BLOCK_BYTES // largest))
 
     def _columns(self, rows: list[Row]) -> RowColumns:
-        """Columns of the rows whose ids ascend."""
+        """Return the columns of the rows with ascending ids."""
         try:
             columns = _columns_of(rows)
         except (TypeError, OverflowError):
@@ -155,7 +155,7 @@ class RowScan:
         )
 
     def _ascending(self, rows: list[Row]) -> list[Row]:
-        """Rows whose ids go up."""
+        """Return the rows with ascending ids."""
         number = np.fromiter(map(_ROWID, rows), dtype=np.int64, count=len(rows))
         if number[0] > self._highest and (np.diff(number) > 0).all():
             self._highest = int(number[-1])
@@ -166,7 +166,7 @@ class RowScan:
         return [row for row, is_kept in zip(rows, keep, strict=True) if is_kept]
 
     def _reachable(self, after: int) -> int | None:
-        """The first row id beyond ``after`` from which SQLite can read again."""
+        """Return the first row id after ``after`` from which SQLite can read again."""
         step, failing = 1, after
         while (found := self._probe(min(after + step, self.last))) is None:
             failing = min(after + step, self.last)
@@ -184,7 +184,7 @@ class RowScan:
         return found if after < found <= self.last else None
 
     def _probe(self, at: int) -> int | None:
-        """The id of the first row at or after ``at``, past all ids at the end, None on damage."""
+        """Return the first row id at or after ``at``; above all ids at the end; None on damage."""
         query = "SELECT rowid, data FROM messages WHERE rowid >= ? ORDER BY rowid LIMIT 1"
         try:
             rows = fetched(self.database, query, (at,))
@@ -194,14 +194,14 @@ class RowScan:
 
 
 def _columns_of(rows: Sequence[Row]) -> RowColumns:
-    """Columns of rows.
+    """Convert rows to columns.
 
     Raises:
-        TypeError: A value of another type than it must have.
+        TypeError: A value has a wrong type.
         OverflowError: A number of more than 64 bits.
     """
     ids, topics, times, payloads = zip(*rows, strict=True)
-    # Unlike NumPy, ``array`` takes no float for an integer.
+    # Unlike NumPy, ``array`` does not accept a float as an integer.
     return RowColumns(
         np.frombuffer(array("q", ids), np.int64),
         np.frombuffer(array("q", topics), np.int64),
@@ -212,7 +212,7 @@ def _columns_of(rows: Sequence[Row]) -> RowColumns:
 
 
 def _columns_with_odd(rows: Sequence[Row]) -> RowColumns:
-    """Columns of those rows that have the right types, and the others as they are."""
+    """Convert the rows with correct types to columns, and keep the others."""
     sound = [row for row in rows if _is_sound(row)]
     odd = tuple(row for row in rows if not _is_sound(row))
     if not sound:
@@ -240,7 +240,7 @@ def _joined(parts: Sequence[RowColumns]) -> RowColumns:
 
 
 def _rising(number: Int64s, highest: int) -> NDArray[np.bool_]:
-    """Which ids rise above all before them, a single outlier left aside."""
+    """Return a mask of the ids above all earlier ids, ignoring a single outlier."""
     before = np.concatenate(([highest], number[:-1]))
     after = np.concatenate((number[1:], [LAST_ROWID]))
     keep = ~((number > after) & (before < after))
@@ -250,7 +250,7 @@ def _rising(number: Int64s, highest: int) -> NDArray[np.bool_]:
 
 
 def index_times(database: Database, index: str) -> tuple[Int64s, Int64s] | None:
-    """Row ids, sorted, and timestamps as the time index has them; None if it is damaged."""
+    """Return the sorted row ids and timestamps of the time index; None if it is damaged."""
     query = f"SELECT rowid, timestamp FROM messages INDEXED BY {index} ORDER BY timestamp"  # noqa: S608
     parts: list[NDArray[np.int64]] = []
     try:

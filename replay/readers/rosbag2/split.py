@@ -1,4 +1,4 @@
-"""The storage files of a ROS 2 bag folder: found, opened, decompressed where they are packed."""
+"""Storage files of a ROS 2 bag folder: discovery, opening and decompression."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PACKED: Final = ".zstd"
 PACKED_DAMAGED: Final = "compressed file"
 
 _HEAD_BYTES: Final = 18
-"""The longest header of a zstd frame (RFC 8878, 3.1.1)."""
+"""Maximum size of a zstd frame's header (RFC 8878, 3.1.1)."""
 _READ_BYTES: Final = MIB
 _FED_BYTES: Final = 1024
 _WINDOW_BYTES: Final = 1 << 27
@@ -44,11 +44,11 @@ class Split:
     """One storage file.
 
     Attributes:
-        path: Where it is.
-        topics: What it holds.
-        range_ns: First and last log time where known.
-        fault: Why it cannot be opened, or empty.
-        missing: What its opening shows to be missing.
+        path: Path of the file.
+        topics: Topics of the file.
+        range_ns: First and last log time, where known.
+        fault: Reason why it cannot be opened, or empty.
+        missing: Losses found when it was opened.
     """
 
     path: Path
@@ -59,7 +59,7 @@ class Split:
 
 
 def stored_files(folder: Path, metadata: Metadata, notices: list[str]) -> list[Path]:
-    """Storage files in the folder, listed or not; of a file and its packed twin only one."""
+    """List the storage files in the folder; of a file and its compressed copy, only one."""
     listed = [hint.name for hint in metadata.splits]
     found = {path.name: path for path in sorted(folder.iterdir()) if _is_stored(path)}
     for name in list(found):
@@ -67,7 +67,7 @@ def stored_files(folder: Path, metadata: Metadata, notices: list[str]) -> list[P
         if name != twin and twin in found:
             left_out = name if twin in listed and name not in listed else twin
             found.pop(left_out)
-            notices.append(f"{left_out} is the same file packed or unpacked; it was not read")
+            notices.append(f"{left_out} is a compressed or decompressed copy; it was not read")
     stems = {name.split(".")[0]: name for name in found if name in listed}
     for name in [name for name in found if name not in listed]:
         original = stems.get(name.split(".")[0])
@@ -84,8 +84,8 @@ def _is_stored(path: Path) -> bool:
     return path.is_file() and path.name.lower().removesuffix(PACKED).endswith(STORED)
 
 
-def look_into(path: Path, metadata: Metadata, limits: Limits) -> Split:
-    """Open a storage file for a moment to learn what it holds."""
+def examined(path: Path, metadata: Metadata, limits: Limits) -> Split:
+    """Open a storage file briefly to find its topics and time range."""
     hint = next((hint for hint in metadata.splits if hint.name == path.name), None)
     try:
         with opened(path, limits, open_unsealed) as (log, fault):
@@ -110,7 +110,7 @@ def _open_part(path: Path, limits: Limits) -> Log:
 def opened(
     path: Path, limits: Limits, open_one: Callable[[Path, Limits], Log] = _open_part
 ) -> Iterator[tuple[Log, str]]:
-    """The log in a storage file, and what went wrong when it was unpacked (or nothing)."""
+    """Open the log in a storage file; yield it with the problem of its decompression, or empty."""
     if not path.name.endswith(PACKED):
         with open_one(path, limits) as log:
             yield log, ""
@@ -128,11 +128,11 @@ def opened(
 
 
 def unpack(packed: Path, plain: Path, limits: Limits) -> str:
-    """Decompress to ``plain`` as far as possible; why it ended early, or empty.
+    """Decompress to ``plain`` as far as possible; return why it ended early, or empty.
 
     Raises:
-        LogError: The disk for temporary files is too small for it.
-        OSError: It cannot be read or written.
+        LogError: The disk for temporary files is too small.
+        OSError: A file cannot be read or written.
     """
     import zstandard
 
@@ -153,25 +153,27 @@ def unpack(packed: Path, plain: Path, limits: Limits) -> str:
                     written += target.write(out)
                     if written > max_bytes:
                         size = packed.stat().st_size
-                        return f"{size} bytes unpack to over {max_bytes}, the limit (--max-chunk)"
+                        return (
+                            f"{size} bytes decompress to over {max_bytes}, the limit (--max-chunk)"
+                        )
             except zstandard.ZstdError as error:
                 return f"compressed file is damaged after {written} bytes ({error})"
     return "" if unpacking.is_at_end else f"compressed file is cut after {written} bytes"
 
 
 def _declared(packed: Path) -> int:
-    """What the first frame says it holds, which zstd holds it to; -1 where it says nothing."""
+    """Return the size that the first frame declares, which zstd enforces; -1 if unknown."""
     import zstandard
 
     with packed.open("rb") as source:
         try:
             return zstandard.frame_content_size(source.read(_HEAD_BYTES))
         except zstandard.ZstdError:
-            return -1  # of a damaged head unpacking says more
+            return -1  # decompression reports a damaged header in more detail
 
 
 class _Unpacking:
-    """Frames of zstd, fed a little at a time since a kilobyte can hold thirty megabytes."""
+    """Decompressor of zstd frames in small steps, as a kilobyte may expand to 30 megabytes."""
 
     def __init__(self) -> None:
         import zstandard
@@ -181,11 +183,11 @@ class _Unpacking:
 
     @property
     def is_at_end(self) -> bool:
-        """Did the last frame end?"""
+        """True if the last frame is complete."""
         return bool(self._frame.eof)
 
     def feed(self, part: bytes) -> Iterator[bytes]:
-        """What comes out of ``part``."""
+        """Decompress ``part``."""
         view = memoryview(part)
         for first in range(0, len(view), _FED_BYTES):
             piece = bytes(view[first : first + _FED_BYTES])

@@ -1,10 +1,9 @@
-"""Open a SQLite file as its recorder left it, without changing a byte of the user's folder.
+"""Opening of a SQLite file as its recorder left it, without changing the user's folder.
 
-* A write-ahead log is read along with the file, its index kept in memory instead of in a ``-shm``
-  file (exclusive locking mode over SQLite's VFS without locks).
-* A hot rollback journal (the recorder died inside a transaction) is played back in a temporary
-  copy.
-* The path goes percent-encoded into the URI, so that ``run%41.db3`` opens itself.
+* A write-ahead log is read with the file. Its index is in memory instead of in a ``-shm`` file
+  (exclusive locking mode on SQLite's VFS without locks).
+* A hot rollback journal (the recorder died inside a transaction) is applied to a temporary copy.
+* The path is percent-encoded in the URI, so that ``run%41.db3`` opens the file of that name.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from .wal import check_wal
 
 SQLITE_MAGIC: Final = b"SQLite format 3\x00"
 FAULTS: Final = (sqlite3.Error, UnicodeError, ValueError, OverflowError, MemoryError)
-"""What the standard library raises on a damaged file; a message that is no UTF-8 is one of them."""
+"""Exceptions of the standard library for damaged files, including invalid UTF-8 in messages."""
 
 _WAL_VERSION: Final = 2
 _WAIT_S: Final = 1.0
@@ -32,8 +31,8 @@ _GUARD_EVERY: Final = 100_000
 _STEPS_PER_BYTE: Final = 40
 _STEPS_AT_LEAST: Final = 100_000_000
 _SETTINGS: Final = (
-    # Lets SQLite open a file that is shorter than its header says; nothing here can write. It
-    # comes first: the others read the schema.
+    # Allows SQLite to open a file that is shorter than its header states; nothing is written. It
+    # must come first, because the others read the schema.
     "writable_schema=ON",
     "trusted_schema=OFF",
     "cell_size_check=ON",
@@ -46,11 +45,11 @@ class Database:
     """An open, read-only database.
 
     Attributes:
-        connection: Text comes as ``str``, bytes that are no UTF-8 escaped.
-        notices: What had to be done to open it, for the ledger.
-        copy: Place of the temporary copy, or None.
-        damage: What is known to be missing, or empty.
-        plain: The file that holds all of it, with no journal beside it, or None.
+        connection: Connection that returns text as ``str``, with invalid UTF-8 escaped.
+        notices: Notices on the opening, for the ledger.
+        copy: Folder of the temporary copy, or None.
+        damage: Description of the missing data, or empty.
+        plain: The file if it is complete and has no journal, else None.
     """
 
     connection: sqlite3.Connection
@@ -60,14 +59,14 @@ class Database:
     plain: Path | None = None
 
     def close(self) -> None:
-        """Close it and remove the temporary copy."""
+        """Close the database and remove the temporary copy."""
         self.connection.close()
         if self.copy is not None:
             self.copy.close()
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """The file that SQLite keeps beside ``path``, such as ``-wal``."""
+    """Return the path of SQLite's companion file of ``path``, such as ``-wal``."""
     return path.with_name(path.name + suffix)
 
 
@@ -75,9 +74,9 @@ def open_database(path: Path, limits: Limits) -> Database:
     """Open ``path`` for reading.
 
     Raises:
-        LogFormatError: No SQLite file.
-        LogError: SQLite cannot open it; the message says what to do.
-        OSError: It cannot be read, or a temporary copy cannot be written.
+        LogFormatError: Not a SQLite file.
+        LogError: SQLite cannot open it; the message states the remedy.
+        OSError: The file cannot be read, or a temporary copy cannot be written.
     """
     with path.open("rb") as file:
         head = file.read(100)
@@ -93,16 +92,16 @@ def open_database(path: Path, limits: Limits) -> Database:
 
 
 def explained(error: Exception) -> str:
-    """What SQLite said, and what to do about it."""
+    """Describe an error of SQLite and its remedy."""
     name = getattr(error, "sqlite_errorname", "")
     if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
         return "locked by another program; stop the recorder, or copy the file and read the copy"
     if name.startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
-        return f"damaged ({error}); 'sqlite3 FILE .recover' may save more"
+        return f"damaged ({error}); 'sqlite3 FILE .recover' may recover more"
     if name.startswith("SQLITE_INTERRUPT"):
         return "damaged: reading it takes more steps than its size allows"
     if isinstance(error, UnicodeError):
-        return "damaged in its table of tables; 'sqlite3 FILE .recover' may save something"
+        return "damaged in its table of tables; 'sqlite3 FILE .recover' may recover some data"
     return f"SQLite cannot read it: {error}"
 
 
@@ -125,23 +124,23 @@ def _opened(path: Path, head: bytes, limits: Limits) -> Database:
 
 
 def _shortfall(missing: int) -> str:
-    return f"{missing} bytes fewer than its header says" if missing else ""
+    return f"{missing} bytes fewer than its header states" if missing else ""
 
 
 def _wal_damage(path: Path) -> str:
-    """Why committed rows in a write-ahead log are out of SQLite's reach, or empty."""
+    """Return why SQLite cannot read committed rows of a write-ahead log, or empty."""
     state = check_wal(path)
     if state is None:
-        return "the write-ahead log's header is damaged, nothing in it can be read"
+        return "the write-ahead log's header is damaged, so the log cannot be read"
     if state.has_lost_commit:
         return f"the write-ahead log is damaged at frame {state.sound + 1} of {state.frames}"
     return ""
 
 
 def _missing_bytes(head: bytes, path: Path) -> tuple[int, int]:
-    """Bytes by which the file falls short of its header's page count; bytes of a page cut in two.
+    """Return the bytes missing for the header's page count, and the bytes of a truncated page.
 
-    See section 1.3 of SQLite's description of the file format.
+    See section 1.3 of SQLite's file format description.
     """
     page_bytes = int.from_bytes(head[16:18], "big")
     page_bytes = 65536 if page_bytes == 1 else page_bytes
@@ -187,7 +186,7 @@ def _text(raw: bytes) -> str:
 
 
 def _guard(connection: sqlite3.Connection, path: Path) -> None:
-    """Stop a file whose pages refer to each other from being read for ever."""
+    """Limit the number of steps, because pages of a damaged file may refer to each other."""
     size = path.stat().st_size + (
         beside(path, "-wal").stat().st_size if beside(path, "-wal").exists() else 0
     )
@@ -202,7 +201,7 @@ def _guard(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def _repaired_copy(path: Path, limits: Limits) -> Database:
-    """A copy in which SQLite undoes the transaction that the recorder did not end."""
+    """Open a copy in which SQLite undoes the recorder's unfinished transaction."""
     journal = beside(path, "-journal")
     folder = _room_for_copy(path, path.stat().st_size + journal.stat().st_size)
     try:
@@ -215,13 +214,13 @@ def _repaired_copy(path: Path, limits: Limits) -> Database:
         raise
     said = (
         "the recorder died while writing: its unfinished transaction was undone in a temporary "
-        "copy, the file itself is as it was"
+        "copy; the file itself is unchanged"
     )
     return Database(connection, [said], folder)
 
 
 def _copy_without_torn_page(path: Path, torn: int, missing: int, limits: Limits) -> Database:
-    """A copy that ends with a whole page; SQLite reads the rest of a torn page as zeros."""
+    """Open a copy that ends with a complete page, because SQLite pads a partial page with zeros."""
     folder = _room_for_copy(path, path.stat().st_size)
     try:
         copy = folder.path / "copy.db3"
@@ -231,7 +230,7 @@ def _copy_without_torn_page(path: Path, torn: int, missing: int, limits: Limits)
     except BaseException:
         folder.close()
         raise
-    said = "the file ends within a page: its whole pages were read in a temporary copy"
+    said = "the file ends inside a page: its complete pages were read from a temporary copy"
     return Database(connection, [said], folder, _shortfall(missing))
 
 

@@ -1,4 +1,4 @@
-"""What a ROS 2 SQLite bag says of itself: topics, definitions, row counts, its time index."""
+"""Tables of a ROS 2 SQLite bag other than the messages: topics, definitions and time index."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DEFINITIONS: Final = frozenset({"topic_type", "encoding", "encoded_message_defi
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """One line of the topics table."""
+    """One row of the topics table."""
 
     number: int
     name: str
@@ -31,13 +31,13 @@ class Stored:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """What the tables other than the messages hold.
+    """Contents of the tables other than the messages.
 
     Attributes:
-        stored: Lines of the topics table.
-        topics: By name; the first line of a name decides its type.
-        index: Quoted name of an index that begins with the timestamp, or None.
-        notices: What is odd about them.
+        stored: Rows of the topics table.
+        topics: Topics by name; the first row of a name determines its type.
+        index: Quoted name of an index that starts with the timestamp, or None.
+        notices: Remarks on the tables, one sentence each.
     """
 
     stored: tuple[Stored, ...]
@@ -46,7 +46,7 @@ class Tables:
     notices: tuple[str, ...]
 
     def places(self) -> dict[int, int]:
-        """From topic number to place among ``topics``; none for a second type under one name."""
+        """Return indices in ``topics`` by topic number, without second types of a name."""
         place = {name: i for i, name in enumerate(self.topics)}
         return {
             one.number: place[one.name]
@@ -55,9 +55,9 @@ class Tables:
         }
 
     def counts(self, database: Database) -> dict[str, int] | None:
-        """Rows by topic name, "" for those of no topic; None if a damaged page hides some.
+        """Count rows by topic name, with "" for rows without a topic; None on a damaged page.
 
-        SQLite goes through all rows for it, but not through their payloads.
+        SQLite reads all rows for this, but not their payloads.
         """
         query = "SELECT topic_id, COUNT(*) FROM messages NOT INDEXED GROUP BY topic_id"
         try:
@@ -73,7 +73,7 @@ class Tables:
 
 
 def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
-    """Everything but the messages.
+    """Read all tables except the messages.
 
     Raises:
         LogFormatError: The tables of a ROS 2 bag are missing or damaged.
@@ -83,7 +83,7 @@ def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
         _require(database, kinds, path)
         notices: list[str] = []
         stored = _stored(database, notices)
-        # Not through the index, which a cut takes away first.
+        # Without the index, which is the first part that a truncated file lacks.
         is_empty = not fetched(database, "SELECT 1 FROM messages NOT INDEXED LIMIT 1")
         definitions = _definitions(database, kinds, limits)
         topics = _topics(stored, 0 if is_empty else None, definitions, notices)
@@ -94,12 +94,12 @@ def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
 
 
 def fetched(database: Database, query: str, values: Sequence[int] = ()) -> list[Any]:
-    """All rows of a query that has few."""
+    """Return all rows of a query with few rows."""
     return database.connection.execute(query, values).fetchall()
 
 
 def _kinds(database: Database) -> dict[str, str]:
-    """Kind of each table-like thing by name; a virtual table may run code of its own."""
+    """Return the kinds of tables and views by name, because a virtual table may run code."""
     kinds: dict[str, str] = {}
     for name, kind, sql in fetched(database, "SELECT name, type, sql FROM sqlite_master"):
         if kind in ("table", "view"):
@@ -117,7 +117,7 @@ def _require(database: Database, kinds: dict[str, str], path: Path) -> None:
         if kinds.get(table) != "table" or not columns <= _columns(database, table):
             held = ", ".join(sorted(kinds)) or "nothing"
             raise LogFormatError(
-                f"{path}: no ROS 2 bag: expected a table {table!r} with columns "
+                f"{path}: not a ROS 2 bag: expected a table {table!r} with columns "
                 f"{', '.join(sorted(columns))}; it holds {held}"
             )
 
@@ -131,7 +131,7 @@ def _stored(database: Database, notices: list[str]) -> list[Stored]:
         if isinstance(number, int) and isinstance(name, str) and name:
             stored.append(Stored(number, name, str(type_name or ""), str(encoding or "cdr")))
         else:
-            notices.append(f"the topics table has a line without a name: id {number!r:.40}")
+            notices.append(f"the topics table has a row without a name: id {number!r:.40}")
     return stored
 
 
@@ -147,7 +147,7 @@ def _time_index(database: Database) -> str | None:
 def _definitions(
     database: Database, kinds: dict[str, str], limits: Limits
 ) -> dict[str, tuple[str, bytes]]:
-    """Coding and text of each type's definition, as far as the file has them."""
+    """Return the encoding and text of each type's definition, where available."""
     if kinds.get("message_definitions") != "table":
         return {}
     if not _columns(database, "message_definitions") >= _DEFINITIONS:

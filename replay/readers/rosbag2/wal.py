@@ -1,8 +1,8 @@
-"""Check a SQLite write-ahead log: SQLite drops what follows a damaged frame without a word.
+"""Check of a SQLite write-ahead log, because SQLite silently ignores data after a damaged frame.
 
-A frame is 24 bytes of header and a page; its checksum runs on from the frame before, so the first
-frame that does not fit ends what SQLite reads. Layout and checksum as in section 4 of SQLite's
-description of its file format.
+A frame consists of a header of 24 bytes and a page. Its checksum continues that of the previous
+frame, so SQLite stops at the first frame that does not match. Section 4 of SQLite's file format
+description defines the layout and the checksum.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _MASK: Final = 0xFFFF_FFFF
 
 @dataclass(frozen=True, slots=True)
 class WalState:
-    """What a write-ahead log holds.
+    """The state of a write-ahead log.
 
     Attributes:
-        frames: Whole frames of the present generation.
-        sound: Frames before the first that does not fit its checksum.
-        has_lost_commit: A transaction was committed at or behind the first unsound frame.
+        frames: Number of complete frames of the current generation.
+        sound: Number of frames before the first one that does not match its checksum.
+        has_lost_commit: True if a transaction was committed at or after that frame.
     """
 
     frames: int
@@ -37,7 +37,7 @@ class WalState:
 
 
 def check_wal(path: Path) -> WalState | None:
-    """Walk the frames of a write-ahead log; None if even its header is damaged."""
+    """Check the frames of a write-ahead log; None if its header is damaged."""
     with path.open("rb") as file:
         head = file.read(_HEADER.size)
         if len(head) < _HEADER.size:
@@ -66,10 +66,10 @@ def check_wal(path: Path) -> WalState | None:
 
 
 class _Checksum:
-    """The running checksum over ``steps`` pairs of words, in one sweep.
+    """Vectorised running checksum over ``steps`` pairs of words.
 
-    A pair (x, y) takes (s, t) to (s + t + x, s + 2 t + x + y) modulo 2^32; that is linear, so the
-    pairs weigh in with powers of the matrix ((1, 1), (1, 2)).
+    A pair (x, y) maps (s, t) to (s + t + x, s + 2 t + x + y) modulo 2^32. The map is linear, so the
+    pairs contribute with powers of the matrix ((1, 1), (1, 2)).
     """
 
     def __init__(self, steps: int) -> None:
@@ -84,7 +84,7 @@ class _Checksum:
         self._weights: tuple[NDArray[np.uint32], ...] = tuple(weights)
 
     def after(self, state: tuple[int, int], words: NDArray[np.uint32]) -> tuple[int, int]:
-        """The checksum after ``words``, begun from ``state``."""
+        """Return the checksum after ``words``, starting from ``state``."""
         x = words[0::2].astype(np.uint32)
         xy = x + words[1::2].astype(np.uint32)
         a, b, c, d = self._weights

@@ -43,7 +43,7 @@ def test_one_failing_drive_does_not_stop_the_rest(
 
     reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
     assert set(reported) == {"monday", "tuesday", "broken"}
-    assert "does not begin like MCAP" in reported["broken"]["error"]
+    assert "not an MCAP file" in reported["broken"]["error"]
     assert reported["monday"]["result"]["pose"]["rows"] > 1000
     assert not (out / reported["broken"]["name"] / "manifest.json").exists()
 
@@ -56,7 +56,7 @@ def test_one_failing_drive_does_not_stop_the_rest(
     assert run(["replay", str(drives), "-o", str(out), "--retry-failed", "--json"]) == 4
     (only,) = json.loads(capsys.readouterr().out)["drives"]
     assert only["name"][:-9] == "broken"
-    assert "does not begin like MCAP" in Path(only["run"], "failure.log").read_text()
+    assert "not an MCAP file" in Path(only["run"], "failure.log").read_text()
 
 
 def test_two_workers_give_the_bytes_of_one(drives: Path, tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
         4,
         (str(BOMB_BYTES), str(DEFAULT_LIMITS.chunk_bytes)),
     ),
-    "zstd file": (_packed_file, 4, (r"\d+ bytes unpack", str(DEFAULT_LIMITS.chunk_bytes))),
+    "zstd file": (_packed_file, 4, (r"\d+ bytes decompress", str(DEFAULT_LIMITS.chunk_bytes))),
 }
 
 

@@ -249,7 +249,7 @@ def test_blocks_that_run_in_a_circle_are_found_out(tmp_path: Path) -> None:
     ("content", "says"),
     [
         (b"", "empty file"),
-        (b"PK\x03\x04" + bytes(100), "no MDF file"),
+        (b"PK\x03\x04" + bytes(100), "not an MDF file"),
         (b"MDF     3.30    " + bytes(100), "version '3.30'"),
         (b"MDF     4.10    " + bytes(100), "header damaged"),
     ],

@@ -52,7 +52,7 @@ def test_two_recordings_in_a_row_are_both_read(tmp_path: Path) -> None:
     reading = read_back(stored(tmp_path / "x.mcap", one + two))
 
     assert reading.messages == {"/a": [same(1, b"first"), same(2, b"second")]}
-    assert any("2 recordings" in notice for notice in reading.ledger.notices)
+    assert any("2 consecutive recordings" in notice for notice in reading.ledger.notices)
     assert reading.ledger.is_whole
     assert reading.ledger.accounts["/a"].declared == 2
 
@@ -215,7 +215,7 @@ def test_a_chunk_without_checksum_among_others_is_noticed(tmp_path: Path) -> Non
     reading = read_back(stored(tmp_path / "x.mcap", McapFile(chunks)))
 
     assert reading.count() == 2
-    assert any("1 of 2 chunks carry no checksum" in notice for notice in reading.ledger.notices)
+    assert any("1 of 2 chunks have no checksum" in notice for notice in reading.ledger.notices)
 
 
 def test_a_file_without_any_checksum_says_so(tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def test_a_wrong_time_in_an_index_without_checksum_is_found_out(tmp_path: Path) 
     reading = read_back(path, Selection(None, 405, 505))
 
     assert [m[0] for m in reading.messages["/t0"]] == [*range(405, 410), *range(500, 505)]
-    assert any("does not fit the chunk" in notice for notice in reading.ledger.notices)
+    assert any("does not match the chunk" in notice for notice in reading.ledger.notices)
 
 
 @settings(max_examples=100, deadline=None)

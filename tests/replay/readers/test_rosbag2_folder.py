@@ -330,5 +330,5 @@ def test_a_folder_without_a_file_that_opens_is_refused(tmp_path: Path) -> None:
     (folder / "part_0.db3").write_bytes(b"")
     (folder / "metadata.yaml").write_text("")
 
-    with pytest.raises(LogError, match="expected at least one storage file that opens"):
+    with pytest.raises(LogError, match="expected at least one readable storage file"):
         open_log(folder)

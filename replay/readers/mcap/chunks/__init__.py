@@ -1,1 +1,1 @@
-"""The chunks of an MCAP file: found, decompressed, and their messages as columns."""
+"""Chunks of an MCAP file: index, decompression, and columns of their messages."""

@@ -1,4 +1,4 @@
-"""Blocks from rows, each message entered into the account."""
+"""Conversion of rows to blocks, with an account of every message."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ UNDECLARED: Final = "message of a channel that the file does not declare"
 TOO_LARGE: Final = "message over the size limit"
 TIME_TOO_LATE: Final = "log time of 2^63 ns or later"
 NO_PUBLISH_TIME: Final = (
-    "publish times of 2^63 ns or later count as not available; the log time stands for them"
+    "publish times of 2^63 ns or later count as not available; the log time is used instead"
 )
 LATEST: Final = np.uint64((1 << 63) - 1)
 Uint64s: TypeAlias = NDArray[np.uint64]
 
 
-class Giver:
-    """Yields the messages of one recording as blocks.
+class BlockBuilder:
+    """Converts the messages of one recording to blocks.
 
     Attributes:
-        met: Messages met, by channel number.
-        dropped: Messages known to be dropped, by channel number.
+        met: Number of messages found, by channel number.
+        dropped: Number of messages known to be dropped, by channel number.
     """
 
     def __init__(
@@ -54,13 +54,13 @@ class Giver:
         self._limits = limits
         self._is_timeless = selection.start_ns is None and selection.end_ns is None
 
-    def give(self, rows: Rows, checks: Checks, at: int) -> Iterator[Block]:
-        """All messages of ``rows``, a block per topic, each under the channel in force there.
+    def build(self, rows: Rows, checks: Checks, at: int) -> Iterator[Block]:
+        """Yield the messages of ``rows``, one block per topic, by the channels valid there.
 
         Args:
-            rows: Messages and definitions of a chunk or a run, whose bytes are right.
+            rows: Messages and definitions of a chunk or a run, with verified bytes.
             checks: Records definitions that cannot be read.
-            at: Where in the file the chunk or run begins.
+            at: Offset of the chunk or run in the file.
         """
         begin = 0
         for found in rows.definitions:
@@ -68,55 +68,55 @@ class Giver:
                 if self.declarations.changed_by(found):
                     rows = rows.in_stored_order()
                     end = int(np.searchsorted(rows.offset, found.at))
-                    yield from self._give_part(rows.take(slice(begin, end)))
+                    yield from self._build_part(rows.take(slice(begin, end)))
                     begin = end
                 self.declarations.declare(found)
             except BrokenRecordError as error:
                 checks.bad_definitions.add(f"in the chunk or record at byte {at}: {error}")
-        yield from self._give_part(rows.take(slice(begin, None)) if begin else rows)
+        yield from self._build_part(rows.take(slice(begin, None)) if begin else rows)
 
     def drop(self, rows: Rows, reason: str, detail: str) -> None:
-        """All messages of ``rows`` are dropped."""
+        """Drop all messages of ``rows``."""
         channels, counts = np.unique(rows.channel, return_counts=True)
         for channel_id, count in zip(channels.tolist(), counts.tolist(), strict=True):
-            self.lose_of_channel(channel_id, reason, count, detail, None)
+            self.drop_of_channel(channel_id, reason, count, detail, None)
 
-    def lose_of_channel(
+    def drop_of_channel(
         self, channel_id: int, reason: str, count: int, detail: str, t_ns: int | None
     ) -> None:
-        """``count`` messages of a channel are dropped."""
+        """Drop ``count`` messages of a channel."""
         self.dropped[channel_id] += count
         self._ledger.drop(self.declarations.topic(channel_id), reason, count, detail, t_ns)
 
     def wants(self, index: MessageIndex) -> bool:
-        """Is any of these messages asked for?"""
+        """Return whether any of these messages is selected."""
         if not self._selection.wants(self.declarations.topic(index.channel_id)):
             return False
         return bool(self._in_time(index.entries["log"]).any())
 
-    def pass_over(self, index: MessageIndex) -> None:
-        """Account for messages none of which is asked for, without reading them."""
+    def skip_unread(self, index: MessageIndex) -> None:
+        """Account for unselected messages without reading them."""
         count = len(index.entries)
         self.met[index.channel_id] += count
         self._account(self.declarations.topic(index.channel_id), index.entries["log"])
 
-    def pass_over_counted(self, channel_id: int, count: int) -> None:
-        """Account for messages in chunks that nobody looked into, as the statistics count them."""
+    def skip_counted(self, channel_id: int, count: int) -> None:
+        """Account for messages in unread chunks, by the counts of the statistics."""
         topic = self.declarations.topic(channel_id)
         self.met[channel_id] += count
         self._ledger.find(topic, count)
         is_wanted = self._selection.wants(topic)
         self._ledger.skip(topic, NOT_ASKED_TIME if is_wanted else NOT_ASKED_TOPIC, count)
 
-    def pass_over_large(self, channel_id: int, log: int, size: int, at: int) -> None:
-        """Account for a message outside chunks that is too large to be read."""
+    def skip_oversized(self, channel_id: int, log: int, size: int, at: int) -> None:
+        """Account for a message outside chunks that exceeds the size limit."""
         self.met[channel_id] += 1
         topic = self.declarations.topic(channel_id)
         kept = self._account(topic, np.array([log], dtype=np.uint64))
         if kept is None or len(kept):
             self._ledger.skip(topic, TOO_LARGE, 1, self._too_large(size, at), log)
 
-    def _give_part(self, rows: Rows) -> Iterator[Block]:
+    def _build_part(self, rows: Rows) -> Iterator[Block]:
         if not len(rows):
             return
         rows, parts = self._by_topic(rows)
@@ -125,7 +125,7 @@ class Giver:
             yield from self._blocks(topic, rows, start, index)
 
     def _by_topic(self, rows: Rows) -> tuple[Rows, list[tuple[str, NDArray[np.intp] | slice]]]:
-        """The messages of each topic in stored order, the topics in the order of their first."""
+        """Group the messages by topic, in stored order and by each topic's first message."""
         if rows.groups:
             parts = {self.declarations.topic(number): part for number, part in rows.groups}
             if len(parts) == len(rows.groups):
@@ -185,7 +185,7 @@ class Giver:
             )
 
     def _account(self, topic: str, log: Uint64s) -> NDArray[np.intp] | None:
-        """Enter messages of one topic as found or skipped; which to give, None for all."""
+        """Account for messages of one topic; return the selected indices, or None for all."""
         self._ledger.find(topic, len(log))
         if not self._selection.wants(topic):
             self._ledger.skip(topic, NOT_ASKED_TOPIC, len(log))
@@ -202,7 +202,7 @@ class Giver:
         return kept
 
     def _in_time(self, log: Uint64s) -> NDArray[np.bool_]:
-        """Which of these log times are asked for (and are times at all)."""
+        """Return a mask of the log times that are valid and selected."""
         asked = log <= LATEST
         if self._selection.start_ns is not None:
             asked &= log >= np.uint64(min(max(self._selection.start_ns, 0), 1 << 63))

@@ -1,7 +1,7 @@
-"""The summary's index of chunks in columns: a log of an hour has thousands of them.
+"""The summary's index of chunks, in columns, because a log of an hour has thousands of chunks.
 
-Nothing is made per chunk unless it is asked for, so that opening a log and finding a window in it
-cost the same however long the log is.
+Objects for single chunks are created only on demand, so that opening a log and finding a window in
+it take the same time for logs of any length.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from crosscue.replay.readers.mcap.records import CHUNK_FIXED, PREFIX, BrokenReco
 
 SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
 FARTHEST: Final = 1 << 62
-"""No file is as long as this; entries that point beyond it are left out."""
+"""Upper bound for file sizes; entries that point beyond it are ignored."""
 _FIXED: Final = 36
 _PAIR: Final = 10
 _AFTER_MAP: Final = 12
@@ -29,18 +29,18 @@ _RUN: Final = 8
 
 @dataclass(frozen=True, eq=False)
 class ChunkTable(Mapping[int, ChunkIndex]):
-    """What the summary says of N chunks, sorted by offset; also a mapping from the offset.
+    """Index entries of N chunks, sorted by offset; also a mapping from the offset.
 
     Attributes:
-        at: Shape (N,), int64: where each chunk record begins, counted from the file's start.
-        length: Shape (N,), int64: of the chunk record.
-        index_length: Shape (N,), int64: of the message indexes behind it.
+        at: Shape (N,), int64: offset of each chunk record from the file's start.
+        length: Shape (N,), int64: length of the chunk record.
+        index_length: Shape (N,), int64: length of the message indexes after it.
         start: Shape (N,), uint64: earliest log time.
         end: Shape (N,), uint64: latest log time.
-        sizes: Shape (N, 2), uint64: stored and decompressed bytes of the records.
+        sizes: Shape (N, 2), uint64: stored and decompressed sizes of the records in bytes.
         compression: N names.
-        edges: Shape (N + 1,), int64: where in ``channel`` the numbers of each chunk are.
-        channel: Shape (M,), uint16: channels that have a message index, chunk by chunk.
+        edges: Shape (N + 1,), int64: edges of the chunks' ranges in ``channel``.
+        channel: Shape (M,), uint16: channels with a message index, chunk by chunk.
     """
 
     at: NDArray[np.int64]
@@ -55,19 +55,19 @@ class ChunkTable(Mapping[int, ChunkIndex]):
 
     @property
     def after(self) -> NDArray[np.int64]:
-        """Shape (N,): where whatever follows a chunk and its message indexes begins."""
+        """Offset after each chunk and its message indexes, shape (N,)."""
         return self.at + self.length + self.index_length
 
     @property
     def is_tiled(self) -> bool:
-        """Do the chunks with their message indexes not overlap?"""
+        """True if no chunks with their message indexes overlap."""
         return bool((self.after[:-1] <= self.at[1:]).all())
 
     def naming(self, channels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which chunks have a message index for any of these channels.
+        """Return a mask of the chunks with a message index for any of these channels.
 
         Args:
-            channels: Shape (65536,), by channel number.
+            channels: Shape (65536,): mask by channel number.
         """
         rows = np.repeat(np.arange(len(self)), np.diff(self.edges))
         named = np.zeros(len(self), dtype=np.bool_)
@@ -76,11 +76,11 @@ class ChunkTable(Mapping[int, ChunkIndex]):
 
     @property
     def is_unnamed(self) -> NDArray[np.bool_]:
-        """Shape (N,): no message index says which channels are in the chunk."""
+        """Mask of the chunks without message indexes, shape (N,)."""
         return np.equal(self.edges[1:], self.edges[:-1])
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Self:
-        """Some of the chunks."""
+        """Return the selected chunks."""
         picked = np.arange(len(self))[rows]
         edges = np.concatenate(([0], np.cumsum(np.diff(self.edges)[picked]))).astype(np.int64)
         pairs = np.repeat(self.edges[picked] - edges[:-1], np.diff(edges)) + np.arange(edges[-1])
@@ -138,7 +138,7 @@ class ChunkTable(Mapping[int, ChunkIndex]):
 
 
 def run_of(records: bytes, at: int, size: int) -> int:
-    """How many records of one kind and size stand one after the other from ``at`` on."""
+    """Return the number of consecutive records of one kind and size from ``at`` on."""
     prefix, count = records[at : at + PREFIX.size], 1
     ahead = at + (_RUN - 1) * size
     if records[ahead : ahead + PREFIX.size] != prefix:
@@ -157,13 +157,13 @@ def run_of(records: bytes, at: int, size: int) -> int:
 
 
 def table_of(records: bytes, begins: Sequence[int], sizes: Sequence[int], base: int) -> ChunkTable:
-    """The table of the ChunkIndex contents at ``begins``, each of ``sizes`` bytes.
+    """Parse the ChunkIndex contents at ``begins``, each of ``sizes`` bytes.
 
     Args:
         records: The summary.
         begins: N offsets in it.
         sizes: N lengths.
-        base: Where the recording begins within a concatenated file.
+        base: Offset of the recording within a concatenated file.
 
     Raises:
         BrokenRecordError: A record is shorter than its fields.
@@ -175,7 +175,7 @@ def table_of(records: bytes, begins: Sequence[int], sizes: Sequence[int], base: 
     times = fixed[:, :32].copy().view("<u8")
     map_size = fixed[:, 32:].copy().view("<u4")[:, 0].astype(np.int64)
     if (map_size % _PAIR).any():
-        raise BrokenRecordError("a map of channels is no whole number of entries")
+        raise BrokenRecordError("a map of channels ends inside an entry")
     _need(size, _FIXED + map_size + _AFTER_MAP)
     behind = _gathered(view, begin + _FIXED + map_size, _AFTER_MAP)
     name_size = behind[:, 8:].copy().view("<u4")[:, 0].astype(np.int64)
@@ -204,7 +204,7 @@ def table_of(records: bytes, begins: Sequence[int], sizes: Sequence[int], base: 
 
 
 def _sorted(table: ChunkTable, sane: NDArray[np.bool_]) -> ChunkTable:
-    """By offset, one entry each: the last."""
+    """Sort by offset and keep the last entry of each offset."""
     at = table.at
     if sane.all() and (at[1:] > at[:-1]).all():
         return table
@@ -213,14 +213,14 @@ def _sorted(table: ChunkTable, sane: NDArray[np.bool_]) -> ChunkTable:
 
 
 def _gathered(view: NDArray[np.uint8], at: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
-    """Shape (N, size): the bytes from each place on."""
+    """Return ``size`` bytes from each offset on, shape (N, size)."""
     return np.take(view, at[:, None] + np.arange(size))
 
 
 def _names(
     view: NDArray[np.uint8], at: NDArray[np.int64], size: NDArray[np.int64]
 ) -> NDArray[np.bytes_]:
-    """The compression names; shorter ones are filled with zeros, which the dtype leaves out."""
+    """Return the compression names; the dtype ignores the zero padding of shorter names."""
     padded = np.zeros((len(at), _LONGEST_NAME), dtype=np.uint8)
     for width in np.unique(size).tolist():
         rows = size == width

@@ -1,4 +1,4 @@
-"""Chunks decompressed to no more than they declare, with their checksum verified."""
+"""Decompression of chunks to at most their declared size, with checksum verification."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ if TYPE_CHECKING:
 Bytes: TypeAlias = NDArray[np.uint8]
 
 UNKNOWN_SIZES: Final = (-1, 0)
-"""What zstandard and lz4 say when a frame does not declare its size."""
+"""Values of zstandard and lz4 for frames that do not declare their size."""
 LZ4_STEP: Final = 256 << 10
 
 
 def inflate(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
-    """The records of a chunk, their size and checksum as the chunk declares.
+    """Decompress the records of a chunk, and verify their size and checksum.
 
     Args:
-        body: Shape (B,), the chunk's records as stored.
-        head: What the chunk says of them.
-        room: Where to write them, one byte more than ``head.size``; not used if they are not
-            compressed.
+        body: Shape (B,): the chunk's records as stored.
+        head: The chunk's header.
+        room: Output buffer, one byte larger than ``head.size``; unused for uncompressed chunks.
 
     Returns:
-        Shape (``head.size``,), uint8: the first bytes of ``room``, or ``body``.
+        Shape (``head.size``,), uint8: the start of ``room``, or ``body``.
 
     Raises:
-        BrokenRecordError: Something is not as declared; nothing beyond the declared size was
-            allocated.
+        BrokenRecordError: The records contradict the header. No memory beyond the declared size
+            was allocated.
     """
     if len(body) != head.body_size:
         raise BrokenRecordError(f"holds {len(body)} of {head.body_size} bytes")
@@ -49,7 +48,7 @@ def inflate(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
 
 
 def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
-    """As much of a cut chunk as its first bytes give; at most ``head.size`` bytes, unverified."""
+    """Decompress the start of a truncated chunk; at most ``head.size`` unverified bytes."""
     if head.compression == "" or not len(body):
         return body[: head.size]
     give = _zstd_prefix if head.compression == "zstd" else _lz4_prefix
@@ -70,7 +69,7 @@ def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
         declared = zstandard.frame_content_size(body.data)
         if declared > size:
             raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
-        # One byte of room more than is due, so that a frame which holds more is noticed.
+        # The buffer is one byte too large, so that oversized frames are detected.
         done = 0
         with _decompressor().stream_reader(body.data, read_across_frames=True) as stream:
             while done <= size:
@@ -79,7 +78,7 @@ def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
                     break
                 done += step
     except zstandard.ZstdError as error:
-        raise BrokenRecordError(f"zstd says: {error}") from None
+        raise BrokenRecordError(f"zstd: {error}") from None
     if done > size:
         raise BrokenRecordError(f"decompresses to more than the {size} bytes it declares")
     return records[:done]
@@ -89,7 +88,7 @@ _of_thread: Final = local()
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:
-    """This thread's own: making one takes as long as a small chunk."""
+    """Return this thread's decompressor; creating one takes as long as a small chunk."""
     import zstandard
 
     if not hasattr(_of_thread, "zstd"):
@@ -107,7 +106,7 @@ def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
         if declared not in (*UNKNOWN_SIZES, size):
             raise BrokenRecordError(f"its lz4 frame declares {declared} bytes, the chunk {size}")
         while not is_done:
-            # In small steps: the library allocates new memory each time, which is slow when large.
+            # Small steps, because the library allocates memory each time, which is slow if large.
             step, taken, is_done = lz4.frame.decompress_chunk(
                 context, view[used:], max_length=min(size - done, LZ4_STEP) or 1
             )
@@ -118,7 +117,7 @@ def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
             records[done : done + len(step)] = np.frombuffer(step, dtype=np.uint8)
             done, used = done + len(step), used + taken
     except (RuntimeError, ValueError, EOFError) as error:
-        raise BrokenRecordError(f"lz4 says: {error}") from None
+        raise BrokenRecordError(f"lz4: {error}") from None
     if not is_done:
         raise BrokenRecordError(f"its lz4 frame does not end after {done} bytes")
     return records[:done]

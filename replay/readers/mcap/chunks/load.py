@@ -1,9 +1,8 @@
-"""Chunks read, decompressed and verified, small ones several at a time, handed back in order.
+"""Loading of chunks in order: reading, decompression and verification.
 
-Those that compression made much smaller are loaded ahead of their use on another thread; others
-(plain ones, pictures) when they are used, which takes less time than handing them over.
-Consecutive small chunks are loaded next to each other into one buffer, so that their messages can
-be given together.
+Chunks with a high compression ratio are loaded ahead on another thread. Other chunks (uncompressed
+data, images) are loaded when used, because handing them over would take longer. Consecutive small
+chunks are loaded into one buffer, so that their messages form common blocks.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ from crosscue.replay.readers.mcap.segments import Segment
 from crosscue.replay.readers.mcap.walk import Chunk, Item
 
 WORKERS: Final = 1
-"""One hides most of the work; each more costs more in handing over the interpreter."""
+"""Number of threads. One hides most of the work; more would only compete for the interpreter."""
 AHEAD: Final = 2
-"""Groups of chunks, or other items, under way at once ..."""
+"""Maximum number of groups of chunks, or other items, that are loaded ahead."""
 AHEAD_BYTES: Final = 32 << 20
-"""... unless they are larger than this together."""
+"""Maximum total size of the groups that are loaded ahead."""
 GROUP_BYTES: Final = 4 << 20
-"""Chunks are grouped up to this size together."""
+"""Maximum total size of a group of chunks."""
 GROUP_CHUNKS: Final = 64
 WORTHWHILE: Final = 1.5
-"""Times as large as stored, from which on decompression takes longer than the handing over."""
+"""Compression ratio above which decompression takes longer than the handover to a thread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +44,7 @@ class Stretch:
 
     @property
     def records(self) -> Bytes:
-        """The records alone."""
+        """The records of the chunk."""
         return self.whole[self.begin : self.end]
 
 
@@ -54,11 +53,11 @@ class Group:
     """Chunks that are loaded together.
 
     Attributes:
-        chunks: Them.
-        begins: Where the records of each begin in ``whole``.
-        size: Bytes of all records.
-        whole: Where they are, from the moment when the first is loaded.
-        future: The records of each, or what is wrong with them, if another thread loads them.
+        chunks: The chunks.
+        begins: Offset of each chunk's records in ``whole``.
+        size: Total size of the records in bytes.
+        whole: Buffer of the records, once the first chunk is loaded.
+        future: The records or the error of each chunk, if another thread loads them.
     """
 
     chunks: list[Chunk] = field(default_factory=list)
@@ -68,13 +67,13 @@ class Group:
     future: Future[list[Stretch | BrokenRecordError]] | None = None
 
     def add(self, chunk: Chunk) -> None:
-        """One more."""
+        """Add a chunk."""
         self.chunks.append(chunk)
         self.begins.append(self.size)
         self.size += _size(chunk)
 
     def has_room_for(self, chunk: Chunk) -> bool:
-        """May ``chunk`` be loaded next to the others?"""
+        """Return whether ``chunk`` can be loaded together with the others."""
         if not self.chunks:
             return True
         if not _is_plain_case(chunk) or not _is_plain_case(self.chunks[-1]):
@@ -84,7 +83,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """One chunk of a group; ``is_last`` of it."""
+    """One chunk of a group."""
 
     loader: Loader
     group: Group
@@ -92,14 +91,14 @@ class Load:
 
     @property
     def is_last(self) -> bool:
-        """Is no other chunk of the group to follow?"""
+        """True for the last chunk of the group."""
         return self.number + 1 == len(self.group.chunks)
 
     def stretch(self) -> Stretch:
-        """The chunk's records.
+        """Return the chunk's records.
 
         Raises:
-            BrokenRecordError: Not as declared, or over the limits.
+            BrokenRecordError: They contradict the header, or exceed the limits.
         """
         group = self.group
         future = group.future
@@ -114,7 +113,7 @@ class Load:
 
 
 class Loader:
-    """Loads chunks; results do not depend on timing."""
+    """Loads chunks; results are independent of the timing of threads."""
 
     def __init__(self, file: ByteFile, limits: Limits) -> None:
         self._file = file
@@ -132,7 +131,7 @@ class Loader:
     def ahead(
         self, items: Iterator[Item], wanted: Callable[[Chunk], bool]
     ) -> Iterator[tuple[Item, Load | None]]:
-        """The items in order, each wanted chunk with its records to come."""
+        """Yield the items in order, each selected chunk with its load in progress."""
         queue: deque[tuple[list[tuple[Item, Load | None]], Group]] = deque()
         entries: list[tuple[Item, Load | None]] = []
         group = Group()
@@ -165,15 +164,15 @@ class Loader:
             group.future = self._pool.submit(self.load_group, group)
 
     def section_crc(self, segment: Segment) -> Future[int | None]:
-        """The checksum of a segment's data section, computed from its bytes."""
+        """Compute the checksum of a segment's data section from its bytes."""
         return self.crc(segment.base, segment.end)
 
     def crc(self, begin: int, end: int) -> Future[int | None]:
-        """The checksum of the bytes from ``begin`` to ``end``."""
+        """Compute the checksum of the bytes from ``begin`` to ``end``."""
         return self._pool.submit(self._file.crc, begin, end, self._stop)
 
     def load_group(self, group: Group) -> list[Stretch | BrokenRecordError]:
-        """The records of each chunk of a group, or what is wrong with it."""
+        """Load each chunk of a group; return its records or its error."""
         loaded: list[Stretch | BrokenRecordError] = []
         for number in range(len(group.chunks)):
             try:
@@ -183,10 +182,10 @@ class Loader:
         return loaded
 
     def load_of(self, group: Group, number: int) -> Stretch:
-        """The records of one chunk of a group; to be called in the order of the chunks.
+        """Load one chunk of a group; chunks must be loaded in order.
 
         Raises:
-            BrokenRecordError: Not as declared, or over the limits.
+            BrokenRecordError: The records contradict the header, or exceed the limits.
         """
         chunk = group.chunks[number]
         if len(group.chunks) == 1:
@@ -196,20 +195,20 @@ class Loader:
             group.whole = self._file.buffers.take(group.size + 1)
         whole, begin = group.whole, group.begins[number]
         if number + 1 == len(group.chunks):
-            group.whole = None  # free for use again once its messages are
+            group.whole = None  # reusable once no message refers to it
         end = begin + _size(chunk)
         self.load(chunk, whole[begin : end + 1])
         return Stretch(whole, begin, end)
 
     def load(self, chunk: Chunk, room: Bytes | None = None) -> Bytes:
-        """The records of a chunk: all of them verified, or what a cut one begins with.
+        """Load the verified records of a chunk, or the start of a truncated chunk.
 
         Args:
-            chunk: Which one.
-            room: Where they shall lie, one byte more than it declares; None for anywhere.
+            chunk: The chunk.
+            room: Output buffer, one byte larger than the declared size; None for a new one.
 
         Raises:
-            BrokenRecordError: Not as declared, or over the limits.
+            BrokenRecordError: The records contradict the header, or exceed the limits.
         """
         head = chunk.head
         if chunk.fault or head is None:
@@ -235,5 +234,5 @@ def _size(chunk: Chunk) -> int:
 
 
 def _is_plain_case(chunk: Chunk) -> bool:
-    """Does everything said of the chunk agree, so that it can be loaded next to others?"""
+    """Return whether header and summary agree, so that the chunk can be loaded with others."""
     return chunk.head is not None and not (chunk.fault or chunk.differs or chunk.is_cut)

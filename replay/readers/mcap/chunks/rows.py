@@ -1,9 +1,9 @@
-"""The messages in a stretch of records, as columns.
+"""Columns of the messages in a chunk, or in a run of records outside chunks.
 
-A stretch is the content of a chunk, or a run of records outside chunks. Where the messages begin is
-taken from the chunk's message indexes if these are true, and found by scanning if not. True means:
-every entry points to a message of its channel and log time, and the messages together with the few
-other records between them cover the chunk exactly.
+The offsets of the messages are read from the chunk's message indexes if these are correct, and
+found by scanning otherwise. The indexes are correct if every entry points to a message of its
+channel and log time, and the messages with the few other records between them cover the chunk
+exactly.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from crosscue.replay.readers.mcap.records import (
     heads_at,
 )
 
-GAPS_WORTH_A_LOOK: Final = 256
-"""Stretches between indexed messages beyond which scanning everything is as fast."""
+MAX_GAPS: Final = 256
+"""Number of gaps between indexed messages above which scanning the complete chunk is as fast."""
 MAX_DEFINITIONS: Final = 1 << 17
-"""Schemas and channels together in one chunk; each has a 16-bit number."""
+"""Maximum number of schemas and channels in a chunk; each has a 16-bit number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A Schema or Channel record met on the way.
+    """A Schema or Channel record between messages.
 
     Attributes:
-        at: Where its record begins.
+        at: Offset of the record.
         opcode: ``SCHEMA`` or ``CHANNEL``.
-        content: The record's content.
+        content: Content of the record.
     """
 
     at: int
@@ -61,18 +61,18 @@ class Rows:
     """N messages of one buffer.
 
     Attributes:
-        buffer: Shape (B,).
-        offset: Shape (N,), int64: where each message record begins.
-        stop: Shape (N,), int64: where it ends.
-        channel: Shape (N,), uint16.
-        sequence: Shape (N,), uint32.
-        log: Shape (N,), uint64.
-        publish: Shape (N,), uint64.
-        definitions: The schemas and channels between them.
+        buffer: Shape (B,), uint8.
+        offset: Shape (N,), int64: start of each message record.
+        stop: Shape (N,), int64: end of each message record.
+        channel: Shape (N,), uint16: channel numbers.
+        sequence: Shape (N,), uint32: sequence numbers.
+        log: Shape (N,), uint64: log times.
+        publish: Shape (N,), uint64: publish times.
+        definitions: The schemas and channels between the messages.
         ignored: Number of records of other kinds.
-        end: Where the last whole record ends.
-        groups: If filled, messages stand channel by channel, those of each channel in stored order:
-            channel numbers and where their messages are. If empty, all are in stored order.
+        end: End of the last complete record.
+        groups: Channel numbers with the ranges of their messages, if the messages are sorted by
+            channel and then in stored order. If empty, all messages are in stored order.
     """
 
     buffer: NDArray[np.uint8]
@@ -91,7 +91,7 @@ class Rows:
         return len(self.offset)
 
     def take(self, index: slice | NDArray[np.intp]) -> Rows:
-        """Some of the messages in the order of ``index``, with all definitions."""
+        """Return the selected messages in the order of ``index``, with all definitions."""
         return replace(
             self,
             offset=self.offset[index],
@@ -104,12 +104,12 @@ class Rows:
         )
 
     def in_stored_order(self) -> Rows:
-        """The same messages, all channels in one order."""
+        """Return the messages of all channels in stored order."""
         return self.take(np.argsort(self.offset, kind="stable")) if self.groups else self
 
 
 def opcodes(*codes: int) -> NDArray[np.bool_]:
-    """A table of operation codes, true at ``codes``."""
+    """Return a mask of operation codes that is true at ``codes``."""
     table = np.zeros(256, dtype=np.bool_)
     table[list(codes)] = True
     return table
@@ -121,7 +121,7 @@ NEVER_IN_A_CHUNK: Final = opcodes(
 
 
 def rows_by_index(buffer: NDArray[np.uint8], indexes: Sequence[MessageIndex]) -> Rows | None:
-    """The messages of a chunk, found through its message indexes; None if these are not true."""
+    """Find the messages of a chunk by its message indexes; None if these are incorrect."""
     filled = [index for index in indexes if len(index.entries)]
     if not filled:
         return None
@@ -164,7 +164,7 @@ def rows_by_index(buffer: NDArray[np.uint8], indexes: Sequence[MessageIndex]) ->
 def _groups(
     offset: NDArray[np.int64], filled: Sequence[MessageIndex]
 ) -> tuple[tuple[int, slice], ...]:
-    """The messages of each channel; empty if some channel's are not in stored order."""
+    """Return the range of each channel's messages; empty if a channel is not in stored order."""
     edges = [0, *accumulate(len(index.entries) for index in filled)]
     inner = edges[1:-1]
     turns = sum(bool(offset[edge] < offset[edge - 1]) for edge in inner)
@@ -180,10 +180,10 @@ def _groups(
 def _between_messages(
     buffer: NDArray[np.uint8], offset: NDArray[np.int64], stop: NDArray[np.int64]
 ) -> tuple[list[Definition], int] | None:
-    """Definitions and number of other records, if with the messages they cover the buffer.
+    """Return the definitions and the number of other records, if no bytes are left over.
 
-    The k-th end is at most the (k+1)-th begin, for all k, exactly if no two messages overlap; so
-    begins and ends may be sorted each for itself.
+    Messages do not overlap if and only if the k-th end is at most the (k+1)-th start for all k.
+    Starts and ends can therefore be sorted separately.
     """
     begin, end = np.empty(len(offset) + 1, np.int64), np.empty(len(offset) + 1, np.int64)
     begin[:-1], begin[-1] = offset, len(buffer)
@@ -191,7 +191,7 @@ def _between_messages(
     begin.sort(kind="stable")
     end.sort(kind="stable")
     gaps = (end != begin).nonzero()[0]
-    if len(gaps) > GAPS_WORTH_A_LOOK or np.count_nonzero(end > begin):
+    if len(gaps) > MAX_GAPS or np.count_nonzero(end > begin):
         return None
     definitions: list[Definition] = []
     ignored = 0
@@ -207,12 +207,12 @@ def _between_messages(
 
 
 def join(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
-    """Messages of consecutive chunks as those of one.
+    """Join the messages of consecutive chunks.
 
     Args:
-        whole: Shape (B,): the buffer in which the chunks lie one after the other.
-        parts: The messages of each, in groups and without definitions, and where in ``whole`` the
-            chunk begins.
+        whole: Shape (B,): buffer with the consecutive chunks.
+        parts: The messages of each chunk, in groups and without definitions, and the chunk's
+            offset in ``whole``.
     """
     if len(parts) == 1:
         rows, begin = parts[0]
@@ -242,12 +242,12 @@ def join(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
 
 
 def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_records: int) -> Rows:
-    """The messages of a stretch up to where it cannot be followed any further (``Rows.end``).
+    """Find messages by scanning records up to the first unreadable one (``Rows.end``).
 
     Args:
         buffer: Shape (B,).
-        stop_at: Operation codes before which to stop.
-        max_records: Records allowed.
+        stop_at: Mask of the operation codes before which to stop.
+        max_records: Maximum number of records.
 
     Raises:
         BrokenRecordError: More than ``max_records`` records, or too many definitions.
@@ -260,7 +260,7 @@ def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_reco
     end = scan.end
     after = np.append(scan.offset, end)[1:][is_message]
     short = np.flatnonzero(after - offset < MESSAGE_HEAD.itemsize)
-    if len(short):  # a message that cannot hold its own fields: nothing is trusted from there on
+    if len(short):  # a message shorter than its fields: nothing after it is trusted
         end = int(offset[short[0]])
         offset = offset[: short[0]]
         after = after[: short[0]]
@@ -295,7 +295,7 @@ def _definitions(buffer: NDArray[np.uint8], scan: Scan, end: int) -> tuple[list[
 
 
 def _others(buffer: NDArray[np.uint8], begin: int, end: int) -> tuple[list[Definition], int] | None:
-    """What is between two indexed messages; None if a message is there or it does not fit."""
+    """Parse the records between two indexed messages; None if invalid or if one is a message."""
     view, at, ignored = buffer.data, begin, 0
     found: list[Definition] = []
     while at < end:
@@ -316,7 +316,7 @@ def _others(buffer: NDArray[np.uint8], begin: int, end: int) -> tuple[list[Defin
 
 
 def contradicts(rows: Rows, indexes: Sequence[MessageIndex]) -> bool:
-    """Does an index name a message that is not among ``rows``?"""
+    """Return whether an index refers to a message that is not in ``rows``."""
     rows = rows.in_stored_order()
     for index in indexes:
         offsets = index.entries["offset"]

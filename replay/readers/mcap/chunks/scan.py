@@ -1,8 +1,8 @@
-"""From one record to the next through a buffer, without an object per record.
+"""Scan of the records in a buffer, without an object per record.
 
-A record says only where the next one begins, so this cannot be done on whole columns. A plain loop
-takes 0.15 us a record, a quarter of what reading it costs in all; the loop compiled by Numba was
-faster from four million records on only, and took 140 MB of memory for its import.
+The offset of a record depends on the length of the previous one, so the scan cannot be vectorised.
+A plain loop takes 0.15 us per record, a quarter of the total reading time. A loop compiled by Numba
+was faster only from four million records on, and its import took 140 MB of memory.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ class Scan:
     """The records of a buffer.
 
     Attributes:
-        offset: Shape (N,), int64: where each record begins.
-        opcode: Shape (N,), uint8.
-        end: Where the last one ends: the buffer's size if they tile it, else where the first record
-            begins that is not whole, has operation code 0, is one to stop at, or is one too many.
+        offset: Shape (N,), int64: offset of each record.
+        opcode: Shape (N,), uint8: operation codes.
+        end: End of the last record. It is the buffer's size, or the offset of the first record that
+            is incomplete, has operation code 0 or one to stop at, or exceeds the maximum number.
     """
 
     offset: NDArray[np.int64]
@@ -32,12 +32,12 @@ class Scan:
 
 
 def scan_of(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_records: int) -> Scan:
-    """The records of ``buffer`` from its beginning.
+    """Scan the records of ``buffer`` from its start.
 
     Args:
         buffer: Shape (B,).
-        stop_at: Shape (256,), bool: operation codes before which to stop.
-        max_records: Records after which to stop.
+        stop_at: Shape (256,), bool: mask of the operation codes before which to stop.
+        max_records: Maximum number of records.
     """
     view, unpack = buffer.data, PREFIX.unpack_from
     stops = frozenset(np.flatnonzero(stop_at).tolist()) | {0}

@@ -1,1 +1,1 @@
-"""Where an MCAP file goes on after damage."""
+"""Search for readable records after damaged bytes of an MCAP file."""

@@ -1,8 +1,9 @@
-"""Where a recording goes on after a place where its records cannot be followed.
+"""Search for the next chunk or recording after unreadable records.
 
-A chunk is taken for one only if it proves itself: its lengths agree with each other and its records
-match their checksum or, without one, fill it and are in the time that it declares. Chunks within
-another recording's bytes are not taken: the search ends where another recording begins.
+A candidate is accepted as a chunk only if it is verified: its lengths are consistent, and its
+records match their checksum. Without a checksum, the records must fill the chunk and lie in its
+declared time range. The search ends where another recording starts, so that the chunks of that
+recording are not accepted.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from crosscue.replay.readers.mcap.records import (
 )
 
 FIRST_PIECE: Final = 4 << 10
-"""Searched first; doubled as long as nothing is found."""
+"""Number of bytes searched first; doubled until something is found."""
 TRIES: Final = 16
-"""Candidates decompressed at most, so that a search stays linear in the bytes it examines."""
+"""Maximum number of candidates decompressed, which keeps a search linear in its bytes."""
 
 
 def find_bytes(file: ByteFile, at: int, end: int, wanted: bytes) -> int | None:
-    """Where these bytes stand next, from ``at`` on and wholly before ``end``."""
+    """Return the next offset of these bytes from ``at`` on that ends before ``end``."""
     while at + len(wanted) <= end:
         window = bytes(file.read(at, min(PIECE, end - at)))
         found = window.find(wanted)
@@ -49,19 +50,19 @@ def find_bytes(file: ByteFile, at: int, end: int, wanted: bytes) -> int | None:
 def find_chunk(
     file: ByteFile, since: int, at: int, until: int, end: int, limits: Limits
 ) -> tuple[int, bool] | None:
-    """The next place from which to go on.
+    """Find the next chunk or recording.
 
     Args:
         file: The bytes.
-        since: Where another recording may begin at the earliest; before ``at`` if the record before
-            the damaged place may have swallowed its beginning.
-        at: Where a chunk may begin at the earliest.
-        until: Where to give up.
-        end: Where a chunk must end.
-        limits: Chunks over these are not tried.
+        since: First offset at which another recording may start. It is before ``at`` if the record
+            before the damage may extend over the recording's start.
+        at: First offset at which a chunk may start.
+        until: End of the search.
+        end: Latest end of a chunk.
+        limits: Chunks over these limits are not tried.
 
     Returns:
-        The place, and whether it is a chunk (else another recording); None if there is neither.
+        The offset, and True for a chunk or False for a recording; None if neither is found.
     """
     begins = MAGIC + bytes([HEADER])
     other = find_bytes(file, since, min(at + len(begins), until), begins)
@@ -74,14 +75,14 @@ def find_chunk(
         for offset in _candidates(window, min(piece, behind - at)):
             if tries < TRIES and _agrees(file, at + offset, end, limits):
                 tries += 1
-                if _proves_itself(file, at + offset, limits):
+                if _is_verified(file, at + offset, limits):
                     return at + offset, True
         at, piece = behind, min(2 * piece, PIECE)
     return None if other is None else (other, False)
 
 
 def _candidates(window: Bytes, limit_at: int) -> list[int]:
-    """Offsets, up to ``limit_at``, where a chunk of a sane length may begin."""
+    """Return offsets up to ``limit_at`` at which a chunk of plausible length may start."""
     first = window[: max(min(limit_at, len(window) - PREFIX.size - CHUNK_FIXED), 0)]
     at = np.flatnonzero(first == CHUNK)
     for byte in (6, 7, 8):  # no chunk has a length of 2^40 bytes
@@ -93,7 +94,7 @@ def _candidates(window: Bytes, limit_at: int) -> list[int]:
 
 
 def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
-    """Do the lengths of what is at ``at``, taken for a chunk, agree with each other?"""
+    """Return whether the lengths of a chunk at ``at`` would be consistent."""
     raw = file.peek(at, MAX_HEAD)
     length = PREFIX.unpack_from(raw)[1]
     try:
@@ -109,7 +110,7 @@ def _agrees(file: ByteFile, at: int, end: int, limits: Limits) -> bool:
     )
 
 
-def _proves_itself(file: ByteFile, at: int, limits: Limits) -> bool:
+def _is_verified(file: ByteFile, at: int, limits: Limits) -> bool:
     head = read_chunk_head(file.peek(at, MAX_HEAD)[PREFIX.size :])
     body_at = at + PREFIX.size + head.body_at
     try:
@@ -121,24 +122,24 @@ def _proves_itself(file: ByteFile, at: int, limits: Limits) -> bool:
 
 
 def _is_filled(records: Bytes, head: ChunkHead, limits: Limits) -> bool:
-    """Without a checksum: do records fill the chunk, with messages of the time it declares?"""
+    """Return whether records fill a chunk without checksum and lie in its declared time range."""
     rows = rows_by_scan(records, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     if rows.end != len(records) or not len(rows):
         return False
     return bool(rows.log.min() == head.start and rows.log.max() == head.end)
 
 
-REPAIRED: Final = "its header is damaged, repaired by the summary and proved by the checksum"
+REPAIRED: Final = "its damaged header was repaired from the summary and verified by the checksum"
 _CRC_AT: Final = PREFIX.size + 24
 
 
-def proved_head(file: ByteFile, index: ChunkIndex, limits: Limits) -> ChunkHead | None:
-    """A chunk's head as the summary has it, if the chunk's checksum proves it; else None.
+def verified_head(file: ByteFile, index: ChunkIndex, limits: Limits) -> ChunkHead | None:
+    """Return a chunk's header from the summary if the chunk's checksum verifies it; else None.
 
     Args:
         file: The bytes.
-        index: What the summary says of the chunk.
-        limits: Nothing larger is decompressed.
+        index: Entry of the chunk in the summary.
+        limits: Maximum sizes that are decompressed.
     """
     name = index.compression
     body_at = CHUNK_FIXED + len(name)
@@ -157,12 +158,12 @@ def proved_head(file: ByteFile, index: ChunkIndex, limits: Limits) -> ChunkHead 
 
 
 def is_doubtful(kind: bool, head: ChunkHead | None, index: ChunkIndex) -> bool:
-    """Does the summary say otherwise what a chunk is, and where and how its records are stored?
+    """Return whether a chunk's record contradicts its entry in the summary.
 
     Args:
-        kind: Its record says that it is a chunk.
-        head: What it says of itself; None if that cannot be read.
-        index: What the summary says.
+        kind: True if the record's operation code is that of a chunk.
+        head: Header of the chunk; None if it cannot be read.
+        index: Entry of the chunk in the summary.
     """
     if head is None or not kind:
         return True

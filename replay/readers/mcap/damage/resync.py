@@ -1,9 +1,9 @@
-"""Where records outside chunks go on after a place where they cannot be followed.
+"""Search for records outside chunks after unreadable bytes.
 
-A record is believed only together with those behind it: ``LINKS`` in a row must be plausible, or
-fewer that lead exactly to a place known to begin something else. A message is plausible if its
-channel is known and its log time is within the recording; a schema or channel, if its fields fill
-it exactly.
+A record is accepted only together with its successors: ``LINKS`` consecutive records must be
+plausible, or fewer that end exactly where a known record starts. A message is plausible if its
+channel is known and its log time is within the recording. A schema or channel is plausible if its
+fields fill the record exactly.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from crosscue.replay.readers.mcap.records import (
 )
 
 LINKS: Final = 3
-"""Plausible records in a row that are believed wherever they end."""
+"""Number of consecutive plausible records that are accepted wherever they end."""
 DAY_NS: Final = 86_400 * 10**9
-"""How far from the messages before it a log time may lie, where no statistics bound it."""
+"""Maximum difference of a log time from earlier messages, if no statistics bound it."""
 LATEST: Final = (1 << 63) - 1
 MAX_UINT64: Final = (1 << 64) - 1
 PIECE_MIN: Final = 4 << 10
@@ -51,14 +51,14 @@ MAX_DEFINITION: Final = 1 << 20
 
 
 class Plausible:
-    """What is known of a recording's messages, against which found ones are held."""
+    """Criteria for plausible messages, learned from a recording's known messages."""
 
     def __init__(self, channels: Iterable[int] = (), span: tuple[int, int] | None = None) -> None:
-        """What is known before reading.
+        """Set the criteria known before reading.
 
         Args:
             channels: Numbers of declared channels.
-            span: First and last log time as the statistics say; None if they do not.
+            span: First and last log time in the statistics; None if unknown.
         """
         self._channels: NDArray[np.bool_] = np.zeros(1 << 16, dtype=np.bool_)
         self._channels[list(channels)] = True
@@ -67,7 +67,7 @@ class Plausible:
         self._is_close = False
 
     def learn(self, rows: Rows) -> None:
-        """Take in the channels and messages of a run."""
+        """Learn from the channels and messages of a run."""
         for found in rows.definitions:
             if found.opcode == CHANNEL and len(found.content) >= 2:
                 self._channels[int.from_bytes(found.content[:2], "little")] = True
@@ -81,11 +81,11 @@ class Plausible:
 
     @property
     def is_declared(self) -> bool:
-        """Is it declared, and not only guessed from other messages, when messages may stand?"""
+        """True if the time range is declared, and not only estimated from other messages."""
         return self._declared is not None
 
     def span(self) -> tuple[int, int]:
-        """Log times between which a message is plausible, both included."""
+        """Range of plausible log times, both ends inclusive."""
         if self._declared is not None:
             return self._declared
         if self._met is None:
@@ -93,9 +93,9 @@ class Plausible:
         return self._met[0] - DAY_NS, min(self._met[1] + DAY_NS, LATEST)
 
     def messages(self, heads: Heads | Rows) -> NDArray[np.bool_]:
-        """Shape (N,): which messages are plausible.
+        """Return a mask of the plausible messages, shape (N,).
 
-        The publish time counts where messages before were published about when they were logged.
+        The publish time is checked if earlier messages were published close to their log times.
         """
         first, last = self.span()
         is_plausible: NDArray[np.bool_] = _within(heads.log, first, last)
@@ -107,26 +107,26 @@ class Plausible:
 
 
 def _within(log: NDArray[np.uint64], first: int, last: int) -> NDArray[np.bool_]:
-    """Which times are between two, both included."""
+    """Return a mask of the times between ``first`` and ``last``, both inclusive."""
     low, high = np.uint64(max(first, 0)), np.uint64(min(max(last, 0), MAX_UINT64))
     is_in: NDArray[np.bool_] = (log >= low) & (log <= high)
     return is_in
 
 
 class Resync:
-    """Finds records of one data section by what they must look like."""
+    """Finds plausible records in a data section."""
 
     def __init__(
         self, file: ByteFile, end: int, has_end: bool, known: Sequence[int], plausible: Plausible
     ) -> None:
-        """A search over one data section.
+        """Prepare a search in a data section.
 
         Args:
             file: The bytes.
-            end: Where the section, or the file, ends.
-            has_end: The section's end is known.
-            known: Where chunks begin, as a trusted summary says.
-            plausible: What a message must look like.
+            end: End of the section or of the file.
+            has_end: True if the section's end is known.
+            known: Offsets of chunks in a trusted summary.
+            plausible: Criteria for messages.
         """
         self._file = file
         self._end = end
@@ -135,7 +135,7 @@ class Resync:
         self.plausible = plausible
 
     def last_trusted(self, rows: Rows) -> int:
-        """Where, within a run that leads into damage, the last plausible message begins.
+        """Return the start of the last plausible message of a run that leads into damage.
 
         Its length led into the damage, so it is the first record that cannot be trusted.
         """
@@ -143,7 +143,7 @@ class Resync:
         return int(rows.offset[good[-1]]) if len(good) else 0
 
     def is_message(self, at: int, length: int) -> bool:
-        """Is a record built like a plausible message, whatever kind it says it is?"""
+        """Return whether a record of any kind has the structure of a plausible message."""
         raw = self._file.peek(at, MESSAGE_HEAD.itemsize)
         if length < MESSAGE_FIXED or len(raw) < MESSAGE_HEAD.itemsize:
             return False
@@ -151,7 +151,7 @@ class Resync:
         return bool(self.plausible.messages(head)[0])
 
     def continues(self, at: int, links: int = LINKS) -> bool:
-        """Do ``links`` plausible records follow ``at``, or fewer up to where something begins?"""
+        """Return whether ``links`` plausible records, or fewer up to an anchor, start at ``at``."""
         for _ in range(links):
             if self._is_anchor(at):
                 return True
@@ -162,7 +162,7 @@ class Resync:
         return True
 
     def find(self, at: int, end: int) -> int | None:
-        """Where plausible records begin again, from ``at`` on and before ``end``."""
+        """Return the next offset from ``at`` on and before ``end`` with plausible records."""
         piece = PIECE_MIN
         while at < end:
             window = self._file.read(at, min(piece + MESSAGE_HEAD.itemsize, self._end - at))
@@ -173,10 +173,10 @@ class Resync:
         return None
 
     def swallowed(self, at: int, rows: Rows) -> tuple[int, int] | None:
-        """The first message of a run in which other records stand up to its very end, if any.
+        """Find the first message of a run whose end consists of other records, if any.
 
         Returns:
-            Which message, and the offset in the buffer at which the first of the others begins.
+            Index of the message, and the offset in the buffer of the first of these records.
         """
         found = self._messages(rows.buffer, _kinds(rows.buffer, rows.end, MESSAGE, MESSAGE))
         found = found[~np.isin(found, rows.offset)]
@@ -205,7 +205,7 @@ class Resync:
         return raw == PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
     def _candidates(self, window: NDArray[np.uint8], limit_at: int) -> list[int]:
-        """Offsets, below ``limit_at``, at which a message, schema or channel may begin."""
+        """Return offsets below ``limit_at`` at which a message, schema or channel may start."""
         at = _kinds(window, limit_at, SCHEMA, MESSAGE)
         is_message = window[at] == MESSAGE
         found = np.concatenate((self._messages(window, at[is_message]), at[~is_message]))
@@ -221,7 +221,7 @@ class Resync:
         return kept
 
     def _after(self, at: int) -> int | None:
-        """Where the record at ``at`` ends if it is plausible."""
+        """Return the end of the record at ``at`` if it is plausible, else None."""
         raw = self._file.peek(at, PREFIX.size)
         if len(raw) < PREFIX.size:
             return None
@@ -259,7 +259,7 @@ class Resync:
 
 
 def _kinds(window: NDArray[np.uint8], limit_at: int, first: int, last: int) -> NDArray[np.int64]:
-    """Offsets, below ``limit_at``, of records of one of these kinds that may have a sane length."""
+    """Return offsets below ``limit_at`` of possible records of these kinds and plausible length."""
     heads = window[: max(min(limit_at, len(window) - MESSAGE_HEAD.itemsize + 1), 0)]
     at: NDArray[np.int64] = np.flatnonzero((heads >= first) & (heads <= last)).astype(np.int64)
     for byte in (6, 7, 8):  # no record has a length of 2^40 bytes
@@ -268,7 +268,7 @@ def _kinds(window: NDArray[np.uint8], limit_at: int, first: int, last: int) -> N
 
 
 def is_exact(found: Definition) -> bool:
-    """Do the fields of a schema or channel fill its record exactly?"""
+    """Return whether the fields of a schema or channel fill its record exactly."""
     try:
         return _fills(found)
     except BrokenRecordError:
