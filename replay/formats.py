@@ -153,7 +153,7 @@ def format_of(path: Path) -> str:
         is_folder, is_file = path.is_dir(), path.is_file()
         if not is_folder and not is_file:
             what = "not a regular file or folder" if path.exists() else "no such file or folder"
-            raise LogError(f"{path}: {what}; give a recording")
+            raise LogError(f"{path}: {what}; expected a log file or folder")
         if is_folder:
             # ``glob`` silently finds nothing in a folder without read permission.
             next(path.iterdir(), None)
@@ -170,9 +170,7 @@ def format_of(path: Path) -> str:
     wanted = ", ".join(
         f"{f.says} ({' '.join(f.suffixes) if f.suffixes else 'folder'})" for f in formats.values()
     )
-    what = (
-        "a folder without any known recording in it" if is_folder else f"suffix {suffix!r} unknown"
-    )
+    what = "a folder without a known log in it" if is_folder else f"suffix {suffix!r} unknown"
     raise UnknownFormatError(f"{path}: {what}; there are: {wanted}")
 
 

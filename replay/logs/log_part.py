@@ -64,7 +64,7 @@ def part_in_words(
     start_ns = _time_ns("--from", start, logs)
     end_ns = _time_ns("--to", end, logs)
     if start_ns is not None and end_ns is not None and end_ns <= start_ns:
-        raise UsageError(f"--to {end}: not after --from {start}; give a later time")
+        raise UsageError(f"--to {end}: not after --from {start}; try a later time")
     return Selection(wanted, start_ns, end_ns)
 
 

@@ -119,7 +119,7 @@ def chain_of(
             continue
         rest = _repair(int(k), at, end, is_sound, links, keep, len(stream), is_end)
         if rest < 0:
-            tally.damage("object does not end where its size says", f"{place}, offset {at[k]}")
+            tally.damage("object of wrong size", f"{place}, offset {at[k]}")
             rest = len(stream)
         elif rest < len(stream):
             break

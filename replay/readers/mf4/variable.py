@@ -44,7 +44,7 @@ class StoredValues:
         self._stream = stream
 
     def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
-        """As ``VariableValues`` says."""
+        """Read the values of N records; see ``VariableValues``."""
         payload, length = _nothing(len(key), width)
         for begin, end, rows in _windows(key):
             near = key if len(rows) == len(key) else key[rows]
@@ -80,7 +80,7 @@ class GroupValues:
         """Offset or index of the first requested value after the last existing one, if any."""
 
     def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:
-        """As ``VariableValues`` says."""
+        """Read the values of N records; see ``VariableValues``."""
         payload, length = _nothing(len(key), width)
         if self._by_order:
             key = np.arange(first, first + len(key))

@@ -131,7 +131,7 @@ class _Checked:
         if self.unchecked:
             said.append(
                 f"{self.unchecked} chunks have no checksum: a changed payload byte in them cannot "
-                "be seen"
+                "be detected"
             )
         if self.loose:
             said.append(

@@ -423,13 +423,13 @@ def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
     last_ns = next((int(part[-1]) for part in reversed(steps.log_ns) if len(part)), None)
     found = raw.find(_U32.pack(_HEADER), begin)
     while found >= 0:
-        if _stands_in_a_row(raw, found, known, last_ns):
+        if _is_consecutive(raw, found, known, last_ns):
             return found
         found = raw.find(_U32.pack(_HEADER), found + 1)
     return None
 
 
-def _stands_in_a_row(raw: bytes, at: int, known: set[int], near_ns: int | None) -> bool:
+def _is_consecutive(raw: bytes, at: int, known: set[int], near_ns: int | None) -> bool:
     """Return whether ``_IN_A_ROW`` plausible messages, or fewer up to the end, start at ``at``."""
     for _ in range(_IN_A_ROW):
         if at == len(raw):

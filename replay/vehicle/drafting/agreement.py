@@ -177,10 +177,10 @@ def judge_yaw_rate(
     if found.wrong:
         return found
     if speed is not None and (bias := _bias(series, speed, grid)) is not None:
-        text = f"{bias / DEGREE:+.2f} deg/s while the car stands"
+        text = f"{bias / DEGREE:+.2f} deg/s while the car is stationary"
         found = replace(found, facts=(*found.facts, text))
         if abs(bias) > GYRO_BIAS_RADPS:
-            found = replace(found, wrong=(*found.wrong, "turns while the car stands"))
+            found = replace(found, wrong=(*found.wrong, "turns while the car is stationary"))
     return _judged(found, series.turned(grid), references, GYRO_BIAS_RADPS)
 
 

@@ -60,12 +60,12 @@ class KnowsItsCameras(Protocol):
 
 
 MEASURE: Final = {
-    "x_m": "ahead of the rear axle: measure it, then give --camera-x-m",
-    "y_m": "left of the car's middle: measure it, then give --camera-y-m",
-    "z_m": "above the road: measure it, then give --camera-height-m",
-    "yaw_rad": "to the left, or give --camera-yaw-deg; likewise",
-    "pitch_rad": "below the horizon, or give --camera-pitch-deg; a drive with pictures, speed and "
-    "focal_px shows it",
+    "x_m": "ahead of the rear axle: measure it, then pass --camera-x-m",
+    "y_m": "left of the car's middle: measure it, then pass --camera-y-m",
+    "z_m": "above the road: measure it, then pass --camera-height-m",
+    "yaw_rad": "to the left: estimated as pitch_rad is, or pass --camera-yaw-deg",
+    "pitch_rad": "below the horizon: estimated from a drive with images, speed and focal_px, or "
+    "pass --camera-pitch-deg",
 }
 
 AFTER_CAMERA: Final = """\

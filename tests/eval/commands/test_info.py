@@ -343,7 +343,7 @@ def test_the_command_on_nothing_readable_ends_with_four(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert run(["info", str(tmp_path)]) == 4
-    assert "a folder without any known recording in it" in capsys.readouterr().err
+    assert "a folder without a known log in it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -232,7 +232,7 @@ def test_an_empty_folder_and_one_without_pictures_are_refused(tmp_path: Path) ->
     (tmp_path / "letters" / "a.txt").write_text("dear")
 
     for name in ("empty", "letters"):
-        with pytest.raises(UnknownFormatError, match="without any known recording"):
+        with pytest.raises(UnknownFormatError, match="without a known log"):
             open_log(tmp_path / name)
 
 

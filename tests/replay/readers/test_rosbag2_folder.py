@@ -75,7 +75,9 @@ def test_every_kind_of_folder_comes_back_whole(
     # SQLite counts nothing by itself, and opening reads the topics only.
     declared = dict.fromkeys(count_by_topic(rows)) if storage == "sqlite3" else count_by_topic(rows)
     assert {t.name: t.declared for t in reading.log.topics} == declared
-    assert any("unpacked" in said for said in reading.ledger.notices) == (compression == "file")
+    assert any("decompressed to" in said for said in reading.ledger.notices) == (
+        compression == "file"
+    )
 
 
 @pytest.mark.parametrize("storage", STORAGES)

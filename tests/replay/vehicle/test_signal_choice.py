@@ -101,7 +101,7 @@ def test_a_yaw_rate_that_turns_while_the_car_stands_is_never_chosen() -> None:
         with_gnss=False,
     )
 
-    assert "turns while the car stands" in found.yaw_rates[0].verdict.wrong
+    assert "turns while the car is stationary" in found.yaw_rates[0].verdict.wrong
 
 
 @pytest.mark.parametrize("sign", [1, -1])

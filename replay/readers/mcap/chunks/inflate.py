@@ -135,7 +135,7 @@ def _zstd_prefix(body: Bytes, size: int) -> Bytes:
                     break
                 done += step
         except zstandard.ZstdError:
-            pass  # what came before it stands
+            pass  # keep the part before the damage
     return records[:done]
 
 
@@ -154,7 +154,7 @@ def _lz4_prefix(body: Bytes, size: int) -> Bytes:
             if stream.eof or not step:
                 break
     except (RuntimeError, ValueError, EOFError):
-        pass  # what came before it stands
+        pass  # keep the part before the damage
     return np.frombuffer(b"".join(got), dtype=np.uint8)
 
 

@@ -1,7 +1,7 @@
 """Search for the next chunk or recording after unreadable records.
 
 A candidate is accepted as a chunk only if it is verified: its lengths are consistent, and its
-records match their checksum. Without a checksum, the records must fill the chunk and lie in its
+records match their checksum. Without a checksum, the records must fill the chunk and be within its
 declared time range. The search ends where another recording starts, so that the chunks of that
 recording are not accepted.
 """
