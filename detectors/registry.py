@@ -50,7 +50,7 @@ def chosen(names: str, sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
     """
     asked = [name.strip() for name in names.split(",") if name.strip()]
     if not asked:
-        raise UsageError(f"--detectors: none named; there are: {', '.join(known(sections))}")
+        raise UsageError(f"--detectors: none named; expected some of {', '.join(known(sections))}")
     found = tuple(_choice(name, sections) for name in asked)
     if len({choice.name for choice in found}) != len(found):
         raise UsageError(f"--detectors {names}: one is named twice; name each once")

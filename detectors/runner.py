@@ -16,6 +16,7 @@ from .result_cache import ResultCache, picture_key
 
 BATCH: Final = 8
 """Number of pictures decoded and passed to a detector at a time."""
+OTHER_SIZE: Final = "picture of another size than the first"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +77,8 @@ class Runner:
         depth_bits: Number of bits that the camera uses in a 16-bit picture.
         on_skip: Called with the time and reason of each picture that cannot be decoded.
         light_labels: Labels of traffic lights, whose lenses are examined.
+        is_one_size: True to skip pictures of another size than the first, because the camera's
+            intrinsics are for one size.
         counts: Account of all frames so far.
     """
 
@@ -85,7 +88,9 @@ class Runner:
     depth_bits: int
     on_skip: Callable[[int, str, str], None]
     light_labels: tuple[str, ...] = ()
+    is_one_size: bool = False
     counts: Counts = field(default_factory=Counts)
+    _size_px: tuple[int, int] | None = None
 
     def __call__(self, block: Block) -> Iterator[FrameResult]:
         """Yield the results of a block's pictures in order, without those that do not decode.
@@ -118,6 +123,10 @@ class Runner:
     def _decode(self, prepared: _Prepared) -> bool:
         try:
             prepared.size_px = size_of(prepared.picture)
+            self._size_px = self._size_px or prepared.size_px
+            if self.is_one_size and prepared.size_px != self._size_px:
+                self.on_skip(prepared.t_ns, OTHER_SIZE, f"{prepared.size_px}, not {self._size_px}")
+                return False
             for named, found in zip(self.detectors, prepared.known, strict=True):
                 view = named.detector.view
                 scale = _scale(prepared, view)

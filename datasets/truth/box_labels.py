@@ -170,7 +170,7 @@ def _recognised(path: Path, files: Sequence[Path]) -> LabelFormat:
         for one in _texts(files):
             words = _lines(one)[:1]
             if words:
-                return "kitti" if len(words[0].split()) >= _KITTI_COLUMNS else "yolo"
+                return "yolo" if words[0].split()[0].replace(".", "").isdigit() else "kitti"
         return "yolo"
     raise AnnotationError(
         f"{path}: no labels of boxes; expected a COCO .json, or a folder of YOLO .txt, Pascal VOC "

@@ -17,6 +17,7 @@ from .class_names import COCO_80, COCO_90, meaning_of
 from .recognise import size_in
 
 _LINE: Final = 100
+_DECODE: Final = 'decode = "full"  # as scripts around networks do; "reduced" is faster'
 _NOTHING: Final = ("background", "bg")
 """Names of a background class, which no detection has."""
 
@@ -79,6 +80,7 @@ def draft(
         "",
         "[input]",
         *_table(given),
+        *([_DECODE] if guess.network is None else []),
         "",
         "[output]",
         *_table(output),

@@ -65,7 +65,6 @@ from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.plan import camera_of, pictures_only
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
-from crosscue.replay.vehicle.intrinsics import check_center, doubts
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .clocks import clock_rows
@@ -144,6 +143,7 @@ def detect_into(
     if camera is None:
         raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
     named = [Named(choice.name, make(choice)) for choice in choices]
+    _refuse_uncounted(named, vehicle)
     log, topic = logs[camera[0]], camera[1]
     ledger = Ledger(log_names(logs)[camera[0]])
     planned = pictures_only(camera)
@@ -165,6 +165,7 @@ def detect_into(
                 topic.name, reason, 1, why, int(clock.log_times(np.array([t_ns]))[0])
             ),
             vehicle.cues.traffic_light_labels,
+            is_one_size=vehicle.camera.focal_px is not None,
         )
         drawer = Drawer(run.path / "pictures", draw)
         tables = _Tables(
@@ -190,7 +191,6 @@ def detect_into(
         notices = (
             *gaps_text(timeline.segments),
             *_simulated_only(choices, logs),
-            *_without_cues(named, vehicle),
             *_without_thresholds(named, vehicle),
             *_without_masks(tables.boxes_only, vehicle),
             *tables.notices,
@@ -279,19 +279,24 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
     ]
 
 
-def _without_cues(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
-    """Return warnings about detectors whose labels no cue uses."""
+def _refuse_uncounted(named: Sequence[Named], vehicle: Vehicle) -> None:
+    """Refuse detectors whose labels no cue counts.
+
+    Raises:
+        VehicleError: A detector reports no label of a cue.
+    """
     if vehicle.counts_any_label:
-        return []
+        return
     counted = {label for labels in vehicle.cue_labels().values() for label in labels}
-    labels = {one.name: reportable(one.detector) for one in named}
-    return [
-        f"warning: {name}: no cue counts any of its {len(some)} labels ({', '.join(some[:3])}"
-        f"{', ...' if len(some) > 3 else ''}); "
-        "state what its classes mean under [labels] in its card"
-        for name, some in labels.items()
-        if some and counted.isdisjoint(some)
-    ]
+    for one in named:
+        labels = reportable(one.detector)
+        if labels and counted.isdisjoint(labels):
+            raise VehicleError(
+                f"{one.name}: no cue counts any of its {len(labels)} labels "
+                f"({', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}); state what its "
+                "classes mean under [labels] in its card, or count them in the vehicle file: "
+                f'[cues.own.NAME] labels = ["{labels[0]}"]'
+            )
 
 
 def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
@@ -413,10 +418,7 @@ class _Tables:
         self._size = result.size_px
         self._frame += 1
         if self._frame == 0:
-            check_center(self.vehicle.camera, result.size_px)
-            self.notices += [
-                f"warning: {one}" for one in doubts(self.vehicle.camera, result.size_px)
-            ]
+            self.vehicle.camera.check_size(result.size_px)
             self._meanings = meanings(self.vehicle)
             self._min_scores = [min_scores_of(one.detector) for one in self.detectors]
             self._labels = all_labels(

@@ -39,7 +39,6 @@ from crosscue.replay.vehicle.drafting.agreement import (
 )
 from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
 from crosscue.replay.vehicle.drafting.series import Grid, Series, Track
-from crosscue.replay.vehicle.intrinsics import doubts
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 WHEELS: Final = ("front left", "front right", "rear left", "rear right")
@@ -350,7 +349,8 @@ def _of_camera(shown: Shown | None, log: Log, camera: Camera) -> Iterator[str]:
         yield "camera: not one picture in the seconds examined"
         return
     wide, high = shown.pixels.shape[1], shown.pixels.shape[0]
-    yield from doubts(camera, (wide, high))
+    if (found := camera.mismatch((wide, high))) is not None:
+        yield found
     published = log.intrinsics(shown.topic) if isinstance(log, KnowsItsCameras) else None
     if published is not None and camera.focal_px is not None:
         focal = published[0]

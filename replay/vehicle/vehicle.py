@@ -18,6 +18,7 @@ from pydantic_core import PydanticCustomError
 
 from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
 
+from .camera import Camera as Camera
 from .cue_spec import CueSpec as CueSpec
 from .cue_spec import Input as Input
 from .cue_spec import Scoring as Scoring
@@ -126,29 +127,6 @@ class Compass(Section):
     """Minimum time between two readings that are used: twice the correlation time of the error."""
     gate_nis: Positive | None = 10.8
     """Readings with a larger normalised innovation squared are rejected."""
-
-
-class Camera(Section):
-    """Pinhole camera model and mounting."""
-
-    x_m: Finite = 0.0
-    """Distance ahead of the rear axle."""
-    y_m: Finite = 0.0
-    z_m: Finite = 1.2
-    focal_px: Positive | None = None
-    center_px: tuple[Finite, Finite] | None = None
-    roll_rad: Finite = 0.0
-    """Rotation about the optical axis, positive with the right side down."""
-    pitch_rad: Finite = 0.0
-    """Angle of the optical axis below the horizon."""
-    yaw_rad: Finite = 0.0
-    """Angle of the optical axis to the left; ``crosscue fit odometry`` estimates it where the truth
-    is the camera's track."""
-    pitch_sd_rad: NotNegative = 0.01
-    """Standard deviation of the pitch in a frame: a vehicle pitches by about half a degree when it
-    brakes."""
-    depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
-    """Number of bits used in 16-bit images; 12 for many cameras."""
 
 
 class Regions(Section):

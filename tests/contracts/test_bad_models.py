@@ -17,6 +17,7 @@ from support.pictures import picture_folder
 ROWS = np.array([[[4.0, 4.0, 20.0, 20.0, 0.9, 1.0]]], np.float32)
 OUTPUT = 'kind = "end-to-end"\nscore = 0.3\nclasses = {}\n'
 CAMERA = "version = 1\n[camera]\nfocal_px = 900.0\ncenter_px = [960.0, 540.0]\n"
+COUNTED = 'version = 1\n[cues.own.pets]\nlabels = ["dog"]\n'
 BAD = {
     "nan": "net.toml: output: 1 of 1 candidates are not finite numbers; correct the card",
     "other-shape": "net.toml: output: expected (1, N, 6)",
@@ -24,9 +25,10 @@ BAD = {
     "no-classes": "net.toml: output.classes is empty; list the network's classes",
     "other-size": "the network does not run on input 40 x 32",
     "empty-card": "net.toml:1: version: missing; add it",
-    "other-weights": "; fetch the weights again, or write a card for these",
+    "other-weights": "; fetch the weights again, or write a card for this file",
     "no-weights": "net.onnx: No such file",
     "other-camera": "outside the images of 24 x 16 pixels",
+    "not-counted": "net: no cue counts any of its 2 labels (cat, dog); state what its classes mean",
 }
 """What is bad of a network for three pictures, and a part of the line that says so."""
 
@@ -50,7 +52,11 @@ def made_bad(folder: Path, bad: str) -> None:
         (folder / "net.onnx").write_bytes(model + b" ")
     if bad == "no-weights":
         (folder / "net.onnx").unlink()
-    (folder / "car.toml").write_text(CAMERA if bad == "other-camera" else "version = 1\n")
+    cars = {
+        "other-camera": COUNTED + CAMERA.removeprefix("version = 1\n"),
+        "not-counted": "version = 1\n",
+    }
+    (folder / "car.toml").write_text(cars.get(bad, COUNTED))
 
 
 @pytest.fixture(scope="module")
@@ -97,16 +103,14 @@ def test_no_card_is_left_for_a_network_without_numbers(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_network_of_which_no_cue_counts_a_label_and_labels_of_other_pictures(
+def test_labels_of_other_pictures_are_refused(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made_bad(tmp_path, "nothing")
-    out = tmp_path / "out"
-    argv = ["detect", log, "--detectors", tmp_path / "net.toml", "--no-cache", "-o", out]
-    assert cli.run([str(one) for one in argv]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "warning: net: no cue counts any of its 2 labels (cat, dog)" in said
-    assert "[labels] in its card" in said
+    out, car = tmp_path / "out", tmp_path / "car.toml"
+    argv = ["detect", log, "--detectors", tmp_path / "net.toml", "--vehicle", car, "--no-cache"]
+    assert cli.run([*map(str, argv), "-o", str(out)]) == 0
+    capsys.readouterr()
 
     box = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [1, 1, 9, 9]}
     picture = {"id": 1, "file_name": "elsewhere.png", "width": 24, "height": 16}

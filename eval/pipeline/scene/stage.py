@@ -94,6 +94,7 @@ def estimate_scene(
     regions = vehicle.regions
     fresh_regions = regions.kind == "ground" or detected.settings.regions != regions
     for frame in stored_frames(run, detected.detectors, with_road_masks=fresh_regions):
+        vehicle.camera.check_size(frame.size_px)
         fresh_ns = restarts.before(frame.seen.t_ns)
         if fresh_ns is not None:
             scene.restart(fresh_ns)

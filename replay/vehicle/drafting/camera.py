@@ -17,6 +17,7 @@ class Intrinsics(NamedTuple):
     focal_px: float
     center_px: tuple[float, float]
     source: str
+    size_px: tuple[int, int] | None = None
 
 
 class Measured(NamedTuple):
@@ -101,6 +102,8 @@ def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
     else:
         yield f"focal_px = {found.focal_px:.10g}  # {found.source}"
         yield f"center_px = [{found.center_px[0]:.10g}, {found.center_px[1]:.10g}]"
+        if found.size_px is not None:
+            yield f"size_px = [{found.size_px[0]}, {found.size_px[1]}]"
     for name, default in (
         ("x_m", 0.0),
         ("y_m", 0.0),
@@ -151,5 +154,8 @@ def _of_message(log: Log, name: str) -> Intrinsics | None:
             k = [float(value) for value in rows["k"][0]]
             warn_of(ledger)
             is_calibrated = len(k) == 9 and all(map(math.isfinite, k)) and k[0] > 0.0
-            return Intrinsics(k[0], (k[2], k[5]), f"from {name}") if is_calibrated else None
+            if not is_calibrated:
+                return None
+            size_px = (int(rows["width_px"][0]), int(rows["height_px"][0]))
+            return Intrinsics(k[0], (k[2], k[5]), f"from {name}", size_px if all(size_px) else None)
     return None

@@ -143,6 +143,7 @@ def test_class_names_of_an_openvino_file_are_read(
     crosscue.draft_card(path)
 
     card = read_card(tmp_path / "my.toml")
+    assert card.input.decode == "full"
     assert card.output.classes == (classes or tuple(labels or ()))
     assert "stop sign" in map(card.meaning, range(3))
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from crosscue.detectors.runner import OTHER_SIZE
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
 from crosscue.replay.files.made_of import SIMULATED
@@ -196,23 +197,70 @@ def test_a_camera_that_changes_size_is_followed_and_reported(tmp_path: Path) -> 
     assert "(64, 48) became (128, 96)" in open_run(out).drive_manifest().notices[0]
 
 
-def test_intrinsics_of_another_size_are_refused_and_doubtful_ones_are_named(
+OTHER_SIZES = {
+    "center_px = [640.0, 24.0]": "center_px = (640, 24): outside the images of 64 x 48 pixels",
+    "center_px = [44.0, 24.0]": "center_px = (44, 24): far from the middle of the images",
+    "focal_px = 600.0": "focal_px = 600: images of 64 x 48 pixels would show 6 deg",
+    "focal_px = 60.0\ncenter_px = [32.0, 24.0]\nsize_px = [80, 60]": "camera.size_px = [80, 60]: "
+    "the images are 64 x 48 pixels; if they are scaled, state focal_px = 48, "
+    "center_px = [25.6, 19.2], size_px = [64, 48]",
+    "focal_px = 60.0\nsize_px = [64, 64]": "[64, 64]: the images are 64 x 48 pixels; state",
+}
+
+
+@pytest.mark.parametrize("camera", OTHER_SIZES)
+def test_intrinsics_of_images_of_another_size_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str
+) -> None:
+    log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
+    vehicle.write_text(f"version = 1\n[camera]\n{camera}\n")
+
+    for command in ("detect", "replay"):
+        argv = [command, str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache"]
+        assert run([*argv, "--detectors", BRIGHT]) == 2
+
+        said = capsys.readouterr().err
+        assert OTHER_SIZES[camera] in said
+        assert said.count("\n") == 1
+        assert not out.exists()
+
+
+def test_unusual_intrinsics_are_used_where_their_size_is_stated(tmp_path: Path) -> None:
+    log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
+    camera = "focal_px = 600.0\ncenter_px = [44.0, 24.0]\nsize_px = [64, 48]"
+    vehicle.write_text(f"version = 1\n[camera]\n{camera}\n")
+    command = ["detect", str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache", "-q"]
+
+    assert run([*command, "--detectors", BRIGHT]) == 0
+
+
+def test_an_estimate_with_intrinsics_of_another_size_leaves_the_run_as_it_was(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
+    assert run(["replay", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache"]) == 0
+    before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
+    vehicle.write_text("version = 1\n[camera]\nfocal_px = 60.0\nsize_px = [80, 60]\n")
+    capsys.readouterr()
+
+    assert run(["estimate", str(out), "--vehicle", str(vehicle)]) == 2
+
+    assert "camera.size_px = [80, 60]: the images are 64 x 48" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
+
+
+def test_a_later_picture_of_another_size_than_the_intrinsics_is_dropped(tmp_path: Path) -> None:
+    log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
+    ok, encoded = cv2.imencode(".png", np.zeros((96, 128), np.uint8))
+    assert ok
+    (log / "frame_4.png").write_bytes(encoded.tobytes())
+    vehicle.write_text("version = 1\n[camera]\nfocal_px = 60.0\n")
     command = ["detect", str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache", "-q"]
-    command += ["--detectors", BRIGHT]
 
-    vehicle.write_text("version = 1\n[camera]\nfocal_px = 60.0\ncenter_px = [640.0, 24.0]\n")
-    assert run(command) == 2
-    said = capsys.readouterr().err
-    assert "camera.center_px = (640, 24): outside the images of 64 x 48 pixels" in said
-    assert not (out / "manifest.json").exists()
+    assert run([*command, "--detectors", BRIGHT]) == 3
 
-    vehicle.write_text("version = 1\n[camera]\nfocal_px = 600.0\ncenter_px = [32.0, 24.0]\n")
-    assert run([*command, "--overwrite"]) == 0
-    (notice,) = open_run(out).drive_manifest().notices
-    assert "camera.focal_px = 600: an image 64 pixels wide would show 6 deg" in notice
+    account = open_run(out).drive_manifest().account.reading[0].topics["cam"]
+    assert (account.used, account.dropped) == (4, {OTHER_SIZE: 1})
 
 
 @pytest.mark.parametrize(

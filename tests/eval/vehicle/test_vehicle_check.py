@@ -94,8 +94,9 @@ def vehicle_of(path: Path, camera: str) -> Path:
 @pytest.mark.parametrize(
     ("camera", "says"),
     [
-        ("focal_px = 1970.0\ncenter_px = [970.5, 483.0]", "center_px = (970.5, 483): far from"),
-        ("focal_px = 20000.0", "focal_px = 20000: a picture"),
+        ("focal_px = 1970.0\ncenter_px = [970.5, 483.0]", "center_px = (970.5, 483): outside"),
+        ("focal_px = 20000.0", "focal_px = 20000: images"),
+        ("focal_px = 1970.0\nsize_px = [1920, 1080]", "size_px = [1920, 1080]: the images are"),
         ("focal_px = 1500.0", "the data set publishes 1970"),
     ],
 )

@@ -1,11 +1,16 @@
-"""A drafted vehicle file names topics as the log does, whatever characters they have."""
+"""A drafted vehicle file names topics as the log does, and holds the camera's calibration."""
 
 import tomllib
 
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from crosscue.replay.base import Block, Table, Topic
+from crosscue.replay.vehicle.drafting.camera import Mounting, camera_lines
 from crosscue.replay.vehicle.drafting.text import _quoted
+from support.memory_log import MemoryLog
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))
@@ -14,3 +19,22 @@ def test_a_quoted_name_reads_back_and_hides_nothing(name: str) -> None:
 
     assert tomllib.loads(f"name = {text}") == {"name": name}
     assert text.isprintable()
+
+
+@pytest.mark.parametrize("size_px", [(1280, 720), (0, 0)])
+def test_the_size_of_calibrated_images_is_written_where_the_log_states_it(
+    size_px: tuple[int, int],
+) -> None:
+    k = np.array([[900.0, 0.0, 640.0, 0.0, 900.0, 360.0, 0.0, 0.0, 1.0]])
+    columns = {"width_px": np.array([size_px[0]]), "height_px": np.array([size_px[1]]), "k": k}
+    block = Block("/info", np.zeros(1, np.int64), Table(columns))
+    topics = (
+        Topic("/image", "sensor_msgs/msg/Image", "columns"),
+        Topic("/info", "sensor_msgs/msg/CameraInfo", "columns"),
+    )
+
+    lines = camera_lines([MemoryLog(topics, [block])], Mounting())
+
+    camera = tomllib.loads("\n".join(lines))["camera"]
+    assert (camera["focal_px"], camera["center_px"]) == (900.0, [640.0, 360.0])
+    assert camera.get("size_px") == (list(size_px) if all(size_px) else None)
