@@ -53,7 +53,7 @@ class Input(Settings):
     mean: Colour = (0.0, 0.0, 0.0)
     scale: Colour = (1.0, 1.0, 1.0)
     fit: Literal["stretch", "letterbox", "letterbox-center", "crop", "network"] = "stretch"
-    """How a picture is fitted into the input. Stretch: scaled regardless of its proportions.
+    """Method of fitting a picture into the input. Stretch: scaled without keeping its proportions.
     Letterbox: proportions kept, at the top left or in the center, and the rest filled with
     ``pad``. Crop: proportions kept, the middle of the picture. Network: the network scales the
     picture itself, as torchvision's do: the shorter side to the smaller of width and height, the

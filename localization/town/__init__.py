@@ -1,1 +1,1 @@
-"""The Monte Carlo simulator: town, vehicle, drives."""
+"""Monte Carlo simulator: town, vehicle and drives."""

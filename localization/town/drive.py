@@ -1,11 +1,11 @@
-"""A whole simulated drive: town, vehicle, sensors, filter and decisions, step by step.
+"""Simulate a complete drive step by step: town, vehicle, sensors, filter and decisions.
 
-Truth and estimate meet in three places only: sensors measure the truth, local sensors show the
-roads of the next intersection as seen from the vehicle, and the result compares the two at the end.
-Decisions see the estimate.
+Truth and estimate are separate except in three places: sensors measure the truth, local sensors
+show the roads of the next intersection relative to the vehicle, and the result compares the two at
+the end. Decisions use the estimate.
 
-Everything here is plain Python on numbers and arrays. ``drive`` runs it as it is, to be stepped
-through in a debugger; ``drive_many`` compiles the same functions and is thousands of times as fast.
+All functions are plain Python on numbers and arrays. ``drive`` runs them uncompiled, for example in
+a debugger; ``drive_many`` compiles the same functions and is thousands of times as fast.
 """
 
 from __future__ import annotations
@@ -84,17 +84,17 @@ CITY_STREAM: Final = np.uint64(1)
 PLACE_STREAM: Final = np.uint64(2)
 SENSOR_STREAM: Final = np.uint64(3)
 NO_CITY: Final = -1.0
-"""In place of an outcome: the settings yield a city without intersections."""
+"""Outcome of a city without intersections."""
 STEP_FIELDS: Final = 16
 EVENT_FIELDS: Final = 6
 GOAL_SET, LANDMARK_SET, LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED = range(5)
-"""Kinds of events: a new goal, a new landmark, one passed unnoticed, fused, refused."""
+"""Kinds of events: a new goal, and a landmark that is new, missed, used or rejected."""
 _QUARTERS: Final = (0, 1, 3)
 """Straight, left, right: the order in which options are listed."""
 
 
 class Outcome(IntEnum):
-    """How a drive ended."""
+    """Outcome of a drive."""
 
     REACHED = 0
     LOST = 1
@@ -105,31 +105,31 @@ REACHED, LOST, GIVEN_UP = (int(outcome) for outcome in Outcome)
 
 
 class Result(NamedTuple):
-    """What is kept of a drive; all lengths in metres.
+    """Result of a drive; all lengths in metres.
 
     Attributes:
-        outcome: As ``Outcome``.
-        travelled_m: Driven in truth.
-        seconds: Of driving.
-        steps: Of the filter.
-        straight_m: From start to the first goal as the crow flies.
-        manhattan_m: The same along x and along y.
-        area_km2: Of the city.
-        landmarks: In the city at the start.
-        passed: Landmarks driven past.
-        detected: Of these, those fused.
-        refused: Of these, those refused by the gate.
-        decisions: At intersections.
-        turns: Decisions that were not straight.
-        goals: Reached.
-        first_goal_m: Travelled when the first goal was reached; NaN if it never was.
-        first_goal_axis_m: Major axis then.
-        major_axis_m: At the end.
-        error_m: Estimate from truth at the end.
-        nees: Of x, y, heading at the end.
-        goal_error_m: True distance from the last goal reached, when it was; NaN if none was.
-        furthest_m: Largest distance from the start of any goal reached; 0 without.
-        longest_gap_m: Longest distance between landmarks fused, start and end included.
+        outcome: Value of ``Outcome``.
+        travelled_m: True distance travelled.
+        seconds: Duration of the drive.
+        steps: Number of filter steps.
+        straight_m: Straight-line distance from the start to the first goal.
+        manhattan_m: Manhattan distance from the start to the first goal.
+        area_km2: Area of the city.
+        landmarks: Number of landmarks in the city at the start.
+        passed: Number of landmarks passed.
+        detected: Number of passed landmarks that were used.
+        refused: Number of passed landmarks that the gate rejected.
+        decisions: Number of decisions at intersections.
+        turns: Number of decisions other than straight.
+        goals: Number of goals reached.
+        first_goal_m: Distance travelled to the first goal; NaN if it was not reached.
+        first_goal_axis_m: Major axis at the first goal.
+        major_axis_m: Major axis at the end.
+        error_m: Position error at the end.
+        nees: NEES of x, y and heading at the end.
+        goal_error_m: True distance from the last reached goal on arrival; NaN without one.
+        furthest_m: Largest distance of a reached goal from the start; 0 without one.
+        longest_gap_m: Longest distance between used landmarks, including start and end.
     """
 
     outcome: int
@@ -163,8 +163,8 @@ class Landmarks(NamedTuple):
     """L landmarks.
 
     Attributes:
-        nodes: Shape (L,): their intersections.
-        places_m: Shape (L, 2).
+        nodes: Shape (L,): intersections of the landmarks.
+        places_m: Shape (L, 2): positions.
         is_visited: Shape (L,).
     """
 
@@ -174,7 +174,7 @@ class Landmarks(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """The present goal and the landmarks, and the stream that later ones are drawn from."""
+    """The current goal and landmarks, and the random stream for later ones."""
 
     goal: int
     landmarks: Landmarks
@@ -182,7 +182,7 @@ class Targets(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """Counts and distances of the result that grow while driving."""
+    """Counts and distances of the result that accumulate during the drive."""
 
     passed: int
     detected: int
@@ -199,14 +199,14 @@ class Tally(NamedTuple):
 
 
 class Log(NamedTuple):
-    """What is kept of a drive step by step; arrays without rows keep nothing.
+    """Record of a drive's steps and events; arrays without rows record nothing.
 
     Attributes:
-        steps: Shape (S, 16): true x, y, heading, speed; left and right wheel's path as read;
-            compass, NaN where none was read; then the filter's x, y, heading and their covariance
+        steps: Shape (S, 16): true x, y, heading, speed; measured paths of the left and right wheel;
+            compass, NaN without a reading; then the filter's x, y, heading and their covariance
             xx, xy, xh, yy, yh, hh.
         events: Shape (E, 6): step, kind, x, y of goal or landmark, x, y measured by a landmark.
-        noted: Shape (1,): events so far.
+        noted: Shape (1,): number of events so far.
     """
 
     steps: NDArray[np.float64]
@@ -215,14 +215,14 @@ class Log(NamedTuple):
 
 
 def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log) -> None:
-    """Drive once.
+    """Simulate one drive.
 
     Args:
         p: Settings.
-        seed: Everything random comes from it.
-        row: Shape (22,), filled: the fields of ``Result``; with three more columns, x, y, heading
+        seed: Seed of all random numbers.
+        row: Output, shape (22,): the fields of ``Result``. With three more columns, x, y, heading
             of the filter before the first step follow.
-        log: Filled as far as it has room.
+        log: Output: steps and events, up to its capacity.
     """
     row[:] = np.nan
     streets = make_streets(stream_of(seed, CITY_STREAM), p)
@@ -296,13 +296,13 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log
 
 
 def drive_each(p: Parameters, seeds: Keys, rows: NDArray[np.float64], log: Log) -> None:
-    """``drive_one`` for each of N seeds; rows have shape (N, 22)."""
+    """Run ``drive_one`` for each of N seeds; rows have shape (N, 22)."""
     for i in range(len(seeds)):
         drive_one(p, seeds[i], rows[i], log)
 
 
 def estimate(p: Parameters, belief: State, reading: Reading) -> State:
-    """The belief after one step's odometry and, where it was read, the compass."""
+    """Predict with one step's odometry, and update with the compass if it was read."""
     distance_m = 0.5 * (reading.left_m + reading.right_m)
     turn_rad = (reading.right_m - reading.left_m) / p.track_width_m
     slip_var = p.slip_per_sqrt_m**2 * abs(distance_m)
@@ -323,7 +323,7 @@ def estimate(p: Parameters, belief: State, reading: Reading) -> State:
 
 
 def _start(p: Parameters, streets: Streets, places: Stream) -> tuple[int, int, Targets]:
-    """Where the drive starts, in which direction, and where to."""
+    """Draw start, direction and targets of the drive."""
     start, places = draw_place(places, streets.inside)
     way, places = below(places, 4)
     while not has_way(streets.ways, start, way):
@@ -337,7 +337,7 @@ def _start(p: Parameters, streets: Streets, places: Stream) -> tuple[int, int, T
 
 
 def _one_landmark(p: Parameters, streets: Streets, places: Stream) -> tuple[Ints, Stream]:
-    """Perhaps one landmark, as dense as requested on average."""
+    """Draw at most one landmark, with the requested density on average."""
     number, places = uniform(places)
     nodes = np.empty(1 if number < p.landmarks_per_km2 * streets.area_km2 else 0, np.int64)
     if len(nodes):
@@ -394,7 +394,7 @@ def _first_belief(p: Parameters, vehicle: Vehicle, noise: Stream) -> tuple[State
 def _is_at_goal(
     p: Parameters, streets: Streets, targets: Targets, belief: State, axis_m: float
 ) -> bool:
-    """Does the vehicle believe to be at its goal?"""
+    """Whether the estimated position is at the goal."""
     x, y = place_of(streets, targets.goal)
     away_m = math.hypot(belief.x_m - x, belief.y_m - y)
     return away_m <= max(p.arrive_within_m, axis_m / 2.0)
@@ -432,7 +432,7 @@ def _decide(
     room_m: float,
     axis_m: float,
 ) -> tuple[int, Memory]:
-    """The turn at the intersection ahead (eq. 4), seen from where the vehicle believes to be."""
+    """Decide on the turn at the intersection ahead (eq. 4), from the estimated position."""
     heading = belief.heading_rad
     at_x = belief.x_m + room_m * math.cos(heading)
     at_y = belief.y_m + room_m * math.sin(heading)
@@ -460,7 +460,7 @@ def _decide(
 def _target(
     p: Parameters, streets: Streets, targets: Targets, x_m: float, y_m: float, axis_m: float
 ) -> tuple[float, float]:
-    """The goal, or the landmark sought on the way to it."""
+    """Position of the goal, or of a landmark on the way to it."""
     goal_x, goal_y = place_of(streets, targets.goal)
     if not seeks_landmarks(p.strategy, axis_m, p.hybrid_above_m):
         return goal_x, goal_y
@@ -505,7 +505,7 @@ def _pass_landmark(
     log: Log,
     steps: int,
 ) -> tuple[State, Tally, Stream]:
-    """Perhaps recognise it, which measures the vehicle's position."""
+    """Draw whether a landmark is recognised; if so, it measures the vehicle's position."""
     number, noise = uniform(noise)
     node = landmarks.nodes[landmark]
     if number >= p.detection_rate:
@@ -556,7 +556,7 @@ def _finish(
     tally: Tally,
     steps: int,
 ) -> None:
-    """The rest of the drive's ``Result``."""
+    """Write the rest of the drive's ``Result``."""
     axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
     outcome = REACHED if tally.goals == p.goals else GIVEN_UP
     ex, ey = belief.x_m - vehicle.x_m, belief.y_m - vehicle.y_m
@@ -592,7 +592,7 @@ def _note_targets(
 def _note(
     log: Log, steps: int, kind: int, streets: Streets, node: int, x_m: float, y_m: float
 ) -> None:
-    """Keep an event while there is room."""
+    """Record an event, up to the log's capacity."""
     if log.noted[0] == len(log.events):
         return
     row = log.events[log.noted[0]]
@@ -602,12 +602,12 @@ def _note(
 
 
 def no_log() -> Log:
-    """Keeps nothing."""
+    """Return a log that records nothing."""
     return Log(np.empty((0, STEP_FIELDS)), np.empty((0, EVENT_FIELDS)), np.zeros(1, np.int64))
 
 
 def drive(settings: settings_of.Drive, seed: int, log: Log | None = None) -> Result:
-    """Drive once without compiling anything; the same numbers, slowly."""
+    """Simulate one drive without compilation; slower, with the same result."""
     row = np.empty(FIELDS)
     with np.errstate(over="ignore"):
         drive_one(parameters_of(settings), np.uint64(seed), row, no_log() if log is None else log)
@@ -615,7 +615,7 @@ def drive(settings: settings_of.Drive, seed: int, log: Log | None = None) -> Res
 
 
 def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
-    """Drive once for each seed; other threads run meanwhile.
+    """Simulate one drive per seed; the interpreter's lock is released meanwhile.
 
     Args:
         settings: City, vehicle, sensors, navigation.
@@ -632,13 +632,13 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
     if failed := np.flatnonzero(rows[:, 0] == NO_CITY).tolist():
         raise ValueError(
             f"city of seed {seeds[failed[0]]}: no intersection; expected at least one where three "
-            "roads meet; try a larger area or shorter blocks"
+            "roads meet; use a larger area or shorter blocks"
         )
     return rows
 
 
 def streets_of(settings: settings_of.Drive, seed: int) -> Streets:
-    """The streets that a drive with this seed has."""
+    """Return the streets of the drive with this seed."""
     make = kept(make_streets)
     with np.errstate(over="ignore"):
         stream = stream_of(np.uint64(seed), CITY_STREAM)
@@ -647,12 +647,12 @@ def streets_of(settings: settings_of.Drive, seed: int) -> Streets:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Traced:
-    """One drive step by step; simulated throughout.
+    """A simulated drive with all its steps.
 
     Attributes:
-        result: As ``drive`` returns it.
+        result: Result of ``drive``.
         steps: Shape (S, 16), as in ``Log``.
-        events: Shape (E, 6), likewise.
+        events: Shape (E, 6), as in ``Log``.
         first_belief: x, y, heading of the filter before the first step.
     """
 
@@ -662,19 +662,19 @@ class Traced:
     first_belief: tuple[float, float, float]
 
     def of_kind(self, *kinds: int) -> NDArray[np.float64]:
-        """Shape (K, 6): events of these kinds."""
+        """Select the events of these kinds, shape (K, 6)."""
         chosen: NDArray[np.float64] = self.events[np.isin(self.events[:, 1], kinds)]
         return chosen
 
     def goal_to_goal_m(self) -> float:
-        """From the start to each goal reached, as the crow flies, added up."""
+        """Length of the polyline from the start through all reached goals."""
         begin = np.array(self.first_belief[:2])
         ways = np.diff(np.vstack([begin, self.of_kind(GOAL_SET)[: self.result.goals, 2:4]]), axis=0)
         return float(np.hypot(ways[:, 0], ways[:, 1]).sum())
 
 
 def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
-    """Drive once and keep every step.
+    """Simulate one drive and record every step.
 
     Raises:
         ValueError: As ``drive_many``.
@@ -694,7 +694,7 @@ def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
 
 
 def as_result(row: NDArray[np.float64]) -> Result:
-    """One row as a record, its counts whole numbers again."""
+    """Convert a row to a ``Result`` with integer counts."""
     kinds = get_type_hints(Result)
     pairs = zip(Result._fields, row.tolist(), strict=True)
     return Result(**{name: kinds[name](value) for name, value in pairs})

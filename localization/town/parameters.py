@@ -1,4 +1,4 @@
-"""Settings of a drive in the form that compiled code takes: angles in radians, no None."""
+"""Settings of a drive for compiled code: plain numbers, angles in radians, no None."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .settings import Drive
 
 
 class Parameters(NamedTuple):
-    """``settings.Drive`` as numbers.
+    """The settings of ``settings.Drive`` as numbers.
 
     ``compass_sd_rad`` is negative without a compass; ``strategy`` is a ``navigation.Strategy``.
     """
@@ -66,7 +66,7 @@ class Parameters(NamedTuple):
 
 
 def parameters_of(settings: Drive) -> Parameters:
-    """The numbers of a drive's settings."""
+    """Convert a drive's settings to numbers."""
     city, car, sensors, nav = settings.city, settings.car, settings.sensors, settings.navigation
     compass = sensors.compass_2sigma_deg
     return Parameters(

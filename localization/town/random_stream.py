@@ -1,13 +1,13 @@
-"""Random numbers that belong to a drive, whatever process drives it and when.
+"""Random numbers of a drive, independent of the process and the time of its simulation.
 
-SplitMix64 with a step of its own for each stream (Steele, Lea, Flood, *Fast splittable pseudorandom
-number generators*, OOPSLA 2014): the k-th number is a hash of key and k, so it is a counter-based
-generator. Normals by the ziggurat method (Marsaglia, Tsang 2000; the layout of Doornik 2005) with
-256 layers.
+The generator is SplitMix64 with a separate step for each stream (Steele, Lea, Flood, *Fast
+splittable pseudorandom number generators*, OOPSLA 2014). The k-th number is a hash of key and k, so
+it is a counter-based generator. Normal variates use the ziggurat method (Marsaglia, Tsang 2000; the
+layout of Doornik 2005) with 256 layers.
 
-A stream is a NamedTuple of its state and step; each function returns a number and the stream after
-it. All whole numbers are uint64, in which arithmetic wraps: outside compiled code call them under
-``numpy.errstate(over="ignore")``.
+A stream is a NamedTuple of its state and step. Each function returns a number and the stream after
+it. All integers are uint64 with wrapping arithmetic; outside compiled code, call the functions
+under ``numpy.errstate(over="ignore")``.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ ZERO, ONE, U11, U27, U30, U31 = (np.uint64(n) for n in (0, 1, 11, 27, 30, 31))
 
 
 class Stream(NamedTuple):
-    """Numbers of one key, in order."""
+    """State of the random numbers of one key."""
 
     state: np.uint64
     step: np.uint64
 
 
 def mix(number: np.uint64) -> np.uint64:
-    """The finaliser of SplitMix64: a bijection of 64-bit numbers in which every bit matters."""
+    """Apply SplitMix64's finaliser, a bijection of 64-bit numbers that mixes all bits."""
     number = (number ^ (number >> U30)) * MIX_1
     number = (number ^ (number >> U27)) * MIX_2
     return number ^ (number >> U31)
 
 
 def join(key: np.uint64, part: np.uint64) -> np.uint64:
-    """One key from a key and another number; their order matters."""
+    """Combine a key and a number to a new key; the order matters."""
     return mix(key ^ mix(part + GOLDEN)) + GOLDEN
 
 
 def key_of(*parts: int) -> int:
-    """One 64-bit key from several numbers; their order matters."""
+    """Combine several numbers to one 64-bit key; the order matters."""
     key = ZERO
     with np.errstate(over="ignore"):
         for part in parts:
@@ -59,7 +59,7 @@ def key_of(*parts: int) -> int:
 
 
 def stream_of(seed: np.uint64, purpose: np.uint64) -> Stream:
-    """The stream that a drive uses for one purpose."""
+    """Create a drive's stream for one purpose."""
     key = join(join(ZERO, seed), purpose)
     step = mix(key ^ GOLDEN) | ONE
     transitions, left = 0, step ^ (step >> ONE)
@@ -70,19 +70,19 @@ def stream_of(seed: np.uint64, purpose: np.uint64) -> Stream:
 
 
 def uniform(stream: Stream) -> tuple[float, Stream]:
-    """In [0, 1), a multiple of 2**-53."""
+    """Draw a uniform number in [0, 1), a multiple of 2**-53."""
     state = stream.state + stream.step
     return np.int64(mix(state) >> U11) * TO_UNIT, Stream(state, stream.step)
 
 
 def below(stream: Stream, n: int) -> tuple[int, Stream]:
-    """A whole number in [0, n)."""
+    """Draw an integer in [0, n)."""
     number, stream = uniform(stream)
     return int(number * n), stream
 
 
 def normal(stream: Stream) -> tuple[float, Stream]:
-    """Standard normal."""
+    """Draw a standard normal number."""
     while True:
         stream = Stream(stream.state + stream.step, stream.step)
         bits = mix(stream.state)
@@ -102,7 +102,7 @@ def normal(stream: Stream) -> tuple[float, Stream]:
 
 
 def _tail(stream: Stream) -> tuple[float, Stream]:
-    """Beyond the last layer, positive."""
+    """Draw a positive number from the tail beyond the last layer."""
     while True:
         one, stream = uniform(stream)
         other, stream = uniform(stream)
@@ -112,9 +112,9 @@ def _tail(stream: Stream) -> tuple[float, Stream]:
 
 
 def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Right edges of the layers, shape (257,), and how much of each is inside the next, (256,).
+    """Right edges of the layers, shape (257,), and the fraction of each inside the next, (256,).
 
-    All layers have the same area; the first holds the tail's.
+    All layers have the same area; the first one includes the tail.
     """
     r = TAIL_FROM
     tail = math.sqrt(math.pi / 2.0) * math.erfc(r / math.sqrt(2.0))

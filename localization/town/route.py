@@ -1,4 +1,4 @@
-"""The path through the town: streets, turns at intersections, and the lane they make."""
+"""The vehicle's path through the town: streets, turns at intersections, and the lane."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from .vehicle import Lane, Vehicle
 
 UNDECIDED: Final = -1
 STRAIGHT, LEFT, BACK, RIGHT = range(4)
-"""Quarter turns to the left."""
+"""Turns at an intersection, in quarter turns to the left."""
 MAX_ARCS: Final = 3
 ARC_FIELDS: Final = 5
-"""Of an arc: x, y, heading where it begins, curvature, length."""
+"""Number of values of an arc: x, y and heading of its start, curvature, length."""
 
 
 class Route(NamedTuple):
-    """Where on its path the vehicle is.
+    """Position of the vehicle on its path.
 
     Attributes:
-        way: Direction of the street that it drives on, or turns into.
+        way: Direction of the current street, or of the one after the current turn.
         node: Intersection ahead.
-        turn: Decided for that intersection, or ``UNDECIDED``.
-        arc: Which arc of a turn it is on; ``arcs`` on a street.
-        arcs: How many the turn has.
-        along_m: Travelled on that arc.
+        turn: Decision for that intersection, or ``UNDECIDED``.
+        arc: Index of the current arc of a turn; ``arcs`` on a street.
+        arcs: Number of arcs of the turn.
+        along_m: Distance travelled on the current arc.
     """
 
     way: int
@@ -43,20 +43,20 @@ class Route(NamedTuple):
 
 
 def remaining_m(streets: Streets, route: Route, vehicle: Vehicle) -> float:
-    """To the centre of the next intersection, along the lane."""
+    """Distance to the centre of the next intersection, along the lane."""
     x, y = place_of(streets, route.node)
     return COSINES[route.way] * (x - vehicle.x_m) + SINES[route.way] * (y - vehicle.y_m)
 
 
 def entry_m(p: Parameters, turn: int) -> float:
-    """Where a turn begins, before the centre of the intersection."""
+    """Distance of a turn's start before the centre of the intersection."""
     if turn == LEFT:
         return p.left_radius_m - p.lane_offset_m
     return p.right_radius_m + p.lane_offset_m if turn == RIGHT else 0.0
 
 
 def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: Vehicle) -> float:
-    """The speed for this place of the path."""
+    """Target speed at this position of the path."""
     if route.arc < route.arcs:
         return p.turn_mps
     if route.turn in (UNDECIDED, STRAIGHT):
@@ -68,7 +68,7 @@ def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: Vehicle) 
 def lane_of(
     p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64], vehicle: Vehicle
 ) -> Lane:
-    """How the vehicle lies to its lane."""
+    """Position of the vehicle relative to its lane."""
     c, s = math.cos(vehicle.heading_rad), math.sin(vehicle.heading_rad)
     if route.arc < route.arcs:
         x, y, heading, curvature, _ = _arc_at(arcs, route.arc)
@@ -90,7 +90,7 @@ def _arc_at(arcs: NDArray[np.float64], i: int) -> tuple[float, float, float, flo
 
 
 def advance(route: Route, arcs: NDArray[np.float64], lane: Lane, distance_m: float) -> Route:
-    """Go on along the arc of a turn, if the vehicle is on one."""
+    """Advance along the arc of a turn, if the vehicle is on one."""
     if route.arc == route.arcs:
         return route
     along_m = route.along_m + distance_m / (1.0 - lane.offset_m * lane.curvature)
@@ -98,7 +98,7 @@ def advance(route: Route, arcs: NDArray[np.float64], lane: Lane, distance_m: flo
 
 
 def next_arc(route: Route, arcs: NDArray[np.float64]) -> Route:
-    """The next arc, or the street, once this arc has been driven."""
+    """Change to the next arc or the street at the end of an arc."""
     length_m = arcs[route.arc, 4]
     if route.along_m < length_m:
         return route
@@ -108,7 +108,7 @@ def next_arc(route: Route, arcs: NDArray[np.float64]) -> Route:
 
 
 def enter(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64]) -> Route:
-    """Lay the arcs of the decided turn into ``arcs``, and head for the next intersection."""
+    """Write the arcs of the decided turn to ``arcs``, and set the next intersection."""
     count = _lay_turn(p, streets, route, arcs)
     way = (route.way + route.turn) & 3
     node = route.node + step_of(way, len(streets.xs_m))
@@ -137,7 +137,7 @@ def _lay_turning_circle(
     radius_m: float,
     offset_m: float,
 ) -> int:
-    """Out of the lane to the right, round to the left, and into the lane back."""
+    """Write the arcs of a U-turn: a swing to the right, a left turn, and back into the lane."""
     swing = math.acos((offset_m + radius_m) / (2.0 * radius_m))
     for i in range(MAX_ARCS):
         side, angle = (1.0, math.pi + 2.0 * swing) if i == 1 else (-1.0, swing)

@@ -1,8 +1,8 @@
 """Settings of a simulated drive: city, car, sensors, navigation; SI units, degrees where named.
 
-The source states the sizes of cities, the compass's uncertainty and the limits of 50 and 100 m.
-Everything else is ours; ``sensors.compass_interval_m`` is the one number calibrated to a published
-result (9.3 km at 30 degrees).
+The dissertation states the sizes of cities, the compass's uncertainty and the limits of 50 and
+100 m. All other defaults are crosscue's; only ``sensors.compass_interval_m`` is calibrated to a
+published result (9.3 km at 30 degrees).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class City(Section):
     shortest_block_m: Annotated[float, Field(ge=50.0, le=1000.0)] = 50.0
     longest_block_m: Annotated[float, Field(ge=50.0, le=1000.0)] = 300.0
     dead_end_fraction: Annotated[float, Field(ge=0.0, le=0.2)] = 0.03
-    """Of the intersections, before the streets that lead there are cut."""
+    """Fraction of intersections that become dead ends."""
     one_way_fraction: Annotated[float, Field(ge=0.0, le=0.8)] = 0.15
-    """Of the blocks."""
+    """Fraction of blocks with one-way streets."""
     goal_at_least_m: Annotated[float, Field(ge=0.0, le=250.0)] = 200.0
-    """A goal is not drawn nearer to the car than this, as the crow flies."""
+    """Minimum straight-line distance of a new goal from the car."""
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -49,39 +49,40 @@ class Car(Section):
     turn_mps: Annotated[float, Field(ge=2.0, le=6.0)] = 4.0
     accel_mps2: Annotated[float, Field(ge=1.0, le=4.0)] = 2.5
     lane_offset_m: Annotated[float, Field(ge=1.0, le=4.0)] = 1.75
-    """Lane centre from street centre, to the right."""
+    """Distance of the lane's centre from the street's, to the right."""
     left_radius_m: Annotated[float, Field(ge=5.0, le=12.0)] = 8.0
     right_radius_m: Annotated[float, Field(ge=5.0, le=12.0)] = 6.0
     decide_at_m: Annotated[float, Field(ge=15.0, le=32.0)] = 30.0
-    """Before the centre of the intersection, whose kind the car's own sensors see by then."""
+    """Distance of the decision before the intersection's centre; the car's sensors detect the
+    intersection's kind by then."""
     steering_p: NotNegative = 0.027
-    """Road-wheel angle per metre beside the lane."""
+    """Road-wheel angle per metre of offset from the lane."""
     steering_i: NotNegative = 0.0002
-    """Per metre beside it and metre driven."""
+    """Road-wheel angle per metre of offset and metre driven."""
     steering_d: NotNegative = 0.54
-    """Per metre of growth beside it and metre driven."""
+    """Road-wheel angle per metre of change of the offset and metre driven."""
     speed_p: NotNegative = 2.0
     speed_i: NotNegative = 0.05
     speed_d: NotNegative = 0.05
 
 
 class Sensors(Section):
-    """Odometer, compass, landmarks, and how well the start is known."""
+    """Odometer, compass, landmarks, and uncertainty of the start."""
 
     compass_2sigma_deg: Annotated[float, Field(gt=0.0, le=180.0)] | None = 30.0
-    """None: no compass."""
+    """Two standard deviations of the compass; None for no compass."""
     compass_interval_m: Annotated[float, Field(ge=1.0, le=100.0)] = 1.876
-    """Distance between readings with errors of their own; ``study range --calibrate`` finds it."""
+    """Distance between readings with independent errors; ``study range --calibrate`` fits it."""
     slip_per_sqrt_m: NotNegative = 0.003
     """S.d. of a wheel's path after one metre."""
     encoder_step_m: Positive = 0.02
-    """Path of a wheel per encoder count; readings are off by up to half of it."""
+    """Path of a wheel per encoder count; errors are up to half of it."""
     landmark_sd_m: Positive = 5.0
     """S.d., in x and y, of the position that a recognised landmark yields."""
     landmark_gate_nis: Positive = 13.8
-    """Refuse a landmark whose normalised innovation squared is larger (0.1 % of the right ones)."""
+    """Normalised innovation squared above which a landmark is rejected (0.1 % of correct ones)."""
     detection_rate: Proportion = 1.0
-    """Of the landmarks passed."""
+    """Fraction of passed landmarks that are recognised."""
     start_position_sd_m: Positive = 1.0
     start_heading_sd_deg: Positive = 5.0
     speed_sd_mps: Positive = 0.2
@@ -93,19 +94,19 @@ class Navigation(Section):
 
     strategy: Literal["straight to goal", "landmark to landmark", "hybrid"] = "straight to goal"
     penalty_deg: NotNegative = 45.0
-    """Added each time that the same option was taken at the same intersection."""
+    """Penalty for each time that the same option was taken at the same intersection."""
     recognise_within_m: Positive = 30.0
     same_option_deg: Annotated[float, Field(ge=1.0, le=60.0)] = 45.0
     after_m: NotNegative = 10.0
-    """How far behind the intersection the bearing to the goal is taken."""
+    """Distance after the intersection at which the bearing to the goal is computed."""
     arrive_within_m: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
-    """The goal is reached within this distance, or once inside the 2-sigma circle."""
+    """Distance within which the goal is reached; it is also reached inside the 2-sigma circle."""
     hybrid_above_m: Positive = 50.0
     lost_above_m: Positive = 100.0
 
 
 class Drive(Section):
-    """One drive; with its seed it is determined."""
+    """Settings of a drive; with a seed, they determine it."""
 
     city: City = City()
     car: Car = Car()
@@ -113,10 +114,10 @@ class Drive(Section):
     navigation: Navigation = Navigation()
     landmarks_per_km2: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     landmark_per_goal: bool = False
-    """One landmark at a time instead, drawn again for every goal."""
+    """True for at most one landmark at a time, drawn again for every goal."""
     goals: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    """Goals one after another; a million of them means until lost or too far."""
+    """Number of successive goals; a million means to drive until lost or too far."""
     longest_m: Annotated[float, Field(gt=0.0, le=1e6)] = 60_000.0
-    """The drive is given up after this distance."""
+    """Maximum distance of the drive."""
     longest_s: Annotated[float, Field(gt=0.0, le=1e6)] = 1e6
-    """Or this time."""
+    """Maximum duration of the drive."""

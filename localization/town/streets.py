@@ -1,9 +1,9 @@
-"""The streets of random gridded cities: blocks of many sizes, dead ends, one-way streets.
+"""Generate random gridded cities, with blocks of many sizes, dead ends and one-way streets.
 
 An intersection is a crossing of a street along x with one along y, numbered row by row. Directions
-are 0 east, 1 north, 2 west, 3 south; the bits of one byte say in which of them an intersection may
-be left. Streets that would let a car in and never out again are opened both ways, so that from any
-intersection of the city every other one can be reached.
+are 0 east, 1 north, 2 west, 3 south; the bits of one byte are the directions in which an
+intersection can be left. One-way streets that would trap a car are opened in both directions, so
+that every intersection of the city can be reached from every other one.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
 SINES: Final = tuple(math.sin(heading) for heading in HEADINGS_RAD)
 MAX_TRIES: Final = 1000
 ONWARD, HOMEWARD, EITHER = 1, 2, 4
-"""Kinds of reach: from a place along roads, to it, and whichever way roads lead."""
+"""Kinds of connection: from a place along roads, to it along roads, and in either direction."""
 _BOTH: Final = ONWARD | HOMEWARD
 _ALL: Final = ONWARD | HOMEWARD | EITHER
 
 
 class Streets(NamedTuple):
-    """A city with the part of it that is driven in.
+    """Streets of a city, and its largest connected part.
 
     Attributes:
-        xs_m: Shape (X,), increasing: the streets along y.
-        ys_m: Shape (Y,), increasing: the streets along x.
-        ways: Shape (X * Y,), uint8: bit d is set where direction d may be taken.
-        inside: Shape (X * Y,): intersections of the largest connected part.
-        area_km2: As asked for; the grid ends within a block of it.
+        xs_m: Shape (X,), increasing: x of the streets along y.
+        ys_m: Shape (Y,), increasing: y of the streets along x.
+        ways: Shape (X * Y,), uint8: bit d is set if an intersection can be left in direction d.
+        inside: Shape (X * Y,): True for intersections of the largest connected part.
+        area_km2: Requested area; the grid ends within a block of it.
     """
 
     xs_m: NDArray[np.float64]
@@ -46,23 +46,23 @@ class Streets(NamedTuple):
 
 
 def step_of(way: int, columns: int) -> int:
-    """From an intersection's number to that of its neighbour in a direction."""
+    """Difference of the numbers of an intersection's neighbour in a direction and its own."""
     return (1, columns, -1, -columns)[way]
 
 
 def has_way(ways: NDArray[np.uint8], node: int, way: int) -> bool:
-    """May intersection ``node`` be left in this direction?"""
+    """Whether intersection ``node`` can be left in a direction."""
     return (int(ways[node]) >> way) & 1 == 1
 
 
 def place_of(streets: Streets, node: int) -> tuple[float, float]:
-    """Where an intersection is, metres."""
+    """Position of an intersection in metres."""
     columns = len(streets.xs_m)
     return streets.xs_m[node % columns], streets.ys_m[node // columns]
 
 
 def make_streets(stream: Stream, p: Parameters) -> Streets:
-    """A random city; the same stream and settings give the same one."""
+    """Generate a random city; the same stream and settings yield the same one."""
     number, stream = uniform(stream)
     area_km2 = p.min_km2 + (p.max_km2 - p.min_km2) * number
     side_m = 1000.0 * math.sqrt(area_km2)
@@ -82,7 +82,7 @@ def make_streets(stream: Stream, p: Parameters) -> Streets:
     gates = _gates_of(ways, columns)
     reach = _largest_part(gates, columns)
     inside = reach != 0
-    # Nobody can come to what is not connected with the rest; its streets are not streets.
+    # Intersections outside the connected part cannot be reached, so their streets are removed.
     for node in range(size):
         if not inside[node]:
             ways[node] = 0
@@ -125,7 +125,7 @@ def _open(ways: NDArray[np.uint8], node: int, way: int) -> None:
 
 
 def _make_dead_end(ways: NDArray[np.uint8], columns: int, node: int, keep: int) -> None:
-    """Leave one street of an intersection: the first one there is, from ``keep`` on."""
+    """Close all streets of an intersection but one: the first existing one from ``keep`` on."""
     kept = False
     for turn in range(4):
         way = (keep + turn) & 3
@@ -138,7 +138,7 @@ def _make_dead_end(ways: NDArray[np.uint8], columns: int, node: int, keep: int) 
 
 
 def _gates_of(ways: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
-    """Shape (4, N): which kinds of reach come into each place, from the neighbour on each side."""
+    """Kinds of connection that each place gets from each of its four neighbours, shape (4, N)."""
     size = len(ways)
     gates = np.zeros((4, size), np.uint8)
     for way, apart in ((0, 1), (1, columns)):
@@ -152,9 +152,9 @@ def _gates_of(ways: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
 
 
 def _spread(reach: NDArray[np.uint8], gates: NDArray[np.uint8], columns: int) -> None:
-    """Let all kinds of reach go on through the gates, sweep by sweep, until none grows.
+    """Propagate connections through the gates, sweep by sweep, until nothing changes.
 
-    Cities are mostly open: a few sweeps do, each as quick as one pass over all places.
+    Few sweeps suffice because cities are mostly open; each is one pass over all places.
     """
     size, grows = len(reach), True
     while grows:
@@ -170,7 +170,7 @@ def _spread(reach: NDArray[np.uint8], gates: NDArray[np.uint8], columns: int) ->
 def _reach_from(
     reach: NDArray[np.uint8], gates: NDArray[np.uint8], node: int, neighbour: int, way: int
 ) -> bool:
-    """Reach a place from its neighbour in direction ``way``; is there more than before?"""
+    """Propagate from a place's neighbour in direction ``way``; return True if anything changes."""
     if neighbour < 0 or neighbour >= len(reach):
         return False
     before = reach[node]
@@ -179,7 +179,7 @@ def _reach_from(
 
 
 def _largest_part(gates: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
-    """What can be reached, and how, from the first place of the part with most places."""
+    """Connections of each place to the first place of the largest part."""
     size = gates.shape[1]
     best, seen = np.zeros(size, np.uint8), np.zeros(size, np.bool_)
     largest, left = 0, size
@@ -205,7 +205,7 @@ def _largest_part(gates: NDArray[np.uint8], columns: int) -> NDArray[np.uint8]:
 def _open_traps(
     ways: NDArray[np.uint8], columns: int, reach: NDArray[np.uint8], gates: NDArray[np.uint8]
 ) -> None:
-    """Open one-way streets both ways where they lead into, or out of, what has no way back."""
+    """Open one-way streets in both directions where they lead into or out of a trap."""
     opened = True
     while opened:
         opened = False
@@ -225,7 +225,7 @@ def _open_traps(
 
 
 def has_intersection(streets: Streets) -> bool:
-    """Is there a place where at least three roads begin or end?"""
+    """Whether a city has a place where at least three roads meet."""
     ways, columns = streets.ways, len(streets.xs_m)
     comes = np.zeros(len(ways), np.int64)
     for node in range(len(ways)):
@@ -243,7 +243,7 @@ def has_intersection(streets: Streets) -> bool:
 
 
 def draw_place(stream: Stream, inside: NDArray[np.bool_]) -> tuple[int, Stream]:
-    """A random intersection of the part driven in."""
+    """Draw a random intersection of the connected part."""
     while True:
         node, stream = below(stream, len(inside))
         if inside[node]:
@@ -251,7 +251,7 @@ def draw_place(stream: Stream, inside: NDArray[np.bool_]) -> tuple[int, Stream]:
 
 
 def draw_goal(stream: Stream, streets: Streets, start: int, min_m: float) -> tuple[int, Stream]:
-    """A random intersection at least so far from ``start``; the last one drawn after many tries."""
+    """Draw an intersection at least ``min_m`` from ``start``; after many tries, the last one."""
     x, y = place_of(streets, start)
     goal = start
     for _ in range(MAX_TRIES):
@@ -265,7 +265,7 @@ def draw_goal(stream: Stream, streets: Streets, start: int, min_m: float) -> tup
 def draw_landmarks(
     stream: Stream, streets: Streets, per_km2: float
 ) -> tuple[NDArray[np.int64], Stream]:
-    """Intersections with a landmark, all different, in the order drawn."""
+    """Draw distinct intersections with a landmark, in random order."""
     number, stream = uniform(stream)
     wanted = min(int(per_km2 * streets.area_km2 + number), streets.inside.sum())
     has = np.zeros(len(streets.ways), np.bool_)

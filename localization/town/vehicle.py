@@ -1,6 +1,6 @@
 """The simulated vehicle: lane keeping, motion, wheel encoders and compass.
 
-Truth is a bicycle model (eq. 5 and 6) that PID controllers keep in its lane.
+The true motion is a bicycle model (eq. 5 and 6) that PID controllers keep in its lane.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from .random_stream import Stream, normal
 
 MAX_STEERING_RAD: Final = 0.7
 BRAKE_FACTOR: Final = 1.5
-"""Braking may be this much harder than accelerating."""
+"""Ratio of the maximum deceleration to the maximum acceleration."""
 MIN_SPEED_MPS: Final = 1.0
 MAX_INTEGRAL: Final = 2.0
 """Bound of both controllers' integrals."""
 
 
 class Lane(NamedTuple):
-    """How the vehicle lies to its lane: offset (left positive), its growth per metre, curvature."""
+    """Lane relative to the vehicle: offset (left positive), its change per metre, curvature."""
 
     offset_m: float
     growth: float
@@ -31,7 +31,7 @@ class Lane(NamedTuple):
 
 
 class Vehicle(NamedTuple):
-    """The true state, and what controllers and encoders remember."""
+    """True state of the vehicle, and state of controllers and encoders."""
 
     x_m: float
     y_m: float
@@ -47,7 +47,7 @@ class Vehicle(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What the sensors measured in one step; ``compass_rad`` is NaN where it was not read."""
+    """Measurements of one step; ``compass_rad`` is NaN without a reading."""
 
     left_m: float
     right_m: float
@@ -55,14 +55,14 @@ class Reading(NamedTuple):
 
 
 def steering_rad(p: Parameters, lane: Lane, offset_integral: float) -> float:
-    """PID on the offset from the lane, with the lane's own curvature fed forward."""
+    """Steering angle by PID control of the offset, with the lane's curvature as feedforward."""
     angle = p.wheelbase_m * lane.curvature - p.steering_p * lane.offset_m
     angle -= p.steering_i * offset_integral + p.steering_d * lane.growth
     return min(max(angle, -MAX_STEERING_RAD), MAX_STEERING_RAD)
 
 
 def move(p: Parameters, vehicle: Vehicle, lane: Lane, wanted_mps: float) -> Vehicle:
-    """Control and drive one step (eq. 5 and 6)."""
+    """Control the vehicle and move it by one step (eq. 5 and 6)."""
     v, dt = vehicle, p.step_s
     slow = wanted_mps - v.speed_mps
     speed_integral = _bounded(v.speed_integral + slow * dt)
@@ -95,7 +95,7 @@ def _bounded(integral: float) -> float:
 def measure(
     p: Parameters, before: Vehicle, after: Vehicle, noise: Stream
 ) -> tuple[Vehicle, Reading, Stream]:
-    """Read the wheels, with slip, as their encoders count; and the compass, where one is due."""
+    """Measure wheel paths with slip and encoder resolution, and the compass if a reading is due."""
     distance = after.travelled_m - before.travelled_m
     half = 0.5 * p.track_width_m * wrap(after.heading_rad - before.heading_rad)
     left, unread_left, noise = _encoder(p, distance - half, before.unread_left_m, noise)
@@ -125,7 +125,7 @@ def measure(
 def _encoder(
     p: Parameters, path_m: float, unread_m: float, noise: Stream
 ) -> tuple[float, float, Stream]:
-    """A wheel's path as read, and the part of a count that is left over."""
+    """Measured path of a wheel, and the remaining fraction of a count."""
     error, noise = normal(noise)
     unread = unread_m + path_m + p.slip_per_sqrt_m * math.sqrt(abs(path_m)) * error
     read = math.floor(unread / p.encoder_step_m + 0.5) * p.encoder_step_m
