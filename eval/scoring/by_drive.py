@@ -1,4 +1,4 @@
-"""What each drive adds to the metrics that two runs are compared by: a sum over some rows."""
+"""Contribution of each drive to the metrics that runs are compared by: a sum and its rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FOLDER: Final = "score"
-"""Of a score, in a run or in a study."""
+"""Folder of a score, in a run or in a study."""
 METRICS: Final = "metrics.json"
 BY_DRIVE: Final = "by_drive"
 Direction = Literal["higher", "lower"]
@@ -46,15 +46,15 @@ BETTER: Final[Mapping[str, Direction]] = {
         "lower",
     ),
 }
-"""By the last part of a metric's path; metrics of other names are shown but not judged.
+"""Better direction by the last part of a metric's path; other metrics are shown but not judged.
 
-How much was scored is no merit. Nor is the mean distance of the approaches that were detected: one
-more, detected late, lowers it. So where it is judged, approaches not detected count as 0 m.
+The amount scored is not judged. The mean distance at detection is judged with undetected approaches
+counted as 0 m, because an additional, late detection would otherwise lower it.
 """
 OR_0: Final = "_or_0"
 SCORED: Final = "scored"
 SHOWN: Final = frozenset({SCORED, "detected_m", "full_m"})
-"""Kept for each drive, too, for queries, and to see what is no longer scored at all."""
+"""Also stored for each drive, for queries, and to find metrics that are no longer scored."""
 PARTS: Final = (
     "by_distance",
     "by_control",
@@ -64,18 +64,18 @@ PARTS: Final = (
     "things",
     "attribution",
 )
-"""Metrics below these stand on few rows each; they are shown but not judged."""
+"""Metrics below these are based on few rows each; they are shown but not judged."""
 
 
 class DriveMetric(NamedTuple):
-    """One drive's part of one metric.
+    """Contribution of one drive to one metric.
 
     Attributes:
-        log: Identity of the drive's log: what pairs two runs of it.
-        metric: Its path.
-        kind: Of parts from several drives: the mean over rows, its root, or the sum.
-        total: Sum over rows, of squares for ``rms``.
-        rows: How many; 0 where the drive has none.
+        log: Identity of the drive's log, by which two runs of it are paired.
+        metric: Path of the metric.
+        kind: How contributions are combined: mean over rows, its root, or sum.
+        total: Sum over rows; of squares for ``rms``.
+        rows: Number of rows; 0 if the drive has none.
     """
 
     log: str
@@ -86,7 +86,7 @@ class DriveMetric(NamedTuple):
 
 
 def direction(path: str) -> Direction | None:
-    """Which of two values of a metric is better; None where it is not judged."""
+    """Return the better direction of a metric; None if it is not judged."""
     parts = path.split(".")
     return None if set(parts) & set(PARTS) else BETTER.get(parts[-1])
 
@@ -94,7 +94,7 @@ def direction(path: str) -> Direction | None:
 def no_longer_scored(
     before: Sequence[DriveMetric], after: Sequence[DriveMetric]
 ) -> tuple[str, ...]:
-    """Paths that drives of both have only in the first run, or of which no row is scored now."""
+    """Return the metrics that the first run of a common drive has and the second lacks."""
     known = {one.metric for one in after}
     logs = {one.log for one in before} & {one.log for one in after}
     scored = {one.metric for one in after if one.log in logs and one.total > 0.0}
@@ -113,13 +113,13 @@ def no_longer_scored(
 def parts_of(
     log: str, tree: Mapping[str, Any], pose_rmse_m: float | None, is_lost: bool
 ) -> Iterator[DriveMetric]:
-    """What one drive adds to every metric that is judged or shown.
+    """Yield the contributions of one drive to all metrics that are judged or shown.
 
     Args:
         log: Identity of its log.
-        tree: Its own scores as ``as_metrics`` returns them.
-        pose_rmse_m: Absolute pose error; None where the pose was not scored.
-        is_lost: The pose was lost.
+        tree: Scores of the drive, from ``as_metrics``.
+        pose_rmse_m: Absolute pose error; None if the pose was not scored.
+        is_lost: True if the pose was lost.
     """
     sections = {name: tree[name] or {} for name in ("cues", "approaches", "belief", "range")}
     values = metric_values(sections, parts=False)
@@ -141,7 +141,7 @@ COUNTED_BY: Final = {
     "detected_m": "detected",
     "full_m": "full",
 }
-"""Under a condition: the count beside a metric that says how many approaches it stands on."""
+"""Sibling of a metric of a condition that is the number of its approaches."""
 
 
 def _part(
@@ -164,7 +164,7 @@ def _part(
 
 
 def _of_all(part: DriveMetric, values: Mapping[str, MetricValue]) -> DriveMetric:
-    """A mean distance over every approach whose range is known, those not detected at 0 m."""
+    """Return the mean distance over all approaches of known range, undetected ones at 0 m."""
     outer = part.metric.rpartition(".")[0]
     unknown = values.get(f"{outer}.without_range", MetricValue(0.0)).value
     rows = int(values[f"{outer}.approaches"].value - unknown)
@@ -172,7 +172,7 @@ def _of_all(part: DriveMetric, values: Mapping[str, MetricValue]) -> DriveMetric
 
 
 def table_of(parts: Iterator[DriveMetric]) -> pa.Table:
-    """As ``by_drive.parquet``."""
+    """Return the table ``by_drive.parquet``."""
     import pyarrow as pa
 
     schema = pa.schema(

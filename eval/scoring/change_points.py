@@ -1,16 +1,16 @@
-"""Where a metric changed in a history of versions, judged drive by drive.
+"""Change points of metrics in a history of versions, judged drive by drive.
 
-If nothing changed, it is arbitrary which of a drive's results came from which version. Shuffling
-the results of each drive among the versions it was replayed with shows by how much chance alone
-makes the versions before some split differ from those after it: the permutation test of
-``crosscue compare``, for more than two versions. A split's difference is the mean over drives,
-weighted by their rows, in units of its own spread; the largest over all splits and metrics counts
-(Westfall, Young, *Resampling-Based Multiple Testing*, 1993). If it is larger than in 95 % of the
-shuffles, that split is a change point, and what lies before and after it is searched in the same
-manner, all such parts together (binary segmentation; Vostrikova, *Soviet Mathematics Doklady* 24,
-1981). So a history in which nothing changed shows any change point in at most 5 % of cases, and so
-does each further round of the search. At the end each change point is tested once more between its
-neighbors, and one that they explain is dropped.
+If nothing changed, the assignment of a drive's results to versions is arbitrary. Shuffling the
+results of each drive among its versions therefore yields the distribution, under chance alone, of
+the difference between the versions before and after a split. This is the permutation test of
+``crosscue compare``, for more than two versions. The difference at a split is the mean over drives,
+weighted by their rows, in units of its standard deviation. The test uses the largest difference
+over all splits and metrics (Westfall, Young, *Resampling-Based Multiple Testing*, 1993). If it
+exceeds that of 95 % of the shuffles, the split is a change point, and the parts before and after it
+are searched together in the same way (binary segmentation; Vostrikova, *Soviet Mathematics Doklady*
+24, 1981). Hence a history without changes shows a change point in at most 5 % of cases, and so does
+each further round of the search. Finally, each change point is tested again between its neighbors,
+and dropped if they explain it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 FALSE_ALARMS: Final = 0.05
 MIN_DRIVES: Final = 6
-"""With results on both sides of a split; fewer decide nothing, as in a comparison."""
+"""Min number of drives with results on both sides of a split, as in a comparison."""
 SHUFFLES: Final = 1000
 SEED: Final = 0
 ROUNDING: Final = 1e-9
@@ -33,11 +33,11 @@ ROUNDING: Final = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Results:
-    """One metric of G drives under V versions.
+    """Results of G drives with V versions, for one metric.
 
     Attributes:
-        values: Shape (G, V); NaN where a drive has none.
-        weights: Shape (G,): rows that a drive's values stand on.
+        values: Shape (G, V); NaN where a drive has no result.
+        weights: Shape (G,): numbers of rows behind a drive's values.
     """
 
     values: NDArray[np.float64]
@@ -49,10 +49,10 @@ class ChangePoint:
     """A change of one metric.
 
     Attributes:
-        at: The first version, by its place, that differs from those before.
-        p: How often chance makes any metric differ so much at any split.
-        by: How much more it is from there on than before, up to the next change points; mean over
-            the drives on both sides.
+        at: Index of the first version that differs from those before.
+        p: Probability that any metric differs as much at any split by chance.
+        by: Value after minus value before, up to the neighboring change points; mean over the
+            drives on both sides.
     """
 
     at: int
@@ -61,10 +61,10 @@ class ChangePoint:
 
 
 def change_points(results: Mapping[str, Results]) -> dict[str, tuple[ChangePoint, ...]]:
-    """The change points of every metric, in order; see the head of this file.
+    """Return the change points of every metric, in order of versions.
 
     Args:
-        results: By metric; all with the same drives and versions.
+        results: Results by metric, all with the same drives and versions.
     """
     found: dict[str, list[ChangePoint]] = {name: [] for name in results}
     spans = [_Span(name, 0, one.values.shape[1]) for name, one in results.items()]
@@ -81,7 +81,10 @@ def change_points(results: Mapping[str, Results]) -> dict[str, tuple[ChangePoint
 
 
 def _confirmed(points: Sequence[ChangePoint], one: Results) -> tuple[ChangePoint, ...]:
-    """Those that still stand between their neighbors: a first split may be beside the change."""
+    """Return the points that are significant between their neighbors.
+
+    The first split of a search may be next to a change.
+    """
     edges = [0, *(point.at for point in points), one.values.shape[1]]
     kept = []
     for i, point in enumerate(points):
@@ -98,7 +101,7 @@ def _confirmed(points: Sequence[ChangePoint], one: Results) -> tuple[ChangePoint
 
 @dataclass(frozen=True, slots=True)
 class _Span:
-    """Some versions of a metric, from ``first`` up to ``end``, not included."""
+    """A span of versions of a metric, from ``first`` to ``end`` (exclusive)."""
 
     name: str
     first: int
@@ -108,7 +111,7 @@ class _Span:
 def _found_in(
     spans: Sequence[_Span], results: Mapping[str, Results]
 ) -> Iterator[tuple[_Span, ChangePoint]]:
-    """The clearest split of each span where chance over all spans is ruled out."""
+    """Yield the most significant split of each span, if it is significant over all spans."""
     statistics = {}
     for span in spans:
         one = results[span.name]
@@ -128,9 +131,9 @@ def _found_in(
 def _statistics(
     values: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Difference at every split, in units of its spread, for every shuffle.
+    """Return the difference at each split in standard deviations, for each shuffle.
 
-    Shape (S, V - 1), the first row unshuffled; None where too few drives decide, or none differs.
+    Shape (S, V - 1), the first row unshuffled; None if there are too few drives, or none differs.
     """
     signed = _differences(values, weights)
     if signed is None:
@@ -149,7 +152,7 @@ def _statistics(
 def _differences(
     values: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """After minus before at every split, for every shuffle, as above."""
+    """Return the value after minus the value before each split, for each shuffle, (S, V - 1)."""
     is_known = np.isfinite(values)
     weight = _split_weights(is_known, weights)
     if weight is None:
@@ -162,7 +165,7 @@ def _differences(
 def _split_weights(
     is_known: NDArray[np.bool_], weights: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """What each value adds to the difference at each split: shape (V - 1, G, V)."""
+    """Return the weight of each value in the difference at each split, shape (V - 1, G, V)."""
     versions = is_known.shape[1]
     if versions < 2:
         return None
@@ -184,15 +187,15 @@ def _split_weights(
 
 
 def _shuffled(values: NDArray[np.float64], is_known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Each drive's values among the versions that it has: shape (S, G, V); the first as they are.
+    """Shuffle each drive's values among its versions, shape (S, G, V), the first unshuffled.
 
-    The same shuffles for every metric of a drive: metrics that depend on each other still do.
+    All metrics of a drive are shuffled alike, to keep their dependence.
     """
     chance = np.random.default_rng(SEED)
     keys = chance.random((SHUFFLES, *values.shape))
     place = np.arange(values.shape[1])
     keys[0] = place
-    # A version that a drive lacks stays where it is: its key sorts it to its own place.
+    # The keys of missing versions sort them to their own places.
     order = np.broadcast_to(place, keys.shape).copy()
     for drive, known in enumerate(is_known):
         there = np.flatnonzero(known)

@@ -1,4 +1,4 @@
-"""What is scored, as columns: rows of a run's tables, checked."""
+"""Columns of a run's tables that are scored."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 AMBIGUOUS: Final = "log time comes twice"
-"""Why rows of either side of a set-back are not scored."""
+"""Reason why rows around a set-back of the clock are not scored."""
 NONE: Final = -1
-"""Stands for a null approach."""
+"""Value for rows without an approach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CueRows:
-    """N rows: what was looked for in a frame and how many were found.
+    """N rows of cues: what was searched in a frame, and the number found.
 
     Attributes:
         t_ns: Shape (N,).
         approach: Shape (N,); ``NONE`` outside approaches.
-        cue: Shape (N,), names.
-        count: Shape (N,), never negative.
+        cue: Shape (N,), names of cues.
+        count: Shape (N,), not negative.
     """
 
     t_ns: NDArray[np.int64]
@@ -45,13 +45,13 @@ class RangeRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeliefRows:
-    """N steps.
+    """N steps of the belief.
 
     Attributes:
         t_ns: Shape (N,).
         approach: Shape (N,); ``NONE`` outside approaches.
-        features: A feature's name to its N probabilities, NaN where missing.
-        established: Shape (N,): presence of the intersection is established.
+        features: N probabilities by name of the feature, NaN where missing.
+        established: Shape (N,): True where the presence of the intersection is established.
     """
 
     t_ns: NDArray[np.int64]
@@ -62,15 +62,15 @@ class BeliefRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunTables:
-    """What a run says; None where it has no such table.
+    """The tables of a run that are scored; None for a missing table.
 
     Attributes:
-        frames_ns: Sorted times of all frames examined.
+        frames_ns: Sorted times of all examined frames.
         cues: From ``cues.parquet``.
         ranges: From ``range.parquet``.
         belief: From ``belief.parquet``.
-        ambiguous: Rows left out, as their log time comes twice: of ``frames``, of ``belief``, and
-            of ranges by reference (``start``, ``end``).
+        ambiguous: Numbers of rows left out because their log time occurs twice: of ``frames``, of
+            ``belief``, and of ranges by reference (``start``, ``end``).
     """
 
     frames_ns: NDArray[np.int64] | None
@@ -80,7 +80,7 @@ class RunTables:
     ambiguous: Mapping[str, int] = field(default_factory=dict)
 
     def span_ns(self) -> tuple[int, int] | None:
-        """First and last time in any table, or None for nothing at all."""
+        """First and last time in any table; None if all are empty."""
         tables = (self.cues, self.ranges, self.belief)
         times = [part.t_ns for part in tables if part is not None]
         if self.frames_ns is not None:

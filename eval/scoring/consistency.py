@@ -1,13 +1,13 @@
-"""The chi-square distribution, as far as consistency checks need it."""
+"""Quantiles of the chi-square distribution for consistency checks."""
 
 from __future__ import annotations
 
 
 def quantile(probability: float, dimensions: int) -> float:
-    """The value below which a chi-square variable lies with ``probability``.
+    """Return the quantile of a chi-square variable with ``dimensions`` degrees of freedom.
 
     Raises:
-        ValueError: ``probability`` outside (0, 1), or ``dimensions`` below 1.
+        ValueError: ``probability`` is outside (0, 1), or ``dimensions`` is below 1.
     """
     from scipy.special import chdtri
 
@@ -19,7 +19,7 @@ def quantile(probability: float, dimensions: int) -> float:
 
 
 def mean_band(dimensions: int, samples: int, fraction: float = 0.95) -> tuple[float, float]:
-    """Where the mean of independent chi-square samples lies with probability ``fraction``."""
+    """Return the central interval of the mean of independent chi-square samples."""
     total = dimensions * samples
     tail = 0.5 * (1.0 - fraction)
     return quantile(tail, total) / samples, quantile(1.0 - tail, total) / samples

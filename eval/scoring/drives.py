@@ -1,7 +1,6 @@
-"""All scores of one drive or many, from tables: coverage, cues, approaches, belief, range.
+"""Scores of drives from their tables: coverage, cues, approaches, belief, range.
 
-``judge`` lays one drive beside its truth; ``score`` pools any number of judged drives. Notebooks,
-the command line and CI use these two.
+``judge`` compares one drive with its truth; ``score`` pools any number of judged drives.
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ SECTIONS: Final = ("cues", "approaches", "belief", "range")
 
 @dataclass(frozen=True, slots=True)
 class ScoreSettings:
-    """What may be chosen.
+    """Settings of scores.
 
     Attributes:
-        threshold: A feature is detected above this probability.
-        bins_m: Borders of bins of true range.
+        threshold: Probability above which a feature counts as detected.
+        bins_m: Edges of the bins of true range.
         detection: ``confirmed``, or ``published``: the first frame counts, with any range.
     """
 
@@ -55,17 +54,17 @@ class ScoreSettings:
     detection: Definition = "confirmed"
 
     def __post_init__(self) -> None:
-        """Refuse what means nothing.
+        """Check the values.
 
         Raises:
-            ValueError: Naming what was wanted.
+            ValueError: A value is out of range.
         """
         if not 0.0 < self.threshold < 1.0:
             raise ValueError(f"threshold: expected in (0, 1), got {self.threshold}")
         if self.detection not in RULES:
             raise ValueError(f"detection: expected {' or '.join(RULES)}, got {self.detection}")
         if len(self.bins_m) < 2 or (np.diff(self.bins_m) <= 0.0).any():
-            raise ValueError(f"bins_m: expected two or more growing borders, got {self.bins_m}")
+            raise ValueError(f"bins_m: expected two or more increasing edges, got {self.bins_m}")
 
 
 DEFAULTS: Final = ScoreSettings()
@@ -73,16 +72,16 @@ DEFAULTS: Final = ScoreSettings()
 
 @dataclass(frozen=True, slots=True)
 class DriveCoverage:
-    """How much of a drive could be scored.
+    """Coverage of a drive by its truth.
 
     Attributes:
-        drive: Name.
-        frames: In the run.
-        frames_ambiguous: Of which the log time comes twice, so that no truth is theirs.
-        frames_annotated: Of which the truth speaks.
-        truth_s: Length of the truth.
-        truth_covered_s: Of which the run reports something.
-        not_scored: Sections that were not scored at all, and why.
+        drive: Name of the drive.
+        frames: Number of frames in the run.
+        frames_ambiguous: Number of frames without truth because their log time occurs twice.
+        frames_annotated: Number of frames with truth.
+        truth_s: Duration of the truth.
+        truth_covered_s: Duration of the truth that the run covers.
+        not_scored: Reasons by name of the sections that were not scored at all.
     """
 
     drive: str
@@ -96,7 +95,7 @@ class DriveCoverage:
 
 @dataclass(frozen=True, slots=True)
 class DriveJudged:
-    """One drive laid beside its truth."""
+    """One drive, compared with its truth."""
 
     coverage: DriveCoverage
     cues: tuple[CueFrames, ...]
@@ -107,15 +106,15 @@ class DriveJudged:
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """All drives together.
+    """Scores of all drives together.
 
     Attributes:
-        settings: As used.
-        drives: Coverage of each.
-        cues: By cue.
-        approaches: None where no drive has any.
-        belief: By feature.
-        range: By reference.
+        settings: Settings of the scores.
+        drives: Coverage of each drive.
+        cues: Scores by cue.
+        approaches: Scores of approaches; None if no drive has any.
+        belief: Scores by feature.
+        range: Scores by reference.
     """
 
     settings: ScoreSettings
@@ -126,7 +125,7 @@ class Scores:
     range: dict[str, RangeScore]
 
     def not_scored(self) -> dict[str, str]:
-        """Sections that no drive has, and why."""
+        """Reasons by name of the sections that no drive has."""
         return {
             section: self.drives[0].not_scored[section]
             for section in SECTIONS
@@ -135,10 +134,10 @@ class Scores:
 
 
 def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAULTS) -> DriveJudged:
-    """Lay one drive beside its truth.
+    """Compare one drive with its truth.
 
     Raises:
-        SchemaError: They share no moment: the truth belongs to another log or clock.
+        SchemaError: Their times do not overlap: the truth belongs to another log or clock.
     """
     covered_s = _check_fits(tables, truth)
     cues = tuple(match_cues(tables, truth))
@@ -168,7 +167,7 @@ def _frames(tables: RunTables) -> np.typing.NDArray[np.int64]:
 
 
 def _check_fits(tables: RunTables, truth: DriveTruth) -> float:
-    """Seconds of the truth's time that the run covers."""
+    """Return the duration of the truth that the run covers, in seconds."""
     span, reported = tables.span_ns(), truth.truth
     if span is None:
         return 0.0
@@ -176,7 +175,7 @@ def _check_fits(tables: RunTables, truth: DriveTruth) -> float:
         raise SchemaError(
             f"{truth.drive}: its truth covers {reported.start_ns} to {reported.end_ns} ns, "
             f"the run of {span[0]} to {span[1]} ns; it belongs to "
-            "another log or clock: give the right one"
+            "another log or clock; use the truth of this log"
         )
     return (min(span[1], reported.end_ns) - max(span[0], reported.start_ns)) * 1e-9
 
@@ -207,7 +206,7 @@ def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> 
     """Score any number of judged drives together.
 
     Raises:
-        ValueError: No drive, or two of one name.
+        ValueError: There is no drive, or two have the same name.
     """
     names = [one.coverage.drive for one in drives]
     if not names or len(set(names)) != len(names):
@@ -226,7 +225,7 @@ def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> 
 
 
 def as_metrics(scores: Scores) -> dict[str, Any]:
-    """What ``metrics.json`` holds of these scores, as plain values; coverage first."""
+    """Return the scores as plain values, as in ``metrics.json``, coverage first."""
     tree = asdict(scores)
     return {
         "format": FORMAT,

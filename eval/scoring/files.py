@@ -1,4 +1,4 @@
-"""Files of a score: metrics as JSON, curves, frames and drives as tables."""
+"""Write the files of a score: metrics as JSON, and curves, frames and drives as tables."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str
     """Write ``metrics.json``; ``curves``, ``cue_frames``, ``approaches``, ``by_drive`` as Parquet.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: A file cannot be written.
     """
     write_text(folder / METRICS, strict_json(metrics) + "\n")
     judged = [one.judged for one in scored]
@@ -62,7 +62,7 @@ def _writer(table: pa.Table) -> Any:
 
 
 def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
-    """Probabilities against true distance, a row for each step of each matched approach.
+    """Return probabilities and true distance, one row per step of each matched approach.
 
     Columns: drive, approach (id in the truth), intersection, t_ns, distance_m, then features.
     """
@@ -87,7 +87,7 @@ def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
 
 
 def approach_table(judged: Sequence[DriveJudged]) -> pa.Table:
-    """Every approach of the truth with its result; a distance that is not known is null.
+    """Return each approach of the truth with its result; unknown distances are null.
 
     Columns: drive, approach (number in the run), truth (id in the truth), intersection, control,
     conditions, present, detected_m, full_m, features_m, false_features and the two reasons why not.
@@ -134,9 +134,9 @@ def _known(distance_m: float | None) -> float | None:
 
 
 def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:
-    """Every frame in which a cue was looked for, with what is true of it.
+    """Return each frame in which a cue was searched, with the truth about it.
 
-    Columns: drive, t_ns, cue, count, approach, distance_m, object, feature (1 so, 0 not so,
+    Columns: drive, t_ns, cue, count, approach, distance_m, object, feature (1 true, 0 false,
     null unknown), true_count (null unknown), visible.
     """
     import pyarrow as pa

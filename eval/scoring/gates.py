@@ -7,8 +7,8 @@ A gate file is TOML::
     [[gate]]
     metric = "cues.stop_sign.precision"
     min = 0.95
-    use = "low"      # the interval's lower end must reach it; default: "value"
-    min_count = 100  # on fewer rows than this the gate fails; default: 1
+    use = "low"      # compare the interval's lower end; default: "value"
+    min_count = 100  # with fewer rows than this, the gate fails; default: 1
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Gate(BaseModel):
     min: Bound | None = None
     max: Bound | None = None
     use: Literal["value", "low", "high"] = "value"
-    """The metric itself, or an end of its interval (the wider one where there are two)."""
+    """The metric itself, or an end of its interval (of the wider one if there are two)."""
     min_count: Annotated[int, Field(ge=1)] = 1
-    """Rows that the metric must stand on, where it says how many."""
+    """Min number of rows behind the metric, if the metric reports it."""
 
     @model_validator(mode="after")
     def _has_bounds(self) -> Self:
@@ -53,7 +53,7 @@ class Gate(BaseModel):
         return self
 
     def text(self) -> str:
-        """Metric and bounds for a person."""
+        """Return metric and bounds as text."""
         end = "" if self.use == "value" else f" ({self.use} end)"
         low = "" if self.min is None else f" >= {self.min:g}"
         high = "" if self.max is None else f" <= {self.max:g}"
@@ -61,7 +61,7 @@ class Gate(BaseModel):
 
 
 class GateFile(BaseModel):
-    """A whole gate file."""
+    """A gate file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -75,8 +75,8 @@ class GateResult:
 
     Attributes:
         gate: The gate.
-        value: What was compared; NaN where nothing was scored.
-        failure: Empty when it passed.
+        value: Compared value; NaN if nothing was scored.
+        failure: Reason of the failure; empty if the gate passed.
     """
 
     gate: Gate
@@ -88,12 +88,12 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
     """Read a gate file.
 
     Raises:
-        UsageError: Not there, not TOML, or not what version 1 says.
+        UsageError: The file is missing, not TOML, or not a gate file of version 1.
     """
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; this is no gate file")
+            raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; expected a gate file")
         text = content.decode("utf-8")
         tree = toml_tree(text)
     except (OSError, ValueError) as error:
@@ -109,15 +109,15 @@ def check_gates(
     values: Mapping[str, MetricValue],
     not_scored: Mapping[str, str],
 ) -> tuple[GateResult, ...]:
-    """Hold gates against metrics.
+    """Check gates against metrics.
 
     Args:
-        gates: In order.
-        values: From ``metric_values``.
-        not_scored: Sections without any score, and why: gates on them fail.
+        gates: The gates.
+        values: Metrics, from ``metric_values``.
+        not_scored: Reasons by name of the sections without scores, whose gates fail.
 
     Raises:
-        UsageError: A metric that there is not; the message names close ones.
+        UsageError: A metric does not exist; the message suggests similar ones.
     """
     return tuple(_check(gate, values, not_scored) for gate in gates)
 
@@ -138,13 +138,13 @@ def _check(
 def _close(name: str, values: Mapping[str, MetricValue]) -> str:
     close = difflib.get_close_matches(name, values, n=3, cutoff=0.6)
     if close:
-        return f"close ones: {', '.join(close)}"
-    return f"there are {len(values)}, see score --json; such as {', '.join(sorted(values)[:2])}"
+        return f"did you mean {' or '.join(close)}?"
+    return f"score --json lists all {len(values)}, such as {', '.join(sorted(values)[:2])}"
 
 
 def _failure(gate: Gate, found: MetricValue, value: float) -> str:
     if math.isnan(found.value):
-        return "not scored: nothing to measure it by"
+        return "not scored: no data for it"
     if math.isnan(value):
         return f"its interval has no {gate.use} end: too few drives"
     if found.of is not None and found.of < gate.min_count:

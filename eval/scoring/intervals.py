@@ -1,15 +1,16 @@
-"""How sure a fraction or a mean is.
+"""Confidence intervals of fractions and means.
 
-Wilson's interval (E. B. Wilson, JASA 22, 1927) takes every count as independent. Frames of one
-drive are not: a sign missed in one frame is missed in the next. So wherever several drives or
-approaches are merged, an interval over whole clusters is shown beside it. Trust the wider one.
+Wilson's interval (E. B. Wilson, JASA 22, 1927) assumes that counts are independent. Frames of one
+drive are not: a sign missed in one frame is missed in the next. Therefore, where several drives or
+approaches are pooled, an interval over clusters is shown as well. Trust the wider one.
 
-Resampling clusters covers too little for few of them: 82 to 88 % of five to eight, where 95 % is
-stated. Here the variance is the jackknife's over clusters (MacKinnon, Nielsen, Webb, *Fast and
-Reliable Jackknife and Bootstrap Methods for Cluster-Robust Inference*, 2023), and the quantile that
-of Student's t for so many clusters of equal size as would do as well (Kish, *Survey Sampling*,
-section 8.2). A fraction has the same as a Wilson interval of its effective number of rows (Korn,
-Graubard, *Survey Methodology* 24, 1998), which stays within 0 and 1.
+Bootstrap intervals over few clusters are too narrow: with five to eight clusters, intervals of
+nominally 95 % cover 82 to 88 %. Here the variance is that of the jackknife over clusters
+(MacKinnon, Nielsen, Webb, *Fast and Reliable Jackknife and Bootstrap Methods for Cluster-Robust
+Inference*, 2023). The quantile is that of Student's t for the effective number of clusters of equal
+size (Kish, *Survey Sampling*, section 8.2). For fractions, the interval is Wilson's with the
+effective number of rows (Korn, Graubard, *Survey Methodology* 24, 1998), which stays within 0 and
+1.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from numpy.typing import NDArray
 CONFIDENCE: Final = 0.95
 MIN_CLUSTERS: Final = 4
 TOO_FEW: Final = "too few clusters"
-"""What is printed where an interval needs more drives or approaches than exist."""
+"""Text in place of an interval over too few drives or approaches."""
 
 
 class Interval(NamedTuple):
-    """Both ends; NaN where nothing can be said."""
+    """Ends of an interval; NaN if undefined."""
 
     low: float
     high: float
@@ -42,12 +43,12 @@ class Proportion:
     """``right`` out of ``of``.
 
     Attributes:
-        value: NaN for none out of none.
-        low: Lower end of Wilson's interval, as if counts were independent.
-        high: Its upper end.
-        clusters: How many drives or approaches the counts come from.
-        clusters_low: Lower end over whole clusters; NaN for fewer than four.
-        clusters_high: Its upper end.
+        value: Fraction; NaN for 0 out of 0.
+        low: Lower end of Wilson's interval, which assumes independent counts.
+        high: Upper end of Wilson's interval.
+        clusters: Number of drives or approaches that the counts come from.
+        clusters_low: Lower end of the interval over clusters; NaN for fewer than four.
+        clusters_high: Upper end of the interval over clusters.
     """
 
     right: int
@@ -62,14 +63,14 @@ class Proportion:
 
 @dataclass(frozen=True, slots=True)
 class Mean:
-    """A mean over rows, its interval over whole clusters.
+    """Mean over rows, with an interval over clusters.
 
     Attributes:
-        value: NaN for no rows.
-        low: NaN for fewer than four clusters: few drives say little about the next.
-        high: The same.
-        of: Rows.
-        clusters: Drives or approaches.
+        value: Mean; NaN without rows.
+        low: Lower end; NaN for fewer than four clusters.
+        high: Upper end; NaN for fewer than four clusters.
+        of: Number of rows.
+        clusters: Number of drives or approaches.
     """
 
     value: float
@@ -80,10 +81,10 @@ class Mean:
 
 
 def wilson(right: int, of: int, confidence: float = CONFIDENCE) -> Interval:
-    """Wilson's score interval for ``right`` out of ``of`` independent trials.
+    """Return Wilson's score interval for ``right`` out of ``of`` independent trials.
 
     Raises:
-        ValueError: ``right`` is not within 0 to ``of``, or ``confidence`` not in (0, 1).
+        ValueError: ``right`` is outside 0 to ``of``, or ``confidence`` is outside (0, 1).
     """
     from scipy.special import ndtri
 
@@ -100,18 +101,18 @@ def _wilson(fraction: float, of: float, z: float) -> Interval:
     shrink = 1.0 + z * z / of
     middle = (fraction + 0.5 * z * z / of) / shrink
     half = z * math.sqrt(fraction * (1.0 - fraction) / of + 0.25 * (z / of) ** 2) / shrink
-    # At the ends the formula is exact but rounding is not.
+    # At the ends, the formula yields exactly 0 or 1 except for rounding errors.
     return Interval(
         0.0 if fraction == 0.0 else middle - half, 1.0 if fraction == 1.0 else middle + half
     )
 
 
 def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) -> Proportion:
-    """The fraction of true rows with both intervals.
+    """Return the fraction of true rows, with both intervals.
 
     Args:
         is_right: Shape (N,).
-        clusters: Shape (N,): which drive or approach a row belongs to.
+        clusters: Shape (N,): index of the drive or approach of each row.
     """
     right, of = int(is_right.sum()), len(is_right)
     ends = wilson(right, of)
@@ -129,7 +130,7 @@ def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64])
 
 
 def mean(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Mean:
-    """The mean of finite values, with an interval over whole clusters."""
+    """Return the mean of finite values, with an interval over clusters."""
     kept = np.isfinite(values)
     values, clusters = values[kept], clusters[kept]
     ends = mean_by_cluster(values, clusters)
@@ -140,12 +141,12 @@ def mean(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Mean:
 def mean_by_cluster(
     values: NDArray[np.float64], clusters: NDArray[np.int64], confidence: float = CONFIDENCE
 ) -> Interval:
-    """Interval of the mean over rows that counts whole clusters as independent.
+    """Return the interval of a mean over rows, with clusters as independent units.
 
     Args:
         values: Shape (N,).
         clusters: Shape (N,).
-        confidence: Of the interval.
+        confidence: Confidence level.
     """
     found = _spread(values, clusters)
     if found is None:
@@ -159,23 +160,23 @@ def fraction_by_cluster(
     clusters: NDArray[np.int64],
     confidence: float = CONFIDENCE,
 ) -> Interval:
-    """Interval of the fraction of true rows that counts whole clusters as independent.
+    """Return the interval of the fraction of true rows, with clusters as independent units.
 
-    Where all clusters agree nothing shows how alike rows of one cluster are: each cluster counts as
-    one row then.
+    If all clusters agree, the correlation within clusters is unknown. Each cluster then counts as
+    one row.
     """
     found = _spread(is_right.astype(np.float64), clusters)
     return UNKNOWN if found is None else found.within_0_and_1(len(is_right), confidence)
 
 
 class Spread(NamedTuple):
-    """What clusters say of a mean, or of a number like one.
+    """Mean over rows and its standard deviation, from clusters.
 
     Attributes:
-        mean: Over rows.
-        sd: Its standard deviation.
-        clusters: How many.
-        equal_clusters: So many clusters of equal size would do as well.
+        mean: Mean over rows.
+        sd: Standard deviation of the mean.
+        clusters: Number of clusters.
+        equal_clusters: Effective number of clusters of equal size.
     """
 
     mean: float
@@ -184,13 +185,13 @@ class Spread(NamedTuple):
     equal_clusters: float
 
     def quantile(self, confidence: float) -> float:
-        """Of Student's t."""
+        """Return the two-sided quantile of Student's t."""
         from scipy.special import stdtrit
 
         return float(stdtrit(max(self.equal_clusters - 1.0, 1.0), 0.5 + 0.5 * confidence))
 
     def within_0_and_1(self, rows: float, confidence: float = CONFIDENCE) -> Interval:
-        """Wilson's interval of the effective number of rows, which are at most ``rows``."""
+        """Return Wilson's interval for the effective number of rows, at most ``rows``."""
         from scipy.special import ndtri
 
         if self.sd == 0.0:
@@ -200,7 +201,7 @@ class Spread(NamedTuple):
 
 
 def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Spread | None:
-    """Mean over rows and its standard deviation by the jackknife; None for too few clusters."""
+    """Return the mean and its standard deviation by the jackknife; None for too few clusters."""
     names, which = np.unique(clusters, return_inverse=True)
     n = len(names)
     if n < MIN_CLUSTERS:

@@ -1,4 +1,4 @@
-"""Every number of a metrics tree under its path, such as ``cues.stop_sign.precision``."""
+"""Numbers of a metrics tree by path, such as ``cues.stop_sign.precision``."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class MetricValue:
     """One number and its interval.
 
     Attributes:
-        value: NaN where nothing was scored.
-        low: NaN where the metric has no interval.
-        high: The same.
-        of: How many rows it stands on, or None where it does not say.
+        value: Value; NaN if nothing was scored.
+        low: Lower end; NaN if the metric has no interval.
+        high: Upper end; NaN if the metric has no interval.
+        of: Number of rows behind it; None if not reported.
     """
 
     value: float
@@ -25,11 +25,11 @@ class MetricValue:
 
 
 def metric_values(tree: Mapping[str, object], *, parts: bool = True) -> dict[str, MetricValue]:
-    """All numbers of a tree by path; texts, flags and lists are passed over.
+    """Return all numbers of a tree by path; texts, flags and lists are ignored.
 
     Args:
         tree: As in ``metrics.json``. A branch with a ``value`` is one metric with an interval.
-        parts: Give the parts of such branches paths of their own, too.
+        parts: True to also include the parts of such branches under their own paths.
     """
     return dict(_walk(tree, "", parts))
 
@@ -50,7 +50,7 @@ def _walk(
 
 
 def _with_interval(branch: Mapping[str, object]) -> MetricValue:
-    """The wider of both intervals where rows were also counted by drive or approach."""
+    """Return a metric with the wider of its intervals over rows and over clusters."""
     low = [_number(branch.get(name)) for name in ("low", "clusters_low")]
     high = [_number(branch.get(name)) for name in ("high", "clusters_high")]
     of = branch.get("of")

@@ -1,4 +1,4 @@
-"""Rows of many drives laid together."""
+"""Pool the rows of many drives."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
-"""Borders of bins of true range."""
+"""Edges of the bins of true range."""
 
 
 def cluster_numbers(
     drives: Sequence[str], approaches: Sequence[NDArray[np.int64]]
 ) -> NDArray[np.int64]:
-    """One number for each approach of each drive, row by row over all drives.
+    """Return the number of each row's cluster, which is an approach of a drive.
 
     Args:
-        drives: Names.
-        approaches: For each drive, shape (N,): the approach that each row belongs to.
+        drives: Names of the drives.
+        approaches: For each drive, shape (N,): the approach of each row.
     """
     numbers = [np.empty(0, np.int64)]
     drive_of: dict[str, dict[int, int]] = {}
@@ -37,7 +37,7 @@ def cluster_numbers(
 
 
 def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Counts by reason, added up."""
+    """Return the sums of counts by reason."""
     total: dict[str, int] = {}
     for one in counts:
         for reason, count in one.items():
@@ -48,14 +48,14 @@ def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 def first_reasons(
     rows: NDArray[np.bool_], reasons: Mapping[str, NDArray[np.bool_]]
 ) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Take rows away for reasons; each row goes for the first reason that holds.
+    """Remove rows for reasons; each row is counted for the first reason that applies.
 
     Args:
-        rows: Shape (N,): where to begin.
-        reasons: From reason to shape (N,): whether it holds.
+        rows: Shape (N,): the initial rows.
+        reasons: Mask by reason, shape (N,): rows that it applies to.
 
     Returns:
-        The rows that stay, and how many went for each reason (none: not listed).
+        The remaining rows, and the numbers of rows removed by reason, if not zero.
     """
     counts: dict[str, int] = {}
     for reason, holds in reasons.items():
@@ -69,7 +69,7 @@ def first_reasons(
 def distance_bins(
     distance_m: NDArray[np.float64], borders_m: Sequence[float]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Which rows are in which half-open bin; every row is in exactly one."""
+    """Return the rows of each half-open bin, as masks; every row is in exactly one bin."""
     found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
     for low, high in pairwise(borders_m):
         found[f"{low:g}-{high:g}"] = (distance_m >= low) & (distance_m < high)

@@ -1,4 +1,4 @@
-"""The tables of a run that are scored, as columns; from a run folder or from tables in memory."""
+"""Read the tables of a run that are scored, from a run folder or from tables in memory."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 def in_log_time(where: str, tables: Mapping[str, pa.Table], timeline: Timeline) -> RunTables:
-    """Tables of a run, by name, in the time of its logs, with what that leaves out counted.
+    """Return tables of a run in log time, with counts of the rows that this leaves out.
 
     Raises:
-        RunError: A column is missing, or holds what cannot be.
+        RunError: A column is missing, or has impossible values.
     """
     kept = {name: table_in_log_time(table, timeline) for name, table in tables.items()}
     counts = {
@@ -38,7 +38,7 @@ def in_log_time(where: str, tables: Mapping[str, pa.Table], timeline: Timeline) 
 
 
 def _rows_by_kind(table: pa.Table, name: str) -> Mapping[str, int]:
-    """Rows that are judged one by one: of a range by reference; cues are judged by frame."""
+    """Return numbers of separately judged rows: ranges by reference; cues are judged by frame."""
     if name == "cues":
         return {}
     if name == "range":
@@ -54,17 +54,17 @@ def run_tables(
     range_table: pa.Table | None = None,
     belief_table: pa.Table | None = None,
 ) -> RunTables:
-    """Check tables in memory and take their columns.
+    """Check tables in memory and return their columns.
 
     Args:
-        where: Named in errors.
-        frames_table: Columns as in ``frames.parquet``; likewise the other three.
-        cues_table: See there.
-        range_table: See there.
-        belief_table: See there.
+        where: Name of the run in errors.
+        frames_table: Columns as in ``frames.parquet``.
+        cues_table: Columns as in ``cues.parquet``.
+        range_table: Columns as in ``range.parquet``.
+        belief_table: Columns as in ``belief.parquet``.
 
     Raises:
-        RunError: A column is missing, or holds what cannot be.
+        RunError: A column is missing, or has impossible values.
     """
     frames = None
     if frames_table is not None:
@@ -110,7 +110,7 @@ def _belief(table: pa.Table, where: str) -> BeliefRows:
         if name in (*NOT_FEATURES, *LABELS):
             continue
         values = _numbers(table, name, where)
-        # NaN compares false: it is left out later, and counted.
+        # NaN compares false here; it is left out and counted later.
         if ((values < 0.0) | (values > 1.0)).any():
             raise UnreadableRunError(f"{where}: {name}: a probability outside 0 to 1; replay again")
         features[name] = values

@@ -1,4 +1,4 @@
-"""Run folders against their truth: scored one by one, pooled, and written down."""
+"""Compare run folders with their truth, and pool their scores."""
 
 from __future__ import annotations
 
@@ -45,23 +45,23 @@ from .run_tables import in_log_time
 from .truth import DriveTruth
 
 TABLES: Final = ("frames", "cues", "range", "belief")
-"""Of a run, that are scored."""
+"""Tables of a run that are scored."""
 SLACK_NS: Final = 1_000_000_000
-"""An approach may lie so far outside the run: clocks and last pictures differ a little."""
+"""Tolerance for approaches outside the run, because clocks and last pictures differ a little."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunScored:
-    """One run laid beside its truth.
+    """One run, compared with its truth.
 
     Attributes:
-        run: Its folder.
-        truth_path: Where the truth is.
+        run: Folder of the run.
+        truth_path: Path of the truth file.
         truth: The truth.
-        judged: Everything but the pose.
-        pose: None where it was not scored.
-        poses: What figures of the pose are drawn of; None where it was not scored.
-        why_no_pose: Empty where it was.
+        judged: Comparison of everything but the pose.
+        pose: Scores of the pose; None if it was not scored.
+        poses: Poses for figures; None if the pose was not scored.
+        why_no_pose: Reason why the pose was not scored; empty if it was.
     """
 
     run: RunFolder
@@ -74,17 +74,17 @@ class RunScored:
 
 
 class SceneJudged(NamedTuple):
-    """A run laid beside its truth, but for the pose."""
+    """Comparison of a run with its truth, without the pose."""
 
     truth: DriveTruth
     judged: DriveJudged
 
 
 def find_truth(run: RunFolder, given: Path | None) -> Path:
-    """The truth file given, or the one beside (or in) a log of the run.
+    """Return the given truth file, or the one next to (or in) a log of the run.
 
     Raises:
-        UsageError: None was given and none is there.
+        UsageError: No truth file is given, and none exists.
         RunError: The manifest cannot be read.
     """
     if given is not None:
@@ -98,11 +98,13 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
             if (folder / FILE).is_file():
                 return folder / FILE
             looked.append(str(folder))
-    raise UsageError(f"{run.path}: no {FILE} beside its logs ({', '.join(looked)}); give --truth")
+    raise UsageError(
+        f"{run.path}: no {FILE} next to its logs ({', '.join(looked)}); name it with --truth"
+    )
 
 
 def _place(run: RunFolder, log: LogRow) -> Path:
-    """Where a log lies or lay; its truth may still be there."""
+    """Return the present or former path of a log, whose truth may still be there."""
     try:
         return Path(place_of(run, log))
     except RunError:
@@ -117,17 +119,17 @@ def judge_run(
     *,
     any_log: bool = False,
 ) -> RunScored:
-    """Lay a run beside its truth; pose tracks go into its ``score`` folder.
+    """Compare a run with its truth; write pose tracks to its ``score`` folder.
 
     Args:
         run: A finished run.
         truth_path: Its truth.
-        settings: Of the scores.
+        settings: Settings of the scores.
         rpe_m: Distances of the relative pose error.
-        any_log: Take the truth though it names the hash of another file: the same drive, converted.
+        any_log: Accept truth made for another file of the same drive, such as a converted log.
 
     Raises:
-        RunError: A table is damaged, or it holds many drives merged.
+        RunError: A table is damaged, or the run contains merged drives.
         SchemaError: The truth does not fit the run, or there is nothing to score.
     """
     truth, judged = judge_scene(run, truth_path, settings, any_log=any_log)
@@ -147,10 +149,10 @@ def judge_scene(
     *,
     any_log: bool = False,
 ) -> SceneJudged:
-    """Lay everything but the pose of a run beside its truth; nothing is written.
+    """Compare everything but the pose of a run with its truth; nothing is written.
 
     Raises:
-        RunError: A table is damaged, or it holds many drives merged.
+        RunError: A table is damaged, or the run contains merged drives.
         SchemaError: The truth does not fit the run.
     """
     run.drive_manifest()
@@ -163,7 +165,7 @@ def judge_scene(
 
 
 def tables_of(run: RunFolder) -> RunTables:
-    """Read a run's tables; one that is not there becomes None.
+    """Read a run's tables; a missing one becomes None.
 
     Raises:
         RunError: A table is damaged or has other columns.
@@ -174,7 +176,7 @@ def tables_of(run: RunFolder) -> RunTables:
 
 
 def smoothed_ranges(one: RunScored) -> dict[str, FilterAndSmoother]:
-    """By reference, the range filter beside what all of the run's measurements say together."""
+    """Return errors of the range filter and of its smoother, by reference."""
     return score_smoothed(tables_of(one.run), one.truth, odometer_of(one.run))
 
 
@@ -184,21 +186,21 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
     found = {digest for log in logs for digest in log.sha256.values()}
     if reported and logs and not found:
         raise SchemaError(
-            f"{path}: names its log by hash, and the run read its log by ranges: no hash; "
-            "replay the whole log, or give --any-log if both are the same drive"
+            f"{path}: identifies its log by hash, but the run has no hash, because it read only "
+            "parts of its log; replay the complete log, or use --any-log for the same drive"
         )
     if reported and not reported & found:
         names = ", ".join(log.name for log in logs)
         raise SchemaError(
-            f"{path}: by its hash it belongs to another {truth.log or 'log'}, not to {names}; "
-            "give the truth of that log, or --any-log for the same drive in another file"
+            f"{path}: belongs to another {truth.log or 'log'} by its hash, not to {names}; "
+            "use the truth of that log, or --any-log for another file of the same drive"
         )
 
 
 def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) -> None:
-    """Refuse truth of approaches that lie wholly outside a run over its whole log.
+    """Refuse truth with an approach completely outside a run of the complete log.
 
-    A truth that shares no moment with the run at all is refused by ``judge``.
+    Truth whose time does not overlap with the run's at all is refused by ``judge``.
     """
     selection = run.drive_manifest().selection
     span = tables.span_ns()
@@ -222,14 +224,15 @@ def _why_no_pose(run: RunFolder, truth: Truth) -> str:
 
 
 def scores_of(scored: Sequence[RunScored], settings: ScoreSettings = DEFAULTS) -> Scores:
-    """The pooled scores of runs."""
+    """Return the pooled scores of runs."""
     return score([one.judged for one in scored], settings)
 
 
 def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
-    """The content of ``metrics.json``: everything pooled, with the pose.
+    """Return the content of ``metrics.json``: pooled scores, with the pose.
 
-    A single run's pose is given whole; of several, means over drives and each one by itself.
+    The pose of a single run is included completely; for several runs, means over drives and the
+    pose of each are included.
     """
     tree = as_metrics(scores)
     tree["account"] = account_of_scores(scored).as_json()
@@ -247,7 +250,7 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
 
 
 def account_of_scores(scored: Sequence[RunScored]) -> ScoredAccount | SummedAccount:
-    """The account of one run, or of all added up, with the scoring as its last stage."""
+    """Return the account of one run, or the sum of several, with scoring as the last stage."""
     if len(scored) == 1:
         (only,) = scored
         of = only.run.drive_manifest().account
@@ -264,7 +267,7 @@ def account_of_scores(scored: Sequence[RunScored]) -> ScoredAccount | SummedAcco
 
 
 def scoring_of(one: RunScored) -> dict[str, Line]:
-    """Frames with truth, cue by cue, and true poses: scored, or why not."""
+    """Return numbers of scored and unscored frames by cue, and of true poses, by reason."""
     found = {
         f"cue {cue.cue}": line(
             cue.frames,
@@ -289,7 +292,7 @@ def scoring_of(one: RunScored) -> dict[str, Line]:
 
 
 def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
-    """Pairs of runs of one log: pooled, such a drive counts twice."""
+    """Return pairs of runs of the same log, whose drive counts twice when pooled."""
     first: dict[str, str] = {}
     pairs: list[tuple[str, str]] = []
     for one in scored:
@@ -302,7 +305,7 @@ def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
 
 
 def _digests(log: LogRow) -> Iterator[str]:
-    """What a log is known by: hashes of its files, and its identity."""
+    """Yield the identifiers of a log: hashes of its files, and its identity."""
     yield from log.sha256.values()
     yield log.identity.digest
 

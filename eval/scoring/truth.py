@@ -1,4 +1,4 @@
-"""What is true at a time of a drive: which approach, how far to go, what is there to be seen."""
+"""Truth of a drive at given times: the approach, the range, and the visible cues."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ from .columns import NONE
 COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
 MAX_BYTES: Final = 256 * MIB
 NEAREST_NS: Final = 500_000_000
-"""A true range further away in time than this says nothing about a moment."""
+"""Max time between a moment and the true ranges it is interpolated from."""
 CROSSING_NS: Final = 10_000_000_000
-"""After entering, so long is the car taken to be in the intersection: nothing is judged then."""
+"""Time after entering during which the car is assumed to be in the intersection.
+
+Nothing is judged in this time.
+"""
 FEATURES: Final = ("intersection", "left", "right", "straight")
 
 
@@ -32,9 +35,9 @@ class TrueRanges:
 
     Attributes:
         t_ns: Shape (N,).
-        approach: Shape (N,): ids.
-        start_m: Shape (N,), to the start of the intersection along the path.
-        end_m: Shape (N,), to its end; NaN where unknown.
+        approach: Shape (N,): ids of approaches.
+        start_m: Shape (N,): range to the start of the intersection, along the path.
+        end_m: Shape (N,): range to its end; NaN where unknown.
     """
 
     t_ns: Int64s
@@ -43,11 +46,11 @@ class TrueRanges:
     end_m: Floats
 
     def at(self, t_ns: Int64s, approach: Int64s) -> tuple[Floats, Floats]:
-        """Ranges to start and end, shape (M,) each; NaN where no true one is near in time.
+        """Return ranges to start and end, shape (M,) each; NaN without a true range near in time.
 
         Args:
             t_ns: Shape (M,).
-            approach: Shape (M,): which approach the ranges must belong to.
+            approach: Shape (M,): approach that the ranges must belong to.
         """
         start, end = np.full(len(t_ns), math.nan), np.full(len(t_ns), math.nan)
         for one in np.unique(approach[approach != NONE]).tolist():
@@ -60,7 +63,7 @@ class TrueRanges:
 
 
 def _between(when: Int64s, known: Int64s, values: Floats) -> Floats:
-    """Linear between neighbours, drawn on past the ends; NaN far from any."""
+    """Interpolate linearly, and extrapolate past the ends; NaN far in time from any value."""
     after = np.clip(np.searchsorted(known, when), 1, max(len(known) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(known) - 1)
@@ -77,9 +80,9 @@ class DriveTruth:
     """The truth of one drive.
 
     Attributes:
-        drive: What the drive is called in results.
-        truth: The file.
-        ranges: None where it reports neither ranges nor a track.
+        drive: Name of the drive in results.
+        truth: Contents of the truth file.
+        ranges: True ranges; None if the truth has neither ranges nor a track.
     """
 
     drive: str
@@ -87,14 +90,14 @@ class DriveTruth:
     ranges: TrueRanges | None
 
     def approach_at(self, t_ns: Int64s) -> Int64s:
-        """Ids of the approaches under way, shape (N,); ``NONE`` where none is."""
+        """Return the ids of the current approaches, shape (N,); ``NONE`` outside approaches."""
         found = np.full(len(t_ns), NONE, np.int64)
         for one in self.truth.approaches:
             found[(t_ns >= one.start_ns) & (t_ns < one.enter_ns)] = one.id
         return found
 
     def is_crossing(self, t_ns: Int64s) -> np.typing.NDArray[np.bool_]:
-        """Whether the car has just entered an intersection and no other approach has begun."""
+        """Return True where the car has just entered an intersection, before the next approach."""
         found = np.zeros(len(t_ns), np.bool_)
         for one in self.truth.approaches:
             found |= (t_ns >= one.enter_ns) & (t_ns < one.enter_ns + CROSSING_NS)
@@ -102,27 +105,27 @@ class DriveTruth:
         return found
 
     def is_annotated(self, t_ns: Int64s) -> np.typing.NDArray[np.bool_]:
-        """Whether the truth speaks of these times at all."""
+        """Return True where the truth covers a time."""
         return np.asarray((t_ns >= self.truth.start_ns) & (t_ns < self.truth.end_ns))
 
     def start_m(self, t_ns: Int64s) -> Floats:
-        """Ranges to the start of the intersection ahead, NaN where unknown."""
+        """Return ranges to the start of the intersection ahead; NaN where unknown."""
         if self.ranges is None:
             return np.full(len(t_ns), math.nan)
         return self.ranges.at(t_ns, self.approach_at(t_ns))[0]
 
     def approach(self, number: int) -> Approach:
-        """By its id."""
+        """Return the approach of an id."""
         return next(one for one in self.truth.approaches if one.id == number)
 
 
 def load(path: Path, drive: str) -> DriveTruth:
-    """Read a truth file and the ranges beside it.
+    """Read a truth file and its ranges.
 
-    Ranges come from its CSV file, or where none exists from the way along its track.
+    Ranges are read from its CSV file or, without one, computed along its track.
 
     Raises:
-        AnnotationError: A file does not fit.
+        AnnotationError: A file is not valid.
         LogError: The trajectory cannot be read.
     """
     truth = truth_file.load(path)
@@ -166,7 +169,7 @@ def _range_row(row: dict[str, str], known: set[int], where: str) -> tuple[int, i
         end_m = float(row["end_m"]) if row["end_m"] else math.nan
     except (TypeError, ValueError):
         raise AnnotationError(
-            f"{where}: expected whole t_ns and approach, numbers in metres"
+            f"{where}: expected integers for t_ns and approach, and numbers in metres"
         ) from None
     if not math.isfinite(start_m) or math.isinf(end_m) or not -(2**62) < t_ns < 2**62:
         raise AnnotationError(f"{where}: expected finite numbers")
@@ -176,7 +179,7 @@ def _range_row(row: dict[str, str], known: set[int], where: str) -> tuple[int, i
 
 
 def _ranges_along(path: Path, truth: Truth) -> TrueRanges:
-    """From the way still to go along the true track until the rear axle enters."""
+    """Return ranges as the remaining distance along the true track until the rear axle enters."""
     track = read_tum(path)
     steps = np.linalg.norm(np.diff(track.xyz_m[:, :2], axis=0), axis=1)
     gone = np.concatenate([[0.0], np.cumsum(steps)])
@@ -203,12 +206,12 @@ def _ranges_along(path: Path, truth: Truth) -> TrueRanges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CueTruthAt:
-    """What is true of one cue at M times.
+    """Truth about one cue at M times.
 
     Attributes:
-        present: Shape (M,), int8: 1 there, 0 not there, ``NONE`` unknown.
-        count: Shape (M,): how many things; ``NONE`` unknown.
-        visible: Shape (M,): fraction of the most visible one; NaN unknown.
+        present: Shape (M,), int8: 1 present, 0 absent, ``NONE`` unknown.
+        count: Shape (M,): number of objects; ``NONE`` unknown.
+        visible: Shape (M,): visible fraction of the most visible object; NaN unknown.
     """
 
     present: np.typing.NDArray[np.int8]
@@ -217,10 +220,10 @@ class CueTruthAt:
 
 
 def cue_at(spans: list[CueTruth], t_ns: Int64s) -> CueTruthAt:
-    """Look times up in the spans and moments of one cue.
+    """Return the truth at given times from the spans and moments of one cue.
 
-    Where two speak of one time, a thing that is there wins over one that is not: they are two
-    things.
+    Where two spans overlap, presence has precedence over absence, because they describe two
+    objects.
     """
     present = np.full(len(t_ns), NONE, np.int8)
     count = np.full(len(t_ns), NONE, np.int64)
@@ -241,7 +244,7 @@ def cue_at(spans: list[CueTruth], t_ns: Int64s) -> CueTruthAt:
 
 
 def has_feature(approach: Approach, feature: str) -> bool | None:
-    """Whether an approach's intersection has a feature; None for one that truth does not know."""
+    """Return whether an approach's intersection has a feature; None if the truth is unknown."""
     if feature == "intersection":
         return True
     there = {

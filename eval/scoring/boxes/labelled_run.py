@@ -1,9 +1,9 @@
-"""A run's detections beside labelled boxes of its pictures.
+"""Match a run's detections with labelled boxes of its pictures.
 
-Pictures of the labels find their frames by file name, where the log is a folder of images; else by
-log time (``t_ns`` of a COCO file, or a file name that is a time in nanoseconds), the nearest frame;
-else by the number that a file name ends in, the first frame being 0. What belongs to no frame is
-counted and left out, and frames without labels are not judged.
+Labelled pictures are matched to frames by file name if the log is a folder of images; else by log
+time (``t_ns`` of a COCO file, or a file name that is a time in nanoseconds), to the nearest frame;
+else by the frame number, from 0, at the end of the file name. Pictures without a frame are counted
+and left out, and frames without labels are not judged.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ from .matching import NOBODY, Boxes
 OTHER_LOG: Final = "images that are not in the run"
 OTHER_CLASS: Final = "boxes of classes that the detector does not report"
 FAR: Final = 0.4
-"""Fraction of the time between frames that a picture may be off the frame it belongs to."""
+"""Max time between a picture and its frame, as a fraction of the time between frames."""
 _FOUND: Final = ("log_t_ns", "detector", "label", "score", "x0", "y0", "x1", "y1", "range_m")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledRun:
-    """One detector's boxes and the labelled ones, over the labelled frames of a run.
+    """Boxes of one detector and labelled boxes, over the labelled frames of a run.
 
     Attributes:
-        run: Where it comes from.
-        detector: As it ran.
-        classes: That both know.
-        members: From class to the detector's labels that mean it.
+        run: Folder of the run.
+        detector: The detector, as it ran.
+        classes: Classes in common.
+        members: Labels of the detector, by class that they count as.
         truth: Labelled boxes.
         found: Detections.
-        t_ns: Shape (P,): times of the labelled frames in the run's tables, growing.
-        sizes_px: Width and height of each.
-        names: Of each in the labels.
-        rule: How labels found their frames, for people.
-        frames: All frames of the run.
-        left_out: What of the labels was left out or repaired, by reason.
-        not_judged: Detections of classes that the labels do not have, by label.
+        t_ns: Shape (P,): times of the labelled frames in the run's tables, increasing.
+        sizes_px: Width and height of each frame.
+        names: Name of each frame in the labels.
+        rule: Rule by which pictures were matched to frames, as text.
+        frames: Number of frames of the run.
+        left_out: Number of labels left out or repaired, by reason.
+        not_judged: Number of detections of classes that the labels lack, by label.
     """
 
     run: RunFolder
@@ -72,22 +72,22 @@ class LabelledRun:
 
     @property
     def is_whole(self) -> bool:
-        """Nothing was dropped when the run was made."""
+        """True if nothing was dropped when the run was made."""
         return all(one.is_whole for one in self.run.drive_manifest().account.reading)
 
     def blocks(self, block_s: float) -> Int64s:
-        """Shape (P,): pictures taken within so many seconds have the same number."""
+        """Return block numbers, shape (P,): equal for pictures within ``block_s`` seconds."""
         if block_s <= 0.0:
             return np.arange(len(self.t_ns))
         return np.asarray((self.t_ns - self.t_ns[0]) // int(block_s * 1e9), np.int64)
 
     def threshold(self, name: str) -> float:
-        """Of a class, as the detector says; the highest of its labels."""
+        """Return the detector's threshold of a class, the highest of its labels."""
         thresholds = self.detector.min_scores
         return max(thresholds.get(label, MIN_SCORE) for label in self.members[name])
 
     def part(self, is_chosen: np.typing.NDArray[np.bool_]) -> tuple[Boxes, Boxes]:
-        """Labels and detections of some pictures, shape (P,), under their numbers there."""
+        """Return labels and detections of the chosen pictures, shape (P,), renumbered."""
         return (
             self.truth.taken(is_chosen[self.truth.picture]),
             self.found.taken(is_chosen[self.found.picture]),
@@ -100,18 +100,20 @@ def labelled_run(
     detector: str | None = None,
     meanings: Mapping[str, str] | None = None,
 ) -> LabelledRun:
-    """Put labels beside a run's detections.
+    """Match labels to a run's detections.
 
     Args:
-        run: With the tables of the detect stage.
-        labels: Of its pictures.
-        detector: Its name; may be left out where only one finds objects.
-        meanings: From a class of the labels or of the detector to the class that it counts as;
-            empty for one that is neither to be found nor wrong.
+        run: Run with the tables of the detect stage.
+        labels: Labels of its pictures.
+        detector: Name of the detector; None if only one detects objects.
+        meanings: Class that a class of the labels or of the detector counts as; empty for a class
+            to ignore.
 
     Raises:
-        UsageError: No such detector, several and none named, or a class that nobody has.
-        SchemaError: No picture is in the run, no class is common, or pictures of another size.
+        UsageError: The detector does not exist, there are several and none is named, or neither
+            labels nor detections have a class.
+        SchemaError: No picture is in the run, there is no common class, or pictures have another
+            size.
         RunError: A table is missing or damaged.
     """
     detected = run.drive_manifest().detected
@@ -171,7 +173,7 @@ def _placed(
     t_ns: Int64s,
     left_out: Counter[str],
 ) -> tuple[dict[int, LabelPicture], str]:
-    """From a frame's log time to its labels, and how they were found."""
+    """Return labels by log time of the frame, and the rule by which they were matched."""
     found, rule = _times(run, detected, labels, t_ns)
     inside = set(t_ns.tolist())
     placed: dict[int, LabelPicture] = {}
@@ -181,14 +183,14 @@ def _placed(
         elif t in placed:
             raise SchemaError(
                 f"{labels.where}: {placed[t].name} and {picture.name} belong to one frame, {t} ns "
-                f"({rule}); give each its own name or time"
+                f"({rule}); use different names or times"
             )
         else:
             placed[t] = picture
     if not placed:
         raise SchemaError(
             f"{labels.where}: none of its {len(labels.pictures)} images is in {run.path} ({rule}); "
-            "give labels of the log that was replayed"
+            "use labels of the replayed log"
         )
     return placed, rule
 
@@ -196,7 +198,7 @@ def _placed(
 def _times(
     run: RunFolder, detected: DetectManifest, labels: BoxLabels, t_ns: Int64s
 ) -> tuple[list[int | None], str]:
-    """The log time of each labelled picture; None for one that belongs to no frame."""
+    """Return the log time of each labelled picture, None without a frame, and the rule."""
     log = detected.logs[detected.camera_log]
     if log.format == "images" and not run.without_images:
         with reopened(run, log) as opened:
@@ -218,8 +220,8 @@ def _times(
     part = detected.selection
     if part.start_ns is not None or part.end_ns is not None:
         raise UsageError(
-            f"{labels.where}: numbers its images, but {run.path} is a part of its log; "
-            "replay the whole log, or label by time"
+            f"{labels.where}: has numbered images, but {run.path} is part of a log; "
+            "replay the complete log, or label by time"
         )
     numbers = [re.search(r"([0-9]{1,9})$", _stem(one.name)) for one in labels.pictures]
     return [
@@ -229,7 +231,7 @@ def _times(
 
 
 def _stem(name: str) -> str:
-    """Without folders and ending."""
+    """Return a file name without folders and suffix."""
     return re.sub(r"\.[^.]*$", "", re.split(r"[/\\]", name)[-1])
 
 
@@ -242,9 +244,9 @@ def _time_of(picture: LabelPicture) -> int | None:
 def _classes(
     labels: BoxLabels, detector: str, reported: Sequence[str], meanings: dict[str, str]
 ) -> tuple[tuple[str, ...], dict[str, str | None], dict[str, str | None]]:
-    """Classes that both know; from a name in the labels, and in the detections, to a class.
+    """Return the common classes, and the class by name in the labels and in the detections.
 
-    Names that are missing there are not judged; None is neither to be found nor wrong.
+    Names that are missing in these are not judged; those of class None are ignored.
     """
     for name, means in meanings.items():
         if name not in (*labels.classes, *reported):
@@ -266,13 +268,13 @@ def _classes(
     if not both:
         raise SchemaError(
             f"{labels.where}: no class that {detector} reports; the labels have "
-            f"{_listed(labels.classes)}; say what they mean with --map LABEL=NAME"
+            f"{_listed(labels.classes)}; map them with --map LABEL=NAME"
         )
     return tuple(sorted(both)), of_labels, of_found
 
 
 def _labels_met(run: RunFolder, detector: str) -> tuple[str, ...]:
-    """Of a detector that does not say what it can report: what it did report."""
+    """Return the reported labels of a detector that does not declare its labels."""
     table = run.table("detections", ["detector", "label"])
     rows = zip(table["detector"].to_pylist(), table["label"].to_pylist(), strict=True)
     return tuple(sorted({label for name, label in rows if name == detector}))
@@ -293,7 +295,7 @@ def _truth(
     of_labels: Mapping[str, str | None],
     left_out: Counter[str],
 ) -> list[tuple[int, str | None, tuple[float, float, float, float], bool, float]]:
-    """Picture, class (None for a region of anything), box, whether it is ignored, and range."""
+    """Return picture, class (None for any class), box, whether it is ignored, and range."""
     rows = []
     for number, (picture, size) in enumerate(zip(pictures, sizes, strict=True)):
         if picture.size_px not in (None, size):
@@ -310,7 +312,7 @@ def _truth(
     if not rows:
         raise EmptyResultError(
             f"{pictures[0].name} and {len(pictures) - 1} other labelled images: no box of a class "
-            "that the detector reports; give labels with some"
+            "that the detector reports; use labels with some"
         )
     return rows
 
@@ -339,7 +341,10 @@ def _found(
     of_found: Mapping[str, str | None],
     numbers: Mapping[str, int],
 ) -> tuple[Boxes, dict[str, int]]:
-    """The detector's boxes in labelled frames, also those of objects that another found better."""
+    """Return the detector's boxes in labelled frames, and counts of unjudged ones by label.
+
+    Boxes of objects for which another detector had priority are included.
+    """
     place = {t: i for i, t in enumerate(times)}
     rows = []
     not_judged: Counter[str] = Counter()

@@ -1,10 +1,10 @@
-"""Which detection is which labelled box, by COCO's rules (as pycocotools has them).
+"""Match detections to labelled boxes by COCO's rules, as in pycocotools.
 
-Detections take turns, the highest score first; each takes the free label of its class that it
-overlaps most, if it overlaps enough (intersection over union). An ignored label may be taken any
-number of times, and the overlap with it is the fraction of the detection inside it; whoever takes
-one is neither right nor wrong. A part (a size, a range) ignores labels outside it and detections
-outside it that take nothing.
+In order of decreasing score, each detection is matched to the free label of its class with the
+largest overlap (intersection over union), if that is large enough. An ignored region can be matched
+any number of times, and the overlap with it is the fraction of the detection inside it. Detections
+matched to an ignored label are neither right nor wrong. A part (a size, a range) ignores labels
+outside it, and unmatched detections outside it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 Bools: TypeAlias = NDArray[np.bool_]
 OVERLAPS: Final = np.linspace(0.5, 0.95, 10)
-"""COCO's: average precision is their mean."""
+"""COCO's overlap thresholds; average precision is the mean over them."""
 MAX_DETECTIONS: Final = 100
-"""Of one class in one picture, as COCO has it; lower ones are left out."""
+"""Max detections of one class in one picture, as in COCO; those of lower scores are left out."""
 NOBODY: Final = -1
 
 
@@ -33,11 +33,11 @@ class Boxes:
 
     Attributes:
         picture: Shape (N,): number of the picture.
-        label: Shape (N,): number of the class; ``NOBODY`` for a region of anything.
+        label: Shape (N,): number of the class; ``NOBODY`` for a region of any class.
         boxes_px: Shape (N, 4): x0, y0, x1, y1.
-        scores: Shape (N,); of labels 1.
-        is_ignored: Shape (N,): of labels, neither to be found nor wrong when found.
-        range_m: Shape (N,): from the camera, NaN unknown.
+        scores: Shape (N,); 1 for labels.
+        is_ignored: Shape (N,): True for labels that are not judged.
+        range_m: Shape (N,): range from the camera, NaN unknown.
     """
 
     picture: Int64s
@@ -48,7 +48,7 @@ class Boxes:
     range_m: Floats
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up."""
+        """Check the shapes of the columns."""
         n = len(self.picture)
         if self.boxes_px.shape != (n, 4):
             raise ValueError(f"boxes_px: expected ({n}, 4), got {self.boxes_px.shape}")
@@ -61,11 +61,11 @@ class Boxes:
 
     @property
     def areas_px2(self) -> Floats:
-        """Shape (N,)."""
+        """Areas, shape (N,)."""
         return np.asarray(np.prod(self.boxes_px[:, 2:] - self.boxes_px[:, :2], axis=1))
 
     def taken(self, rows: Bools | Int64s) -> Boxes:
-        """Some of them."""
+        """Return the boxes of some rows."""
         return Boxes(
             self.picture[rows],
             self.label[rows],
@@ -78,12 +78,12 @@ class Boxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """Which boxes are judged: by area, and by range where that is limited.
+    """Selection of the boxes to judge, by area and by range.
 
     Attributes:
-        name: As printed.
-        areas_px2: From and up to, both included, as COCO has it.
-        ranges_m: From, and up to without it; None for any, known or not.
+        name: Name, as printed.
+        areas_px2: Interval of areas, both ends included, as in COCO.
+        ranges_m: Half-open interval of ranges; None for any range, known or not.
     """
 
     name: str
@@ -91,12 +91,12 @@ class Part:
     ranges_m: tuple[float, float] | None = None
 
     def holds(self, boxes: Boxes) -> Bools:
-        """Which boxes belong to it, shape (N,)."""
+        """Return True for boxes of this part, shape (N,)."""
         low, high = self.areas_px2
         areas = boxes.areas_px2
         inside = (areas >= low) & (areas <= high)
         if self.ranges_m is not None:
-            # A comparison with NaN is false: what has no range belongs to none.
+            # Comparisons with NaN are false, so boxes without a range are in no part.
             inside &= (boxes.range_m >= self.ranges_m[0]) & (boxes.range_m < self.ranges_m[1])
         return np.asarray(inside)
 
@@ -107,7 +107,7 @@ SIZES: Final = (
     Part("medium", (32.0**2, 96.0**2)),
     Part("large", (96.0**2, 1e10)),
 )
-"""COCO's, in pixels of the camera's picture."""
+"""COCO's sizes, in pixels of the camera's picture."""
 RANGES: Final = tuple(
     Part(f"{low:g} to {high:g} m" if np.isfinite(high) else f"over {low:g} m", ranges_m=(low, high))
     for low, high in ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, np.inf))
@@ -116,15 +116,15 @@ RANGES: Final = tuple(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """Detections of one class with what they took, best first over all pictures.
+    """Detections of one class and their matched labels, best first over all pictures.
 
     Attributes:
         picture: Shape (D,).
-        scores: Shape (D,), falling.
-        row: Shape (D,): of the detection.
-        took: Shape (T, D): row of the label taken at each overlap, or ``NOBODY``.
-        is_out: Shape (T, D): neither right nor wrong.
-        labels: Shape (L,): pictures of the labels to be found.
+        scores: Shape (D,), decreasing.
+        row: Shape (D,): row of the detection.
+        took: Shape (T, D): row of the label matched at each overlap, or ``NOBODY``.
+        is_out: Shape (T, D): True if neither right nor wrong.
+        labels: Shape (L,): pictures of the labels to detect.
     """
 
     picture: Int64s
@@ -151,11 +151,11 @@ def match(
     """Match one class in all pictures.
 
     Args:
-        truth: Labels; regions of anything count for every class.
+        truth: Labels; regions of any class apply to every class.
         found: Detections.
         label: Number of the class.
-        part: What is judged.
-        overlaps: Shape (T,): what makes a detection right.
+        part: Boxes to judge.
+        overlaps: Shape (T,): min overlaps of a correct detection.
     """
     mine = np.flatnonzero((truth.label == label) | (truth.label == NOBODY))
     their = np.flatnonzero(found.label == label)
@@ -168,7 +168,7 @@ def match(
     for picture, some in sorted(_by_picture(found.picture[their], their).items()):
         best = some[np.argsort(-found.scores[some], kind="mergesort")][:MAX_DETECTIONS]
         labels = by_picture.get(picture, np.empty(0, np.int64))
-        # COCO's order: labels to be found first.
+        # COCO's order: judged labels before ignored ones.
         labels = labels[np.argsort(is_out_of_part[labels], kind="mergesort")]
         taken, is_out = _match_one(
             found.boxes_px[best],
@@ -204,7 +204,7 @@ def _by_picture(pictures: Int64s, rows: Int64s) -> dict[int, Int64s]:
 def _match_one(
     boxes: Floats, truth: Floats, is_ignored: Bools, is_region: Bools, overlaps: Floats
 ) -> tuple[Int64s, Bools]:
-    """Of one picture: what each detection took, and which are neither right nor wrong."""
+    """Match the detections of one picture; return their labels, and which are not judged."""
     took = np.full((len(overlaps), len(boxes)), NOBODY, np.int64)
     is_out = np.zeros(took.shape, np.bool_)
     if not len(truth):
@@ -214,11 +214,11 @@ def _match_one(
         is_free = np.ones(len(truth), np.bool_)
         for i in range(len(boxes)):
             can = (is_free | is_region) & (fractions[i] >= wanted)
-            # What is to be found goes before what is ignored, whatever the overlap.
+            # Judged labels have precedence over ignored ones, whatever the overlap.
             for group in (can & ~is_ignored, can & is_ignored):
                 some = np.flatnonzero(group)
                 if len(some):
-                    # Of equal ones the last, as pycocotools has it.
+                    # The last of equal overlaps, as in pycocotools.
                     k = int(some[len(some) - 1 - int(np.argmax(fractions[i, some][::-1]))])
                     took[step, i], is_out[step, i], is_free[k] = k, is_ignored[k], False
                     break
@@ -226,7 +226,7 @@ def _match_one(
 
 
 def overlap_table(boxes: Floats, truth: Floats, is_region: Bools) -> Floats:
-    """Intersection over union, shape (D, L); with a region, over the detection's own area."""
+    """Return intersections over union, shape (D, L); for regions, over the detection's area."""
     low = np.maximum(boxes[:, None, :2], truth[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], truth[None, :, 2:])
     both = np.prod(np.maximum(high - low, 0.0), axis=2)

@@ -1,7 +1,7 @@
-"""Do scores mean what they say? Detections by score, and how many of them are right.
+"""Calibration of scores: the fraction of correct detections by score.
 
-The expected calibration error is the mean distance of both over ten bins of the score, weighted by
-detections (Naeini et al., AAAI 2015).
+The expected calibration error is the mean difference of score and fraction over ten bins of the
+score, weighted by detections (Naeini et al., AAAI 2015).
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ BINS: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class ScoreBin:
-    """Detections with about the same score.
+    """Detections in one bin of the score.
 
     Attributes:
-        low: Scores from here.
-        high: Up to here.
-        detections: How many.
-        right: Of these.
-        mean_score: NaN for none.
-        interval: Of the fraction right, as if detections were independent.
+        low: Lower edge.
+        high: Upper edge.
+        detections: Number of detections.
+        right: Number of correct detections.
+        mean_score: Mean score; NaN without detections.
+        interval: Interval of the correct fraction, which assumes independent detections.
     """
 
     low: float
@@ -42,19 +42,19 @@ class ScoreBin:
 
     @property
     def fraction(self) -> float:
-        """Right of detections; NaN for none."""
+        """Fraction of correct detections; NaN without detections."""
         return self.right / self.detections if self.detections else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class Reliability:
-    """Of one class.
+    """Calibration of one class.
 
     Attributes:
         label: The class.
-        bins: Ten of equal width.
+        bins: Ten bins of equal width.
         error: Expected calibration error; NaN without detections.
-        detections: How many it is made of.
+        detections: Number of detections.
     """
 
     label: str
@@ -64,10 +64,10 @@ class Reliability:
 
 
 def reliability(label: str, scores: NDArray[np.float64], is_right: Bools) -> Reliability:
-    """Bin detections by score.
+    """Return the calibration of one class.
 
     Args:
-        label: Their class.
+        label: The class.
         scores: Shape (N,), in [0, 1].
         is_right: Shape (N,).
     """

@@ -1,11 +1,11 @@
 """Average precision, precision and recall of detections, with intervals over pictures.
 
 Average precision is COCO's: the mean of the precision's upper envelope at 101 recalls, over the
-overlaps 0.5 to 0.95 (AP) or at 0.5 (AP50). Pictures that were taken close in time show the same
-objects, so whole blocks of them count as independent. The standard deviation of AP is that of the
-bootstrap over blocks (Davison and Hinkley, *Bootstrap Methods*, 1997), that of precision and recall
-the jackknife's. Intervals are those of ``crosscue.eval.scoring.intervals``: percentiles of a
-bootstrap cover too little for few blocks.
+overlaps 0.5 to 0.95 (AP) or at 0.5 (AP50). Pictures that are close in time show the same objects,
+so blocks of pictures are the independent units. The standard deviation of AP is estimated by the
+bootstrap over blocks (Davison and Hinkley, *Bootstrap Methods*, 1997), and those of precision and
+recall by the jackknife. Intervals are those of ``crosscue.eval.scoring.intervals``, because
+bootstrap percentiles are too narrow for few blocks.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SEED: Final = 0
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A number with its 95 % interval; NaN where it is not defined."""
+    """A number with its 95 % interval; NaN if undefined."""
 
     value: float
     low: float
@@ -47,19 +47,19 @@ _UNKNOWN: Final = Measured(math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True, slots=True)
 class PartScore:
-    """One class in one part.
+    """Scores of one class in one part.
 
     Attributes:
         label: The class; ``all`` for the mean over classes.
-        part: Size or range; ``all`` for everything.
-        labels: To be found.
-        right: Detections above the threshold on a label, at the overlap asked for.
-        wrong: Detections above the threshold on none.
-        threshold: Only detections with a higher score count in these two.
-        ap: Mean over overlaps 0.5 to 0.95.
-        ap50: At 0.5.
-        precision: Right of right and wrong.
-        recall: Right of labels.
+        part: Size or range; ``all`` for all boxes.
+        labels: Number of labels to detect.
+        right: Number of correct detections above the threshold, at the requested overlap.
+        wrong: Number of false detections above the threshold.
+        threshold: Threshold for ``right`` and ``wrong``.
+        ap: Average precision over overlaps 0.5 to 0.95.
+        ap50: Average precision at overlap 0.5.
+        precision: Precision above the threshold.
+        recall: Recall above the threshold.
     """
 
     label: str
@@ -83,16 +83,16 @@ def score_parts(
     overlap: float = 0.5,
     seed: int = SEED,
 ) -> list[PartScore]:
-    """Every class in every part that has something in it, and their mean.
+    """Score every class in every non-empty part, and the mean over classes.
 
     Args:
         truth: Labels.
         found: Detections.
-        classes: By the numbers in both.
-        thresholds: Of each class.
-        blocks: Shape (P,): pictures of one block are drawn together.
-        overlap: That makes a detection right, for precision and recall.
-        seed: Of the bootstrap.
+        classes: Names of the classes, by their number in both.
+        thresholds: Threshold by class.
+        blocks: Shape (P,): block of each picture; blocks are resampled as a unit.
+        overlap: Min overlap of a correct detection, for precision and recall.
+        seed: Seed of the bootstrap.
     """
     weights = drawn(blocks, seed)
     has_range = bool((np.isfinite(truth.range_m) & ~truth.is_ignored).any())
@@ -107,7 +107,7 @@ def score_parts(
             for name, row in zip(classes, rows, strict=True)
         ]
         if part in RANGES and not np.isfinite(found.range_m).any():
-            # Without a range of its own a false detection belongs nowhere.
+            # False detections have no range, so they are in no part.
             some = [replace(one, precision=_UNKNOWN) for one in some]
         known = [row for row in rows if row.labels]
         if known and part is ALL:
@@ -117,12 +117,12 @@ def score_parts(
 
 
 def drawn(blocks: NDArray[np.int64], seed: int, rounds: int = ROUNDS) -> NDArray[np.float64] | None:
-    """How often each picture is drawn, shape (R, P); None for fewer blocks than make an interval.
+    """Draw how often each picture is in a bootstrap sample, shape (R, P); None for few blocks.
 
     Args:
-        blocks: Shape (P,).
-        seed: The same draws the same.
-        rounds: How often.
+        blocks: Shape (P,): block of each picture.
+        seed: Seed of the random numbers.
+        rounds: Number R of bootstrap samples.
     """
     names, which = np.unique(blocks, return_inverse=True)
     n = len(names)
@@ -133,11 +133,11 @@ def drawn(blocks: NDArray[np.int64], seed: int, rounds: int = ROUNDS) -> NDArray
 
 
 def interval_of(value: float, rounds: NDArray[np.float64], blocks: int) -> Interval:
-    """The 95 % interval of a number from 0 to 1, by what it is in rounds of drawn blocks."""
+    """Return the 95 % interval of a number from 0 to 1, from its values in bootstrap samples."""
     kept = rounds[np.isfinite(rounds)]
     if blocks < MIN_CLUSTERS or not len(kept) or not math.isfinite(value):
         return UNKNOWN
-    # Blocks drawn from so few vary less than new ones would.
+    # Samples of few blocks vary less than new blocks would.
     sd = float(kept.std()) * math.sqrt(blocks / (blocks - 1))
     return Spread(value, sd, blocks, blocks).within_0_and_1(math.inf)
 
@@ -145,12 +145,15 @@ def interval_of(value: float, rounds: NDArray[np.float64], blocks: int) -> Inter
 def average_precision(
     matched: Matched, step: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """At one overlap: as it is, or for each of R rounds of pictures drawn, shape (R,).
+    """Return the average precision at one overlap, for all pictures or for R samples of them.
 
     Args:
-        matched: Of one class.
-        step: Number of the overlap.
-        weights: Shape (R, P): how often each picture counts.
+        matched: Matched detections of one class.
+        step: Index of the overlap.
+        weights: Shape (R, P): count of each picture in each sample; None counts each once.
+
+    Returns:
+        Shape (R,), or (1,) without ``weights``.
     """
     counted = weights if weights is not None else np.ones((1, _pictures(matched)))
     total = counted[:, matched.labels].sum(axis=1)
@@ -174,7 +177,7 @@ def _pictures(matched: Matched) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """One class in one part, with the values of every round of the bootstrap."""
+    """One class in one part, with the values of all bootstrap samples."""
 
     matched: Matched
     blocks: NDArray[np.int64]
@@ -219,7 +222,7 @@ class _Row:
 
 
 def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
-    """Of classes with labels, as COCO has it; counts are sums."""
+    """Return the mean over classes with labels, as in COCO; counts are summed."""
 
     def over(name: str) -> Measured:
         rounds = np.stack([getattr(row, f"{name}_rounds") for row in rows]).mean(axis=0)
@@ -245,7 +248,7 @@ def _measured(value: float, rounds: NDArray[np.float64], blocks: NDArray[np.int6
 
 
 def _less(of: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pictures of labels that were not found: of all, less of those that were."""
+    """Return the pictures of missed labels: those of all labels minus those of found ones."""
     n = int(max(of.max(initial=-1), right.max(initial=-1))) + 1
     left = np.bincount(of, minlength=n) - np.bincount(right, minlength=n)
     return np.repeat(np.arange(n), np.maximum(left, 0))
@@ -254,7 +257,7 @@ def _less(of: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
 def _fraction_of(
     right: NDArray[np.int64], wrong: NDArray[np.int64], blocks: NDArray[np.int64]
 ) -> Measured:
-    """From the pictures of what is right, and of what is not."""
+    """Return the fraction that is right, from the pictures of right and wrong items."""
     is_right = np.repeat([True, False], [len(right), len(wrong)])
     if not len(is_right):
         return _UNKNOWN

@@ -1,1 +1,1 @@
-"""Pose errors, consistency and the batch smoother."""
+"""Pose errors, their consistency, and the batch smoother."""

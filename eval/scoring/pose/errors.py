@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the true one, and whether it knew.
+"""Errors of an estimated trajectory, and their consistency with its covariance.
 
 Absolute (APE) and relative (RPE) pose errors as evo defines them (M. Grupp, *evo*; Sturm et al.,
 "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012), and the normalised estimation
@@ -28,15 +28,15 @@ Indices: TypeAlias = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How many true poses were scored, and why the others were not.
+    """Numbers of true poses that were scored or left out.
 
     Attributes:
-        truth_poses: All.
-        scored: With an estimate.
-        before_estimate: Earlier than the first estimate.
-        after_estimate: Later than the last one.
-        in_gap: Within the estimate's time, but none near enough.
-        ambiguous: At moments that come twice on the log's clock.
+        truth_poses: All true poses.
+        scored: True poses with an estimate.
+        before_estimate: True poses before the first estimate.
+        after_estimate: True poses after the last estimate.
+        in_gap: True poses in between, without an estimate near in time.
+        ambiguous: True poses at times that occur twice on the log's clock.
     """
 
     truth_poses: int
@@ -53,10 +53,10 @@ class Paired:
 
     Attributes:
         truth: N poses.
-        estimate: N poses; their times are the true ones.
+        estimate: N poses at the times of the true ones.
         cov_xyh: Shape (N, 6): the estimate's covariance of x, y, heading: xx, xy, xh, yy, yh, hh;
             or None.
-        coverage: What was left out.
+        coverage: Numbers of poses that were left out.
     """
 
     truth: Trajectory
@@ -67,7 +67,7 @@ class Paired:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Of N errors, under evo's names; all NaN for none."""
+    """Statistics of N errors, with evo's names; all NaN without errors."""
 
     rmse: float
     mean: float
@@ -83,7 +83,7 @@ class PoseErrors:
     """N errors.
 
     Attributes:
-        t_ns: Shape (N,): of the pose, or of the later one of a pair.
+        t_ns: Shape (N,): time of the pose, or of the later pose of a pair.
         translation_m: Shape (N,).
         rotation_rad: Shape (N,), in [0, pi].
     """
@@ -95,7 +95,7 @@ class PoseErrors:
 
 @dataclass(frozen=True, slots=True)
 class FilterAndSmoother:
-    """Errors of a filter of one number beside those of its smoother, at the same rows."""
+    """Errors of a one-dimensional filter and of its smoother, at the same rows."""
 
     rows: int
     filter_rmse_m: float
@@ -106,16 +106,16 @@ class FilterAndSmoother:
 
 @dataclass(frozen=True, slots=True)
 class NeesSummary:
-    """Are errors as large as claimed?
+    """Consistency of errors with their covariance.
 
     Attributes:
-        dimensions: Of the error; also what the mean should be.
-        rows: With a covariance that can be inverted.
-        rows_singular: Without; left out.
-        mean: NEES on average.
-        band_low: The mean is above this with 97.5 %, ...
-        band_high: ... and below this with 97.5 %, if the claims are right.
-        fraction_inside_95: Of rows inside their own 95 % region; should be 0.95.
+        dimensions: Dimension of the error, which is the expected mean.
+        rows: Number of rows with an invertible covariance.
+        rows_singular: Number of rows with a singular covariance, which are left out.
+        mean: Mean NEES.
+        band_low: Lower end of the central 95 % interval of the mean of a consistent filter.
+        band_high: Upper end of that interval.
+        fraction_inside_95: Fraction of rows inside their 95 % region; 0.95 is expected.
     """
 
     dimensions: int
@@ -128,14 +128,14 @@ class NeesSummary:
 
 
 class RpeDelta(NamedTuple):
-    """Over what a relative error is taken.
+    """Distance between the poses of a relative error.
 
     Attributes:
-        size: Frames (a whole number) or metres of the path.
-        unit: Which.
-        all_pairs: Every pair of that distance, not only one after the other.
-        tolerance: In metres with ``all_pairs``: how far off a pair may be, as a fraction of
-            ``size``.
+        size: Number of frames, or metres along the path.
+        unit: Unit of ``size``.
+        all_pairs: True for all pairs of that distance, False for consecutive pairs.
+        tolerance: Allowed deviation of a pair from ``size``, as a fraction of it, for metres with
+            ``all_pairs``.
     """
 
     size: float
@@ -151,14 +151,14 @@ def pair(
     cov_xyh: Floats | None = None,
     how: Pairing = "interpolated",
 ) -> Paired:
-    """For each true pose the estimate at its time.
+    """Return the estimates at the times of the true poses.
 
     Args:
         truth: True poses.
         estimate: Estimated poses.
-        max_difference_ns: A true pose is scored if an estimate is at least this near in time.
-        cov_xyh: Shape (M, 6): the estimate's covariance; comes along.
-        how: Interpolate between the estimates around, or take the nearest one.
+        max_difference_ns: Max time between a true pose and the nearest estimate.
+        cov_xyh: Shape (M, 6): covariance of the estimates, to be paired as well.
+        how: Interpolate between the estimates, or use the nearest one.
 
     Raises:
         ValueError: ``cov_xyh`` does not fit the estimate.
@@ -193,17 +193,17 @@ def pair(
 
 
 def align(truth: Trajectory, estimate: Trajectory, how: Alignment) -> Trajectory:
-    """The estimate moved as a whole onto the truth, without scaling.
+    """Align the estimate with the truth by a rigid motion, without scaling.
 
     Args:
         truth: N poses.
         estimate: N poses at the same times.
-        how: ``origin``: the first poses meet. ``yaw``: turned about the vertical and shifted, by
-            least squares of the positions. ``se3``: turned any way (Umeyama's solution, by Horn's
-            quaternions, JOSA A 4, 1987).
+        how: ``origin`` aligns the first poses. ``yaw`` rotates about the vertical and translates,
+            by least squares of the positions. ``se3`` also rotates about other axes (Umeyama's
+            solution, by Horn's quaternions, JOSA A 4, 1987).
 
     Raises:
-        UsageError: The positions do not fix the rotation.
+        UsageError: The positions do not determine the rotation.
     """
     if how == "none":
         return estimate
@@ -217,16 +217,16 @@ def align(truth: Trajectory, estimate: Trajectory, how: Alignment) -> Trajectory
 
 
 def ape(truth: Trajectory, estimate: Trajectory) -> PoseErrors:
-    """Error of each pose: evo's translation part and rotation angle."""
+    """Return the absolute error of each pose: evo's translation part and rotation angle."""
     turn = product(inverse(estimate.quat_wxyz), truth.quat_wxyz)
     distance = np.linalg.norm(estimate.xyz_m - truth.xyz_m, axis=1)
     return PoseErrors(truth.t_ns, distance, angle_rad(turn))
 
 
 def rpe(truth: Trajectory, estimate: Trajectory, delta: RpeDelta) -> PoseErrors:
-    """Error of the motion between poses a given way apart: evo's RPE.
+    """Return the error of the motion between poses at a given distance: evo's RPE.
 
-    Pairs are chosen along the estimate, as evo does.
+    Pairs are chosen along the estimate, as in evo.
 
     Raises:
         UsageError: No two poses are that far apart.
@@ -234,7 +234,7 @@ def rpe(truth: Trajectory, estimate: Trajectory, delta: RpeDelta) -> PoseErrors:
     first, second = rpe_pairs(estimate.xyz_m, delta)
     if len(first) == 0:
         raise UsageError(
-            f"no two of {len(estimate)} poses are {delta.size:g} {delta.unit} apart; take less"
+            f"no two of {len(estimate)} poses are {delta.size:g} {delta.unit} apart; use less"
         )
     true_step, true_turn = _steps(truth, first, second)
     step, turn = _steps(estimate, first, second)
@@ -243,10 +243,10 @@ def rpe(truth: Trajectory, estimate: Trajectory, delta: RpeDelta) -> PoseErrors:
 
 
 def rpe_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
-    """Indices of the earlier and the later pose of each pair.
+    """Return the indices of the earlier and the later pose of each pair.
 
     Raises:
-        ValueError: A size that is not positive, or a broken number of frames.
+        ValueError: The size is not positive, or is not an integer number of frames.
     """
     if not (math.isfinite(delta.size) and delta.size > 0.0):
         raise ValueError(f"size: expected > 0, got {delta.size}")
@@ -260,7 +260,7 @@ def rpe_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
 
 
 def statistics(errors: Floats) -> Statistics:
-    """Root mean square, mean, median, population s.d., extremes and sum of squares."""
+    """Return root mean square, mean, median, population s.d., extremes and sum of squares."""
     if len(errors) == 0:
         return Statistics(*[math.nan] * 7)
     squares = errors**2
@@ -276,7 +276,7 @@ def statistics(errors: Floats) -> Statistics:
 
 
 def nees(paired: Paired, dimensions: Literal[2, 3]) -> Floats:
-    """Squared error of (x, y) or (x, y, heading) in units of the claimed covariance.
+    """Return the squared error of (x, y) or (x, y, heading), normalised by the covariance.
 
     Returns:
         Shape (N,); NaN where the covariance cannot be inverted.
@@ -304,13 +304,13 @@ def nees(paired: Paired, dimensions: Literal[2, 3]) -> Floats:
 
 
 def summarise_nees(values: Floats, dimensions: int, independent: int = 1) -> NeesSummary:
-    """Mean NEES with its 95 % band.
+    """Return the mean NEES with its 95 % band.
 
     Args:
         values: Shape (N,); NaN rows are left out.
-        dimensions: Of the error.
-        independent: As how many independent errors the rows count. Rows of one drive hang together
-            and count as one; give the number of drives for rows from many.
+        dimensions: Dimension of the error.
+        independent: Number of independent errors among the rows. Rows of one drive are correlated
+            and count as one, so this is the number of drives.
     """
     kept = values[np.isfinite(values)]
     low, high = mean_band(dimensions, independent)
@@ -350,7 +350,7 @@ def _between(
 
 
 def _moved(estimate: Trajectory, turn: Floats, center: Floats, to: Floats) -> Trajectory:
-    """Turned about ``center``, which goes to ``to``."""
+    """Rotate a trajectory about ``center``, and move ``center`` to ``to``."""
     xyz = rotate(turn, estimate.xyz_m - center) + to
     return Trajectory(estimate.t_ns, xyz, product(turn, estimate.quat_wxyz))
 
@@ -359,12 +359,12 @@ def _yaw_turn(products: Floats) -> Floats:
     along = products[0, 0] + products[1, 1]
     across = products[0, 1] - products[1, 0]
     if math.hypot(along, across) <= 1e-12 * max(float(np.abs(products).max()), 1e-300):
-        raise UsageError("the positions do not fix the yaw (no motion?); align by origin or none")
+        raise UsageError("the positions do not determine yaw (no motion?); align by origin or none")
     return about_z(math.atan2(across, along))
 
 
 def _free_turn(products: Floats) -> Floats:
-    """Horn's quaternion: the eigenvector of the largest eigenvalue."""
+    """Return Horn's quaternion: the eigenvector of the largest eigenvalue."""
     cross = np.array(
         [
             products[1, 2] - products[2, 1],
@@ -380,13 +380,13 @@ def _free_turn(products: Floats) -> Floats:
     values, vectors = np.linalg.eigh(form)
     if values[3] - values[2] <= 1e-12 * max(values[3], 1e-300):
         raise UsageError(
-            "the positions do not fix the rotation (a straight drive?); align by yaw or origin"
+            "the positions do not determine rotation (straight drive?); align by yaw or origin"
         )
     return np.asarray(vectors[:, 3])
 
 
 def _steps(trajectory: Trajectory, first: Indices, second: Indices) -> tuple[Floats, Floats]:
-    """Each later pose as seen from the earlier one."""
+    """Return each later pose in the frame of the earlier one."""
     back = inverse(trajectory.quat_wxyz[first])
     step = rotate(back, trajectory.xyz_m[second] - trajectory.xyz_m[first])
     return step, product(back, trajectory.quat_wxyz[second])
@@ -411,7 +411,7 @@ def _metre_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
 def _nearest_pairs(
     travelled: Floats, first: Indices, size_m: float, tolerance_m: float
 ) -> tuple[Indices, Indices]:
-    """For each pose the later one whose way from it is nearest to ``size_m``."""
+    """Return, for each pose, the later pose whose distance from it is nearest to ``size_m``."""
     wanted = travelled[first] + size_m
     above = np.clip(np.searchsorted(travelled, wanted), first + 1, len(travelled) - 1)
     below = np.searchsorted(travelled, travelled[above - 1])

@@ -1,4 +1,4 @@
-"""What the pose filter was given, read back for the batch smoother."""
+"""Read the measurements of the pose filter, for the batch smoother."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Measured:
     Attributes:
         start: The first belief.
         increments: Odometry.
-        headings: Those that counted.
-        fixes: Positions of the camera by landmarks, and of the antenna by GNSS.
-        is_gnss: Shape (N,): which of the fixes are GNSS positions.
+        headings: Headings that the filter used.
+        fixes: Positions of the camera from landmarks, and of the antenna from GNSS.
+        is_gnss: Shape (N,): True for fixes from GNSS.
     """
 
     start: PoseBelief
@@ -37,7 +37,7 @@ class Measured:
 
 
 def read_measured(run: RunFolder) -> Measured:
-    """The measurements of a finished run.
+    """Read the measurements of a finished run.
 
     Raises:
         RunError: The table is missing (a run of an older crosscue), damaged, or empty.
@@ -58,7 +58,7 @@ def read_measured(run: RunFolder) -> Measured:
         odometry["start_ns"], gaps["start_ns"]
     )
     if len(start["t_ns"]) != 1 or not len(odometry["t_ns"]):
-        raise RunError(f"{run.path}: no odometry in it, so there is nothing to smooth")
+        raise RunError(f"{run.path}: contains no odometry, so there is nothing to smooth")
     cov = np.zeros((4, 4))
     cov[:2, :2] = _matrices(start)[0]
     cov[2, 2], cov[3, 3] = start["heading_var_rad2"][0], start["speed_var_m2ps2"][0]

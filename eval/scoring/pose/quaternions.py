@@ -1,6 +1,6 @@
-"""Unit quaternions in columns, w first (Hamilton): R(a b) = R(a) R(b).
+"""Operations on columns of unit quaternions, w first (Hamilton): R(a b) = R(a) R(b).
 
-scipy's ``Rotation`` computes; it is imported at the first use, which takes a quarter of a second.
+They use scipy's ``Rotation``, which is imported at the first use, because that takes 0.25 s.
 """
 
 from __future__ import annotations
@@ -17,42 +17,42 @@ Floats: TypeAlias = NDArray[np.float64]
 
 
 def rotation_of(quat: Floats) -> Rotation:
-    """Of unit quaternions, shape (4,) or (N, 4)."""
+    """Return the rotation of unit quaternions, shape (4,) or (N, 4)."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(quat, -1, axis=-1))
 
 
 def quat_of(rotation: Rotation) -> Floats:
-    """The quaternion with w not negative."""
+    """Return the quaternion of a rotation, with w not negative."""
     quat: Floats = np.roll(rotation.as_quat(canonical=True), 1, axis=-1)
     return quat
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Rotate by ``b``, then by ``a``; shapes (4,) or (N, 4)."""
+    """Return the rotation by ``b`` and then by ``a``; shapes (4,) or (N, 4)."""
     return quat_of(rotation_of(a) * rotation_of(b))
 
 
 def inverse(quat: Floats) -> Floats:
-    """The rotation back; shape (4,) or (N, 4)."""
+    """Return the inverse rotation; shape (4,) or (N, 4)."""
     return quat_of(rotation_of(quat).inv())
 
 
 def rotate(quat: Floats, xyz: Floats) -> Floats:
-    """Vectors turned; shapes (4,) or (N, 4), and (N, 3)."""
+    """Rotate vectors; shapes (4,) or (N, 4), and (N, 3)."""
     turned: Floats = rotation_of(quat).apply(xyz)
     return turned
 
 
 def angle_rad(quat: Floats) -> Floats:
-    """Angle of each rotation, in [0, pi]; shape () or (N,)."""
+    """Return the angle of each rotation, in [0, pi]; shape () or (N,)."""
     angle: Floats = rotation_of(quat).magnitude()
     return angle
 
 
 def between(a: Floats, b: Floats, fraction: Floats) -> Floats:
-    """Turn evenly from ``a`` to ``b`` (slerp), the shorter way.
+    """Interpolate between ``a`` and ``b`` along the shorter arc (slerp).
 
     Args:
         a: Shape (N, 4).
@@ -67,5 +67,5 @@ def between(a: Floats, b: Floats, fraction: Floats) -> Floats:
 
 
 def about_z(angle: float) -> Floats:
-    """Rotation about the vertical; shape (4,)."""
+    """Return the rotation about the vertical by an angle; shape (4,)."""
     return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])

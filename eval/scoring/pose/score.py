@@ -1,8 +1,8 @@
-"""A run's pose against truth: errors as evo defines them, and consistency.
+"""Errors of a run's pose as defined by evo, and their consistency.
 
-Both tracks are laid into the plane (z, roll and pitch are dropped: the filter has none) and
-compared at the point the truth speaks of. They are written out as TUM files, so that evo gives the
-same numbers from them.
+Both tracks are projected onto the plane, because the filter has no z, roll and pitch. They are
+compared at the body whose track the truth contains, and written as TUM files, for which evo yields
+the same numbers.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 LONGEST_GAP_SHOWN: Final = 0.25
-"""A longer gap is drawn as long as this part of the time without gaps."""
+"""Max length of a gap in charts, as a fraction of the time without gaps."""
 MAX_DIFFERENCE_NS: Final = 100_000_000
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
 PLANE: Final[tuple[Literal[2, 3], ...]] = (2, 3)
@@ -58,16 +58,16 @@ ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
 
 @dataclass(frozen=True, slots=True)
 class PlaneMounting:
-    """A body's pose seen from the rear axle, in the ground plane: where poses are compared.
+    """Mounting, in the ground plane, of the body at which poses are compared.
 
     Attributes:
-        body: What the true track is of.
-        x_m: Ahead.
-        y_m: To the left.
-        yaw_rad: Counter-clockwise.
-        source: Who states that.
-        assumed: Which of the three the truth file does not know, so that the vehicle file's value
-            stands for them, or zero.
+        body: Body whose track the truth contains.
+        x_m: Distance ahead of the rear axle.
+        y_m: Distance to the left.
+        yaw_rad: Yaw, counter-clockwise.
+        source: Origin of these values.
+        assumed: Those of the three that the truth file lacks, so that the vehicle file's value is
+            used, or zero.
     """
 
     body: str
@@ -80,7 +80,7 @@ class PlaneMounting:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Translation in metres and rotation in degrees, under evo's names."""
+    """Translation errors in metres and rotation errors in degrees, with evo's names."""
 
     translation_m: Statistics
     rotation_deg: Statistics
@@ -88,19 +88,20 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class PoseScore:
-    """Everything that is measured of a pose track.
+    """Scores of a pose track.
 
     Attributes:
-        coverage: How much truth was scored, and why the rest was not.
-        distance_m: Way of the true track that was scored.
-        ape: By alignment.
-        rpe: By distance, such as ``100 m``; distances longer than the drive are left out.
-        nees_xy: Are position errors as large as claimed? NaN where ``why_no_nees``.
-        nees_xyh: The same with heading.
+        coverage: Numbers of true poses that were scored or left out.
+        distance_m: Length of the scored true track.
+        ape: Absolute pose errors by alignment.
+        rpe: Relative pose errors by distance, such as ``100 m``, up to the length of the drive.
+        nees_xy: Consistency of position errors; NaN with ``why_no_nees``.
+        nees_xyh: Consistency of position and heading errors; NaN with ``why_no_nees``.
         major_axis_m: Full major axis of the 2-sigma ellipse at the end.
-        lost_at_m: Distance travelled when it first exceeded the vehicle file's limit, or None.
-        compared_at: The body whose pose is compared, and where it sits.
-        why_no_nees: Why there is no NEES at all; empty where there is.
+        lost_at_m: Distance travelled when that axis first exceeded the vehicle file's limit, or
+            None.
+        compared_at: The body whose pose is compared, and its mounting.
+        why_no_nees: Reason why there is no NEES; empty if there is.
     """
 
     coverage: Coverage
@@ -117,20 +118,20 @@ class PoseScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredPoses:
-    """Estimated and true poses at the same times, in the map frame: what figures are drawn of.
+    """Estimated and true poses at the same times, in the map frame, for figures.
 
     Attributes:
         t_ns: Shape (N,), int64.
         estimate_m: Shape (N, 2).
         truth_m: Shape (N, 2).
-        heading_error_rad: Shape (N,): estimate less truth, wrapped.
-        cov: Shape (N, 3, 3): of x, y, heading as the filter claims it.
+        heading_error_rad: Shape (N,): estimate minus truth, wrapped.
+        cov: Shape (N, 3, 3): the filter's covariance of x, y, heading.
         nees: Shape (N,): normalised estimation error squared of x, y, heading.
         travelled_m: Shape (N,).
         major_axis_m: Shape (N,).
         lost_above_m: The vehicle file's limit of the major axis.
-        title: Which run, against which truth.
-        gaps: Of the drive.
+        title: Names of the run and of the truth.
+        gaps: Gaps of the drive.
     """
 
     t_ns: Int64s
@@ -151,7 +152,7 @@ class ScoredPoses:
         return self.shown_s(self.t_ns)
 
     def shown_s(self, t_ns: Int64s) -> Floats:
-        """Where moments are on a chart: seconds, long gaps shortened so that the rest is seen."""
+        """Return positions on a chart's time axis: seconds, with long gaps shortened."""
         first_ns, last_ns = int(self.t_ns[0]), int(self.t_ns[-1])
         inside = [one for one in self.gaps if first_ns <= one.middle_ns <= last_ns]
         lengths = [one.end_ns - one.start_ns for one in inside]
@@ -168,10 +169,10 @@ class ScoredPoses:
 
 
 def load_truth(path: Path) -> tuple[Truth, Trajectory]:
-    """A truth file and its trajectory.
+    """Read a truth file and its trajectory.
 
     Raises:
-        SchemaError: The file does not fit, or speaks of no pose.
+        SchemaError: The file is not valid, or has no pose.
         LogError: The trajectory cannot be read.
     """
     truth = truth_file.load(path)
@@ -182,7 +183,7 @@ def load_truth(path: Path) -> tuple[Truth, Trajectory]:
 
 
 def truth_track(path: Path, run: RunFolder) -> TruthTrack:
-    """The true track inside a run's time, for drawing.
+    """Return the true track within a run's time, for drawing.
 
     Raises:
         SchemaError: The truth does not fit the run.
@@ -198,7 +199,7 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
 def measure(
     run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)
 ) -> tuple[PoseScore, ScoredPoses]:
-    """Score a run's pose; both tracks go into its ``score`` folder.
+    """Score a run's pose; write both tracks to its ``score`` folder.
 
     Args:
         run: A finished run.
@@ -217,7 +218,7 @@ def measure(
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
     paired = _paired(flat, estimate, cov, comes_twice(run.drive_manifest().timeline, flat.t_ns))
     why_no_nees = NO_NEES if OWN_FRAME in run.drive_manifest().notices else ""
-    # Errors across two frames say nothing of a covariance that holds in one of them.
+    # Errors between two frames cannot be compared with a covariance in one of them.
     nees_xy, values = (
         np.full(len(paired.truth), np.nan) if why_no_nees else nees(paired, dimensions)
         for dimensions in PLANE
@@ -245,7 +246,7 @@ def measure(
 def _paired(
     truth: Trajectory, estimate: Trajectory, cov: Floats, twice: NDArray[np.bool_]
 ) -> Paired:
-    """Pairs, but for true poses at moments that come twice: those are counted."""
+    """Return pairs, without true poses at times that occur twice, which are counted."""
     if not twice.any():
         return pair(truth, estimate, MAX_DIFFERENCE_NS, cov)
     once = ~twice
@@ -258,10 +259,10 @@ def _paired(
 
 
 def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]:
-    """Which true poses are within the run's time.
+    """Return True for true poses within the run's time.
 
     Raises:
-        SchemaError: None does, so the truth belongs to another log or clock.
+        SchemaError: No pose is, so the truth belongs to another log or clock.
     """
     if not table.num_rows:
         raise SchemaError(f"{path}: the run has no pose to score; see its notices")
@@ -276,14 +277,14 @@ def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]
 
 
 def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajectory, Floats]:
-    """The estimated track at the point the truth speaks of, with its covariance."""
+    """Return the estimated track of the truth's body, with its covariance."""
     xyh = np.column_stack([table[name].to_numpy() for name in ("x_m", "y_m", "heading_rad")])
     cov = np.column_stack([table[f"cov_{name}"].to_numpy() for name in COVARIANCES])
     return at_truths_point(table["t_ns"].to_numpy(), xyh, cov, vehicle, truth)
 
 
 def mounting_of(truth: Truth, vehicle: Vehicle) -> PlaneMounting:
-    """What the truth file says of it; for what it does not know, what the vehicle file does."""
+    """Return the mounting from the truth file, or from the vehicle file where it is missing."""
     camera, gnss, body = vehicle.camera, vehicle.gnss, truth.pose_point
     of_vehicle = {
         "camera": (camera.x_m, camera.y_m, camera.yaw_rad),
@@ -305,16 +306,16 @@ def mounting_of(truth: Truth, vehicle: Vehicle) -> PlaneMounting:
 def at_truths_point(
     t_ns: Int64s, xyh: Floats, cov_xyh: Floats, vehicle: Vehicle, truth: Truth
 ) -> tuple[Trajectory, Floats]:
-    """Rear-axle poses, shape (N, 3), as poses of the body whose track the truth is.
+    """Transform rear-axle poses, shape (N, 3), to the body whose track the truth contains.
 
-    The covariance that returns is that of estimate less truth: the truth's own is added.
+    The returned covariance is that of estimate minus truth, so it includes the truth's.
 
     Args:
         t_ns: Shape (N,).
         xyh: Shape (N, 3).
         cov_xyh: Shape (N, 6): covariance of x, y, heading: xx, xy, xh, yy, yh, hh.
-        vehicle: Says where the camera and the antenna sit, unless the truth does.
-        truth: Names the body whose track it is.
+        vehicle: Has the mounting of camera and antenna, unless the truth has it.
+        truth: Names the body whose track it contains.
     """
     x, y, heading = xyh.T
     east_m, north_m = map_shift(vehicle, truth)
@@ -326,7 +327,7 @@ def at_truths_point(
         cos, sin = np.cos(heading), np.sin(heading)
         dx, dy = ahead * cos - left * sin, ahead * sin + left * cos
         x, y = x + dx, y + dy
-        # The point swings sideways with the heading's error: the covariance swings along.
+        # A heading error moves the point sideways, which the covariance must include.
         xx, xy, xh, yy, yh, hh = cov.T
         cov = np.column_stack(
             [
@@ -346,7 +347,7 @@ def at_truths_point(
 
 
 def map_shift(vehicle: Vehicle, truth: Truth) -> tuple[float, float]:
-    """Where the zero of a run's map is in the truth's; both point east, at most some km apart."""
+    """Return the origin of a run's map in the truth's map; both axes point east, a few km apart."""
     of_run, of_truth = vehicle.start.map_origin, truth.origin
     if of_run is None or of_truth is None:
         return 0.0, 0.0

@@ -1,4 +1,4 @@
-"""How far the filter is from the best that its measurements allow: a batch smoother beside it."""
+"""Compare the filter with a batch smoother, the best estimate that its measurements allow."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ UPPER: Final = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
 @dataclass(frozen=True, slots=True)
 class SmootherScore:
-    """Filter and smoother at the same true poses, a second or more apart, not aligned.
+    """Errors of filter and smoother at the same true poses, 1 s or more apart, not aligned.
 
     Attributes:
-        poses: How many.
-        filter_rmse_m: Of position.
-        smoother_rmse_m: Of position.
-        filter_heading_rmse_rad: Of heading.
-        smoother_heading_rmse_rad: Of heading.
-        filter_end_m: Error of the last position: there both know the same.
-        smoother_end_m: The same of the smoother.
-        filter_nees_xyh: Are the filter's errors as large as claimed?
-        smoother_nees_xyh: Are the smoother's?
-        range: The range filter beside its smoother, by reference.
+        poses: Number of poses.
+        filter_rmse_m: Position error of the filter.
+        smoother_rmse_m: Position error of the smoother.
+        filter_heading_rmse_rad: Heading error of the filter.
+        smoother_heading_rmse_rad: Heading error of the smoother.
+        filter_end_m: Error of the filter's last position, where both use the same measurements.
+        smoother_end_m: Error of the smoother's last position.
+        filter_nees_xyh: Consistency of the filter.
+        smoother_nees_xyh: Consistency of the smoother.
+        range: Errors of the range filter and of its smoother, by reference.
     """
 
     poses: int
@@ -59,9 +59,9 @@ def score_smoother(
     """Smooth a run's measurements, compare with truth, write ``score/smoother.json``.
 
     Args:
-        run: Finished.
-        truth_path: Of its drive.
-        ranges: The range filter beside its smoother.
+        run: A finished run.
+        truth_path: Truth of its drive.
+        ranges: Errors of the range filter and of its smoother, by reference.
 
     Raises:
         UsageError: GTSAM is not installed.
@@ -76,7 +76,7 @@ def score_smoother(
     wanted = _thinned(track.t_ns[(track.t_ns > first_ns) & (track.t_ns <= last_ns)])
     if not len(wanted):
         raise SchemaError(
-            f"{truth_path}: its times are not those of the run; it belongs to another log"
+            f"{truth_path}: no time in common with the run; it belongs to another log"
         )
     camera, antenna = (np.array([at.x_m, at.y_m]) for at in (vehicle.camera, vehicle.gnss))
     lever_m = np.where(measured.is_gnss[:, None], antenna, camera)
@@ -107,7 +107,7 @@ def score_smoother(
 
 
 def _thinned(t_ns: Int64s) -> Int64s:
-    """Times at least ``MIN_STEP_NS`` apart, the last one among them."""
+    """Return times at least ``MIN_STEP_NS`` apart, including the last one."""
     kept: list[int] = []
     for t in reversed(t_ns.tolist()):
         if not kept or kept[-1] - t >= MIN_STEP_NS:
@@ -150,7 +150,7 @@ def _rms(values: Floats) -> float:
 
 
 def smoother_text(result: SmootherScore) -> str:
-    """For a person, below the score's summary."""
+    """Return the comparison as text, for the end of the score's summary."""
     ratio = result.filter_rmse_m / result.smoother_rmse_m if result.smoother_rmse_m else math.inf
     degrees = 180.0 / math.pi
     return "\n".join(

@@ -1,4 +1,4 @@
-"""What of the truth a recording shows."""
+"""The true track that a recording shows."""
 
 from __future__ import annotations
 

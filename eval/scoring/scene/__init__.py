@@ -1,1 +1,1 @@
-"""What is scored of a scene: cues, ranges, beliefs, and the approaches as a whole."""
+"""Scores of cues, ranges, beliefs and approaches."""

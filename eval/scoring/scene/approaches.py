@@ -1,17 +1,17 @@
-"""Approaches against truth: how far away an intersection is detected, and what was invented.
+"""Scores of approaches: distances at which intersections are detected, and false detections.
 
-As in the source (its Fig. 29): an intersection is detected once p(intersection) exceeds 0.9 *and*
-its range is available; the full intersection once every *present* feature exceeds 0.9. Where
-neither sign nor light stands, nothing speaks of 'intersection' itself (its Fig. 27 as we read it),
-yet the source detects such a one in full 6 times of 10: for the full intersection, presence that a
-road or a car to the side has established counts as well. Distances are true ones, of the rear axle
-to the start of the intersection. Beyond the source: detections must be confirmed (``detection``),
-else they are spurious; absent features that exceeded 0.9, and approaches of the run where none
-exists.
+As in the dissertation (Fig. 29), an intersection is detected when p(intersection) exceeds 0.9 *and*
+its range is available, and the full intersection when every *present* feature exceeds 0.9. Without
+a sign or a light, no cue supports 'intersection' itself (Fig. 27, as interpreted here), yet the
+dissertation reports full detection of such an intersection in 6 of 10 runs. Therefore, for the full
+intersection, presence established by a road or a car to the side also counts. Distances are true
+ranges from the rear axle to the start of the intersection. In addition to the dissertation,
+detections that are not confirmed (``detection``) are spurious; absent features that exceed 0.9 and
+approaches where there is no intersection are counted.
 
-A run's approach belongs to the true one that it shares most time with, from its start until the car
-enters; each belongs to one at most. A further one during the same true approach is a split, one
-that meets no true approach is extra.
+An approach of the run is matched to the true approach with the longest common time, from its start
+until the car enters, one to one. A further approach of the run during the same true approach is a
+split; one without a true approach is extra.
 """
 
 from __future__ import annotations
@@ -37,32 +37,33 @@ NOT_LOOKED_FOR: Final = "not looked for"
 BRIEF: Final = f"for fewer than {CONFIRM_FRAMES} frames"
 WRONG_RANGE: Final = "range outside its 95 % interval"
 NEAR_M: Final = 8.0
-"""The source's full detections all came at least this far away."""
+"""All full detections of the dissertation were at least this far away."""
 
 
 @dataclass(frozen=True, slots=True)
 class ApproachResult:
-    """One true approach.
+    """Result of one true approach.
 
     Attributes:
-        drive: Name.
-        approach: Its id in the truth.
-        intersection: Its name.
-        control: As in the truth.
-        conditions: Tags.
-        present: Features that are there.
-        run_approach: The run's number for it, or None where the run has none.
-        overlap_s: Time shared with that one.
-        splits: Further approaches of the run during it.
-        steps: Of the belief, from start to entering.
-        detected_m: True distance when it was detected; None if never, NaN if without true range.
-        full_m: The same for the full intersection.
-        why_not_detected: Empty when it was.
-        why_not_full: Empty when it was.
-        spurious_m: True distance of a detection as published that was not confirmed; None without.
-        why_spurious: Empty without.
+        drive: Name of the drive.
+        approach: Id of the approach in the truth.
+        intersection: Name of the intersection.
+        control: Control of the intersection, as in the truth.
+        conditions: Tags of conditions.
+        present: Features that are present.
+        run_approach: Number of the matched approach in the run; None without one.
+        overlap_s: Time in common with that approach.
+        splits: Number of further approaches of the run during it.
+        steps: Number of steps of the belief, from start to entering.
+        detected_m: True distance at detection; None if never, NaN if the true range is unknown.
+        full_m: True distance at full detection; None if never, NaN if the true range is unknown.
+        why_not_detected: Reason if it was not detected; else empty.
+        why_not_full: Reason if it was not fully detected; else empty.
+        spurious_m: True distance of a detection as published that was not confirmed; None without
+            one.
+        why_spurious: Reason why that detection was not confirmed; empty without one.
         features_m: True distance at which each present feature first exceeded the threshold.
-        false_features: Absent features that exceeded it at any time before entering.
+        false_features: Absent features that exceeded the threshold at any time before entering.
         at_entering: Last probabilities before entering.
     """
 
@@ -89,7 +90,7 @@ class ApproachResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """Probability against true distance over one approach; arrays of shape (N,)."""
+    """Probabilities and true distance over one approach; arrays of shape (N,)."""
 
     drive: str
     approach: int
@@ -104,12 +105,12 @@ class ApproachesJudged:
     """All approaches of one drive.
 
     Attributes:
-        results: One for each true approach.
-        curves: One for each that the run has.
-        extra: Approaches of the run that meet no true one, within the truth's time.
-        extra_detected: Those of them that said 'intersection' above the threshold.
-        not_judged: Approaches of the run that are outside the truth's time.
-        rows_not_numbers: Belief rows with a missing probability; left out.
+        results: Result of each true approach.
+        curves: Curve of each matched approach.
+        extra: Number of approaches of the run without a true one, within the truth's time.
+        extra_detected: Number of those with p(intersection) above the threshold.
+        not_judged: Number of approaches of the run outside the truth's time.
+        rows_not_numbers: Number of belief rows left out because a probability is missing.
     """
 
     results: tuple[ApproachResult, ...]
@@ -122,7 +123,7 @@ class ApproachesJudged:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Approaches to one intersection, or under one condition."""
+    """Scores of the approaches to one intersection, or under one condition."""
 
     approaches: int
     detected: int
@@ -133,29 +134,29 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class ApproachScore:
-    """All approaches of all drives.
+    """Scores of all approaches of all drives.
 
     Attributes:
-        approaches: In the truth.
-        matched: Of which the run knows.
-        without_range: Of which no true distance is known; they have no part in means.
-        detected: Fraction of approaches.
-        full: Fraction of approaches.
+        approaches: Number of approaches in the truth.
+        matched: Number of those with a matched approach in the run.
+        without_range: Number of those without a known true distance, which means leave out.
+        detected: Fraction of approaches that were detected.
+        full: Fraction of approaches that were fully detected.
         full_from_8_m: Fraction of approaches with full detection at least 8 m away.
-        detected_m: Mean over those detected, its interval over approaches.
-        full_m: The same for full detection.
-        spurious: Approaches with a detection as published that was not confirmed.
-        false_features: Fraction of approaches with at least one absent feature above the threshold.
-        false_by_feature: How often each was.
-        extra: Approaches of runs where none exists.
-        extra_detected: Those that said 'intersection' above the threshold.
-        splits: True approaches that the run broke in pieces.
-        not_judged: Approaches of runs outside the truth's time.
-        rows_not_numbers: Belief rows left out for a missing probability.
-        failures: Reason to number of approaches, for detection and full detection.
-        by_intersection: Means as in Fig. 29.
-        by_condition: The same by tag.
-        results: Every single one.
+        detected_m: Mean distance at detection, with its interval over approaches.
+        full_m: Mean distance at full detection, with its interval over approaches.
+        spurious: Number of approaches with a detection as published that was not confirmed.
+        false_features: Fraction of approaches with an absent feature above the threshold.
+        false_by_feature: Number of those approaches by feature.
+        extra: Number of approaches of runs where there is no true approach.
+        extra_detected: Number of those with p(intersection) above the threshold.
+        splits: Number of true approaches that the run split.
+        not_judged: Number of approaches of runs outside the truth's time.
+        rows_not_numbers: Number of belief rows left out because a probability is missing.
+        failures: Number of approaches by reason, for detection and full detection.
+        by_intersection: Means by intersection, as in Fig. 29.
+        by_condition: Means by condition tag.
+        results: Results of all approaches.
     """
 
     approaches: int
@@ -187,7 +188,7 @@ def judge_approaches(
     definition: Definition = "confirmed",
     not_looked_for: Collection[str] = (),
 ) -> ApproachesJudged | None:
-    """Lay the run's approaches beside the true ones; None for a run or truth without any.
+    """Compare the run's approaches with the true ones; None if either has none.
 
     Args:
         tables: The run's tables.
@@ -195,7 +196,7 @@ def judge_approaches(
         threshold: Probability above which a feature is believed.
         definition: When a detection counts.
         not_looked_for: Features that no cue of the run could show. Where one of them is missing,
-            the reason says so.
+            the reason states it.
     """
     belief = tables.belief
     if belief is None or not truth.truth.approaches:
@@ -229,7 +230,7 @@ def judge_approaches(
 
 
 def run_spans(belief: BeliefRows) -> dict[int, tuple[int, int]]:
-    """First and last time of each approach of a run."""
+    """Return the first and last time of each approach of a run."""
     return {
         number: (int(belief.t_ns[mine].min()), int(belief.t_ns[mine].max()))
         for number in np.unique(belief.approach[belief.approach != NONE]).tolist()
@@ -238,14 +239,14 @@ def run_spans(belief: BeliefRows) -> dict[int, tuple[int, int]]:
 
 
 def overlap_ns(approach: Approach, span: tuple[int, int]) -> int:
-    """Time shared, at least 1 where both have one moment in common; not positive for none."""
+    """Return the common time, at least 1 for a single common moment; not positive for none."""
     return min(approach.enter_ns, span[1] + 1) - max(approach.start_ns, span[0])
 
 
 def associate(
     approaches: Sequence[Approach], spans: Mapping[int, tuple[int, int]]
 ) -> dict[int, int]:
-    """From a true approach's id to the run's number, largest shared time first."""
+    """Return the run's approach number by id of the true approach, longest common time first."""
     ranked = sorted(
         (-overlap_ns(one, span), one.id, number)
         for one in approaches
@@ -260,7 +261,7 @@ def associate(
 
 
 def _steps_of(belief: BeliefRows, number: int | None, approach: Approach) -> BeliefRows:
-    """Rows of the run's approach from the true one's start until the car enters, by time."""
+    """Return the run's rows from the true approach's start until the car enters, by time."""
     mine = belief.approach == number if number is not None else np.zeros(len(belief.t_ns), bool)
     mine = mine & (belief.t_ns >= approach.start_ns) & (belief.t_ns < approach.enter_ns)
     order = np.flatnonzero(mine)
@@ -293,7 +294,7 @@ def _result(
         is_right = _is_range_right(tables, truth, number, steps.t_ns)
     published = likely & ranged
     detected = held(published & is_right, rule.frames)
-    # Where a sign or light stands, it is what must be found; elsewhere nothing could speak of it.
+    # Established presence counts only without a sign or a light, which must otherwise be found.
     sure = likely | steps.established if one.control == "none" else likely
     known = above | {"intersection": sure}
     full = np.ones(len(steps.t_ns), np.bool_)
@@ -341,7 +342,7 @@ def _result(
 def _is_range_right(
     tables: RunTables, truth: DriveTruth, number: int | None, t_ns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """As ``is_range_right``; where the truth has no ranges, nothing can be wrong."""
+    """Return ``is_range_right``, or all True if the truth has no ranges."""
     rows = tables.ranges
     if rows is None or number is None or truth.ranges is None:
         return np.ones(len(t_ns), np.bool_)
@@ -373,14 +374,14 @@ def _range_reason(
 
 
 def _spurious_reason(published: NDArray[np.bool_], is_right: NDArray[np.bool_]) -> str:
-    """Why the first detection as published is not confirmed; empty without any."""
+    """Return why the first detection as published is not confirmed; empty without one."""
     if not published.any():
         return ""
     return BRIEF if is_right[np.argmax(published)] else WRONG_RANGE
 
 
 def _full_reason(missing: Sequence[str], steps: BeliefRows, not_looked_for: Collection[str]) -> str:
-    """List the features that are missing: improbable, without evidence, or not looked for."""
+    """Return the missing features: improbable, without evidence, or not searched."""
     if not missing:
         return "never all at once"
     unsought = [name for name in missing if name in not_looked_for]
@@ -397,7 +398,7 @@ def _never_changes(steps: BeliefRows, name: str) -> bool:
 
 
 def _has_range(tables: RunTables, number: int | None, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """From the first range of an approach on its filter always has one."""
+    """Return True from the first range of an approach on, because its filter then keeps one."""
     if tables.ranges is None or number is None:
         return np.zeros(len(t_ns), np.bool_)
     mine = (tables.ranges.approach == number) & np.isfinite(tables.ranges.range_m)
@@ -419,7 +420,7 @@ def _extras(
     truth: DriveTruth,
     threshold: float,
 ) -> tuple[int, int, int]:
-    """Extra approaches, those of them that were detected, those outside the truth's time."""
+    """Return numbers of extra approaches, of detected ones, and of those outside the truth."""
     extra = detected = outside = 0
     for number, (first, last) in spans.items():
         meets = any(overlap_ns(one, (first, last)) > 0 for one in truth.truth.approaches)
@@ -435,7 +436,7 @@ def _extras(
 
 
 def score_approaches(judged: Sequence[ApproachesJudged]) -> ApproachScore | None:
-    """All drives together; None where none was judged."""
+    """Return the scores of all drives together; None if no drive was judged."""
     results = tuple(result for one in judged for result in one.results)
     if not results:
         return None
@@ -483,7 +484,7 @@ def _is_unknown(distance_m: float | None) -> bool:
 
 
 def _fraction(values: Sequence[bool]) -> Proportion:
-    # Approaches are the clusters, so Wilson's interval is the one that counts.
+    # Approaches are the clusters, so Wilson's interval applies.
     return fraction(np.array(values, np.bool_), np.arange(len(values)))
 
 

@@ -1,8 +1,8 @@
-"""Are probabilities worth their names? Brier score, log score, reliability.
+"""Scores of beliefs as probabilities: Brier score, log score, reliability.
 
-A step is judged by what is true at its time: within a true approach by that intersection's
-features; where the truth says that no intersection is ahead, by the absence of one. Steps of one
-approach hang together, so intervals count approaches.
+A step within a true approach is compared with the features of that intersection. Where the truth
+states that there is no intersection ahead, the step is compared with its absence. Steps of one
+approach are correlated, so intervals are over approaches.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
 CLIP: Final = 1e-6
-"""Log scores are taken of probabilities clipped to this and one minus this."""
+"""Probabilities are clipped to this and one minus this for the log score."""
 BINS: Final = 10
 SILENT: Final = "frames ahead of an intersection without any belief"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeliefJudged:
-    """One feature at N steps of one drive.
+    """Belief in one feature at N steps of one drive, compared with truth.
 
     Attributes:
-        drive: Name.
-        feature: Name.
+        drive: Name of the drive.
+        feature: Name of the feature.
         t_ns: Shape (N,).
-        approach: Shape (N,): ids of true approaches; ``NONE`` where no intersection is ahead.
+        approach: Shape (N,): ids of true approaches; ``NONE`` without an intersection ahead.
         probability: Shape (N,).
-        is_there: Shape (N,).
-        left_out: From reason to steps that could not be judged, and to frames without a step.
+        is_there: Shape (N,): True where the feature is present.
+        left_out: Numbers by reason of steps that could not be judged, and of frames without a step.
     """
 
     drive: str
@@ -54,11 +54,11 @@ class ReliabilityBin:
     """Steps with a probability from ``low`` to ``high``.
 
     Attributes:
-        low: Border.
-        high: Border.
-        steps: How many.
-        mean_probability: What was said, on average.
-        there: How often it was so.
+        low: Lower edge.
+        high: Upper edge.
+        steps: Number of steps.
+        mean_probability: Mean probability of the steps.
+        there: Fraction of steps with the feature.
     """
 
     low: float
@@ -70,19 +70,19 @@ class ReliabilityBin:
 
 @dataclass(frozen=True, slots=True)
 class BeliefScore:
-    """One feature over all drives.
+    """Scores of one feature over all drives.
 
     Attributes:
-        steps: All, and frames ahead of a true intersection for which none exists.
-        scored: With truth.
-        left_out: Reason to steps.
-        fraction_there: How often the feature is there.
-        brier: Mean squared error; smaller is better, 0.25 for always saying one half.
-        brier_of_base_rate: What always saying ``fraction_there`` would get.
-        log_score: Mean of -ln(probability of what is so), clipped; 0.693 for one half.
+        steps: Number of steps, and of frames ahead of a true intersection without a step.
+        scored: Number of steps with truth.
+        left_out: Number of steps by reason.
+        fraction_there: Fraction of steps with the feature.
+        brier: Mean squared error; smaller is better, 0.25 for a constant probability of 0.5.
+        brier_of_base_rate: Brier score of the constant probability ``fraction_there``.
+        log_score: Mean of -ln(probability of the true state), clipped; 0.693 for 0.5.
         clip: Probabilities are clipped to this and one minus this for the log score.
-        clipped: Steps to which that happened.
-        reliability: Bins.
+        clipped: Number of clipped steps.
+        reliability: Bins of the reliability diagram.
     """
 
     steps: int
@@ -99,15 +99,15 @@ class BeliefScore:
 
 @dataclass(frozen=True, slots=True)
 class BeliefDifference:
-    """Second minus first belief over the steps that both have; negative is an improvement.
+    """Scores of the second minus the first belief, over common steps; negative is better.
 
     Attributes:
-        steps: In both.
-        only_first: Steps left out because the second lacks them.
-        only_second: The other way round.
-        brier: Mean difference.
-        log_score: Mean difference.
-        verdict: Who has the better log score, where the interval excludes zero.
+        steps: Number of common steps.
+        only_first: Number of steps that only the first belief has.
+        only_second: Number of steps that only the second belief has.
+        brier: Mean difference of Brier scores.
+        log_score: Mean difference of log scores.
+        verdict: The belief with the better log score, if the interval excludes zero.
     """
 
     steps: int
@@ -119,7 +119,7 @@ class BeliefDifference:
 
 
 def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
-    """Lay the run's probabilities beside the truth; nothing without belief or true approaches."""
+    """Compare the run's probabilities with the truth; empty without belief or true approaches."""
     if tables.belief is None or not truth.truth.approaches:
         return []
     belief = tables.belief
@@ -169,7 +169,7 @@ def _labels(feature: str, at: NDArray[np.int64], truth: DriveTruth) -> NDArray[n
 
 
 def score_belief(judged: Sequence[BeliefJudged]) -> dict[str, BeliefScore]:
-    """Scores by feature, over all drives together."""
+    """Return scores by feature, over all drives together."""
     return {
         feature: _score([one for one in judged if one.feature == feature])
         for feature in dict.fromkeys(one.feature for one in judged)
@@ -205,14 +205,14 @@ def _pooled(
 
 
 def brier(probability: NDArray[np.float64], is_there: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Squared errors, shape (N,); G. W. Brier, Monthly Weather Review 78, 1950, for one event."""
+    """Return squared errors, (N,) (G. W. Brier, Monthly Weather Review 78, 1950, for one event)."""
     return np.asarray((probability - is_there) ** 2)
 
 
 def log_score(
     probability: NDArray[np.float64], is_there: NDArray[np.bool_], clip: float = CLIP
 ) -> NDArray[np.float64]:
-    """Minus the logarithm of the probability given to what is so, clipped, shape (N,)."""
+    """Return minus the logarithm of the clipped probability of the true state, shape (N,)."""
     said = np.where(is_there, probability, 1.0 - probability)
     return np.asarray(-np.log(np.clip(said, clip, 1.0 - clip)))
 
@@ -223,7 +223,7 @@ def reliability(
     clusters: NDArray[np.int64],
     bins: int = BINS,
 ) -> tuple[ReliabilityBin, ...]:
-    """Equally wide bins of probability; empty ones are left out."""
+    """Return bins of equal width in probability, without empty bins."""
     place = np.minimum((probability * bins).astype(np.int64), bins - 1)
     return tuple(
         ReliabilityBin(
@@ -242,7 +242,7 @@ def reliability(
 def compare_belief(
     first: Sequence[BeliefJudged], second: Sequence[BeliefJudged]
 ) -> dict[str, BeliefDifference]:
-    """Two fusions over the same drives, feature by feature, on the steps that both have."""
+    """Compare two beliefs over the same drives by feature, on common steps."""
     names = [
         name
         for name in dict.fromkeys(one.feature for one in first)

@@ -1,17 +1,17 @@
-"""Cues against truth: precision, recall, how much was scored and why not the rest.
+"""Precision, recall and coverage of cues, compared with truth.
 
-A positive is right in one of two readings, and both are given:
+Positives are judged by two criteria, and both are reported:
 
-* *object*: the thing that the cue names is truly there in this frame (a parked car facing left, a
+* *object*: the object that the cue names is present in this frame (a parked car facing left, a
   stop sign, road to the left);
-* *feature*: what the cue stands for is true of the intersection ahead (a left turn, an
-  intersection); for one-way and do-not-enter signs that the way they rule out is closed.
+* *feature*: the feature that the cue supports is true of the intersection ahead (a left turn, an
+  intersection); for one-way and do-not-enter signs, the direction that they exclude is closed.
 
-The source compares detections of signs, lights and cars with the things themselves, and what roads,
-lanes and vehicles past the intersection say with the direction of travel (chapter 3). The table of
-cues says which; where the truth knows only the other reading, that one leads, and the result says
-so. A truth that speaks of things leaves those open that it does not name: there the intersection's
-features say nothing of them.
+The dissertation compares signs, lights and cars with objects, and roads, lanes and vehicles past
+the intersection with the direction of travel (chapter 3). The table of cues records the criterion
+of each cue. If the truth supports only the other criterion, that one leads, and the result reports
+it. If the truth has some objects, those that it does not name are unknown: the features of the
+intersection then are no evidence about them.
 """
 
 from __future__ import annotations
@@ -39,29 +39,30 @@ Reading = Scoring
 
 
 SEEN: Final = 0.5
-"""A thing of which less than this fraction can be seen does not count in ``recall_seen``."""
+"""Min visible fraction of an object that counts in ``recall_seen``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CueFrames:
-    """One cue in N frames of one drive.
+    """One cue in N frames of one drive, compared with truth.
 
     Attributes:
-        drive: Name.
-        cue: Name.
-        t_ns: Shape (N,): frames in which it was looked for.
-        count: Shape (N,): how many were found.
+        drive: Name of the drive.
+        cue: Name of the cue.
+        t_ns: Shape (N,): times of the frames in which the cue was searched.
+        count: Shape (N,): number found.
         approach: Shape (N,): ids of true approaches; ``NONE`` outside.
         distance_m: Shape (N,): true range to the start of the intersection; NaN unknown.
-        is_object: Shape (N,), int8: whether the thing is there; ``NONE`` unknown.
-        is_feature: Shape (N,), int8: whether what it stands for is true; ``NONE`` unknown.
-        true_count: Shape (N,): ``NONE`` unknown.
-        visible: Shape (N,): NaN unknown.
-        frames: How many frames the run has.
-        moments_unmatched: True moments (not spans) at which the run has no frame.
-        left_out: By reading, from reason to frames that could not be scored.
-        conditions: From approach id to its tags.
-        is_open: The truth speaks of other things, and leaves this one open.
+        is_object: Shape (N,), int8: 1 if the object is present, 0 if not; ``NONE`` unknown.
+        is_feature: Shape (N,), int8: 1 if the supported feature is true, 0 if not; ``NONE``
+            unknown.
+        true_count: Shape (N,): true number of objects; ``NONE`` unknown.
+        visible: Shape (N,): visible fraction; NaN unknown.
+        frames: Number of frames of the run.
+        moments_unmatched: Number of true moments (not spans) without a frame of the run.
+        left_out: Numbers of unscored frames by criterion and reason.
+        conditions: Tags by id of the approach.
+        is_open: True if the truth has other objects but not this one.
     """
 
     drive: str
@@ -83,19 +84,19 @@ class CueFrames:
 
 @dataclass(frozen=True, slots=True)
 class CueMetrics:
-    """One cue in one reading, coverage first.
+    """Metrics of one cue by one criterion.
 
     Attributes:
-        frames: In the run.
-        with_truth: Of which the truth speaks.
-        scored: Of which it speaks and in which the cue was looked for.
-        left_out: From reason to frames; with ``scored`` they sum up to ``frames``.
-        positives: Scored frames in which the cue was found.
-        precision: Of the positives, those that were right.
-        recall: Of frames with the thing, those in which it was found; only objects have one.
-        recall_seen: The same for things at least half of which can be seen.
+        frames: Number of frames in the run.
+        with_truth: Number of frames with truth.
+        scored: Number of frames with truth in which the cue was searched.
+        left_out: Number of frames by reason; with ``scored``, they sum up to ``frames``.
+        positives: Number of scored frames in which the cue was found.
+        precision: Fraction of correct positives.
+        recall: Fraction of frames with the object in which it was found; None for features.
+        recall_seen: Recall of objects that are at least half visible.
         by_distance: Precision and recall by true range to the intersection, such as ``10-20``.
-        by_condition: The same by condition tag of the approach.
+        by_condition: Precision and recall by condition tag of the approach.
     """
 
     frames: int
@@ -112,7 +113,7 @@ class CueMetrics:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Of the frames in a distance bin or with a condition tag."""
+    """Metrics of the frames in a distance bin or with a condition tag."""
 
     frames: int
     precision: Proportion
@@ -121,14 +122,14 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Things:
-    """Single things over all frames whose true count is known.
+    """Counts of objects over all frames whose true count is known.
 
     Attributes:
-        frames: With a true count.
-        reported: Things found.
-        true: Things there.
-        matched: In each frame the smaller of both numbers, summed: no more can be right.
-        same_count: Frames in which both numbers agree.
+        frames: Number of frames with a true count.
+        reported: Number of objects found.
+        true: Number of true objects.
+        matched: Sum over frames of the smaller number, an upper bound of correct objects.
+        same_count: Number of frames in which both numbers agree.
     """
 
     frames: int
@@ -140,18 +141,18 @@ class Things:
 
 @dataclass(frozen=True, slots=True)
 class CueScore:
-    """All about one cue.
+    """Scores of one cue.
 
     Attributes:
-        reading: Which reading leads.
-        is_sources_reading: Whether that is the source's definition.
-        precision: Of the leading reading.
-        recall: Of the object reading, or None without such truth.
-        positives: Of the leading reading.
-        scored: Of the leading reading.
-        readings: Both.
-        things: Single things.
-        moments_unmatched: True moments at which no run has a frame.
+        reading: The leading criterion, ``object`` or ``feature``.
+        is_sources_reading: True if that is the dissertation's criterion.
+        precision: Precision by the leading criterion.
+        recall: Recall of objects; None without truth of objects.
+        positives: Number of positives by the leading criterion.
+        scored: Number of scored frames by the leading criterion.
+        readings: Metrics by both criteria.
+        things: Counts of objects.
+        moments_unmatched: Number of true moments without a frame of any run.
     """
 
     reading: Reading
@@ -166,7 +167,7 @@ class CueScore:
 
 
 def match_cues(tables: RunTables, truth: DriveTruth) -> list[CueFrames]:
-    """Lay the run's cues beside the truth; nothing for a run without cues."""
+    """Compare the run's cues with the truth; empty for a run without cues."""
     if tables.cues is None:
         return []
     rows = tables.cues
@@ -231,7 +232,7 @@ def _judge(
 
 
 def _largest(rows: CueRows, cue: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Times in which a cue was looked for, each once, and the largest count given for each."""
+    """Return the distinct times at which a cue was searched, and the largest count of each."""
     mine = rows.cue == cue
     times, which = np.unique(rows.t_ns[mine], return_inverse=True)
     count = np.zeros(len(times), np.int64)
@@ -240,11 +241,11 @@ def _largest(rows: CueRows, cue: str) -> tuple[NDArray[np.int64], NDArray[np.int
 
 
 def _feature_at(cue: str, t_ns: NDArray[np.int64], truth: DriveTruth) -> NDArray[np.int8]:
-    """Whether what the cue stands for is true, at each time; ``NONE`` unknown."""
+    """Return whether the feature of the cue is true at each time; ``NONE`` unknown."""
     found = np.full(len(t_ns), NONE, np.int8)
     if cue not in CUES or not truth.truth.approaches:
         return found
-    # Where the truth speaks and no intersection is ahead, a cue of one stands for nothing.
+    # Where the truth has no intersection ahead, the feature of any cue is false.
     found[truth.is_annotated(t_ns)] = 0
     found[truth.is_crossing(t_ns)] = NONE
     at = truth.approach_at(t_ns)
@@ -261,7 +262,7 @@ def _reasons(
     is_annotated: NDArray[np.bool_],
     is_crossing: NDArray[np.bool_],
 ) -> dict[str, int]:
-    """Why frames are not scored; each has one reason, the first that holds."""
+    """Return numbers of unscored frames by reason; the first reason that applies counts."""
     reasons = {
         "outside the truth's time": ~is_annotated & ~has_truth,
         "in the intersection": is_crossing & ~has_truth,
@@ -272,7 +273,7 @@ def _reasons(
 
 
 def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
-    """Rows in which the cue was found and, in the reading that leads its score, is not so."""
+    """Return the rows in which the cue was found but is false by the leading criterion."""
     readings = [cue.is_object, cue.is_feature]
     if cue.cue in CUES and CUES[cue.cue].scored_as == "feature":
         readings.reverse()
@@ -282,7 +283,7 @@ def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
 
 @dataclass(slots=True)
 class _Pooled:
-    """One cue's rows of all drives, with a number for each approach of each drive."""
+    """Rows of one cue of all drives, with a cluster number for each approach of each drive."""
 
     rows: Sequence[CueFrames]
     cluster: NDArray[np.int64] = field(init=False)
@@ -293,7 +294,7 @@ class _Pooled:
         )
 
     def tag_masks(self) -> dict[str, NDArray[np.bool_]]:
-        """Which rows belong to approaches with each tag; ``no tag`` for the others."""
+        """Return masks of the rows by tag of the approach; ``no tag`` for the others."""
         tags: dict[int, tuple[str, ...]] = {}
         first = 0
         for one in self.rows:
@@ -318,11 +319,11 @@ class _Pooled:
 def score_cues(
     judged: Sequence[CueFrames], bins_m: Sequence[float] = BINS_M
 ) -> dict[str, CueScore]:
-    """Scores by cue, over all drives together.
+    """Return scores by cue, over all drives together.
 
     Args:
-        judged: From ``match_cues``, of any number of drives.
-        bins_m: Borders of distance bins.
+        judged: Results of ``match_cues``, of any number of drives.
+        bins_m: Edges of distance bins.
     """
     by_cue: dict[str, list[CueFrames]] = {}
     for one in judged:
@@ -360,7 +361,7 @@ def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> Cu
     known = truth != NONE
     cut = _Cut(truth, pooled.ints("count") > 0, pooled.cluster, reading == "object")
     visible = pooled.floats("visible")
-    # A thing whose visibility nobody noted counts as seen.
+    # An object of unknown visibility counts as seen.
     seen = known & ((truth == 0) | np.isnan(visible) | (visible >= SEEN))
     return CueMetrics(
         frames=frames,
@@ -386,7 +387,7 @@ def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> Cu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cut:
-    """Shares over any subset of frames."""
+    """Precision and recall over any subset of frames."""
 
     truth: NDArray[np.int64]
     is_found: NDArray[np.bool_]

@@ -1,9 +1,10 @@
-"""When a feature counts as detected: as published, at once; or confirmed by frames and by range.
+"""Definitions of a detection: as published, or confirmed by several frames and by range.
 
 As published, the first frame above the threshold counts, with any range. A spike of one frame, or a
-range 100 m off, then is a detection, and a far one. Confirmed means: above the threshold for three
-frames, the range within its own 95 % interval of the true one in each of them. The distance is that
-at the first of these frames, so both definitions agree where nothing is spurious.
+range that is wrong by 100 m, is then also a detection, at a long distance. A confirmed detection is
+above the threshold for three frames, and its range is within its 95 % interval of the true range in
+each of them. The distance is that of the first of these frames, so both definitions agree if there
+is no spurious detection.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """What a detection must show.
+    """Conditions of a detection.
 
     Attributes:
-        frames: For how many frames in a row it must hold.
-        checks_range: The range must be right, where the truth has one.
-        full_after_detection: An approach that is detected is in full from there on at the earliest.
+        frames: Min number of consecutive frames.
+        checks_range: True if the range must be correct, where the truth has one.
+        full_after_detection: True if full detection is possible only after detection.
     """
 
     frames: int
@@ -44,7 +45,7 @@ RULES: Final[dict[Definition, Rule]] = {
 
 
 def held(holds: Flags, frames: int) -> Flags:
-    """Where a stretch of at least ``frames`` begins or goes on for as long, shape (N,)."""
+    """Return the frames from which on ``holds`` is True for ``frames`` frames, shape (N,)."""
     found = holds.copy()
     for ahead in range(1, frames):
         found[:-ahead] &= holds[ahead:]
@@ -58,14 +59,14 @@ def is_range_right(
     number: int,
     t_ns: NDArray[np.int64],
 ) -> Flags:
-    """Is the latest range at each time within its 95 % interval of the true one?
+    """Return whether the latest range at each time is within its 95 % interval of the true range.
 
-    Of the ranges to start and end one is enough.
+    Either the range to the start or the range to the end is sufficient.
 
     Args:
-        rows: The run's.
-        true_m: To start and end, at the times of ``rows``; NaN where unknown.
-        number: The run's approach.
+        rows: Ranges of the run.
+        true_m: True ranges to start and end, at the times of ``rows``; NaN where unknown.
+        number: Number of the run's approach.
         t_ns: Shape (N,).
     """
     right = np.zeros(len(t_ns), np.bool_)

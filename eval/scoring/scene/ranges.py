@@ -1,4 +1,4 @@
-"""The range filter against truth: errors, and whether its variances are honest (NEES)."""
+"""Errors of the range filter, and consistency of its variances (NEES)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.fusion.intersection_range import RangeBelief, predict, smooth
 
 RESTART_NIS: Final = 25.0
-"""A range that jumps by more standard deviations than the root of this has restarted."""
+"""Squared jump of a range, in units of its variance, above which the filter has restarted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,15 +34,15 @@ class RangeJudged:
     """One reference (``start`` or ``end``) at N steps of one drive; arrays of shape (N,).
 
     Attributes:
-        drive: Name.
-        reference: Name.
+        drive: Name of the drive.
+        reference: ``start`` or ``end``.
         t_ns: Times.
         approach: Ids of true approaches.
         true_m: True ranges.
         error_m: Estimate minus truth.
-        var_m2: What the filter claims.
-        left_out: From reason to rows that could not be judged.
-        controls: From approach id to what controls the intersection, as truth says.
+        var_m2: Variance of the filter.
+        left_out: Number of rows that could not be judged, by reason.
+        controls: Control of the intersection in the truth, by id of the approach.
     """
 
     drive: str
@@ -58,7 +58,7 @@ class RangeJudged:
 
 @dataclass(frozen=True, slots=True)
 class RangeBin:
-    """Rows in one bin of true range, or at one kind of intersection."""
+    """Errors of the rows in one bin of true range, or at one kind of intersection."""
 
     rows: int
     bias_m: float
@@ -69,19 +69,19 @@ class RangeBin:
 
 @dataclass(frozen=True, slots=True)
 class RangeScore:
-    """One reference over all drives.
+    """Scores of one reference over all drives.
 
     Attributes:
-        rows: All.
-        scored: With a true range.
-        left_out: Reason to rows.
-        bias_m: Mean error, its interval over approaches.
+        rows: Number of rows.
+        scored: Number of rows with a true range.
+        left_out: Number of rows by reason.
+        bias_m: Mean error, with its interval over approaches.
         rmse_m: Root mean square error.
-        p95_m: 95 % of errors are smaller.
-        nees: With its band as if each approach were one independent error.
-        by_distance: By true range.
-        by_control: By what controls the intersection. A range to the end where no light stands
-            was measured by something that is not one.
+        p95_m: 95th percentile of absolute errors.
+        nees: NEES; its band counts each approach as one independent error.
+        by_distance: Errors by true range.
+        by_control: Errors by control of the intersection. A range to the end without a light comes
+            from a false detection of a light.
     """
 
     rows: int
@@ -105,20 +105,20 @@ class _Way(Protocol):
 
 
 class Odometer(Protocol):
-    """Says how far the car went since it was last asked; times never fall."""
+    """Odometer that is read at non-decreasing times."""
 
     def until(self, t_ns: int, /) -> _Way:
-        """The way since the last call."""
+        """Return the distance travelled since the last call."""
         ...
 
 
 def sds_off(judged: RangeJudged) -> NDArray[np.float64]:
-    """Errors in standard deviations, without sign, shape (N,)."""
+    """Return absolute errors in standard deviations, shape (N,)."""
     return np.asarray(np.abs(judged.error_m) / np.sqrt(judged.var_m2), np.float64)
 
 
 def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
-    """Lay the run's ranges beside the true ones; nothing without either."""
+    """Compare the run's ranges with the true ones; empty if either has none."""
     if tables.ranges is None or truth.ranges is None:
         return []
     rows = tables.ranges
@@ -159,7 +159,7 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
 def score_smoothed(
     tables: RunTables, truth: DriveTruth, odometer: Odometer
 ) -> dict[str, FilterAndSmoother]:
-    """The filter's ranges, by reference, beside what all of a drive's measurements say."""
+    """Return errors of the range filter and of its smoother, by reference."""
     if tables.ranges is None:
         return {}
     whole = replace(tables, ranges=smoothed_rows(tables.ranges, odometer))
@@ -174,10 +174,9 @@ def score_smoothed(
 
 
 def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
-    """The same rows, each with the measurements behind it weighed in as well.
+    """Return the rows smoothed backwards with the later measurements.
 
-    Where odometry is missing or a range restarted, the measurements behind say nothing of those
-    before.
+    Smoothing stops where odometry is missing or a range restarted.
     """
     times = np.unique(rows.t_ns)
     ways = [odometer.until(t_ns) for t_ns in times.tolist()]
@@ -214,7 +213,7 @@ def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
 
 
 def _goes_on(predicted: RangeBelief, after: RangeBelief) -> bool:
-    """Whether a measurement may have led from one to the other: it adds knowledge, and no leap."""
+    """Return whether ``after`` may be an update of ``predicted``: less variance, and no jump."""
     gained_m2 = predicted.var_m2 - after.var_m2
     leap_m = after.mean_m - predicted.mean_m
     return gained_m2 > -1e-6 and leap_m**2 <= RESTART_NIS * max(gained_m2, 0.0) + 1e-6
@@ -223,7 +222,7 @@ def _goes_on(predicted: RangeBelief, after: RangeBelief) -> bool:
 def score_range(
     judged: Sequence[RangeJudged], bins_m: Sequence[float] = BINS_M
 ) -> dict[str, RangeScore]:
-    """Scores by reference, over all drives together."""
+    """Return scores by reference, over all drives together."""
     return {
         reference: _score([one for one in judged if one.reference == reference], bins_m)
         for reference in dict.fromkeys(one.reference for one in judged)

@@ -379,7 +379,7 @@ def straight() -> Trajectory:
 @pytest.mark.parametrize(
     ("call", "error", "says"),
     [
-        (lambda: align(standing(), standing(), "yaw"), UsageError, "do not fix the yaw"),
+        (lambda: align(standing(), standing(), "yaw"), UsageError, "do not determine yaw"),
         (lambda: align(straight(), straight(), "se3"), UsageError, "align by yaw or origin"),
         (lambda: rpe(straight(), straight(), RpeDelta(9, "frames")), UsageError, "no two of 5"),
         (lambda: rpe(straight(), straight(), RpeDelta(9.0, "metres")), UsageError, "9 metres"),

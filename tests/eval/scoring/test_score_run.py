@@ -131,7 +131,7 @@ def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("gate", "said"),
     [
-        ('metric = "cues.stop_sing.precision"\nmin = 0.9', "close ones: cues.stop_sign.precision"),
+        ('metric = "cues.stop_sing.precision"\nmin = 0.9', "did you mean cues.stop_sign.precision"),
         ('metric = "cues.stop_sign.precision"', "expected min, max or both"),
         ('metric = "cues.stop_sign.precision"\nmin = nan', "finite number"),
         ('metric = "a"\nmin = 2\nmax = 1', "min 2 is above max 1"),
@@ -169,7 +169,7 @@ def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
     ]
     assert len(messages) == 3
     assert "no track" in messages[0]
-    assert "nothing to measure it by" in messages[1]
+    assert "no data for it" in messages[1]
     assert "based on 30 rows" in messages[2]
 
 
@@ -246,7 +246,7 @@ def test_truth_of_another_log_is_refused_by_time_and_by_hash(
     hashed.write_text(json.dumps(tree | {"log": "b.mcap", "log_sha256": {"b.mcap": "11"}}))
 
     assert "another log or clock" in _fails(capsys, "score", run, "--truth", other)
-    assert "by its hash it belongs to another b.mcap" in _fails(
+    assert "belongs to another b.mcap by its hash" in _fails(
         capsys, "score", run, "--truth", hashed
     )
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q", "--any-log"]) == 0
@@ -367,7 +367,7 @@ def test_no_truth_anywhere_is_reported_with_the_places_looked_at(
 ) -> None:
     run = run_folder(tmp_path / "run")
 
-    assert "give --truth" in _fails(capsys, "score", run.path)
+    assert "name it with --truth" in _fails(capsys, "score", run.path)
 
 
 def test_merged_drives_are_not_scored_as_one(
