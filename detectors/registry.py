@@ -96,7 +96,7 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
         names = known({})
         close = difflib.get_close_matches(choice.kind, names, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
-        raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or give module:factory")
+        raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or use module:factory")
     try:
         build = cast("Callable[..., Detector]", attrgetter(factory)(import_module(module)))
     except (ImportError, AttributeError) as error:

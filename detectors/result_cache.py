@@ -59,7 +59,7 @@ class ResultCache:
             self._file = sqlite3.connect(":memory:" if path is None else path, timeout=30.0)
             self._file.execute(_SCHEMA)
         except (sqlite3.Error, OSError) as error:
-            raise OutputError(f"{path}: {error}; give another file with --cache") from None
+            raise OutputError(f"{path}: {error}; use another file with --cache") from None
 
     def get(self, picture: bytes, identity: str, t_ns: int) -> Found | None:
         """Return a detector's result for a picture, with the frame's time; None if not cached."""
@@ -88,7 +88,7 @@ class ResultCache:
                 self._file.executemany("INSERT OR REPLACE INTO found VALUES (?, ?, ?)", packed)
         except sqlite3.Error as error:
             raise OutputError(
-                f"{self._path}: {error}; make room, or give another --cache"
+                f"{self._path}: {error}; free disk space, or use another --cache"
             ) from None
 
     def __enter__(self) -> Self:

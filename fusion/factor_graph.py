@@ -107,7 +107,7 @@ class FactorGraph:
         for kind, names in (("feature", features), ("cue", cues)):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
-                raise ValueError(f"{kind} {twice[0]!r} stands twice; name each once")
+                raise ValueError(f"{kind} {twice[0]!r} appears twice; name each once")
         for edge in self.edges:
             if edge.feature not in features:
                 raise ValueError(f"no feature {edge.feature!r}; there are: {', '.join(features)}")

@@ -222,7 +222,7 @@ def read_card(path: Path) -> ModelCard:
         text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise VehicleError(f"{path}: {why}; give a model card") from None
+        raise VehicleError(f"{path}: {why}; expected a model card") from None
     try:
         tree: dict[str, Any] = tuples(toml_tree(text))
         return ModelCard.model_validate(tree)

@@ -76,7 +76,7 @@ def read_interface(path: Path) -> Interface:
             raise UsageError(f"{path}: over {MAX_BYTES >> 20} MiB; not read")
         return _READERS[suffix](content, path)
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; give a model file") from None
+        raise UsageError(f"{path}: {error.strerror}; expected a model file") from None
     except UsageError:
         raise
     except Exception as error:
@@ -213,7 +213,7 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
     if math.prod(shape) > MAX_INPUT_VALUES:
         raise UsageError(
             f"{path}: input {'x'.join(map(str, shape))} is {math.prod(shape):,} numbers, the limit "
-            f"is {MAX_INPUT_VALUES:,}; give another --size"
+            f"is {MAX_INPUT_VALUES:,}; use another --size"
         )
     network = load_network(_weights(path))
     noise = np.random.default_rng(0).random(shape, np.float32)
@@ -222,7 +222,7 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
     except Exception as error:
         raise UsageError(
             f"{path}: does not run on input {'x'.join(map(str, shape))}: {one_line(error, 160)}; "
-            "give another --size"
+            "use another --size"
         ) from None
     return Interface(
         (Tensor(given.name, shape), *model.inputs[1:]),

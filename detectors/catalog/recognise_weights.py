@@ -40,7 +40,7 @@ def recognise_weights(
     try:
         content = read_at_most(path, MAX_BYTES)
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; give a file of weights") from None
+        raise UsageError(f"{path}: {error.strerror}; expected a weights file") from None
     if content is None:
         raise UsageError(f"{path}: over {MAX_BYTES >> 20} MiB; not read")
     if path.suffix == ".safetensors" and _OURS in content[:_HEADER_BYTES]:

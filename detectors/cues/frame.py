@@ -148,7 +148,7 @@ class CuePass:
 
 
 NO_ODOMETRY: Final = "no odometry, so the camera's own motion is unknown"
-NO_FOCAL_LENGTH: Final = "camera.focal_px is not given"
+NO_FOCAL_LENGTH: Final = "camera.focal_px is not set"
 
 
 def _why_not_followed(ego: Motion | None, vehicle: Vehicle) -> str | None:

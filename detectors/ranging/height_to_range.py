@@ -118,7 +118,7 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         is_near = np.abs(off_m) <= MIN_OUTLIER * range_m
         before, keep = keep, _inliers(off_m) | _inliers(off_m / range_m) | is_near
         if len(np.unique(height_px[keep])) <= len(guess):
-            raise UsageError(f"{family}: too few of {len(range_m)} pairs lie on one curve")
+            raise UsageError(f"{family}: too few of {len(range_m)} pairs are on one curve")
         near_px, near_m = height_px[keep], range_m[keep]
         fitted = least_squares(_residual_of(model, near_px, near_m, scale), parameters / scale)
         parameters = np.asarray(fitted.x, np.float64) * scale

@@ -120,7 +120,7 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
         made = build(camera)
     except TypeError as error:
         raise UsageError(
-            f"matcher {name!r}: {error}; a factory takes a CameraGeometry and returns a Matcher"
+            f"matcher {name!r}: {error}; a factory accepts a CameraGeometry and returns a Matcher"
         ) from error
     lacks = [part for part in ("kind", "describe", "match") if not hasattr(made, part)]
     if lacks:

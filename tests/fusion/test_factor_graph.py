@@ -276,5 +276,5 @@ def test_edges_that_lead_nowhere_are_refused(edges: tuple[Edge, ...], match: str
 
 
 def test_a_name_that_stands_twice_is_refused() -> None:
-    with pytest.raises(ValueError, match="feature 'f' stands twice"):
+    with pytest.raises(ValueError, match="feature 'f' appears twice"):
         FactorGraph((Feature("f"), Feature("f")), (), ())

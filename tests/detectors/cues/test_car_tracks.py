@@ -350,7 +350,7 @@ def test_without_odometry_or_focal_length_it_cannot_either() -> None:
     (why,) = cues([None, None]).not_followed
     assert why == "no odometry, so the camera's own motion is unknown"
     (why,) = cues([None], Vehicle(version=1)).not_followed
-    assert why == "camera.focal_px is not given"
+    assert why == "camera.focal_px is not set"
 
 
 def test_the_default_is_the_published_pairs_only_for_simulated_cars() -> None:

@@ -71,5 +71,5 @@ def test_pairs_that_lie_on_no_curve_are_refused() -> None:
     height_px = np.array([10.0, 10.0, 10.0, 200.0])
     range_m = np.array([30.0, 30.0, 30.0, 90.0])
 
-    with pytest.raises(UsageError, match="pinhole: too few of 4 pairs lie on one curve"):
+    with pytest.raises(UsageError, match="pinhole: too few of 4 pairs are on one curve"):
         fit_range(height_px, range_m, "pinhole")

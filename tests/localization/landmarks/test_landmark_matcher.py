@@ -110,7 +110,7 @@ def test_a_matcher_of_ones_own_is_named_by_module_and_factory() -> None:
         make_matcher("crosscue.localization.landmarks.matcher:nothing")
     with pytest.raises(UsageError, match=r"needs camera\.focal_px"):
         make_matcher("orb-essential")
-    with pytest.raises(UsageError, match="a factory takes a CameraGeometry"):
+    with pytest.raises(UsageError, match="a factory accepts a CameraGeometry"):
         make_matcher("os:getcwd")
     with pytest.raises(UsageError, match="has no kind"):
         make_matcher("builtins:repr")
