@@ -1,8 +1,7 @@
-"""WGS 84: latitude, longitude and height, the earth-fixed frame, and a flat local one.
+"""Convert between WGS 84 coordinates: geodetic, earth-fixed (ECEF), and local east, north, up.
 
-Geodetic to earth-centred earth-fixed (ECEF) and back, and the rotation into east, north, up (ENU).
-The way back is Bowring's iteration on the parametric latitude (B. R. Bowring, "Transformation from
-spatial to geographical coordinates", Survey Review 23, 1976); the constants are WGS 84's (NGA,
+ECEF to geodetic is Bowring's iteration on the parametric latitude (B. R. Bowring, "Transformation
+from spatial to geographical coordinates", Survey Review 23, 1976); the constants are WGS 84's (NGA,
 STND.0036).
 """
 
@@ -20,13 +19,14 @@ FIRST_ECCENTRICITY_2: Final = FLATTENING * (2.0 - FLATTENING)
 SECOND_ECCENTRICITY_2: Final = FIRST_ECCENTRICITY_2 / (1.0 - FIRST_ECCENTRICITY_2)
 
 _BOWRING_STEPS: Final = 3
-"""One step is good to a micrometre near the ground; three hold to the orbit of a satellite."""
+"""Number of iterations. One is exact to a micrometre near the ground, three up to a satellite's
+orbit."""
 
 
 def geodetic_to_ecef(
     lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike
 ) -> NDArray[np.float64]:
-    """Earth-fixed positions of places on or above the ellipsoid.
+    """Convert geodetic coordinates to earth-fixed positions.
 
     Args:
         lat_deg: Geodetic latitude, scalar or shape (N,), degrees north.
@@ -34,7 +34,7 @@ def geodetic_to_ecef(
         alt_m: Height above the ellipsoid, the same shape.
 
     Returns:
-        Shape (N, 3), metres; scalars give N = 1.
+        Shape (N, 3), metres; N is 1 for scalars.
     """
     lat, lon, alt = (
         np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in (lat_deg, lon_deg, alt_m)
@@ -55,7 +55,7 @@ def geodetic_to_ecef(
 def ecef_to_geodetic(
     xyz_m: ArrayLike,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Latitude and longitude in degrees and height in metres of earth-fixed positions.
+    """Convert earth-fixed positions to latitude and longitude in degrees and height in metres.
 
     Args:
         xyz_m: Shape (N, 3) or (3,), metres.
@@ -71,7 +71,7 @@ def ecef_to_geodetic(
         raise ValueError(f"xyz_m: expected (N, 3), got {np.shape(xyz_m)}")
     x, y, z = xyz.T
     across_m = np.hypot(x, y)
-    # Sine and cosine instead of a tangent: the tangent is infinite at the poles.
+    # Sine and cosine are used because the tangent is infinite at the poles.
     sin_b, cos_b = _unit(z * SEMI_MAJOR_M, across_m * SEMI_MINOR_M)
     for _ in range(_BOWRING_STEPS):
         sin_lat, cos_lat = _unit(
@@ -88,7 +88,7 @@ def ecef_to_geodetic(
 
 
 def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> NDArray[np.float64]:
-    """The rotation ``enu_R_ecef`` at one place: ``enu_m = matrix @ (xyz_m - origin_m)``.
+    """Return the rotation ``enu_R_ecef`` at a place: ``enu_m = matrix @ (xyz_m - origin_m)``.
 
     Args:
         lat_rad: Geodetic latitude of the origin.
@@ -111,13 +111,13 @@ def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> NDArray[np.float64]:
 def geodetic_to_enu(
     lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike, origin: tuple[float, float, float]
 ) -> NDArray[np.float64]:
-    """Local east, north, up of places near ``origin``.
+    """Convert geodetic coordinates near ``origin`` to local east, north, up.
 
     Args:
         lat_deg: Shape (N,), degrees.
         lon_deg: Shape (N,), degrees.
         alt_m: Shape (N,), metres.
-        origin: Latitude and longitude in degrees and height in metres of the frame's zero.
+        origin: Latitude and longitude in degrees and height in metres of the frame's origin.
 
     Returns:
         Shape (N, 3), metres.
@@ -131,6 +131,6 @@ def geodetic_to_enu(
 def _unit(
     opposite: NDArray[np.float64], adjacent: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sine and cosine of the angle with these legs."""
+    """Return sine and cosine of the angle with these legs."""
     length = np.hypot(opposite, adjacent)
     return opposite / length, adjacent / length

@@ -1,1 +1,1 @@
-"""Ground truth: its file format, trajectories, annotations of other tools."""
+"""Ground truth: its file format, trajectories, and annotations of other tools."""

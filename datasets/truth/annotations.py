@@ -1,7 +1,7 @@
-"""Annotated pictures from other tools, laid onto a log's frames and turned into truth.
+"""Match annotated pictures of other tools to a log's frames, and convert them to ground truth.
 
-A label that is a cue's name (``stop sign``, ``parked_left``) says that the cue is there. A picture
-that was annotated without it says that the cue is not there. Labels of other things stay labelled
+A label with the name of a cue (``stop sign``, ``parked_left``) means that the cue is present. An
+annotated picture without the label means that the cue is absent. Other labels remain labels of
 objects.
 """
 
@@ -27,27 +27,27 @@ OTHER_THINGS: Final = frozenset(
     {"person", "pedestrian", "bicycle", "car", "motorcycle", "bus", "train", "truck", "van",
      "vehicle", "rider", "trailer"}
 )  # fmt: skip
-"""Labels of things on a road that are not a cue by themselves."""
+"""Labels of objects on a road that are not cues by themselves."""
 SLACK_PX: Final = 1.0
-"""Boxes may lie so far outside: tools round differently."""
+"""Max distance of a box outside the picture; tools round differently."""
 FAR: Final = 0.4
-"""Fraction of the time between frames that a picture may be off the frame it belongs to."""
+"""Max time between a picture and its frame, as a fraction of the time between frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """One annotated thing.
+    """One annotated object.
 
     Attributes:
-        label: As annotated.
-        box_px: x0, y0, x1, y1; None for a label of the whole picture.
-        is_crowd: It stands for a number of things that nobody counted.
-        visible: Share that nothing hides, or None.
-        track: The same number in several pictures is the same thing; None unknown.
-        segmentation: COCO's polygons or runs, or None.
-        place: Where it is in its file, for errors.
-        range_m: From the camera, or None where the file does not say.
-        score: Of a detector, for a box that nobody has confirmed yet.
+        label: Label as annotated.
+        box_px: x0, y0, x1, y1; None for a label of the complete picture.
+        is_crowd: True for a group of objects that are not counted.
+        visible: Visible fraction, or None.
+        track: Number of the object in all pictures; None if unknown.
+        segmentation: COCO's polygons or run lengths, or None.
+        place: Position in its file, for errors.
+        range_m: Distance from the camera, or None if the file does not specify it.
+        score: Score of a detector, for a box that is not confirmed yet.
     """
 
     label: str
@@ -67,10 +67,10 @@ class Picture:
 
     Attributes:
         name: File name.
-        size_px: Width and height as the tool saw it.
-        t_ns: Log time where the file reports it.
-        frame: Number of the frame in its video where the file reports it.
-        things: What was annotated; none is an answer, too.
+        size_px: Width and height in the annotation tool.
+        t_ns: Log time, if the file reports it.
+        frame: Number of the frame in its video, if the file reports it.
+        things: Annotated objects; empty if the picture shows none of them.
     """
 
     name: str
@@ -85,10 +85,10 @@ class Annotations:
     """One file of annotations.
 
     Attributes:
-        where: The file.
-        labels: All that annotators could choose from.
-        pictures: All that were annotated.
-        ignored: What the file holds besides, by kind.
+        where: Path of the file.
+        labels: All labels that annotators could use.
+        pictures: All annotated pictures.
+        ignored: Number of ignored elements of the file, by kind.
     """
 
     where: str
@@ -102,10 +102,10 @@ class LogPictures:
     """The pictures of a log's camera.
 
     Attributes:
-        where: The log.
-        t_ns: Shape (N,), growing.
-        size_px: Width and height of the first one.
-        names: From file name to time where they are files of their own; else empty.
+        where: Path of the log.
+        t_ns: Times, shape (N,), increasing.
+        size_px: Width and height of the first picture.
+        names: Times by file name if the pictures are files; else empty.
     """
 
     where: str
@@ -116,11 +116,11 @@ class LogPictures:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Pictures with their log times.
+    """Log times of pictures.
 
     Attributes:
-        t_ns: One for each picture.
-        rule: How they were found, for people.
+        t_ns: Time of each picture.
+        rule: Description of the rule that found the times, for display.
     """
 
     t_ns: tuple[int, ...]
@@ -128,14 +128,14 @@ class Placed:
 
 
 Sizes = Mapping[str, tuple[int, int]]
-"""From a picture's name without its ending to its width and height; ``*`` for all others."""
+"""Width and height by the name of a picture without suffix; ``*`` for all others."""
 
 
 def size_of(stem: str, sizes: Sizes, path: Path) -> tuple[int, int]:
-    """Of a picture whose labels are in fractions of it.
+    """Return the size of a picture whose labels are in fractions of it.
 
     Raises:
-        AnnotationError: It is not known.
+        AnnotationError: The size is unknown.
     """
     size = sizes.get(stem, sizes.get("*"))
     if size is None:
@@ -164,7 +164,7 @@ def place(annotations: Annotations, log: LogPictures) -> Placed:
             ]
             raise SchemaError(
                 f"{annotations.where}: {' and '.join(names[:2])} belong to one frame, {t_ns} ns "
-                f"({placed.rule}); give each its own time or number"
+                f"({placed.rule}); expected a different time or number for each"
             )
     return placed
 
@@ -173,7 +173,7 @@ def _check_sizes(annotations: Annotations, log: LogPictures) -> None:
     for picture in annotations.pictures:
         if picture.size_px != log.size_px:
             raise SchemaError(
-                f"{annotations.where}: {picture.name}: {_size(picture.size_px)} pixels, those of "
+                f"{annotations.where}: {picture.name}: {_size(picture.size_px)} pixels; those of "
                 f"{log.where} have {_size(log.size_px)}; annotate pictures as recorded"
             )
 
@@ -190,7 +190,7 @@ def _by_name(annotations: Annotations, log: LogPictures) -> Placed | None:
 
 
 def _by_time(annotations: Annotations, log: LogPictures) -> Placed | None:
-    """By ``t_ns``, or by a file name that is a time; each goes to the nearest frame."""
+    """Match each picture to the nearest frame, by ``t_ns`` or a file name that is a time."""
     asked = [_time_of(picture) for picture in annotations.pictures]
     if any(t is None for t in asked):
         return None
@@ -205,7 +205,7 @@ def _by_time(annotations: Annotations, log: LogPictures) -> Placed | None:
         worst = int(off.argmax())
         raise SchemaError(
             f"{annotations.where}: {annotations.pictures[worst].name}: no frame of {log.where} "
-            f"near {wanted[worst]} ns; the nearest is {found[worst]} ns: it is of another log"
+            f"near {wanted[worst]} ns; the nearest is {found[worst]} ns; it belongs to another log"
         )
     return Placed(tuple(found.tolist()), f"by time, at most {off.max() * 1e-6:.1f} ms off")
 
@@ -219,11 +219,11 @@ def _time_of(picture: Picture) -> int | None:
 
 
 def time_in_name(stem: str) -> int | None:
-    """The log time in a picture's name: ``DRIVE_17...ns`` as exported, or nanoseconds alone."""
+    """Return the log time in a picture's name: ``DRIVE_17...ns`` as exported, or nanoseconds."""
     exported = re.search(r"_([0-9]{1,19})ns$", stem)
     if exported is not None:
         return int(exported[1])
-    # Nanoseconds since 1970 have nineteen digits, and no frame's number has.
+    # Nanoseconds since 1970 have nineteen digits, unlike frame numbers.
     return int(stem) if re.fullmatch(r"[0-9]{16,19}", stem) else None
 
 
@@ -236,13 +236,13 @@ def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
             if digits is None:
                 raise SchemaError(
                     f"{annotations.where}: {picture.name}: has neither a time nor a frame; give "
-                    "pictures a t_ns, or names that end in the frame's number, from 0"
+                    "pictures with a t_ns, or names that end in the frame's number, from 0"
                 )
             number = int(digits[1])
         if not 0 <= number < len(log.t_ns):
             raise SchemaError(
                 f"{annotations.where}: {picture.name}: frame {number} of {len(log.t_ns)} in "
-                f"{log.where} (the first is 0); it is of another log"
+                f"{log.where} (the first is 0); it belongs to another log"
             )
         times.append(int(log.t_ns[number]))
     return Placed(tuple(times), "by frame number, the first being 0")
@@ -255,17 +255,17 @@ def meanings(
     *,
     any_thing: bool = False,
 ) -> dict[str, str | None]:
-    """From label to cue; None for things that are not a cue.
+    """Return cues by label; None for objects that are not cues.
 
     Args:
-        annotations: With labels.
-        own: From label to cue as the user says; an empty cue for a thing that is not one.
-        own_cues: Cues beside the usual ones.
-        any_thing: A label that is not nearly a cue's name may be a thing nobody has heard of.
+        annotations: Annotations with labels.
+        own: The user's cues by label; an empty cue for an object that is not a cue.
+        own_cues: Cues in addition to the built-in ones.
+        any_thing: Accept unknown labels, unless they resemble the name of a cue.
 
     Raises:
-        UsageError: ``own`` names a label or cue that there is not.
-        SchemaError: A label is neither a cue nor a known thing.
+        UsageError: ``own`` names an unknown label or cue.
+        SchemaError: A label is neither a cue nor a known object.
     """
     cues = (*CUES, *own_cues)
     for label, cue in own.items():
@@ -293,8 +293,8 @@ def meanings(
                 continue
             hint = close[0] if close else ""
             raise SchemaError(
-                f"{annotations.where}: class {label!r} is neither a cue nor a known thing; say "
-                f"what it is: --map '{label}={hint}' (nothing after = for no cue)"
+                f"{annotations.where}: class {label!r} is neither a cue nor a known object; map it "
+                f"with --map '{label}={hint}' (nothing after = if it is not a cue)"
             )
     return found
 
@@ -304,10 +304,10 @@ def _there_are(names: Sequence[str]) -> str:
 
 
 def check_boxes(annotations: Annotations) -> None:
-    """Refuse boxes without area, or that are outside their picture.
+    """Refuse boxes without area, or outside their picture.
 
     Raises:
-        SchemaError: With the first one's place.
+        SchemaError: A box is invalid; the message states the position of the first one.
     """
     for picture in annotations.pictures:
         width, height = picture.size_px
@@ -320,7 +320,7 @@ def check_boxes(annotations: Annotations) -> None:
                 raise SchemaError(f"{where}: box {_box(thing.box_px)} has no area; correct it")
             if x0 < -SLACK_PX or y0 < -SLACK_PX or x1 > width + SLACK_PX or y1 > height + SLACK_PX:
                 raise SchemaError(
-                    f"{where}: box {_box(thing.box_px)} lies outside the picture of "
+                    f"{where}: box {_box(thing.box_px)} is outside the picture of "
                     f"{_size(picture.size_px)} pixels; correct it"
                 )
 
@@ -332,7 +332,7 @@ def _box(box: tuple[float, float, float, float]) -> str:
 def cue_truths(
     annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
 ) -> tuple[CueTruth, ...]:
-    """One statement for each annotated picture and each cue that could have been labelled."""
+    """Return the truth of each cue that could be labelled, for each annotated picture."""
     meant = {cue for cue in cues.values() if cue is not None}
     known: list[str] = [cue for cue in CUES if cue in meant]
     known += sorted(meant.difference(known))
@@ -359,7 +359,7 @@ def cue_truths(
 def coco_tree(
     annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
 ) -> dict[str, Any]:
-    """The labelled objects as a COCO tree, pictures with their log times, cues by their names."""
+    """Return the labelled objects as a COCO tree, with log times of pictures and names of cues."""
     plain = {
         label: label if (cue := cues[label]) is None else cue.replace("_", " ")
         for label in annotations.labels

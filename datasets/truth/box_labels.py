@@ -1,16 +1,17 @@
-"""Labelled boxes of pictures: COCO, YOLO, Pascal VOC and KITTI.
+"""Read labelled boxes of pictures: COCO, YOLO, Pascal VOC and KITTI.
 
-* COCO: a ``.json`` file. ``iscrowd`` marks regions that are not judged; ``t_ns`` and ``range_m``
-  (of an annotation, metres) are used where they are given.
+* COCO: a ``.json`` file. ``iscrowd`` marks regions that are not scored; ``t_ns`` and ``range_m``
+  (of an annotation, metres) are used if present.
 * YOLO: a folder of ``.txt`` files, ``class x y width height`` in fractions of the picture. Class
   names come from ``classes.txt``, ``obj.names``, ``data.yaml`` or ``dataset.yaml`` there or up to
   two folders above.
-* Pascal VOC: a folder of ``.xml`` files. The first pixel is 1 and the last one belongs to the box;
-  objects marked ``difficult`` are not judged.
-* KITTI: a folder of ``.txt`` files with 15 columns. ``DontCare`` regions are not judged; the range
+* Pascal VOC: a folder of ``.xml`` files. The first pixel is 1, and the last pixel belongs to the
+  box; objects marked ``difficult`` are not scored.
+* KITTI: a folder of ``.txt`` files with 15 columns. ``DontCare`` regions are not scored; the range
   is the distance ahead of the camera.
 
-A file without boxes says that its picture has none; a picture without a file is not labelled.
+A file without boxes means that its picture shows no objects; a picture without a file is not
+labelled.
 """
 
 from __future__ import annotations
@@ -50,10 +51,10 @@ class LabelBox:
     """One labelled object.
 
     Attributes:
-        label: As annotated; empty for a region of anything.
+        label: Label as annotated; empty for a region of any class.
         box: x0, y0, x1, y1, in pixels or in fractions of the picture.
-        is_ignored: Neither to be found nor wrong when found.
-        range_m: From the camera, NaN unknown.
+        is_ignored: True if detecting it counts neither as correct nor as wrong.
+        range_m: Distance from the camera, NaN if unknown.
     """
 
     label: str
@@ -68,10 +69,10 @@ class LabelPicture:
 
     Attributes:
         name: File name of the picture, or of its labels.
-        boxes: None is an answer, too.
-        size_px: Width and height; None where the format does not say.
-        t_ns: Log time, where the file says.
-        is_in_fractions: Boxes are in fractions of the picture, not in pixels.
+        boxes: Labelled boxes; empty if the picture shows no objects.
+        size_px: Width and height; None if the format does not specify them.
+        t_ns: Log time, if the file specifies it.
+        is_in_fractions: True if boxes are in fractions of the picture, not in pixels.
     """
 
     name: str
@@ -81,7 +82,7 @@ class LabelPicture:
     is_in_fractions: bool = False
 
     def inside(self, size_px: tuple[int, int], left_out: Counter[str]) -> list[LabelBox]:
-        """Its boxes in pixels within a picture; what is outside is counted in ``left_out``."""
+        """Return its boxes in pixels within a picture; others are counted in ``left_out``."""
         width, height = size_px
         factor = np.array([width, height] * 2) if self.is_in_fractions else np.ones(4)
         found = []
@@ -103,11 +104,11 @@ class BoxLabels:
     """Labels of any number of pictures.
 
     Attributes:
-        where: The file or folder.
-        format: What it was read as.
-        classes: All that annotators could choose from, as far as the labels say.
-        pictures: All that were labelled.
-        left_out: What was not read, by reason.
+        where: Path of the file or folder.
+        format: Format of the labels.
+        classes: All classes that annotators could use, where known.
+        pictures: All labelled pictures.
+        left_out: Number of boxes that were not read, by reason.
     """
 
     where: str
@@ -124,13 +125,14 @@ def read_box_labels(
 
     Args:
         path: A COCO file, or a folder of the other formats.
-        kind: One of ``FORMATS``; recognised if left out.
-        class_names: In YOLO's order; of the other folders, all that annotators could choose from.
+        kind: One of ``FORMATS``; detected by default.
+        class_names: Class names in YOLO's order; for other formats, all classes that annotators
+            could use.
 
     Raises:
-        UsageError: Another format, or YOLO without class names.
-        AnnotationError: It cannot be read; with the place.
-        EmptyResultError: Not one labelled picture.
+        UsageError: The format is unknown, or YOLO class names are missing.
+        AnnotationError: A file cannot be read; the message states the position.
+        EmptyResultError: There are no labelled pictures.
     """
     if kind not in (None, *FORMATS):
         raise UsageError(f"--format {kind}: expected one of {', '.join(FORMATS)}")
@@ -145,7 +147,7 @@ def read_box_labels(
     else:
         found = _yolo(path, _texts(files), tuple(class_names) or _names_of(path))
     if not found.pictures:
-        raise EmptyResultError(f"{path}: not one labelled image in it; give labels of the run")
+        raise EmptyResultError(f"{path}: no labelled image in it; expected labels of the run")
     return found
 
 
@@ -153,7 +155,7 @@ def _files(path: Path) -> list[Path]:
     if path.is_dir():
         return sorted(one for one in path.iterdir() if one.is_file())
     if not path.exists():
-        raise AnnotationError(f"{path}: No such file or directory; give labels of the run's images")
+        raise AnnotationError(f"{path}: no such file or folder; expected labels of images")
     return [path]
 
 
@@ -237,7 +239,7 @@ def _kitti(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> Box
 
 
 def _classes(pictures: Sequence[LabelPicture], class_names: Sequence[str]) -> tuple[str, ...]:
-    """All that were used, and those that a file lists besides."""
+    """Return all classes that are used or listed."""
     used = {box.label for one in pictures for box in one.boxes if box.label}
     return (*class_names, *sorted(used.difference(class_names)))
 
@@ -271,8 +273,8 @@ def _names_of(path: Path) -> tuple[str, ...]:
             if file.is_file():
                 return _yaml_names(file) if file.suffix == ".yaml" else tuple(_lines(file))
     raise UsageError(
-        f"{path}: YOLO labels without class names (no {', '.join(NAME_FILES)}); put classes.txt "
-        "with one per line beside them, or give --class-names FILE where a command takes it"
+        f"{path}: YOLO labels without class names (no {', '.join(NAME_FILES)}); add classes.txt "
+        "with one name per line to the folder, or use --class-names FILE if the command has it"
     )
 
 
@@ -289,15 +291,15 @@ def _yaml_names(file: Path) -> tuple[str, ...]:
 
 
 def _lines(file: Path, *, is_whole: bool = False) -> list[str]:
-    """Lines that are not empty, stripped; or all as they are."""
+    """Read the lines that are not empty, stripped; or all lines unchanged."""
     try:
         content = read_at_most(file, MAX_TEXT_BYTES)
         if content is None:
-            raise AnnotationError(f"{file}: over {MAX_TEXT_BYTES // MIB} MiB; these are no labels")
+            raise AnnotationError(f"{file}: over {MAX_TEXT_BYTES // MIB} MiB; expected labels")
         lines = content.decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise AnnotationError(f"{file}: {why}; give labels as text") from None
+        raise AnnotationError(f"{file}: {why}; expected labels as text") from None
     return lines if is_whole else [line.strip() for line in lines if line.strip()]
 
 
@@ -312,7 +314,7 @@ def _numbers(words: Sequence[str], where: str) -> list[float]:
 
 
 def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
-    """Class names, or those of a file with one per line.
+    """Return class names, or read them from a file with one name per line.
 
     Raises:
         UsageError: The file cannot be read, or is empty.
@@ -323,12 +325,12 @@ def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
     try:
         content = read_at_most(path, MIB)
         if content is None:
-            raise UsageError(f"{path}: over 1 MiB; give class names, one per line")
+            raise UsageError(f"{path}: over 1 MiB; expected class names, one per line")
         lines = content.decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"{path}: {why}; give class names, one per line") from None
+        raise UsageError(f"{path}: {why}; expected class names, one per line") from None
     names = tuple(line.strip() for line in lines if line.strip())
     if not names:
-        raise UsageError(f"{path}: no name in it; give class names, one per line")
+        raise UsageError(f"{path}: contains no names; expected class names, one per line")
     return names

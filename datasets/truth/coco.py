@@ -1,4 +1,4 @@
-"""COCO annotation files: objects with boxes in pictures."""
+"""Read and write COCO annotation files: objects with boxes in pictures."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ WRITTEN: Final = "annotations.json"
 
 
 def read_coco(path: Path) -> Annotations:
-    """Read a COCO file; pictures may carry ``t_ns``, their log time.
+    """Read a COCO file; pictures may have ``t_ns``, their log time.
 
     Raises:
-        AnnotationError: Not there, not COCO, or references that lead nowhere.
+        AnnotationError: The file does not exist, is not COCO, or has invalid references.
     """
     try:
         content = read_at_most(path, MAX_BYTES)
@@ -35,7 +35,7 @@ def read_coco(path: Path) -> Annotations:
             raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
         tree = json_tree(content)
     except (OSError, ValueError) as error:
-        raise AnnotationError(f"{path}: not readable as JSON ({error}); give a COCO file") from None
+        raise AnnotationError(f"{path}: not JSON ({error}); expected a COCO file") from None
     if not isinstance(tree, dict):
         raise AnnotationError(f"{path}: expected an object with images, annotations and categories")
     labels = _labels(tree, path)
@@ -67,12 +67,12 @@ def read_coco(path: Path) -> Annotations:
 def _rows(tree: Mapping[str, Any], name: str, path: Path) -> list[Mapping[str, Any]]:
     rows = tree.get(name)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise AnnotationError(f"{path}: {name}: expected a list of objects; give a COCO file")
+        raise AnnotationError(f"{path}: {name}: expected a list of objects as in COCO files")
     return rows
 
 
 def _key(value: object) -> int:
-    """An id, or one that no row has."""
+    """Return an id, or an id that no row has if the value is not an id."""
     return value if isinstance(value, int) and not isinstance(value, bool) else -1
 
 
@@ -82,7 +82,7 @@ def _labels(tree: Mapping[str, Any], path: Path) -> dict[int, str]:
         number, name = _key(row.get("id")), row.get("name")
         if number < 0 or number in labels or not isinstance(name, str) or name in labels.values():
             raise AnnotationError(
-                f"{path}: categories.{place}: expected an id and a name, neither twice; correct it"
+                f"{path}: categories.{place}: expected a unique id and a unique name; correct it"
             )
         labels[number] = name
     return labels
@@ -94,9 +94,7 @@ def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
         where = f"{path}: images.{place}"
         number, name, t_ns = _key(row.get("id")), row.get("file_name"), row.get("t_ns")
         if number < 0 or number in pictures or not isinstance(name, str):
-            raise AnnotationError(
-                f"{where}: expected an id that no other has, and a file_name; correct it"
-            )
+            raise AnnotationError(f"{where}: expected a unique id and a file_name; correct it")
         size = (_key(row.get("width")), _key(row.get("height")))
         if not (0 < size[0] <= MAX_SIDE and 0 < size[1] <= MAX_SIDE):
             raise AnnotationError(
@@ -138,7 +136,7 @@ def _is_number(value: object) -> bool:
 
 
 def write_coco(folder: Path, labels: Annotations) -> Path:
-    """Write a COCO file with times of pictures and scores of boxes; returns its path.
+    """Write a COCO file with times of pictures and scores of boxes, and return its path.
 
     Raises:
         OutputError: The file cannot be written.

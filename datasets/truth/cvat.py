@@ -1,7 +1,7 @@
-"""CVAT's own annotation files, XML 1.1: "CVAT for images" and "CVAT for video".
+"""Read and write CVAT's annotation files, XML 1.1: "CVAT for images" and "CVAT for video".
 
-Read by expat's events. A document type declaration is refused, and with it every entity: nothing is
-fetched and nothing grows.
+The files are parsed with expat. A document type declaration is refused, so that there are no
+entities: nothing is fetched or expanded.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ IGNORED: Final = ("polyline", "points", "cuboid", "ellipse", "skeleton")
 def read_cvat(path: Path) -> Annotations:
     """Read an ``annotations.xml``.
 
-    Boxes, polygons, masks and tags are taken; other shapes are counted under ``ignored``.
+    Boxes, polygons, masks and tags are read; other shapes are counted in ``ignored``.
 
     Raises:
-        AnnotationError: Not there, not such a file, or with a document type declaration.
+        AnnotationError: The file does not exist, has another format, or contains a document type
+            declaration.
     """
     reader = _Reader(str(path))
     parser = expat.ParserCreate()
@@ -51,15 +52,13 @@ def read_cvat(path: Path) -> Annotations:
         with path.open("rb") as file:
             parser.ParseFile(file)
     except (OSError, expat.ExpatError) as error:
-        raise AnnotationError(
-            f"{path}: not readable as XML ({error}); give CVAT's XML 1.1"
-        ) from None
+        raise AnnotationError(f"{path}: not XML ({error}); expected CVAT's XML 1.1") from None
     return reader.annotations()
 
 
 @dataclass(slots=True)
 class _Reader:
-    """What has been read so far."""
+    """Parser of a file, with the contents read so far."""
 
     where: str
     _path: list[str] = field(default_factory=list)
@@ -74,18 +73,18 @@ class _Reader:
 
     def refuse_doctype(self, *_: object) -> None:
         raise AnnotationError(
-            f"{self.where}: has a document type declaration, which may hide entities; CVAT writes "
-            "none: take it out"
+            f"{self.where}: has a document type declaration, which may define entities; remove it "
+            "(CVAT does not write it)"
         )
 
     def start(self, tag: str, found: Mapping[str, str]) -> None:
         if not self._path and tag != "annotations":
             raise AnnotationError(
-                f"{self.where}: <{tag}>: expected <annotations>; give CVAT's XML 1.1"
+                f"{self.where}: <{tag}>: expected <annotations> of CVAT's XML 1.1"
             )
         if len(self._path) >= MAX_DEPTH:
             raise AnnotationError(
-                f"{self.where}: elements over {MAX_DEPTH} deep; this is not CVAT's"
+                f"{self.where}: nested over {MAX_DEPTH} levels deep; expected CVAT's XML 1.1"
             )
         self._path.append(tag)
         self._words = []
@@ -104,7 +103,7 @@ class _Reader:
         if self._path[-3:] == ["labels", "label", "name"]:
             self._labels.append(text)
         elif "meta" in self._path:
-            # The first wins: below <segments> other numbers go by the same names.
+            # The first is used, because other numbers below <segments> have the same names.
             self._meta.setdefault("/".join(self._path[-2:]), text)
         elif tag == "image":
             last = self._pictures.pop()
@@ -123,7 +122,7 @@ class _Reader:
         name = self._text(found, "name")
         size = (self._whole(found, "width"), self._whole(found, "height"))
         self._check_size(size)
-        # A name that ends in a number reports the frame; else the number of the picture does.
+        # The frame is the number at the end of the name, else the number of the picture.
         has_number = re.search(r"[0-9]\.[A-Za-z]+$", name) is not None
         return Picture(name, size, None, None if has_number else self._whole(found, "id"))
 
@@ -138,7 +137,7 @@ class _Reader:
             assert self._track is not None
             frame = self._whole(found, "frame")
             things = self._by_frame.setdefault(frame, [])
-            # An ``outside`` box only says where the thing was last; it is not in this frame.
+            # An ``outside`` box is the object's last position; the object is not in this frame.
             if found.get("outside") != "1":
                 number, label = self._track
                 things.append(self._thing(tag, found, label, number, f"track {number}"))
@@ -181,7 +180,7 @@ class _Reader:
     def _text(self, found: Mapping[str, str], name: str) -> str:
         if name not in found:
             raise AnnotationError(
-                f"{self.where}: <{self._path[-1]}> has no {name}; give CVAT's XML 1.1"
+                f"{self.where}: <{self._path[-1]}> has no {name}; expected CVAT's XML 1.1"
             )
         return found[name]
 
@@ -206,14 +205,14 @@ class _Reader:
         return value
 
     def annotations(self) -> Annotations:
-        """Everything, once the file has been read."""
+        """Return all annotations, once the file is read."""
         pictures = tuple(self._pictures) or self._video()
         used = {thing.label for picture in pictures for thing in picture.things}
         labels = tuple(dict.fromkeys([*self._labels, *sorted(used)]))
         return Annotations(self.where, labels, pictures, dict(self._ignored))
 
     def _video(self) -> tuple[Picture, ...]:
-        """Every frame of the task counts as annotated, also those that no track touches."""
+        """Return all frames of the task as annotated pictures, including those without tracks."""
         size = (self._known("original_size/width"), self._known("original_size/height"))
         self._check_size(size)
         first = self._known("start_frame", 0)
@@ -223,7 +222,7 @@ class _Reader:
         if last - first > MAX_FRAMES:
             raise AnnotationError(f"{self.where}: frames {first} to {last}: over {MAX_FRAMES}")
         frames = range(first, last + 1, step)
-        # A thing drawn in a single frame is closed one frame later, maybe behind the last one.
+        # An object drawn in a single frame ends one frame later, possibly after the last frame.
         strange = [n for n, things in self._by_frame.items() if things and n not in frames]
         if strange:
             raise AnnotationError(
@@ -234,7 +233,7 @@ class _Reader:
         )
 
     def _found(self, name: str) -> str | None:
-        """Of the task or job, or from below it."""
+        """Return a value of the task or job, or of an element below it."""
         ends = (f"task/{name}", f"job/{name}", name)
         return next((self._meta[end] for end in ends if end in self._meta), None)
 
@@ -250,7 +249,7 @@ class _Reader:
 
 
 def write_cvat(folder: Path, labels: Annotations) -> Path:
-    """Write "CVAT for images" 1.1; returns its path.
+    """Write a file "CVAT for images" 1.1, and return its path.
 
     Raises:
         OutputError: The file cannot be written.

@@ -1,4 +1,4 @@
-"""How a body that carries a track sits in its car, by how it travels."""
+"""Estimate the mounting of a tracked body in its vehicle from the direction of travel."""
 
 from __future__ import annotations
 
@@ -12,33 +12,34 @@ from .tum import Trajectory, heading_rad
 
 _TRAVEL_STEP_S: Final = 1.0
 _TRAVEL_MIN_M: Final = 3.0
-"""Over a shorter step, positions good to centimetres do not show the course to half a degree."""
+"""Min length of a step; over a shorter one, positions with centimetre errors do not determine the
+course to half a degree."""
 _TRAVEL_MIN_STEPS: Final = 3
 _TRAVEL_SD_RAD: Final = 0.005
-"""What a car slips and a track errs at the least, over a step."""
+"""Min standard deviation of a step's course, from the vehicle's slip and the track's error."""
 _LEVER_M: Final = 1.0
 _LEVER_SD_M: Final = 1.5
-"""A body sits between the rear axle and the windscreen."""
+"""Prior standard deviation of the lever: the body is between the rear axle and the windscreen."""
 _TURNED_MAX_SD_RAD: Final = 0.005
-"""0.3 degrees."""
+"""Max standard deviation of the yaw that is accepted, 0.3 degrees."""
 
 
 class TurnedBy(NamedTuple):
-    """By how much a body is turned in its car, counter-clockwise, and the standard deviation."""
+    """Yaw of a body in its vehicle, counter-clockwise, and the standard deviation."""
 
     yaw_rad: float
     sd_rad: float
 
 
 def turned_by(trajectory: Trajectory) -> TurnedBy | None:
-    """A body's yaw in the car that carries it, by the way that it travels.
+    """Estimate a body's yaw in its vehicle from the direction of travel.
 
-    The middle of the rear axle moves where the car points (a car does not slide sideways), and a
-    point ahead of it swings outwards by its lever times the curvature. So the body's heading less
-    its course is its yaw less that swing; both are fitted, the lever with a wide prior.
+    The centre of the rear axle moves in the direction of the vehicle, which does not slip sideways.
+    A point ahead of it swings outwards by its lever times the curvature. The body's heading minus
+    its course is therefore its yaw minus that swing; both are fitted, the lever with a wide prior.
 
     Returns:
-        None where the drive does not show it: too short, too slow, or bent all the way.
+        The yaw, or None if the drive is too short, too slow, or curved throughout.
     """
     ends_s = (trajectory.t_ns - trajectory.t_ns[0]) * 1e-9
     at_s = np.arange(0.0, ends_s[-1], _TRAVEL_STEP_S)
@@ -73,14 +74,14 @@ def mounting_in_car(
     y_m: float | None = None,
     z_m: float | None = None,
 ) -> tuple[Mounting, str]:
-    """The mounting of a body whose yaw nobody states: its yaw by how it travels.
+    """Return the mounting of a body with unknown yaw, which is estimated from its travel.
 
     Args:
-        track: Of that body.
-        stated: What is published of its place, and by whom.
-        x_m: Where that puts it; see ``Mounting``.
-        y_m: The same.
-        z_m: The same.
+        track: Trajectory of the body.
+        stated: Published description of its position, and its source.
+        x_m: Published position; see ``Mounting``.
+        y_m: Published position.
+        z_m: Published position.
 
     Returns:
         The mounting, and its source.
@@ -89,6 +90,6 @@ def mounting_in_car(
     yaw_rad = None if found is None else round(found.yaw_rad, 5)
     mounting = Mounting(x_m=x_m, y_m=y_m, z_m=z_m, roll_rad=None, pitch_rad=None, yaw_rad=yaw_rad)
     if found is None:
-        return mounting, f"{stated}; yaw unknown, and the drive does not show it"
+        return mounting, f"{stated}; yaw unknown, and the drive does not determine it"
     degrees = math.degrees(found.sd_rad)
     return mounting, f"{stated}; yaw by its direction of travel, +- {degrees:.2f} deg"

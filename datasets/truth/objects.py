@@ -1,4 +1,4 @@
-"""Objects that a data set labels, written as the COCO file that a truth file names."""
+"""Write the labelled objects of a data set as the COCO file of a truth file."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ COCO_IDS: Final = {
     "train": 7,
     "truck": 8,
 }
-"""COCO's own numbers; other labels get numbers from 200 on."""
+"""COCO's category numbers; other labels are numbered from 200."""
 
 
 @dataclass(slots=True)
 class Objects:
-    """Boxes in pictures, as they come."""
+    """Collection of boxes in pictures, in the order of pictures."""
 
     images: list[dict[str, Any]] = field(default_factory=list)
     annotations: list[dict[str, Any]] = field(default_factory=list)
     labels: dict[str, int] = field(default_factory=dict)
 
     def add_picture(self, t_ns: int, file_name: str, size_px: tuple[int, int]) -> None:
-        """A picture; boxes added afterwards are in it."""
+        """Add a picture, to which the boxes added afterwards belong."""
         wide, high = size_px
         number = len(self.images) + 1
         row = {"id": number, "t_ns": t_ns, "file_name": file_name, "width": wide, "height": high}
         self.images.append(row)
 
     def add(self, label: str, box_px: tuple[float, float, float, float], **more: object) -> None:
-        """A box, x0, y0, x1, y1, in the last picture; what is outside is cut off.
+        """Add a box, x0, y0, x1, y1, to the last picture, clipped to the picture.
 
         Args:
-            label: COCO's name where COCO has the class.
-            box_px: Left out if nothing of it is in the picture.
+            label: Label, which is COCO's name if COCO has the class.
+            box_px: Box, which is omitted if it is completely outside the picture.
             more: Further keys of its row.
         """
         image = self.images[-1]
@@ -65,7 +65,7 @@ class Objects:
         )
 
     def save(self, folder: Path, source: str) -> str:
-        """Write the file beside a truth file, and give its name.
+        """Write the file next to a truth file, and return its name.
 
         Raises:
             OutputError: It cannot be written.

@@ -1,7 +1,7 @@
-"""``truth.json``: what is known to be so about a drive, and the check that it fits a log.
+"""Ground truth of a drive, ``truth.json``, and the check that it fits a log.
 
-Version 1 carries pose, approaches, cues and the names of files with objects and ranges; every
-section may be missing.
+Version 1 contains pose, approaches, cues and the names of files with objects and ranges; every
+section is optional.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ CARRIED: Final[dict[str, str]] = {
     "nuscenes": "crosscue.datasets.adapters.nuscenes_truth:write",
     "pandaset": "crosscue.datasets.adapters.pandaset:write_truth",
 }
-"""From a format of ``crosscue.replay.formats.FORMATS`` to the function that writes its truth."""
+"""Functions that write the truth of a data set, by format of ``replay.formats.FORMATS``."""
 
 
 class Section(BaseModel):
-    """Unknown keys are refused."""
+    """Section of a truth file, which refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Origin(Section):
-    """Where the map frame's zero lies; x points east, y north, z up."""
+    """Origin of the map frame; x points east, y north, z up."""
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -57,30 +57,30 @@ class Origin(Section):
 
 
 class Mounting(Section):
-    """A rigid transform from the rear axle, on the ground, to a body; ISO 8855 axes.
+    """Rigid transform from the rear axle, on the ground, to a body; ISO 8855 axes.
 
-    Angles turn yaw first, then pitch, then roll. Null: unknown; a score then takes x, y and yaw
-    from the vehicle file's ``[camera]`` or ``[gnss]``, and says so.
+    The rotations are applied in the order yaw, pitch, roll. Null means unknown: a score then uses
+    x, y and yaw from the vehicle file's ``[camera]`` or ``[gnss]``, and reports it.
     """
 
     x_m: float | None = 0.0
-    """Ahead of the rear axle."""
+    """Distance ahead of the rear axle."""
     y_m: float | None = 0.0
-    """To its left."""
+    """Distance to the left of the centre line."""
     z_m: float | None = 0.0
-    """Above the ground."""
+    """Height above the ground."""
     roll_rad: float | None = 0.0
     pitch_rad: float | None = 0.0
-    """Downwards."""
+    """Pitch, positive downwards."""
     yaw_rad: float | None = 0.0
-    """Counter-clockwise."""
+    """Yaw, positive counter-clockwise."""
 
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
 class Features(Section):
-    """Where one may drive on from an intersection; null where unknown, which is not scored."""
+    """Directions in which an intersection can be left; null means unknown and is not scored."""
 
     left: bool | None
     right: bool | None
@@ -94,17 +94,17 @@ class Approach(Section):
     intersection: str
     start_ns: int
     enter_ns: int
-    """When the rear axle is at the start of the intersection, or the end of a log that ends
-    before."""
+    """Time at which the rear axle reaches the start of the intersection, or the end of a log that
+    ends before."""
     control: Literal["stop_sign", "traffic_light", "none"]
     features: Features
     one_way: Literal["left", "right"] | None = None
-    """Where the crossroad's traffic goes, if only one way."""
+    """Direction of the crossroad's traffic, if it is one-way."""
     do_not_enter: bool = False
     conditions: tuple[str, ...] = ()
     """Free tags: rain, dusk, glare, occluded, ..."""
     length_m: float | None = None
-    """From the start of the intersection to its end."""
+    """Distance from the start of the intersection to its end."""
 
 
 def _examples(schema: dict[str, Any]) -> None:
@@ -112,65 +112,65 @@ def _examples(schema: dict[str, Any]) -> None:
 
 
 class CueTruth(Section):
-    """Whether what a cue stands for is there, at one time or over a half-open span."""
+    """Presence of the object of a cue, at one time or over a half-open span."""
 
     cue: Annotated[Name, Field(json_schema_extra=_examples)]
-    """One of ``CUES``, or of the file's ``own_cues``."""
+    """Name in ``CUES``, or in the file's ``own_cues``."""
     present: bool
     t_ns: int | None = None
     start_ns: int | None = None
     end_ns: int | None = None
     approach: int | None = None
     count: int | None = None
-    """How many things show it."""
+    """Number of objects."""
     visible: float | None = None
-    """Fraction of the most visible one that nothing hides."""
+    """Visible fraction of the most visible object."""
 
 
 class Truth(Section):
-    """A whole truth file."""
+    """Ground truth of a drive, the content of a truth file."""
 
     version: Literal[1]
     log: str = ""
-    """Name of the log it belongs to, for people."""
+    """Name of its log, for display."""
     log_sha256: dict[str, str] = {}
-    """By file name: a run of a log with none of these hashes is refused. Empty: not checked."""
+    """Hashes by file name. A run of a log with none of them is refused; empty: not checked."""
     start_ns: int
     end_ns: int
-    """Log times between which the truth speaks; half open."""
+    """End of the half-open range of log times that the truth covers."""
     pose: str | None = None
-    """TUM trajectory, a file beside this one: seconds on the log clock, metres, quaternion."""
+    """TUM trajectory, a file in the same folder: seconds on the log clock, metres, quaternion."""
     pose_point: Literal["rear_axle", "camera", "antenna", "imu"] = "rear_axle"
-    """The body whose pose the trajectory is: the car, about its rear axle; a camera, x along its
-    optical axis; a GNSS antenna, x along the car; or an inertial unit, x along its forward axis."""
+    """Body of the trajectory: the vehicle at its rear axle; a camera, x along its optical axis; a
+    GNSS antenna, x along the vehicle; or an inertial unit, x along its forward axis."""
     mounting: Mounting | None = None
-    """Where that body sits on the car. Left out: at the rear axle, or, for a camera or an antenna,
-    where the vehicle file's ``[camera]`` or ``[gnss]`` puts it."""
+    """Position of that body on the vehicle. Default: at the rear axle, or, for a camera or an
+    antenna, as in the vehicle file's ``[camera]`` or ``[gnss]``."""
     mounting_source: str = ""
-    """Who states the mounting, and how well."""
+    """Source and accuracy of the mounting."""
     position_sd_m: Annotated[float, Field(gt=0.0)] | None = None
-    """S.d. of east and of north; left out: taken for exact."""
+    """Standard deviation of east and of north; null means exact."""
     heading_sd_rad: Annotated[float, Field(gt=0.0)] | None = None
-    """Of the heading."""
+    """Standard deviation of the heading; null means exact."""
     origin: Origin | None = None
     source: str = ""
-    """Who measured it, and how well."""
+    """Source and accuracy of the measurements."""
     approaches: tuple[Approach, ...] = ()
     cues: tuple[CueTruth, ...] = ()
     own_cues: tuple[Name, ...] = ()
-    """Cues beside the usual ones that this file reports, as the vehicle file's ``[cues.own]``
-    names them."""
+    """Additional cues in this file, named as in the vehicle file's ``[cues.own]``."""
     objects: str | None = None
-    """COCO file of labelled objects beside this one, images by ``t_ns``."""
+    """COCO file of labelled objects in the same folder, with images by ``t_ns``."""
     ranges: str | None = None
-    """CSV beside this one: t_ns, approach, start_m, end_m, of the rear axle at each picture."""
+    """CSV file in the same folder: t_ns, approach, start_m, end_m, of the rear axle at each
+    picture."""
 
 
 class Writer(Protocol):
-    """What a data set's truth function looks like."""
+    """Signature of a data set's truth function."""
 
     def __call__(self, path: Path, folder: Path) -> Path:
-        """Write ``truth.json`` for the data set at ``path`` into ``folder``; its path returns."""
+        """Write ``truth.json`` for the data set at ``path`` to ``folder``, and return its path."""
         ...
 
 
@@ -206,16 +206,16 @@ def _writer(name: str) -> Writer:
 
 
 def save(truth: Truth, folder: Path) -> Path:
-    """Write ``truth.json`` into ``folder``."""
+    """Write ``truth.json`` to ``folder``, and return its path."""
     write_text(folder / FILE, strict_json(truth.model_dump(mode="json")) + "\n")
     return folder / FILE
 
 
 def load(path: Path) -> Truth:
-    """Read and check a truth file; a folder stands for the ``truth.json`` in it.
+    """Read and check a truth file, or the ``truth.json`` of a folder.
 
     Raises:
-        AnnotationError: Not there, not JSON, or not what version 1 says.
+        AnnotationError: The file does not exist, is not JSON, or does not conform to version 1.
     """
     path = path / FILE if path.is_dir() else path
     try:
@@ -228,7 +228,7 @@ def load(path: Path) -> Truth:
         raise AnnotationError(explain(error, None, str(path), Truth)) from None
     except FileNotFoundError:
         raise AnnotationError(
-            f"{path}: no such truth file; for a data set make it with: crosscue truth LOG -o DIR"
+            f"{path}: no such truth file; for a data set write it with: crosscue truth LOG -o DIR"
         ) from None
     except (OSError, ValueError) as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); correct it") from None
@@ -257,7 +257,7 @@ def _check_approaches(truth: Truth, path: Path) -> None:
         before = one
     numbers = [one.id for one in truth.approaches]
     if len(set(numbers)) != len(numbers):
-        raise AnnotationError(f"{path}: approaches: an id stands twice in {numbers}; correct it")
+        raise AnnotationError(f"{path}: approaches: duplicate id in {numbers}; correct it")
 
 
 def _check_cues(truth: Truth, path: Path) -> None:
@@ -267,10 +267,8 @@ def _check_cues(truth: Truth, path: Path) -> None:
         where = f"{path}: cues.{place} ({one.cue})"
         if one.cue not in known:
             near = difflib.get_close_matches(one.cue, known, 1)
-            meant = f", meant: {near[0]}" if near else ""
-            raise AnnotationError(
-                f"{where}: no such cue{meant}; one of your own goes into own_cues"
-            )
+            meant = f", did you mean {near[0]}?" if near else ""
+            raise AnnotationError(f"{where}: no such cue{meant}; list your own cues in own_cues")
         spans = one.start_ns is not None and one.end_ns is not None
         if spans == (one.t_ns is not None) or (one.start_ns is None) != (one.end_ns is None):
             raise AnnotationError(
@@ -294,10 +292,10 @@ def _check_cues(truth: Truth, path: Path) -> None:
 def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     keys = [key for key, _ in pairs]
     if len(set(keys)) != len(keys):
-        raise ValueError(f"a key stands twice in {keys}")
+        raise ValueError(f"duplicate key in {keys}")
     return dict(pairs)
 
 
 def json_schema() -> dict[str, Any]:
-    """The file's JSON Schema, for other tools."""
+    """Return the JSON Schema of the file, for other tools."""
     return Truth.model_json_schema()

@@ -1,7 +1,7 @@
-"""Trajectories in TUM files: ``timestamp x y z qx qy qz qw``, one pose a line, ``#`` for comments.
+"""Read and write trajectories in TUM files: ``timestamp x y z qx qy qz qw``, one pose per line.
 
-Times are decimal seconds; text and integer nanoseconds are turned into each other without a
-detour through floats, which cannot hold a nanosecond of this century.
+Lines with ``#`` are comments. Times are decimal seconds. They are converted to integer nanoseconds
+and back without floats, whose precision is too low for nanoseconds of this century.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Trajectory:
     """N poses of one body in one frame.
 
     Attributes:
-        t_ns: Shape (N,), int64, increasing.
-        xyz_m: Shape (N, 3).
-        quat_wxyz: Shape (N, 4), unit quaternions that turn body axes into the frame's.
+        t_ns: Times, shape (N,), int64, increasing.
+        xyz_m: Positions, shape (N, 3).
+        quat_wxyz: Unit quaternions that rotate body axes to the frame's axes, shape (N, 4).
     """
 
     t_ns: Int64s
@@ -47,10 +47,10 @@ class Trajectory:
     quat_wxyz: Floats
 
     def __post_init__(self) -> None:
-        """Refuse columns that do not line up or are not poses.
+        """Refuse columns of inconsistent shapes, and values that are not poses.
 
         Raises:
-            ValueError: Naming the column, what is wanted and what is given.
+            ValueError: A column is invalid; the message names it with its expected content.
         """
         n = len(self.t_ns)
         if self.xyz_m.shape != (n, 3):
@@ -69,7 +69,7 @@ class Trajectory:
 
 
 def planar(t_ns: Int64s, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Trajectory:
-    """Poses on the ground, turned about the vertical alone.
+    """Return poses on the ground, rotated about the vertical axis only.
 
     Args:
         t_ns: Shape (N,), increasing.
@@ -83,7 +83,7 @@ def planar(t_ns: Int64s, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Traje
 
 
 def heading_rad(trajectory: Trajectory) -> Floats:
-    """Direction of each pose's x axis in the ground plane, counter-clockwise from +x."""
+    """Return the direction of each pose's x axis in the ground plane, counter-clockwise from +x."""
     w, x, y, z = trajectory.quat_wxyz.T
     east: Floats = 1.0 - 2.0 * (y * y + z * z)
     north: Floats = 2.0 * (w * z + x * y)
@@ -91,31 +91,31 @@ def heading_rad(trajectory: Trajectory) -> Floats:
 
 
 def read_tum(path: Path, limits: Limits = DEFAULT_LIMITS) -> Trajectory:
-    """Read a trajectory; times beyond the nanosecond are rounded to it.
+    """Read a trajectory; times are rounded to nanoseconds.
 
     Raises:
-        LogError: Not there or not readable.
-        LogTooLargeError: Larger than one chunk may be.
-        LogFormatError: A line is not a pose or goes back in time; its number is reported.
+        LogError: The file does not exist or is not readable.
+        LogTooLargeError: The file exceeds the limit.
+        LogFormatError: A line is not a pose or goes back in time; the message states its number.
     """
     try:
         size = path.stat().st_size
         if not path.is_file():
-            raise LogError(f"{path}: not a regular file; give a TUM trajectory")
+            raise LogError(f"{path}: not a regular file; expected a TUM trajectory")
         if size > limits.chunk_bytes:
             raise LogTooLargeError(
-                f"{path}: {size} bytes, more than the {limits.chunk_bytes} allowed; cut it"
+                f"{path}: {size} bytes, over the limit of {limits.chunk_bytes}; split it"
             )
         with path.open(encoding="utf-8-sig") as lines:
             return _read(path, lines)
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path") from None
     except UnicodeDecodeError:
-        raise LogFormatError(f"{path}: not text; give a TUM trajectory") from None
+        raise LogFormatError(f"{path}: not text; expected a TUM trajectory") from None
 
 
 def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
-    """Write a trajectory that ``read_tum`` reads back number for number.
+    """Write a trajectory, which ``read_tum`` reads back exactly.
 
     Raises:
         OutputError: It cannot be written.
@@ -130,24 +130,24 @@ def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
 
 
 def seconds_text(t_ns: int) -> str:
-    """Nanoseconds as decimal seconds, all nine places."""
+    """Format nanoseconds as decimal seconds with nine decimal places."""
     whole, rest = divmod(abs(t_ns), 1_000_000_000)
     return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
 
 
 def nanoseconds(text: str) -> int:
-    """Decimal seconds as nanoseconds, rounded half to even beyond the ninth place.
+    """Parse decimal seconds as nanoseconds, rounded half to even beyond the ninth decimal place.
 
     Raises:
-        ValueError: No number, or outside 64 bits.
+        ValueError: The text is not a number, or exceeds 64 bits.
     """
     try:
         seconds = Decimal(text)
     except InvalidOperation:
         raise ValueError(f"{text!r} is not a number of seconds") from None
-    # The exponent first: arithmetic on 1e999999999 overflows.
+    # The exponent is checked first, because arithmetic on 1e999999999 overflows.
     if not seconds.is_finite() or seconds.adjusted() > 9 or abs(seconds) > _LATEST_S:
-        raise ValueError(f"{text!r} is not a time that 64 bits of nanoseconds hold")
+        raise ValueError(f"{text!r} does not fit 64 bits of nanoseconds")
     return int((seconds * 1_000_000_000).quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
 
 
@@ -164,7 +164,7 @@ def _read(path: Path, lines: TextIO) -> Trajectory:
         try:
             t_ns, row = _pose(line)
             if times and t_ns <= times[-1]:
-                raise ValueError(f"time {line.split()[0]} is not after the line before")
+                raise ValueError(f"time {line.split()[0]} is not after that of the previous line")
         except ValueError as error:
             raise LogFormatError(
                 f"{path}, line {number}: {error}; expected timestamp x y z qx qy qz qw"
@@ -185,14 +185,14 @@ def _pose(line: str) -> tuple[int, list[float]]:
     t_ns = nanoseconds(words[0])
     row = [float(word) for word in words[1:]]
     if not all(map(math.isfinite, row)):
-        raise ValueError("a number that is not finite")
+        raise ValueError("a number is not finite")
     norm = math.hypot(*row[3:])
     if abs(norm - 1.0) > _NORM_OFF:
-        raise ValueError(f"a quaternion of length {norm:.3g}")
+        raise ValueError(f"the quaternion has the length {norm:.3g}")
     return t_ns, row
 
 
 def _skip_rest(lines: TextIO) -> None:
-    """Go to the end of a comment longer than one read."""
+    """Skip to the end of a comment that is longer than one read."""
     while (rest := lines.readline(_LINE_CHARACTERS)) and not rest.endswith("\n"):
         pass

@@ -1,7 +1,7 @@
-"""One Pascal VOC file: the boxes of one picture, as XML.
+"""Read a Pascal VOC file: the boxes of one picture, as XML.
 
-Read by expat's events, as CVAT's files are: a document type declaration is refused, and with it
-every entity. (defusedxml, which does the same, has had no release since 2021.)
+The file is parsed with expat, like CVAT's files: a document type declaration is refused, so that
+there are no entities. (defusedxml, which does the same, has had no release since 2021.)
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from crosscue.replay.base import MIB, AnnotationError, read_at_most
 MAX_BYTES: Final = 16 * MIB
 MAX_DEPTH: Final = 16
 VocBox: TypeAlias = tuple[str, tuple[float, float, float, float], bool]
-"""Class; x0, y0, x1, y1 in pixels; whether it is marked difficult."""
+"""Class; x0, y0, x1, y1 in pixels; True if it is marked difficult."""
 
 
 def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:
-    """File name, size and boxes of the picture.
+    """Return file name, size and boxes of the picture.
 
     Raises:
-        AnnotationError: Not there, not such a file, or with a document type declaration.
+        AnnotationError: The file does not exist, has another format, or contains a document type
+            declaration.
     """
     reader = _Reader(str(path))
     parser = expat.ParserCreate()
@@ -36,21 +37,19 @@ def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:
     try:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; this is no Pascal VOC")
+            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; expected Pascal VOC")
         parser.Parse(content, True)
     except (OSError, expat.ExpatError) as error:
-        raise AnnotationError(
-            f"{path}: not readable as XML ({error}); give a Pascal VOC file"
-        ) from None
+        raise AnnotationError(f"{path}: not XML ({error}); expected a Pascal VOC file") from None
     if not reader.is_voc:
-        raise AnnotationError(f"{path}: no <annotation>; give a Pascal VOC file")
+        raise AnnotationError(f"{path}: no <annotation>; expected a Pascal VOC file")
     name = reader.values.get("annotation/filename", "") or path.name
     return name, reader.size(), reader.boxes
 
 
 @dataclass(slots=True)
 class _Reader:
-    """What has been read so far; values by their place below the root."""
+    """Parser of a file, with the contents read so far; values by their path below the root."""
 
     where: str
     is_voc: bool = False
@@ -61,11 +60,11 @@ class _Reader:
     _text: str = ""
 
     def refuse_doctype(self, *_: object) -> None:
-        """No entities."""
+        """Refuse a document type declaration."""
         raise AnnotationError(f"{self.where}: has a document type declaration; remove it")
 
     def start(self, name: str, _attributes: dict[str, str]) -> None:
-        """An element begins."""
+        """Handle the start of an element."""
         self._place.append(name)
         if len(self._place) > MAX_DEPTH:
             raise AnnotationError(f"{self.where}: over {MAX_DEPTH} elements deep; not Pascal VOC")
@@ -75,11 +74,11 @@ class _Reader:
             self._object = {}
 
     def text(self, text: str) -> None:
-        """Characters of the element."""
+        """Handle the text of an element."""
         self._text += text
 
     def end(self, _name: str) -> None:
-        """An element ends."""
+        """Handle the end of an element."""
         place = "/".join(self._place)
         if place.startswith("annotation/object/"):
             self._object.setdefault(place.removeprefix("annotation/object/"), self._text.strip())
@@ -90,7 +89,7 @@ class _Reader:
         self._place.pop()
 
     def size(self) -> tuple[int, int] | None:
-        """Width and height, where the file says."""
+        """Width and height, if the file specifies them."""
         found = [self.values.get(f"annotation/size/{side}", "") for side in ("width", "height")]
         if not all(one.isdecimal() and int(one) > 0 for one in found):
             return None
@@ -110,6 +109,6 @@ class _Reader:
             ) from None
         if not all(map(math.isfinite, (x0, y0, x1, y1))):
             raise AnnotationError(f"{where} ({self._object['name']}): expected finite numbers")
-        # The first pixel is 1, and the last one is inside.
+        # The first pixel is 1, and the last pixel belongs to the box.
         box = (x0 - 1.0, y0 - 1.0, x1, y1)
         return self._object["name"], box, self._object.get("difficult", "0") == "1"

@@ -112,7 +112,7 @@ def test_what_is_outside_is_cut_or_counted(tmp_path: Path) -> None:
             AnnotationError,
             "document type",
         ),
-        ({"7.xml": "<annotation>"}, AnnotationError, "not readable as XML"),
+        ({"7.xml": "<annotation>"}, AnnotationError, "not XML"),
         ({"7.xml": "<html/>"}, AnnotationError, "no <annotation>"),
         (
             {"7.xml": "<annotation><object><name>car</name></object></annotation>"},

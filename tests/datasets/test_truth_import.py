@@ -121,7 +121,7 @@ DAMAGED = {
     "no such category",
     "four numbers",
     "expected a list",
-    "neither twice",
+    "expected a unique id",
 }
 """What is wrong with the file whatever its log is: it cannot be read, exit status 4."""
 
@@ -197,7 +197,7 @@ DAMAGED = {
             "four numbers",
         ),
         ({"annotations": {}}, "expected a list"),
-        ({"categories": [{"id": 3, "name": "a"}, {"id": 3, "name": "b"}]}, "neither twice"),
+        ({"categories": [{"id": 3, "name": "a"}, {"id": 3, "name": "b"}]}, "expected a unique id"),
         (
             {"categories": [{"id": 13, "name": "stop sing"}, {"id": 3, "name": "car"}]},
             "--map 'stop sing=stop_sign'",
@@ -344,10 +344,10 @@ def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "not readable as XML"),
-        ("<annotations>", "not readable as XML"),
+        ("", "not XML"),
+        ("<annotations>", "not XML"),
         ("<svg></svg>", "expected <annotations>"),
-        ("<annotations>" + "<a>" * 70 + "</a>" * 70 + "</annotations>", "over 64 deep"),
+        ("<annotations>" + "<a>" * 70 + "</a>" * 70 + "</annotations>", "over 64 levels deep"),
         (IMAGES_XML.replace('xtl="5.00"', 'xtl="nan"'), "expected a number"),
         (IMAGES_XML.replace('width="64"', 'width="x"'), "expected a whole number"),
         (IMAGES_XML.replace('width="64"', 'width="0"'), "expected pixels"),

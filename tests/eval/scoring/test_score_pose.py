@@ -175,7 +175,7 @@ def test_truth_on_another_clock_is_refused(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("{", "not readable as JSON"),
-        ('{"version": 1, "version": 1}', "stands twice"),
+        ('{"version": 1, "version": 1}', "duplicate key"),
         ('{"version": 1, "start_ns": 5, "end_ns": 5}', "not after start_ns"),
         ('{"version": 1, "start_ns": 5, "end_ns": 9, "pose_file": "x"}', "pose_file"),
         ('{"version": 1, "start_ns": 5, "end_ns": 9}', "pose: missing"),

@@ -176,10 +176,7 @@ def test_describe_lists_every_field_once() -> None:
     [
         ('fields = [{name = "a", start = 60, bits = 8}]', "a: bits 60+8 do not fit 8 bytes"),
         ('fields = [{name = "a", start = 0, bits = 8}, {name = "b", start = 7, bits = 1}]', "b"),
-        (
-            'fields = [{name = "a", start = 4, bits = 8, order = "big"}]',
-            "consist of complete bytes",
-        ),
+        ('fields = [{name = "a", start = 4, bits = 8, order = "big"}]', "of complete bytes"),
         ('fields = [{name = "a", start = 0, bits = 8, only = "new"}]', "only 'new'; there are"),
         ('fields = [{name = "a", start = 24, bits = 9}]', "m.a: does not fit the payload"),
     ],
