@@ -1,8 +1,8 @@
 """comma2k19: one-minute segments of a Toyota RAV4 or Honda Civic with raw CAN, IMU, GNSS and pose.
 
 Every stream is a pair of arrays, times (seconds of the device's boot clock) and values; all share
-one clock. The set's axes [forward, right, down] become REP-103's [forward, left, up] here, at the
-door. CAN payloads are stored padded to 8 bytes: their true lengths are not kept.
+one clock. The data set's axes [forward, right, down] are converted to REP-103's [forward, left, up]
+on reading. CAN payloads are stored padded to 8 bytes, without their true lengths.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LATEST_NS: Final = 1 << 62
 NO_TIME: Final = -(1 << 63)
 MICROTESLA: Final = 1e-6
 FLIP: Final = np.array([1.0, -1.0, -1.0])
-"""[forward, right, down] to [forward, left, up]."""
+"""Signs that convert [forward, right, down] to [forward, left, up]."""
 
 Values = NDArray[np.generic]
 
@@ -84,7 +84,7 @@ class _Stream:
     folder: str
     to_table: Callable[[Values], Table]
     width: int
-    """Columns that it needs."""
+    """Number of columns."""
 
 
 _RAW_GNSS = _named(
@@ -128,7 +128,7 @@ STREAMS: Final[dict[str, _Stream]] = {
 
 @dataclass(slots=True, eq=False)
 class _Source:
-    """One topic: its times and a way to its rows."""
+    """One topic: its times, and a function that reads its rows."""
 
     topic: Topic
     t_ns: Int64s
@@ -149,7 +149,7 @@ class Segment(Closing):
         """Map all arrays of the segment.
 
         Raises:
-            LogFormatError: Not one readable stream in the folder.
+            LogFormatError: The folder contains no readable stream.
         """
         self.path: Final = path
         self._unreadable: list[str] = []
@@ -160,18 +160,18 @@ class Segment(Closing):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Every stream of the segment, CAN one topic a bus."""
+        """Streams of the segment, with one topic per CAN bus."""
         return tuple(source.topic for source in self._sources)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams side by side, a second at a time; see ``Log.read``."""
-        ledger.integrity = "not checkable: .npy files carry no checksum; lengths were compared"
+        """Read all streams in parallel, a second at a time; see ``Log.read``."""
+        ledger.integrity = "not checkable: .npy files have no checksum; lengths were compared"
         for sentence in self._unreadable:
             ledger.drop("", UNREADABLE, None, sentence)
         for source in self._sources:
             ledger.declare(source.topic.name, source.topic.declared)
         if any(source.topic.type_name == "crosscue/CanFrames" for source in self._sources):
-            ledger.notice("CAN frame lengths are not kept by comma2k19; payloads are zero-padded")
+            ledger.notice("comma2k19 does not store CAN frame lengths; payloads are zero-padded")
         filled = [source for source in self._sources if len(source.t_ns)]
         if filled:
             cursors = [0] * len(filled)
@@ -180,7 +180,7 @@ class Segment(Closing):
                 for at, s in zip(cursors, filled, strict=True)
                 if at < len(s.t_ns)
             ]:
-                # From the earliest row, not from the last edge: damaged times lie years apart.
+                # Start at the earliest row, because damaged times may be years apart.
                 edge_ns = min(waiting) + STEP_NS
                 for i, source in enumerate(filled):
                     stop = int(np.searchsorted(source.reach_ns, edge_ns))
@@ -197,7 +197,7 @@ class Segment(Closing):
             ledger.settle(source.topic.name, CUT)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Arrays that are cut or cannot be read; see ``KnowsItsEnd``."""
+        """Report arrays that are truncated or cannot be read; see ``KnowsItsEnd``."""
         for sentence in self._unreadable:
             ledger.drop("", UNREADABLE, None, sentence)
         for source in self._sources:
@@ -205,7 +205,7 @@ class Segment(Closing):
             ledger.drop(source.topic.name, CUT, missing)
 
     def close(self) -> None:
-        """Let the mapped files go."""
+        """Release the mapped files."""
         self._sources = []
 
     def _column(self, relative: str) -> Column | None:
@@ -219,7 +219,7 @@ class Segment(Closing):
             return None
 
     def _has(self, column: Column, kinds: str, width: int = 0) -> bool:
-        """Whether rows are numbers of these kinds, in so many columns; 0 for plain numbers."""
+        """Check that rows are numbers of these kinds with ``width`` columns; 0 for scalars."""
         rows, sides = column.rows, column.rows.shape[1:]
         has_columns = len(sides) == 1 and sides[0] >= width > 0
         if rows.dtype.kind in kinds and (has_columns or (not sides and width < 2)):
@@ -267,7 +267,7 @@ class Segment(Closing):
         t_ns = _to_ns(times.rows[:n])
         for number in np.unique(buses):
             index = np.flatnonzero(buses == number)
-            # A cut file hides which bus the missing frames were on: the first one carries them.
+            # The bus of missing frames of a truncated file is unknown; the first bus reports them.
             missing = lost if number == buses.min() else 0
             topic = Topic(
                 f"can/{int(number)}", "crosscue/CanFrames", "columns", declared=len(index) + missing
@@ -283,7 +283,7 @@ def _frames_of(
         ids = np.asarray(address.rows[rows])
         width = payload.rows.dtype.itemsize
         picked = np.ascontiguousarray(payload.rows[rows])
-        # An element of |S8 hides its trailing zero bytes; the buffer below still has them.
+        # An element of |S8 drops trailing zero bytes; the underlying buffer still has them.
         raw = np.zeros((len(rows), 8), np.uint8)
         raw[:, :width] = picked.view(np.uint8).reshape(len(rows), width)
         return CanFrames(
@@ -320,7 +320,7 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
 
 
 def _to_ns(seconds: Values) -> Int64s:
-    """Nanoseconds, ``NO_TIME`` where damage has made a number that is not a time."""
+    """Convert seconds to nanoseconds, ``NO_TIME`` for damaged numbers that are not times."""
     with np.errstate(invalid="ignore", over="ignore"):
         t_ns = np.rint(np.asarray(seconds, np.float64) * 1e9)
         is_time = np.abs(t_ns) < LATEST_NS

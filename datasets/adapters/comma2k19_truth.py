@@ -1,4 +1,4 @@
-"""The true pose that a comma2k19 segment carries, as ``truth.json`` with a TUM trajectory."""
+"""Write the true pose of a comma2k19 segment as ``truth.json`` with a TUM trajectory."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .npy import read_column
 POSE_FILE: Final = "pose.tum"
 
 LATEST_S: Final = 9e9
-"""Later than any recording, in seconds since 1970 or since the start."""
+"""Upper bound on times of recordings, in seconds since 1970 or since the start."""
 
 
 def write(path: Path, folder: Path) -> Path:
-    """Write the camera's true track, relative to its first position.
+    """Write the camera's true trajectory, relative to its first position.
 
     Raises:
-        LogFormatError: The segment carries no pose.
+        LogFormatError: The segment contains no pose.
         OutputError: It cannot be written.
     """
     from scipy.spatial.transform import Rotation
@@ -40,9 +40,9 @@ def write(path: Path, folder: Path) -> Path:
     )
     n = min(len(times), len(position), len(quat))
     if n < 2:
-        raise LogFormatError(f"{path}/global_pose: {n} poses; the segment carries no usable truth")
+        raise LogFormatError(f"{path}/global_pose: {n} poses; the segment contains no usable truth")
     if not (np.diff(times[:n]) > 0.0).all() or np.abs(times).max() > LATEST_S:
-        raise LogFormatError(f"{path}/global_pose/frame_times: no rising times; copy it again")
+        raise LogFormatError(f"{path}/global_pose/frame_times: expected increasing times")
     if not np.linalg.norm(quat[:n], axis=1).all():
         raise LogFormatError(f"{path}/global_pose/frame_orientations: zeros; copy it again")
     t_ns = np.rint(times[:n] * 1e9).astype(np.int64)
@@ -50,9 +50,9 @@ def write(path: Path, folder: Path) -> Path:
     latitude, longitude, altitude = (float(part[0]) for part in ecef_to_geodetic(xyz[:1]))
     enu_r_ecef = ecef_to_enu_matrix(np.deg2rad(latitude), np.deg2rad(longitude))
     east_north_up = (xyz - xyz[0]) @ enu_r_ecef.T
-    # The quaternions (w first) turn the camera's forward, right and down axes into earth-fixed
-    # ones. The set's own text names the inverse, but only so does forward agree with the recorded
-    # velocity (to 0.998).
+    # The quaternions (w first) rotate the camera's forward, right and down axes to earth-fixed
+    # axes. The data set's documentation specifies the inverse, but only with this convention does
+    # forward agree with the recorded velocity (to 0.998).
     ecef_r_camera = Rotation.from_quat(np.roll(quat[:n], -1, axis=1))
     camera_r_car = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
     enu_r_car = Rotation.from_matrix(enu_r_ecef) * ecef_r_camera * camera_r_car
@@ -80,10 +80,10 @@ def write(path: Path, folder: Path) -> Path:
 
 
 def _numbers(path: Path, shape: tuple[int, ...]) -> Floats:
-    """Rows of one shape, all finite.
+    """Read rows of finite numbers with one shape.
 
     Raises:
-        LogFormatError: They are something else.
+        LogFormatError: The file has other contents.
     """
     rows = read_column(path).rows
     if rows.dtype.kind not in "iuf" or rows.shape[1:] != shape or not np.isfinite(rows).all():

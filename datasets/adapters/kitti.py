@@ -1,18 +1,18 @@
-"""KITTI: a raw drive, or one sequence of the tracking set, as a log; its truth from the INS.
+"""Read a KITTI raw drive or one sequence of the tracking set as a log, with truth from the INS.
 
-A raw drive has folders ``image_00`` to ``image_03`` and ``oxts``, each with ``data/`` (one file a
-row) and ``timestamps.txt`` (UTC date-times to the nanosecond). The tracking set keeps one line of
-``oxts/SEQ.txt`` and one picture ``image_0x/SEQ/NNNNNN.png`` for every frame, and no times: they are
-made from the frame number, at the rate by which the box's speeds add up to the distances between
-its positions (9.65 Hz; 10 Hz where the car stands), which is reported.
+A raw drive has folders ``image_00`` to ``image_03`` and ``oxts``, each with ``data/`` (one file per
+row) and ``timestamps.txt`` (UTC date-times to the nanosecond). The tracking set has one line of
+``oxts/SEQ.txt`` and one picture ``image_0x/SEQ/NNNNNN.png`` for every frame, but no times. They are
+computed from the frame number, with the rate at which the box's speeds match the distances between
+its positions (9.65 Hz; 10 Hz for a stationary vehicle). The rate is reported.
 
 Topics: one per camera folder; from the OXTS box ``oxts/imu``, ``oxts/gnss`` and ``oxts/ins_speed``.
 Intrinsics are those of ``calib/SEQ.txt`` or of ``calib_cam_to_cam.txt`` in the folder of the raw
 drive's day. Labels of the tracking set (``label_02/SEQ.txt``) become objects of the truth; a raw
 drive's tracklets are not read.
 
-All of the box's numbers come from one filter: ``ins_speed`` is not a wheel speed, and ``gnss`` is
-no raw fix.
+All values of the box are outputs of one filter: ``ins_speed`` is not a wheel speed, and ``gnss`` is
+not a raw fix.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
 
 POSE_FILE: Final = "pose.tum"
 TRACKING_PERIOD_NS: Final = 100_000_000
-"""Of a frame, where positions and speeds do not show it."""
+"""Default period of frames, if positions and speeds do not determine it."""
 PERIOD_STEP_S: Final = 1e-4
 MAX_PERIOD_ERROR: Final = 0.2
-"""A fraction; a period further off the published 10 Hz is damage."""
+"""Max relative difference between the period and the published 10 Hz; more means damage."""
 ROWS_PER_BLOCK: Final = 100
 FRAMES_FOR_PERIOD: Final = 10_000
 Unreadable: TypeAlias = tuple[str, str, int | None, str]
 """Topic, reason, count and detail of a stream that cannot be read."""
 
 Line: TypeAlias = tuple[str, int, bytes | str]
-"""Place, time and bytes of a packet; a text in place of bytes says why it has no bytes."""
+"""Position, time and bytes of a packet; a string in place of bytes is the reason for their loss."""
 
 TOPICS: Final[dict[str, tuple[str, Callable[[Packets], Table]]]] = {
     "oxts/imu": ("sensor_msgs/msg/Imu", lambda packets: packets.table(IMU)),
@@ -76,13 +76,13 @@ TOPICS: Final[dict[str, tuple[str, Callable[[Packets], Table]]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Oxts:
-    """The box's packets as they are on disk: one file each, or one line each of one file.
+    """Stored packets of the box: one file each, or one line each of a single file.
 
     Attributes:
-        files: One file a packet, and times; for a single file, times of its lines.
-        single: The one file, or None.
+        files: One file per packet, and times; for a single file, times of its lines.
+        single: The single file, or None.
         period_ns: Time between two of its lines.
-        touched: Takes note of what is read, for a seal.
+        touched: Record of the bytes read, for a seal.
     """
 
     files: TimedFiles
@@ -92,24 +92,24 @@ class Oxts:
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The signals of the GNSS and inertial box."""
+        """Topics of the GNSS and inertial box."""
         return tuple(
             Topic(name, type_name, "columns", declared=self.files.declared)
             for name, (type_name, _) in TOPICS.items()
         )
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        """Every signal's rows, with their account."""
+        """Yield the rows of all signals, and account for them."""
         return _read_oxts(self, ledger, selection)
 
     def report_missing(self, ledger: Ledger) -> None:
-        """Packets without a time, times without a packet; see ``KnowsItsEnd``."""
+        """Report packets without a time and times without a packet; see ``KnowsItsEnd``."""
         for name in TOPICS:
             ledger.drop(name, "a packet without its time", int(np.sum(self.files.t_ns < 0)))
             ledger.drop(name, "a time without its packet", len(self.files.missing_ns))
 
     def lines(self) -> Iterator[Line]:
-        """Every packet in stored order."""
+        """Yield every packet in stored order."""
         if self.single is not None:
             yield from self._lines_of(self.single)
             return
@@ -148,7 +148,7 @@ class Drive(CameraDrive):
         unreadable: Sequence[Unreadable] = (),
         notices: Sequence[str] = (),
     ) -> None:
-        """Put a drive together; ``oxts`` are the packets of the GNSS and inertial box."""
+        """Build a drive; ``oxts`` are the packets of the GNSS and inertial box."""
         numbers = () if oxts is None else (oxts,)
         super().__init__(
             path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices
@@ -156,7 +156,7 @@ class Drive(CameraDrive):
         self.oxts: Final = oxts
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """As ``CameraDrive.read``; says that packets have no checksum."""
+        """Read like ``CameraDrive.read``, and report that packets have no checksum."""
         yield from super().read(ledger, selection)
         ledger.integrity = "; ".join(
             part
@@ -168,7 +168,7 @@ class Drive(CameraDrive):
         )
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
-        """Focal length and optical center of a rectified camera; None where not published.
+        """Return focal length and optical center of a rectified camera; None if not published.
 
         Raises:
             LogFormatError: The file is damaged.
@@ -185,7 +185,7 @@ def open_drive(path: Path, limits: Limits) -> Drive:
     """Open a drive's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
-        LogFormatError: No stream with times, or several sequences in one folder.
+        LogFormatError: No stream has times, or there are several sequences in one folder.
     """
     if (path / "oxts" / "data").is_dir() or (path / "oxts" / "timestamps.txt").is_file():
         return _open_raw(path, limits)
@@ -193,16 +193,16 @@ def open_drive(path: Path, limits: Limits) -> Drive:
 
 
 def write_truth(path: Path, folder: Path) -> Path:
-    """Write the INS's track of a drive, relative to its first position.
+    """Write the INS trajectory of a drive, relative to its first position.
 
     Raises:
-        LogFormatError: Fewer than two packets with times.
+        LogFormatError: There are fewer than two packets with times.
         OutputError: It cannot be written.
     """
     oxts = open_drive(path, DEFAULT_LIMITS).oxts
     packets = _in_time_order(_packets(list(oxts.lines()))) if oxts is not None else None
     if packets is None or len(packets) < 2:
-        raise LogFormatError(f"{path}/oxts: fewer than two packets; the drive carries no truth")
+        raise LogFormatError(f"{path}/oxts: fewer than two packets; the drive contains no truth")
     latitude, longitude, altitude = (float(packets[name][0]) for name in ("lat", "lon", "alt"))
     xyz_m = geodetic_to_enu(
         packets["lat"], packets["lon"], packets["alt"], (latitude, longitude, altitude)
@@ -232,7 +232,7 @@ def write_truth(path: Path, folder: Path) -> Path:
 
 
 def _objects(path: Path, oxts: Oxts | None, folder: Path) -> tuple[str | None, int]:
-    """Labels of a tracking sequence, as a file beside the truth; and how many were damaged."""
+    """Write the labels of a tracking sequence next to the truth; return file and damaged count."""
     single = None if oxts is None else oxts.single
     if oxts is None or single is None or not (path / "label_02" / single.name).is_file():
         return None, 0
@@ -280,12 +280,12 @@ def _timed(
     limits: Limits,
     touched: Touched,
 ) -> TimedFiles | None:
-    """The files of one stream with times; else None, and why is added to ``unreadable``."""
+    """Return the files of a stream with times, or None with a reason added to ``unreadable``."""
     time_file = folder / "timestamps.txt"
     paths = listed(folder / "data") if (folder / "data").is_dir() else []
     if not time_file.is_file():
         if paths:
-            why = f"{folder.name}/timestamps.txt is missing; put it back"
+            why = f"{folder.name}/timestamps.txt is missing; restore it"
             unreadable.append((topic, "rows without times", len(paths), why))
         return None
     try:
@@ -323,16 +323,16 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
             )
             files = TimedFiles(tuple(paths), t_ns, _no_times(), None, ())
             cameras.append(PictureFiles(topic, files, touched))
-    why = "as published" if period_s is None else "by which speeds add up to distances"
+    why = "as published" if period_s is None else "with which speeds match distances"
     notice = (
-        f"{name}: the tracking set keeps no times; they are made from frame numbers, "
+        f"{name}: the tracking set has no times; they are computed from frame numbers, "
         f"{oxts.period_ns * 1e-6:g} ms each ({why}), starting at 0"
     )
     return Drive(path, cameras, oxts, limits, touched, notices=[notice])
 
 
 def _driven_period_s(oxts: Oxts) -> float | None:
-    """Time between frames that makes the box's speeds add up to the way between its positions."""
+    """Return the time between frames for which the box's speeds match its distances."""
     packets = _packets(list(islice(oxts.lines(), FRAMES_FOR_PERIOD)))
     if len(packets) < 2:
         return None
@@ -348,7 +348,7 @@ def _driven_period_s(oxts: Oxts) -> float | None:
 
 
 def _frame_ns(stem: str, period_ns: int) -> int:
-    """Time of a numbered frame, or -1 for a name that is not a number."""
+    """Return the time of a numbered frame, or -1 for a name that is not a number."""
     is_number = stem.isascii() and stem.isdecimal() and len(stem) <= 9
     return int(stem) * period_ns if is_number else -1
 
@@ -382,7 +382,7 @@ def _account(
     ledger: Ledger,
     selection: Selection,
 ) -> None:
-    """Book one stretch of packets for one topic."""
+    """Count a group of packets for one topic."""
     n = len(packets)
     ledger.find(name, n)
     if not selection.wants(name):
@@ -398,7 +398,7 @@ def _account(
 
 
 def _packets(some: Sequence[Line]) -> Packets:
-    """Those lines that are packets."""
+    """Return the lines that are packets."""
     good = [
         (t_ns, row)
         for _, t_ns, raw in some
@@ -409,7 +409,7 @@ def _packets(some: Sequence[Line]) -> Packets:
 
 
 def _in_time_order(packets: Packets) -> Packets:
-    """Packets with times, each time once."""
+    """Return packets with times, with each time once."""
     _, first = np.unique(packets.t_ns, return_index=True)
     first = first[packets.t_ns[first] >= 0]
     return Packets(packets.t_ns[first], packets.numbers[first])

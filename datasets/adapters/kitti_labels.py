@@ -1,8 +1,8 @@
-"""KITTI tracking's labels of one sequence, ``label_02/SEQ.txt``: boxes in the left colour camera.
+"""Read KITTI tracking labels of a sequence, ``label_02/SEQ.txt``: boxes in the left colour camera.
 
 A line has frame, track, class, truncation, occlusion, observation angle, the box's left, top, right
-and bottom in pixels, the cuboid's height, width and length, its place right, down and ahead of the
-camera, and its rotation. Lines of class DontCare mark parts of a picture that were not labelled.
+and bottom in pixels, the cuboid's height, width and length, its position right, down and ahead of
+the camera, and its rotation. Lines of class DontCare mark unlabelled parts of a picture.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ LABELS: Final = {
     "Person_sitting": "person",
     "Cyclist": "cyclist",
 }
-"""From the set's classes to COCO's names; a cyclist's box holds person and bicycle."""
+"""COCO's names by class of the data set; a cyclist's box contains person and bicycle."""
 UNLABELLED: Final = ("car", "person")
-"""Where nothing was labelled, neither of these is missed nor false."""
+"""Classes that are neither missed nor false in unlabelled regions."""
 VISIBLE: Final = {0: 1.0, 1: 0.7, 2: 0.3}
-"""From the set's degrees of occlusion: none, partly, largely."""
+"""Visible fraction by the data set's level of occlusion: none, partly, largely."""
 
 
 class Labelled(NamedTuple):
-    """Objects of a sequence, and how many lines were damaged."""
+    """Objects of a sequence, and the number of damaged lines."""
 
     objects: Objects
     lost: int
 
 
 def read_labels(file: Path, pictures: Path, period_ns: int) -> Labelled:
-    """The labels of a sequence, frame by frame.
+    """Read the labels of a sequence, frame by frame.
 
     Args:
-        file: Of the labels.
+        file: File of the labels.
         pictures: Folder of the sequence's pictures, for their size.
         period_ns: Time from one frame to the next; frame 0 is at 0.
 
     Raises:
-        LogFormatError: It cannot be read, or no picture shows the size.
+        LogFormatError: The file cannot be read, or no picture is available for the size.
     """
     content = read_at_most(file, MAX_FILE_BYTES)
     if content is None:
@@ -100,4 +100,4 @@ def _size_px(pictures: Path) -> tuple[int, int]:
             size = size_in_header(file.read(HEADER_BYTES), "png")
         if size is not None:
             return size
-    raise LogFormatError(f"{pictures}: no picture; the labels need the size of one")
+    raise LogFormatError(f"{pictures}: no picture; expected one for the size of the labels' frames")

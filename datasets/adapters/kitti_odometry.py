@@ -1,16 +1,16 @@
-"""KITTI odometry: one sequence in its published folder layout as a log; its truth from the poses.
+"""Read a KITTI odometry sequence in its published layout as a log, with truth from the poses.
 
 ``sequences/NN/`` holds ``image_0`` to ``image_3`` (``NNNNNN.png``), ``times.txt`` (seconds from the
 first picture, one line each) and ``calib.txt`` (projection matrices P0 to P3 of the rectified
-cameras); ``poses/NN.txt``, for sequences 00 to 10, one line of twelve numbers a picture: the upper
-rows of the matrix that turns points of the left grey camera (image_0: x right, y down, z ahead)
-into that camera's axes at the first picture. The scans in ``velodyne`` are not read.
+cameras). ``poses/NN.txt``, for sequences 00 to 10, has one line of twelve numbers per picture: the
+upper rows of the matrix that transforms points of the left grey camera (image_0: x right, y down,
+z ahead) to that camera's axes at the first picture. The scans in ``velodyne`` are not read.
 
-Topics: one per camera folder and, where poses exist, ``odometry``: forward speed and yaw rate by
-the poses, so it is as good as the truth and no wheel speed.
+Topics: one per camera folder and, if poses exist, ``odometry``: forward speed and yaw rate computed
+from the poses, which are as accurate as the truth and not wheel speeds.
 
-The truth is the left grey camera's track. Its map has the first picture's axes as REP-103 has them:
-x ahead (their z), y left (their -x), z up (their -y).
+The truth is the left grey camera's trajectory. Its map has the first picture's axes in the
+convention of REP-103: x ahead (their z), y left (their -x), z up (their -y).
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ SETUP: Final = (
     "of the sensors' places on the car"
 )
 BOX: Final = Mounting(x_m=-0.05, y_m=0.32, z_m=0.93, roll_rad=None, pitch_rad=None)
-"""The GNSS/INS box; its yaw is the car's, as the set's ``dataformat.txt`` defines it."""
+"""Mounting of the GNSS/INS box; its yaw is the vehicle's, as defined in ``dataformat.txt``."""
 AXES: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""From right, down, ahead to ahead, left, up."""
+"""Rotation from right, down, ahead to ahead, left, up."""
 
 
 class Poses(NamedTuple):
-    """The left grey camera's track.
+    """Trajectory of the left grey camera.
 
     Attributes:
-        t_ns: Shape (N,), int64.
-        xyz_m: Shape (N, 3): ahead, left, up of the first picture.
-        turn: N rotations from ahead, left, up of the camera into those axes.
-        losses: Lines that could not be understood.
-        declared: How many there are times or poses for, whichever are more.
+        t_ns: Times, shape (N,), int64.
+        xyz_m: Positions ahead, left, up of the first picture, shape (N, 3).
+        turn: N rotations from ahead, left, up of the camera to those axes.
+        losses: Lines that could not be parsed.
+        declared: Number of times or of poses, whichever is larger.
     """
 
     t_ns: Int64s
@@ -72,7 +72,7 @@ class Poses(NamedTuple):
     declared: int
 
     def odometry(self) -> Table:
-        """Forward speed and yaw rate, by differences between neighbours."""
+        """Return forward speed and yaw rate, from differences between neighbours."""
         seconds = (self.t_ns - self.t_ns[0]) * 1e-9
         ahead = self.turn.apply((1.0, 0.0, 0.0))
         velocity = np.gradient(self.xyz_m, seconds, axis=0)
@@ -91,7 +91,7 @@ class Drive(CameraDrive):
     format: Final = "kitti-odometry"
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
-        """Focal length and optical center of a rectified camera; None where not published.
+        """Return focal length and optical center of a rectified camera; None if not published.
 
         Raises:
             LogFormatError: The file is damaged.
@@ -100,15 +100,15 @@ class Drive(CameraDrive):
 
 
 def projection(file: Path, camera: str) -> tuple[float, float, float] | None:
-    """Focal length and optical center, px, of a rectified camera in a calibration file.
+    """Read focal length and optical center, px, of a rectified camera from a calibration file.
 
     Args:
-        file: ``calib.txt`` of the odometry set, a sequence's of the tracking set, or
-            ``calib_cam_to_cam.txt`` of a raw drive's day.
-        camera: Its number.
+        file: ``calib.txt`` of the odometry set, the file of a sequence of the tracking set, or
+            ``calib_cam_to_cam.txt`` of the day of a raw drive.
+        camera: Number of the camera.
 
     Raises:
-        LogFormatError: Its line does not hold twelve numbers.
+        LogFormatError: The camera's line does not contain twelve numbers.
     """
     if not file.is_file():
         return None
@@ -126,12 +126,12 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
-        LogFormatError: No times, or no camera.
+        LogFormatError: There are no times, or no camera.
     """
     touched = Touched()
     times_file = path / "times.txt"
     if not times_file.is_file():
-        raise LogFormatError(f"{times_file}: not there; a KITTI odometry sequence has one")
+        raise LogFormatError(f"{times_file}: missing; expected a KITTI odometry sequence")
     times = read_time_file(times_file, limits)
     touched.add(times_file, 0, times_file.stat().st_size)
     cameras = []
@@ -156,12 +156,12 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     notices = ["velodyne: laser scans are not read"] if (path / "velodyne").is_dir() else []
     numbers = () if odometry is None else (odometry,)
     if numbers:
-        notices.append("odometry: made of the true poses; a pose estimated from it is no result")
+        notices.append("odometry: computed from the true poses; do not score poses based on it")
     return Drive(path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices)
 
 
 def pose_file(path: Path) -> Path | None:
-    """``poses/NN.txt`` beside ``sequences``, or ``poses.txt`` in the sequence; None for neither."""
+    """Find ``poses/NN.txt`` next to ``sequences``, or ``poses.txt`` in the sequence, or None."""
     here = path.resolve()
     for file in (here.parent.parent / "poses" / f"{here.name}.txt", here / "poses.txt"):
         if file.is_file():
@@ -170,10 +170,10 @@ def pose_file(path: Path) -> Path | None:
 
 
 def read_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> Poses:
-    """The poses of a sequence.
+    """Read the poses of a sequence.
 
     Raises:
-        LogFormatError: There are none, or fewer than two that can be understood.
+        LogFormatError: The file is missing, or contains fewer than two valid poses.
     """
     file = pose_file(path)
     if file is None:
@@ -186,7 +186,7 @@ def read_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> Poses:
     n = min(len(found), len(times))
     good = np.array([one is not None for one in found[:n]], np.bool_)
     bad = [f"line {i + 1}" for i, one in enumerate(found) if one is None]
-    losses = (Loss("a pose that is no matrix", len(bad), ", ".join(bad[:8])),) if bad else ()
+    losses = (Loss("a pose that is not a matrix", len(bad), ", ".join(bad[:8])),) if bad else ()
     matrices = np.array([one for one in found[:n] if one is not None]).reshape(-1, 3, 4)
     t_ns = times[:n][good]
     if len(matrices) < 2 or not (np.diff(t_ns) > 0).all():
@@ -199,7 +199,7 @@ def read_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> Poses:
 
 
 def write_truth(path: Path, folder: Path) -> Path:
-    """Write the left grey camera's track.
+    """Write the trajectory of the left grey camera.
 
     Raises:
         LogFormatError: The sequence has no poses.
@@ -230,7 +230,7 @@ def write_truth(path: Path, folder: Path) -> Path:
 
 
 def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:
-    """Picture ``NNNNNN`` has the time at place NNNNNN."""
+    """Assign the time with index NNNNNN to picture ``NNNNNN``."""
     numbered = [p.stem.isascii() and p.stem.isdecimal() and len(p.stem) < 10 for p in paths]
     places = np.array(
         [int(p.stem) if is_so else -1 for p, is_so in zip(paths, numbered, strict=True)], np.int64
@@ -251,7 +251,7 @@ def _lines(file: Path) -> list[str]:
 
 
 def _numbers(text: str) -> Floats | None:
-    """Twelve finite numbers, or None."""
+    """Parse twelve finite numbers; None for other lines."""
     try:
         numbers = np.array([float(part) for part in text.split()], np.float64)
     except ValueError:

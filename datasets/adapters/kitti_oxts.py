@@ -1,7 +1,7 @@
-"""OXTS packets of KITTI: thirty numbers of a GNSS/INS box on one line of text.
+"""Parse OXTS packets of KITTI: thirty numbers of a GNSS/INS box on one line of text.
 
-Columns and axes are those of the set's ``dataformat.txt``: the box's axes are x forward, y left and
-z up, as in REP-103; yaw is 0 when heading east and grows counter-clockwise.
+Columns and axes are those of the published ``dataformat.txt``. The box's axes are x forward, y left
+and z up, as in REP-103. Yaw is 0 when heading east and increases counter-clockwise.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Packets:
     """N packets.
 
     Attributes:
-        t_ns: Shape (N,), int64.
-        numbers: Shape (N, 30), in the order of ``COLUMNS``.
+        t_ns: Times, shape (N,), int64.
+        numbers: Values in the order of ``COLUMNS``, shape (N, 30).
     """
 
     t_ns: Int64s
@@ -61,25 +61,25 @@ class Packets:
         return len(self.t_ns)
 
     def __getitem__(self, name: str) -> Floats:
-        """One of ``COLUMNS``, shape (N,)."""
+        """Return a column of ``COLUMNS``, shape (N,)."""
         column: Floats = self.numbers[:, _AT[name]]
         return column
 
     def table(self, names: dict[str, str]) -> Table:
-        """Columns under our names."""
+        """Return a table of columns with new names."""
         return Table({ours: self[theirs] for ours, theirs in names.items()})
 
     def gnss(self) -> Table:
-        """Position, and speed and course over ground (counter-clockwise from east)."""
+        """Return position, speed and course over ground (counter-clockwise from east)."""
         columns = dict(self.table(GNSS).columns)
         columns["speed_mps"] = np.hypot(self["ve"], self["vn"])
         columns["course_rad"] = np.arctan2(self["vn"], self["ve"])
         return Table(columns)
 
     def attitude_wxyz(self) -> Floats:
-        """Unit quaternions that turn the box's axes into east, north, up; shape (N, 4).
+        """Return unit quaternions that rotate the box's axes to east, north, up; shape (N, 4).
 
-        Yaw about z, then pitch about y, then roll about x.
+        The order is yaw about z, pitch about y, roll about x.
         """
         half = np.stack([self["roll"], self["pitch"], self["yaw"]]) / 2.0
         (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
@@ -95,16 +95,16 @@ class Packets:
 
 
 def parse(line: str | bytes) -> tuple[float, ...] | str:
-    """The thirty numbers of one line, or why it is not a packet."""
+    """Parse the thirty numbers of a line, or return the reason why it is not a packet."""
     parts: Sequence[str | bytes] = line[:LINE_BYTES].split()
     if len(parts) != len(COLUMNS):
         return f"{len(parts)} numbers; expected {len(COLUMNS)}"
     try:
         numbers = tuple(float(part) for part in parts)
     except ValueError:
-        return "not all of it are numbers"
+        return "not all values are numbers"
     if not np.isfinite(numbers).all():
         return "a number is not finite"
     if abs(numbers[0]) > 90.0 or abs(numbers[1]) > 360.0:
-        return f"latitude {numbers[0]:g}, longitude {numbers[1]:g}: not on the earth"
+        return f"latitude {numbers[0]:g}, longitude {numbers[1]:g}: out of range"
     return numbers

@@ -1,4 +1,4 @@
-"""NumPy's .npy files read as far as they go, without pickle and without trusting their header."""
+"""Read complete or truncated .npy files of NumPy, without pickle or trust in their header."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ class Column:
     """The readable rows of one array file.
 
     Attributes:
-        path: The file.
-        rows: Shape (N, ...): the rows whose bytes are all there; mapped from the file where
-            its layout allows.
-        declared: Rows that the header promises.
+        path: Path of the file.
+        rows: Complete rows, shape (N, ...); mapped from the file if its layout allows.
+        declared: Number of rows declared in the header.
     """
 
     path: Path
@@ -29,15 +28,15 @@ class Column:
 
     @property
     def missing(self) -> int:
-        """Rows promised but not there."""
+        """Number of missing rows."""
         return self.declared - len(self.rows)
 
 
 def read_column(path: Path) -> Column:
-    """Map an array file; of a cut one, its whole rows.
+    """Map an array file, or the complete rows of a truncated file.
 
     Raises:
-        LogFormatError: Not an .npy file, or one of Python objects.
+        LogFormatError: The file is not an .npy file, or contains Python objects.
     """
     try:
         with path.open("rb") as file:
@@ -57,7 +56,7 @@ def read_column(path: Path) -> Column:
     cells = max(0, path.stat().st_size - offset) // dtype.itemsize
     present = min(shape[0], cells // width if width else 0)
     if by_columns and len(shape) > 1:
-        # Stored column after column, a row is whole only where the last column has it.
+        # In column-major order, a row is complete only if the last column contains it.
         present = max(0, min(shape[0], cells - (width - 1) * shape[0]))
     if present == 0:
         return Column(path, np.empty((0, *shape[1:]), dtype), shape[0])

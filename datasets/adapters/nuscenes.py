@@ -1,18 +1,18 @@
-"""nuScenes, with its CAN bus expansion: one scene as a log.
+"""Read a scene of nuScenes, with its CAN bus expansion, as a log.
 
-A scene is named by an empty file beside the tables' folder, ``scene-0061.nuscenes``; the folder
-itself (``DATAROOT`` with ``v1.0-.../*.json``) stands for its scene where it holds only one. Tables
-are those of the published schema, read row by row; the CAN expansion is ``can_bus/NAME_*.json``.
+A scene is named by an empty file next to the tables' folder, ``scene-0061.nuscenes``. The folder
+itself (``DATAROOT`` with ``v1.0-.../*.json``) also names a scene if it contains only one. Tables
+have the published schema and are read row by row; the CAN expansion is ``can_bus/NAME_*.json``.
 
 Topics: one per camera (key frames and sweeps); ``can/wheel_speed`` (zoe_veh_info, rpm of a wheel
 of 0.305 m); ``can/steering`` (steeranglefeedback, positive to the right as published, to the left
 here); ``can/imu`` (ms_imu); ``can/vehicle_monitor``; ``can/zoesensors``; ``can/pose``. Without
-wheel speeds of the CAN expansion ``odometry`` is made of the ego poses, which are the truth. Laser
-and radar are not read.
+wheel speeds of the CAN expansion, ``odometry`` is computed from the ego poses, which are the truth.
+Laser and radar are not read.
 
-The ego frame's origin is the middle of the rear axle, x ahead, y left, as here. The layout is that
-of the published schema (for the expansion nuscenes-devkit, python-sdk/nuscenes/can_bus/README.md);
-no drive of the set was at hand when this was written.
+The ego frame's origin is the centre of the rear axle, x ahead, y left. The layout is that of the
+published schema (for the expansion nuscenes-devkit, python-sdk/nuscenes/can_bus/README.md). It was
+implemented without access to a drive of the data set.
 """
 
 from __future__ import annotations
@@ -41,22 +41,23 @@ from crosscue.replay.seal.touched import Touched
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
 WHEEL_RADIUS_M: Final = 0.305
-"""Of the Renault Zoe, from nuscenes-devkit, can_bus_tutorial.ipynb ("Known Zoe wheel radius in
-meters"). An unloaded 195/55 R16 tyre has 0.3105 m, 2 % more than this loaded one. An earlier
-edition has 0.328, which is 8 % faster; ``crosscue fit odometry`` finds the scale of a drive."""
+"""Wheel radius of the Renault Zoe, from nuscenes-devkit, can_bus_tutorial.ipynb ("Known Zoe wheel
+radius in meters"). An unloaded 195/55 R16 tyre has 0.3105 m, 2 % more than this loaded tyre. An
+earlier edition has 0.328, which is 8 % faster; ``crosscue fit odometry`` fits the scale of a
+drive."""
 RPM_TO_MPS: Final = WHEEL_RADIUS_M * 2.0 * math.pi / 60.0
 DAMAGED_ROW: Final = "a row that is not understood"
 FRONT: Final = "CAM_FRONT"
 
 
 class Scene(NamedTuple):
-    """Which scene, and where its tables are.
+    """A scene and the location of its tables.
 
     Attributes:
-        name: ``scene-0061``.
-        token: Of its row.
-        root: The folder that ``filename`` in tables is relative to.
-        tables: The folder of the tables.
+        name: Name, such as ``scene-0061``.
+        token: Token of its row.
+        root: Folder to which ``filename`` in tables is relative.
+        tables: Folder of the tables.
     """
 
     name: str
@@ -66,10 +67,10 @@ class Scene(NamedTuple):
 
 
 def find_scene(path: Path) -> Scene:
-    """The scene that a path names.
+    """Find the scene that a path names.
 
     Raises:
-        LogFormatError: No such scene, or several and none named.
+        LogFormatError: The scene does not exist, or the path does not select one of several.
     """
     root = path if path.is_dir() else path.parent
     folders = sorted(file.parent for file in root.glob("v1.0-*/scene.json"))
@@ -99,15 +100,15 @@ def _some(scenes: dict[str, Scene]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneTables:
-    """What the tables say of one scene's cameras.
+    """Tables of one scene's cameras.
 
     Attributes:
         scene: The scene.
         samples: Times of its samples in ns, by token.
         pictures: Rows of ``sample_data`` of cameras, by channel, in order of time.
-        calibrated: ``calibrated_sensor`` rows, by token.
-        losses: What was damaged.
-        files: The tables read.
+        calibrated: Rows of ``calibrated_sensor``, by token.
+        losses: Damaged rows.
+        files: Files of the tables.
     """
 
     scene: Scene
@@ -118,7 +119,7 @@ class SceneTables:
     files: tuple[Path, ...]
 
     def calibration(self, channel: str) -> Row | None:
-        """Of a camera in this scene."""
+        """Return the calibration of a camera in this scene."""
         rows = self.pictures.get(channel)
         return self.calibrated.get(str(rows[0]["calibrated_sensor_token"])) if rows else None
 
@@ -127,7 +128,7 @@ def read_tables(scene: Scene) -> SceneTables:
     """Read the rows of one scene.
 
     Raises:
-        LogFormatError: A table is missing, or one that all rows lean on is damaged.
+        LogFormatError: A table is missing, or a table that all rows refer to is damaged.
     """
     folder = scene.tables
     sensors = whole_table(folder / "sensor.json", "channel", "modality")
@@ -196,7 +197,7 @@ class Drive(CameraDrive):
         touched: Touched,
         unreadable: Sequence[tuple[str, str, int | None, str]],
     ) -> None:
-        """Put a scene together; ``tables`` know its cameras."""
+        """Build a scene from the tables of its cameras."""
         super().__init__(
             path,
             cameras,
@@ -209,7 +210,7 @@ class Drive(CameraDrive):
         self._tables: Final = tables
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
-        """Focal length and optical center of a camera, px.
+        """Return focal length and optical center of a camera, px.
 
         Raises:
             LogFormatError: Its matrix is damaged.
@@ -221,7 +222,7 @@ class Drive(CameraDrive):
 
 
 def matrix_of(row: Row, scene: Scene) -> tuple[float, float, float]:
-    """Focal length and optical center of a ``calibrated_sensor`` row.
+    """Return focal length and optical center of a ``calibrated_sensor`` row.
 
     Raises:
         LogFormatError: They are not numbers of pixels.
@@ -243,7 +244,7 @@ def open_scene(path: Path, limits: Limits) -> Drive:
     """Open a scene; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
-        LogFormatError: No such scene, or no camera in it.
+        LogFormatError: The scene does not exist, or has no camera.
     """
     tables = read_tables(find_scene(path))
     scene, touched = tables.scene, Touched()
@@ -277,7 +278,7 @@ def open_scene(path: Path, limits: Limits) -> Drive:
 
 
 def _timed(root: Path, rows: Sequence[Row]) -> TimedFiles:
-    """Pictures that are there, and the times of those that are not."""
+    """Return existing pictures, and the times of missing ones."""
     places = [(root / str(row["filename"]), int(row["timestamp"]) * 1000) for row in rows]
     there = [(path, t_ns) for path, t_ns in places if path.is_file()]
     missing = [t_ns for path, t_ns in places if not path.is_file()]
@@ -291,14 +292,14 @@ def _timed(root: Path, rows: Sequence[Row]) -> TimedFiles:
 
 
 class EgoPoses(NamedTuple):
-    """The car's track, of the middle of its rear axle.
+    """Trajectory of the centre of the vehicle's rear axle.
 
     Attributes:
-        t_ns: Shape (N,), int64.
-        xyz_m: Shape (N, 3), the map's axes.
-        wxyz: Shape (N, 4), from the car's axes into those.
-        losses: Rows that were damaged.
-        declared: How many there should be.
+        t_ns: Times, shape (N,), int64.
+        xyz_m: Positions in the map, shape (N, 3).
+        wxyz: Quaternions from the vehicle's axes to the map's, shape (N, 4).
+        losses: Damaged rows.
+        declared: Expected number of poses.
     """
 
     t_ns: Int64s
@@ -309,10 +310,10 @@ class EgoPoses(NamedTuple):
 
 
 def ego_poses(tables: SceneTables) -> EgoPoses:
-    """At the pictures of the front camera, or the first there is.
+    """Return the poses at the pictures of the front camera, or of the first camera.
 
     Raises:
-        LogFormatError: The table is missing, or holds fewer than two of them.
+        LogFormatError: The table is missing, or contains fewer than two of them.
     """
     channel = FRONT if FRONT in tables.pictures else next(iter(tables.pictures), "")
     wanted = {str(row["ego_pose_token"]) for row in tables.pictures.get(channel, ())}
@@ -345,7 +346,7 @@ def ego_poses(tables: SceneTables) -> EgoPoses:
 
 
 def _odometry(tables: SceneTables) -> HeldRows:
-    """Forward speed and yaw rate by the ego poses."""
+    """Return forward speed and yaw rate, computed from the ego poses."""
     poses = ego_poses(tables)
     w, x, y, z = poses.wxyz.T
     heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
@@ -363,7 +364,7 @@ def _odometry(tables: SceneTables) -> HeldRows:
 
 
 def numbers(value: Any, count: int) -> list[float] | None:
-    """So many finite numbers, or None."""
+    """Return ``count`` finite numbers, or None."""
     try:
         found = [float(one) for one in value]
     except (TypeError, ValueError):
@@ -392,7 +393,7 @@ def _vectors(**sizes: int) -> _Columns:
 
 
 class _Message(NamedTuple):
-    """How rows of a CAN message become columns."""
+    """Conversion of the rows of a CAN message to columns."""
 
     names: tuple[str, ...]
     of: _Columns
@@ -489,7 +490,7 @@ MESSAGES: Final[dict[str, tuple[str, str, _Message]]] = {
 def _held(
     file: Path, topic_name: str, type_name: str, message: _Message
 ) -> HeldRows | tuple[str, int | None, str]:
-    """A message's rows in order of time; or why none can be read."""
+    """Return a message's rows in order of time, or the reason why they cannot be read."""
     rows = RowsOf(file)
     times: list[int] = []
     values: list[list[float]] = []

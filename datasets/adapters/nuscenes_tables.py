@@ -1,6 +1,6 @@
-"""Rows of nuScenes' JSON tables one by one: those of a whole set are gigabytes in one array.
+"""Read the rows of nuScenes' JSON tables one by one, because a table may be a gigabyte array.
 
-Rows are flat objects. One that is damaged costs itself: reading goes on at the next brace.
+Rows are flat objects. After a damaged row, reading continues at the next brace.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from crosscue.replay.base import PIECE_BYTES, LogFormatError, visible
 Row: TypeAlias = Mapping[str, Any]
 
 MAX_ROW_CHARS: Final = 64 * 1024
-"""So far is read ahead; a row has some hundred characters."""
+"""Max length of a row in characters, which bounds reading ahead; rows have a few hundred."""
 _BETWEEN: Final = " \t\r\n,[]\ufeff"
 
 
@@ -23,14 +23,14 @@ class RowsOf:
     """The rows of one table.
 
     Attributes:
-        path: The file.
-        damaged: How many rows could not be understood so far.
-        first_damage: Where, in words.
-        is_cut: Whether the file ends before its array does; known once all rows are read.
+        path: Path of the file.
+        damaged: Number of damaged rows so far.
+        first_damage: Description of the first damage.
+        is_cut: True if the file ends before its array does; known once all rows are read.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read ``path`` when iterated."""
+        """Prepare to read ``path`` on iteration."""
         self.path: Final = path
         self.damaged = 0
         self.first_damage = ""
@@ -66,7 +66,7 @@ class RowsOf:
         self._see_between(between, passed)
 
     def _see_between(self, text: str, place: int) -> None:
-        """What stands between rows and belongs to none is what is left of one."""
+        """Report unexpected text between rows as the remains of a damaged row."""
         rest = text.strip(_BETWEEN)
         if rest:
             self._damage(rest, place)
@@ -77,7 +77,7 @@ class RowsOf:
 
 
 def _after_row(text: str, start: int) -> int:
-    """Where a damaged row ends: at its brace, unless the next row begins before."""
+    """Return the end of a damaged row: its brace, unless the next row begins before."""
     closing = text.find("}", start + 1)
     opening = text.find("{", start + 1)
     ends = [place for place in (closing + 1, opening) if place > 0]
@@ -85,14 +85,14 @@ def _after_row(text: str, start: int) -> int:
 
 
 def whole_table(path: Path, *needs: str) -> dict[str, Row]:
-    """All rows of a small table by their token.
+    """Read all rows of a small table by their token.
 
     Args:
-        path: The table.
-        needs: Texts that every row must have, besides its token.
+        path: Path of the table.
+        needs: String fields that every row must have in addition to its token.
 
     Raises:
-        LogFormatError: It is not there, or a row, on which others lean, is damaged or lacks a text.
+        LogFormatError: The table is missing, or a row is damaged or lacks a field.
     """
     rows = RowsOf(checked(path))
     found: dict[str, Row] = {}
@@ -108,11 +108,11 @@ def whole_table(path: Path, *needs: str) -> dict[str, Row]:
 
 
 def checked(path: Path) -> Path:
-    """The path of a table that is there.
+    """Return the path of a table after checking that it exists.
 
     Raises:
-        LogFormatError: It is not.
+        LogFormatError: It does not exist.
     """
     if not path.is_file():
-        raise LogFormatError(f"{path}: not there; nuScenes' tables lie in one folder, v1.0-...")
+        raise LogFormatError(f"{path}: missing; expected nuScenes' tables in one folder, v1.0-...")
     return path

@@ -1,8 +1,9 @@
-"""nuScenes' truth of one scene: the car's track, and the boxes in the front camera's key frames.
+"""Write the truth of a nuScenes scene: the ego trajectory, and boxes in the front key frames.
 
-A box is the rectangle around the corners of a cuboid that are ahead of the camera: wider than what
-is visible, and there for hidden cars, too (``visible`` is the middle of the set's four bins, over
-all six cameras). ``motion`` is the attribute of vehicles: moving, stopped or parked.
+A box is the rectangle around the corners of a cuboid, which must all be ahead of the camera. It is
+wider than the visible part, and exists for hidden cars as well (``visible`` is the middle of the
+data set's four bins, over all six cameras). ``motion`` is the attribute of vehicles: moving,
+stopped or parked.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ LABELS: Final = (
     ("vehicle.bicycle", "bicycle"),
     ("human.pedestrian", "person"),
 )
-"""From the beginning of a category to COCO's name; others keep their own."""
+"""COCO's names by prefix of a category; other categories keep their names."""
 VISIBLE: Final = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}
 NEAREST_M: Final = 0.5
 
 
 class _Camera(NamedTuple):
-    """One key frame's camera in the map."""
+    """Camera of a key frame in the map."""
 
     map_r_camera: Rotation
     place_m: Floats
@@ -53,7 +54,7 @@ def write(path: Path, folder: Path) -> Path:
     """Write the truth of a scene.
 
     Raises:
-        LogFormatError: No poses, or tables that cannot be understood.
+        LogFormatError: There are no poses, or a table is damaged.
         OutputError: It cannot be written.
     """
     tables = read_tables(find_scene(path))
@@ -82,7 +83,7 @@ def write(path: Path, folder: Path) -> Path:
 
 
 def _objects(tables: SceneTables) -> tuple[Objects, int]:
-    """Boxes of the front camera's key frames, and how many rows were damaged."""
+    """Return boxes of the front camera's key frames, and the number of damaged rows."""
     folder = tables.scene.tables
     attributes = {
         t: str(row["name"]) for t, row in whole_table(folder / "attribute.json", "name").items()
@@ -132,7 +133,7 @@ def _objects(tables: SceneTables) -> tuple[Objects, int]:
 def _labels(
     folder: Path, of_sample: Mapping[str, list[Row]], categories: Mapping[str, str]
 ) -> dict[str, str]:
-    """Label of each instance in the scene."""
+    """Return the label of each instance in the scene."""
     wanted = {str(row.get("instance_token")) for rows in of_sample.values() for row in rows}
     found = {}
     for row in RowsOf(checked(folder / "instance.json")):
@@ -144,7 +145,7 @@ def _labels(
 
 
 def _key_frames(tables: SceneTables) -> Iterator[tuple[Row, _Camera]]:
-    """The front camera's key frames with where the camera was."""
+    """Yield the front camera's key frames with the camera's pose."""
     rows = [row for row in tables.pictures.get(FRONT, ()) if row.get("is_key_frame")]
     calibration = tables.calibration(FRONT)
     if calibration is None:
@@ -172,7 +173,7 @@ def _key_frames(tables: SceneTables) -> Iterator[tuple[Row, _Camera]]:
 def _box_px(
     xyz_m: Floats, size_m: Floats, turn: Rotation, camera: _Camera
 ) -> tuple[float, float, float, float] | None:
-    """Around the corners in the picture; None where one is beside or behind the camera."""
+    """Return the box around the corners in the picture; None if a corner is not ahead."""
     width, length, height = size_m
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     corners = xyz_m + turn.apply(0.5 * signs * np.array([length, width, height]))

@@ -1,13 +1,13 @@
-"""PandaSet: one sequence in its published folder layout as a log; its truth from the poses.
+"""Read a PandaSet sequence in its published folder layout as a log, with truth from the poses.
 
-``camera/NAME/`` holds ``NN.jpg``, ``timestamps.json`` (seconds since 1970), ``poses.json``
-(position and orientation of the camera in a local frame; its axes are right, down, forward);
-``meta/gps.json`` with ``meta/timestamps.json`` one GNSS/INS row for each sweep of the lidar. Lidar
-and annotations are not read: as published, annotations are pickles, and a pickle runs code when it
-is read. Intrinsics go into ``crosscue vehicle init``.
+``camera/NAME/`` contains ``NN.jpg``, ``timestamps.json`` (seconds since 1970) and ``poses.json``
+(position and orientation of the camera in a local frame; its axes are right, down, forward).
+``meta/gps.json`` with ``meta/timestamps.json`` has one GNSS/INS row for each sweep of the lidar.
+Lidar and annotations are not read: annotations are published as pickles, and loading a pickle runs
+code. ``crosscue vehicle init`` uses the intrinsics.
 
-Topics: one per camera; ``odometry`` (forward speed and yaw rate of the car, from the front camera's
-poses, so it is not a wheel speed and as good as the poses are); ``gnss``.
+Topics: one per camera; ``odometry`` (forward speed and yaw rate of the vehicle from the front
+camera's poses, which are as accurate as the poses and not wheel speeds); ``gnss``.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ _GNSS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """The camera's track.
+    """Trajectory of a camera.
 
     Attributes:
-        t_ns: Shape (N,), int64.
-        xyz_m: Shape (N, 3), float64, local frame.
-        forward: Shape (N, 3): the optical axis in that frame.
-        left: Shape (N, 3): leftwards in the picture.
-        declared: How many there are times or poses for, whichever are more.
+        t_ns: Times, shape (N,), int64.
+        xyz_m: Positions in the local frame, shape (N, 3), float64.
+        forward: Direction of the optical axis in that frame, shape (N, 3).
+        left: Direction to the left in the picture, shape (N, 3).
+        declared: Number of times or of poses, whichever is larger.
     """
 
     t_ns: Int64s
@@ -70,20 +70,21 @@ class Poses:
     declared: int
 
     def speed_mps(self) -> Floats:
-        """Forward speed at each pose, shape (N,): central differences, one-sided at both ends.
+        """Return the forward speed at each pose, shape (N,), from central differences.
 
-        A rigid car has the same forward speed everywhere along its axis, so it is the rear axle's.
+        A rigid vehicle has the same forward speed everywhere along its axis, so this is the speed
+        of the rear axle. Differences are one-sided at both ends.
         """
         seconds = (self.t_ns - self.t_ns[0]) * 1e-9
         velocity = np.gradient(self.xyz_m, seconds, axis=0)
         return np.asarray((velocity * self.forward).sum(axis=1), np.float64)
 
     def heading_rad(self) -> Floats:
-        """From x, counter-clockwise, continuous, shape (N,)."""
+        """Return the heading from x, counter-clockwise, continuous, shape (N,)."""
         return np.unwrap(np.arctan2(self.forward[:, 1], self.forward[:, 0]))
 
     def odometry(self) -> Table:
-        """Speed and yaw rate."""
+        """Return speed and yaw rate."""
         seconds = (self.t_ns - self.t_ns[0]) * 1e-9
         yaw_rate = np.gradient(self.heading_rad(), seconds)
         return Table({"speed_x_mps": self.speed_mps(), "yaw_rate_radps": yaw_rate})
@@ -95,7 +96,7 @@ class Drive(CameraDrive):
     format: Final = "pandaset"
 
     def intrinsics(self, camera: str) -> tuple[float, float, float] | None:
-        """Focal length and optical center of a camera, px; None where they are not published.
+        """Return focal length and optical center of a camera, px; None if not published.
 
         Raises:
             LogFormatError: The file is damaged.
@@ -125,7 +126,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
-        LogFormatError: No camera with times, and no poses.
+        LogFormatError: There is neither a camera with times nor poses.
     """
     unreadable: list[tuple[str, str, int | None, str]] = []
     cameras, touched = [], Touched()
@@ -159,11 +160,11 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
 
 
 def read_poses(path: Path, camera: str = FRONT) -> Poses:
-    """A camera's poses.
+    """Read the poses of a camera.
 
     Args:
-        path: The sequence's folder.
-        camera: One below ``camera``.
+        path: Folder of the sequence.
+        camera: Name of a folder in ``camera``.
 
     Raises:
         LogFormatError: A file is missing or damaged, or there are fewer than two poses.
@@ -188,7 +189,7 @@ def read_poses(path: Path, camera: str = FRONT) -> Poses:
 
 
 def write_truth(path: Path, folder: Path) -> Path:
-    """Write the front camera's track.
+    """Write the trajectory of the front camera.
 
     Raises:
         LogFormatError: The sequence has no poses.
@@ -245,7 +246,7 @@ def _gnss(path: Path) -> HeldRows | None:
 
 
 def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:
-    """Picture ``NN`` has the time at place NN."""
+    """Assign the time with index NN to picture ``NN``."""
     places = np.array([int(p.stem) if p.stem.isdecimal() else -1 for p in paths], np.int64)
     is_timed = (places >= 0) & (places < len(t_ns))
     found = np.full(len(paths), -1, np.int64)
@@ -263,7 +264,7 @@ def _times_ns(path: Path) -> Int64s:
         raise LogFormatError(f"{path}: expected a list of seconds") from None
     if not np.isfinite(seconds).all() or (np.abs(seconds) > 9e9).any():
         raise LogFormatError(f"{path}: a time is not a number of seconds since 1970")
-    # Whole microseconds, as published: more digits are only those of a floating-point number.
+    # Times are published in microseconds; further digits are rounding errors of floats.
     return np.rint(seconds * 1e6).astype(np.int64) * 1000
 
 
@@ -274,6 +275,6 @@ def _json(path: Path) -> Any:
             raise LogFormatError(f"{path}: over {MAX_FILE_BYTES // MIB} MiB; not read")
         return json_tree(content)
     except OSError as error:
-        raise LogFormatError(f"{path}: {error.strerror}; put it back") from None
+        raise LogFormatError(f"{path}: {error.strerror}; restore the file") from None
     except ValueError as error:
         raise LogFormatError(f"{path}: not JSON: {error}") from None

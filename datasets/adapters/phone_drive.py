@@ -1,9 +1,9 @@
-"""A car's CAN values and a phone on its dashboard, as the smartphone driving data set records them.
+"""Read a drive of the smartphone driving data set: a car's CAN values, and a phone's sensors.
 
-A folder holds ``NAME_car.csv`` (speed, steering, engine and position at 10 Hz) and
-``NAME_phone.csv`` (compass, gyro, gravity at 10 Hz, GNSS once a second), both stamped by wall
-clocks without a zone; log times are those clocks', read as UTC. A line of the phone's file is a row
-of several topics, so a damaged line is lost from each of them.
+A folder contains ``NAME_car.csv`` (speed, steering, engine and position at 10 Hz) and
+``NAME_phone.csv`` (compass, gyro, gravity at 10 Hz, GNSS once a second). Both have stamps of wall
+clocks without a time zone, which are read as UTC. A line of the phone's file is a row of several
+topics, so a damaged line is dropped from each of them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_FILE_BYTES: Final = 256 * MIB
 MILE_H_MPS: Final = 0.44704
 MICROTESLA: Final = 1e-6
 QUARTER_HOUR_S: Final = 900.0
-"""Zones differ from UTC by whole ones."""
+"""Quarter of an hour; time zones differ from UTC by multiples of it."""
 DAMAGED: Final = "a line that cannot be understood"
 GRAVITY: Final = tuple(f"motionGravity{axis}(G)" for axis in "XYZ")
 GYRO: Final = tuple(f"gyroRotation{axis}(rad/s)" for axis in "XYZ")
@@ -66,7 +66,7 @@ def _car_position(of: Values) -> dict[str, Floats]:
 
 
 def _yaw_rate(of: Values) -> dict[str, Floats]:
-    """About the vertical, which the phone's own gravity vector shows; it points down."""
+    """Return the yaw rate about the vertical, from the phone's gravity vector (downwards)."""
     down = np.column_stack([of[name] for name in GRAVITY])
     rate = np.column_stack([of[name] for name in GYRO])
     return {"yaw_rate_radps": -(rate * down).sum(axis=1) / np.linalg.norm(down, axis=1)}
@@ -89,7 +89,7 @@ def _fix(of: Values) -> dict[str, Floats]:
 
 
 class _Stream(NamedTuple):
-    """A topic: its type, the columns it is made of, and how."""
+    """A topic: its type, its source columns, and their conversion."""
 
     type_name: str
     fields: tuple[str, ...]
@@ -132,13 +132,13 @@ class Drive(CameraDrive):
     format: Final = "phone-drive"
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All streams, in order of each one's first time; see ``Log.read``."""
+        """Read all streams, in order of their first times; see ``Log.read``."""
         ledger.integrity = "not checkable: no checksums, and a missing line cannot be detected"
         yield from super().read(ledger, selection)
 
 
 class _Lines(NamedTuple):
-    """A file's lines that have a time, and what is damaged."""
+    """Lines of a file that have a time, and the damaged lines."""
 
     t_ns: Int64s
     fields: list[dict[str, str]]
@@ -149,7 +149,7 @@ def open_drive(path: Path, limits: Limits) -> Drive:
     """Read both files of a folder.
 
     Raises:
-        LogFormatError: A file is missing or too large, there are two of a kind, or columns lack.
+        LogFormatError: A file is missing, duplicated or too large, or lacks columns.
     """
     rows: list[HeldRows] = []
     touched = Touched()
@@ -194,7 +194,7 @@ def _read(file: Path, wanted: set[str]) -> _Lines:
 
 
 def _held(name: str, stream: _Stream, lines: _Lines) -> HeldRows:
-    """A stream with a row for each line."""
+    """Return a stream with a row for each line."""
     values = {one: _numbers(lines.fields, one) for one in stream.fields}
     good = np.isfinite(np.column_stack([*values.values()])).all(axis=1)
     bad = int((~good).sum())
@@ -210,7 +210,7 @@ def _held(name: str, stream: _Stream, lines: _Lines) -> HeldRows:
 
 
 def _fixes(lines: _Lines) -> HeldRows:
-    """The lines with which a new position came, at the time it is of, on the wall clock."""
+    """Return the lines with new positions, at the wall-clock times of the positions."""
     fix_s = _numbers(lines.fields, FIX_TIME)
     is_new = np.isfinite(fix_s) & (np.diff(fix_s, prepend=-math.inf) > 0.0)
     rows = np.flatnonzero(is_new)
@@ -219,14 +219,14 @@ def _fixes(lines: _Lines) -> HeldRows:
     picked = _Lines(
         np.rint((fix_s[rows] + zone_s) * 1e9).astype(np.int64),
         [lines.fields[i] for i in rows.tolist()],
-        # A damaged line may have held a new position or none.
+        # A damaged line may or may not have contained a new position.
         tuple(loss._replace(rows=None) for loss in lines.losses),
     )
     return _held("phone/gnss", FIX, picked)
 
 
 def _wall_ns(text: str) -> int | None:
-    """A wall clock's time as if it were UTC; None where it is not a time."""
+    """Parse a wall-clock time as UTC; None if it is not a time."""
     try:
         at = datetime.fromisoformat(text.strip()).replace(tzinfo=UTC)
     except ValueError:

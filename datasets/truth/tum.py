@@ -147,7 +147,7 @@ def nanoseconds(text: str) -> int:
         raise ValueError(f"{text!r} is not a number of seconds") from None
     # The exponent is checked first, because arithmetic on 1e999999999 overflows.
     if not seconds.is_finite() or seconds.adjusted() > 9 or abs(seconds) > _LATEST_S:
-        raise ValueError(f"{text!r} does not fit 64 bits of nanoseconds")
+        raise ValueError(f"{text!r} is not a time within 64 bits of nanoseconds")
     return int((seconds * 1_000_000_000).quantize(Decimal(1), rounding=ROUND_HALF_EVEN))
 
 

@@ -143,5 +143,5 @@ def test_empty_labels_are_an_answer_and_no_labels_are_none(tmp_path: Path) -> No
 
     empty = {"categories": [{"id": 1, "name": "car"}], "images": [], "annotations": []}
     (tmp_path / "coco.json").write_text(json.dumps(empty))
-    with pytest.raises(EmptyResultError, match="not one labelled image"):
+    with pytest.raises(EmptyResultError, match="no labelled image"):
         read(tmp_path / "coco.json")

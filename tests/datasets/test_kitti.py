@@ -128,8 +128,8 @@ def test_the_tracking_layout_gives_made_up_times_and_says_so(tmp_path: Path) -> 
     assert times(by_topic["image_02"]) == [100_000_000 * i for i in range(30) if i != 4]
     assert ledger.topic("image_02").dropped == {"a picture without its time": 1}
     assert ledger.notices == [
-        "0003: the tracking set keeps no times; they are made from frame numbers, "
-        "100 ms each (by which speeds add up to distances), starting at 0"
+        "0003: the tracking set has no times; they are computed from frame numbers, "
+        "100 ms each (with which speeds match distances), starting at 0"
     ]
 
 
@@ -206,9 +206,9 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
     [
         ("", "0 numbers; expected 30"),
         (" ".join(packet_lines(1)[0].split()[:29]), "29 numbers; expected 30"),
-        (packet_lines(1)[0].replace("9.81", "much", 1), "not all of it are numbers"),
+        (packet_lines(1)[0].replace("9.81", "much", 1), "not all values are numbers"),
         (packet_lines(1)[0].replace("9.81", "nan", 1), "a number is not finite"),
-        (packet_lines(1)[0].replace("49", "149", 1), "not on the earth"),
+        (packet_lines(1)[0].replace("49", "149", 1), "out of range"),
     ],
 )
 def test_a_damaged_packet_is_lost_with_place_and_reason(

@@ -422,7 +422,10 @@ LATE = {"end_ns": START_NS + 10**12}
             _truth(**LATE, cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}]),
             "cues.0 \\(stop_sign\\)",
         ),
-        (_truth(cues=[{"cue": "stop_sing", "present": True, "t_ns": START_NS}]), "meant: stop_s"),
+        (
+            _truth(cues=[{"cue": "stop_sing", "present": True, "t_ns": START_NS}]),
+            "did you mean stop_s",
+        ),
         (_truth(cues=[{"cue": "Zebra!", "present": True, "t_ns": START_NS}]), "cues.0.cue"),
         (
             _truth(cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 7}]),

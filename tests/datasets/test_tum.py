@@ -112,7 +112,7 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="No such file"):
         read_tum(tmp_path / "missing")
     binary.write_text(f"{POSE}\n")
-    with pytest.raises(LogTooLargeError, match="18 bytes, more than the 10 allowed"):
+    with pytest.raises(LogTooLargeError, match="18 bytes, over the limit of 10"):
         read_tum(binary, Limits(chunk_bytes=10))
 
 

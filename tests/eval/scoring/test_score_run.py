@@ -270,7 +270,10 @@ def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
     ("change", "said"),
     [
         ({"approaches": "twice"}, "overlap"),
-        ({"cues": [{"cue": "stop_sing", "present": True, "t_ns": at(3)}]}, "meant: stop_sign"),
+        (
+            {"cues": [{"cue": "stop_sing", "present": True, "t_ns": at(3)}]},
+            "did you mean stop_sign",
+        ),
         (
             {"cues": [{"cue": "stop_sign", "present": True, "t_ns": at(3000)}]},
             "expected times from",
