@@ -258,7 +258,7 @@ def test_oxts_without_timestamps_is_lost_and_carries_no_truth(tmp_path: Path) ->
     assert {name: sum(ledger.topic(name).dropped.values()) for name in TOPICS} == dict.fromkeys(
         TOPICS, 5
     )
-    with pytest.raises(LogFormatError, match="carries no truth"):
+    with pytest.raises(LogFormatError, match="contains no truth"):
         write_truth(drive, tmp_path / "truth")
 
 
