@@ -1,1 +1,1 @@
-"""Pictures with labelled boxes, written for and read from labelling tools."""
+"""Exchange pictures with labelled boxes with labelling tools."""

@@ -1,4 +1,4 @@
-"""FiftyOne's ``FiftyOneImageDetectionDataset``: ``labels.json`` beside ``data``."""
+"""Read and write FiftyOne's ``FiftyOneImageDetectionDataset``: ``labels.json`` and ``data``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FILE = "labels.json"
 
 
 def write_fiftyone(folder: Path, labels: Annotations) -> Path:
-    """Write them: boxes as x, y, width and height in fractions of the picture.
+    """Write labels: boxes as x, y, width and height in fractions of the picture.
 
     Raises:
         OutputError: The file cannot be written.
@@ -38,10 +38,10 @@ def write_fiftyone(folder: Path, labels: Annotations) -> Path:
 
 
 def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
-    """Read ``labels.json``, or the folder that holds it.
+    """Read ``labels.json``, or the folder that contains it.
 
     Raises:
-        AnnotationError: It cannot be read, or no size of a picture is known.
+        AnnotationError: The file cannot be read, or the size of a picture is unknown.
     """
     file = path / FILE if path.is_dir() else path
     try:
@@ -67,7 +67,7 @@ def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
 def _thing(row: Any, classes: list[Any], size: tuple[int, int], where: str) -> Thing:
     try:
         label, (x, y, w, h) = row["label"], (float(side) for side in row["bounding_box"])
-        # With a list of classes FiftyOne writes their numbers, else their names.
+        # FiftyOne writes class numbers if there is a list of classes, else class names.
         name = str(classes[label]) if isinstance(label, int) else str(label)
         score = row.get("confidence")
         box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])

@@ -1,4 +1,4 @@
-"""Label Studio: ``tasks.json`` with predictions beside ``images``, and the labelling interface."""
+"""Read and write Label Studio tasks: ``tasks.json`` with predictions, and the interface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNLABELLED = "tasks without an annotation"
 
 
 def write_label_studio(folder: Path, labels: Annotations) -> Path:
-    """Write tasks whose boxes are predictions, and the interface to paste into the project.
+    """Write tasks with boxes as predictions, and the labelling interface to paste into a project.
 
     Raises:
         OutputError: A file cannot be written.
@@ -61,10 +61,10 @@ def write_label_studio(folder: Path, labels: Annotations) -> Path:
 
 
 def read_label_studio(path: Path) -> Annotations:
-    """Read what Label Studio exports as JSON; predictions that nobody confirmed are not labels.
+    """Read a JSON export of Label Studio; unconfirmed predictions are not labels.
 
     Raises:
-        AnnotationError: It cannot be read.
+        AnnotationError: The file cannot be read.
     """
     file = path / FILE if path.is_dir() else path
     try:

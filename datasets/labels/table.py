@@ -1,4 +1,4 @@
-"""The table of formats for labelling tools, and which of them a file is in."""
+"""Table of the formats of labelling tools, and detection of a file's format."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MAX_BYTES: Final = 512 << 20
 
 @dataclass(frozen=True, slots=True)
 class LabelFormat:
-    """One format.
+    """Format of a labelling tool.
 
     Attributes:
-        write: Into a folder, beside the pictures; returns the file to give to the tool.
-        read: A file or folder that the tool exported; sizes are needed where boxes are fractions.
+        write: Writes labels to a folder with pictures; returns the file to import into the tool.
+        read: Reads a file or folder exported by the tool; boxes in fractions require sizes.
         pictures: Folder of the pictures.
-        title: For people.
+        title: Name for display.
     """
 
     write: Callable[[Path, Annotations], Path]
@@ -49,16 +49,16 @@ LABEL_FORMATS: Final[dict[str, LabelFormat]] = {
 
 
 def read_labels(path: Path, sizes: Sizes, kind: str | None = None) -> Annotations:
-    """Read what a labelling tool exported.
+    """Read the export of a labelling tool.
 
     Args:
-        path: Its file or folder.
-        sizes: Of pictures by name without ending; ``*`` for all others.
-        kind: One of ``LABEL_FORMATS``; recognised if left out.
+        path: File or folder of the export.
+        sizes: Sizes of pictures by name without suffix; ``*`` for all others.
+        kind: One of ``LABEL_FORMATS``; detected by default.
 
     Raises:
-        UsageError: Another kind, or none of them.
-        AnnotationError: It cannot be read.
+        UsageError: The format is unknown, or cannot be detected.
+        AnnotationError: The export cannot be read.
     """
     if kind is not None and kind not in LABEL_FORMATS:
         raise UsageError(f"--format {kind}: expected one of {', '.join(LABEL_FORMATS)}")

@@ -1,7 +1,7 @@
-"""YOLO as Ultralytics lays it out: ``data.yaml``, ``labels/NAME.txt`` and ``images``.
+"""Read and write YOLO labels as Ultralytics does: ``data.yaml``, ``labels/NAME.txt``, ``images``.
 
-Parts in folders of their own (``labels/train``) are read too, as FiftyOne and CVAT export them, and
-so is Darknet's ``obj_train_data``, CVAT's "YOLO 1.1".
+Subsets in separate folders (``labels/train``), as exported by FiftyOne and CVAT, can also be read,
+and so can Darknet's ``obj_train_data``, CVAT's "YOLO 1.1".
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DARKNET = "obj_*_data"
 
 
 def write_yolo(folder: Path, labels: Annotations) -> Path:
-    """Write them; a picture without boxes gets an empty file, for that is an answer.
+    """Write labels; a picture without boxes has an empty file, which means that it is labelled.
 
     Raises:
         OutputError: A file cannot be written.
@@ -34,7 +34,7 @@ def write_yolo(folder: Path, labels: Annotations) -> Path:
                 lines.append(" ".join([str(numbers[thing.label]), *map(repr, map(float, box))]))
         place = folder / LABELS / f"{Path(picture.name).stem}.txt"
         write_text(place, "".join(f"{line}\n" for line in lines))
-    # JSON's strings are YAML's. Without a path, Ultralytics looks for pictures beside the file.
+    # JSON strings are valid YAML. Without a path, Ultralytics searches the folder of the file.
     names = [f"  {number}: {strict_json(name).strip()}" for name, number in numbers.items()]
     text = ["train: images", "val: images", "names:", *names]
     write_text(folder / FILE, "\n".join(text) + "\n")
@@ -45,7 +45,7 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
     """Read the folder, its ``labels``, or its ``data.yaml``.
 
     Raises:
-        AnnotationError: A file cannot be read, or no size of a picture is known.
+        AnnotationError: A file cannot be read, or the size of a picture is unknown.
     """
     folder = path.parent if path.is_file() else path
     parts = [read_box_labels(place, "yolo") for place in _label_folders(folder)]
@@ -64,7 +64,7 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
 
 
 def _label_folders(folder: Path) -> list[Path]:
-    """Where the label files are: everything in ``labels`` or Darknet's folders, else here."""
+    """Return the folders of label files: those in ``labels`` or Darknet's folders, else here."""
     inside = [one for one in (folder / LABELS, *folder.glob(DARKNET)) if one.is_dir()]
     found = {file.parent for one in inside for file in one.rglob("*.txt")}
     return sorted(found) or inside or [folder]

@@ -1,4 +1,5 @@
-"""Real drives that crosscue knows: where they are published, their vehicle files and truth.
+"""Published real drives: their sources, vehicle files and truth.
 
-The recordings are others' and are never in this repository; vehicle files and annotations are ours.
+The recordings belong to others and are not in this repository. The vehicle files and annotations
+are part of crosscue.
 """

@@ -1,18 +1,18 @@
-"""Annotate PandaSet's sequence 002: our truth of an approach, from its boxes, its poses and by eye.
+"""Annotate PandaSet's sequence 002: truth of an approach from its boxes, its poses and by eye.
 
     python -m crosscue.datasets.real.annotate_pandaset SEQUENCE [FOLDER]
 
-writes ``truth.json`` and ``ranges.csv`` beside this file, or into FOLDER. SEQUENCE is the folder of
-the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, one row for each box in each
-frame (the set publishes them as pickles, which are not read here).
+writes ``truth.json`` and ``ranges.csv`` to the folder of this file, or to FOLDER. SEQUENCE is the
+folder of the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, one row for each box
+in each frame (the data set publishes them as pickles, which are not read here).
 
-From the boxes: moving cars across the ego road, cars parked across it, vehicles past the far kerb,
-and those of them that come towards the ego vehicle or go away, with how much of the most visible
-one no other box hides: boxes are wider than cars, so that is a lower bound.
-By eye, on frames 0, 20, 40, 60 and 79: the four signals that face the ego vehicle, the roads, and
-that no stop sign stands there. The crosswalk and the far kerb were measured in the frames on the
-ground plane under the boxes; each is known to 2.5 m. Left open, since nothing here can say: lane
-lines past the intersection, one-way and do-not-enter signs.
+Annotated from the boxes: moving cars across the ego road, cars parked across it, vehicles past the
+far kerb, and oncoming and outgoing vehicles among them. Visibility is the fraction of the most
+visible vehicle that no other box hides, which is a lower bound because boxes are wider than cars.
+Annotated by eye, on frames 0, 20, 40, 60 and 79: the four signals that face the ego vehicle, the
+roads, and the absence of stop signs. The crosswalk and the far kerb were measured in the frames on
+the ground plane under the boxes, each to 2.5 m. Not annotated: lane lines past the intersection,
+one-way and do-not-enter signs.
 """
 
 from __future__ import annotations
@@ -34,24 +34,25 @@ from crosscue.replay.vehicle.vehicle import load
 FOLDER: Final = Path(__file__).parent / "pandaset_002"
 RANGES: Final = "ranges.csv"
 CROSSWALK_M: Final = 59.0
-"""Along the road from the camera in the first frame to the near edge of the crosswalk."""
+"""Distance along the road from the camera in the first frame to the crosswalk's near edge."""
 FAR_KERB_M: Final = 79.0
 SIGNALS: Final = 4
-"""Two with a green light, two with a red arrow; three more are seen from behind or the side."""
+"""Number of signals: two with a green light, two with a red arrow. Three more are visible from
+behind or the side."""
 VEHICLES: Final = ("Car", "Pickup Truck", "Medium-sized Truck", "Bus")
 WIDTH_PX: Final = 1920
 GRID: Final = 10
 BEHIND_M: Final = 3.0
-"""Boxes nearer to each other are of one car: most cars are boxed twice."""
+"""Max distance of two boxes of one car; most cars have two boxes."""
 REACH_M: Final = 110.0
-"""The direction of a vehicle further away cannot be recognised in these frames."""
+"""Max distance at which the direction of a vehicle is recognizable in these frames."""
 ALONG: Final = ("oncoming_cars", "outgoing_cars")
 ACROSS_DEG: Final = 45.0
-"""A vehicle whose heading is further off the road, both ways, stands or moves across it."""
+"""Min angle between road and heading of a vehicle across the road."""
 
 
 class Boxes:
-    """Vehicles ahead inside the picture, as the front camera has them."""
+    """Vehicles ahead that are inside the front camera's pictures."""
 
     def __init__(self, sequence: Path, poses: Poses) -> None:
         """Read the boxes of a sequence."""
@@ -68,7 +69,7 @@ class Boxes:
         at = np.column_stack([columns["x_m"], columns["y_m"]]) - poses.xyz_m[frame, :2]
         forward, left = poses.forward[frame, :2], poses.left[frame, :2]
         ahead, aside = (at * forward).sum(axis=1), (at * left).sum(axis=1)
-        # A box is long along its own y axis.
+        # The long axis of a box is its y axis.
         along = np.column_stack([-np.sin(columns["yaw_rad"]), np.cos(columns["yaw_rad"])])
         turn = np.arctan2((along * left).sum(axis=1), (along * forward).sum(axis=1))
         focal, center, _ = _intrinsics(sequence)
@@ -85,13 +86,13 @@ class Boxes:
         """From the camera, along the map's axes."""
 
     def across(self, motion: str, *, to_left: bool) -> NDArray[np.bool_]:
-        """Vehicles across the road that move so, by where they head."""
+        """Return a mask of the vehicles across the road with this motion, by heading."""
         turn = self.turn_deg if to_left else -self.turn_deg
         is_across = (turn > ACROSS_DEG) & (turn < 180.0 - ACROSS_DEG)
         return np.asarray(is_across & (self.motion == motion))
 
     def along(self, *, oncoming: bool) -> NDArray[np.bool_]:
-        """Vehicles that move along the road, by where they head."""
+        """Return a mask of the vehicles that move along the road, by heading."""
         off = np.abs(self.turn_deg)
         heads = off > 180.0 - ACROSS_DEG if oncoming else off < ACROSS_DEG
         return np.asarray(heads & (self.motion == "Moving"))
@@ -108,7 +109,7 @@ def annotate(sequence: Path, folder: Path = FOLDER) -> Path:
     boxes = Boxes(sequence, poses)
     start_ns, end_ns = int(poses.t_ns[0]), int(poses.t_ns[-1]) + 1
     gone_m = _travelled_m(poses)
-    # Of each vehicle from the camera in the first frame, as the crosswalk and the kerb are.
+    # Distance of each vehicle from the camera in the first frame, like crosswalk and kerb.
     past = boxes.ahead_m + gone_m[boxes.frame] > FAR_KERB_M
     seen = {
         "cross_traffic_left": boxes.across("Moving", to_left=True),
@@ -176,7 +177,7 @@ _SOURCE: Final = (
 def _spans(
     cue: str, poses: Poses, boxes: Boxes, rows: NDArray[np.bool_], *, with_visible: bool
 ) -> list[CueTruth]:
-    """Runs of frames with the same answer, as spans that touch; visibility counts in tenths."""
+    """Return runs of frames with equal truth as adjacent spans; visibility is in tenths."""
     present = np.bincount(boxes.frame[rows], minlength=len(poses.t_ns)) > 0
     visible = np.zeros(len(present))
     np.maximum.at(visible, boxes.frame[rows], boxes.visible[rows])
@@ -204,7 +205,7 @@ def _travelled_m(poses: Poses) -> Floats:
 
 
 def _ranges(poses: Poses, gone_m: Floats, camera_x_m: float) -> str:
-    """Ranges of the rear axle at every picture, as a table."""
+    """Return the ranges of the rear axle at every picture as CSV text."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("t_ns", "approach", "start_m", "end_m"))
@@ -217,7 +218,7 @@ def _ranges(poses: Poses, gone_m: Floats, camera_x_m: float) -> str:
 def _projected(
     boxes: dict[str, Any], poses: Poses, intrinsics: tuple[float, float, float]
 ) -> tuple[Floats, Floats]:
-    """Outlines of N boxes in their pictures, shape (N, 4), and depths of their middles."""
+    """Return outlines of N boxes in their pictures, shape (N, 4), and depths of their centres."""
     focal, center_x, center_y = intrinsics
     frame = boxes["frame"]
     forward, left = poses.forward[frame], poses.left[frame]
@@ -236,7 +237,7 @@ def _projected(
 
 
 def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Floats:
-    """Fractions of N outlines that no nearer one of the same frame covers, on a grid of points."""
+    """Return the fractions of N outlines that no nearer one of the frame covers, on a grid."""
     found = np.ones(len(frame))
     steps = (np.arange(GRID) + 0.5) / GRID
     for i, (x0, y0, x1, y1) in enumerate(boxes_px.tolist()):
@@ -250,7 +251,7 @@ def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Flo
 
 
 def _intrinsics(sequence: Path) -> tuple[float, float, float]:
-    """Focal length and the optical axis's column and row."""
+    """Return focal length, and column and row of the optical axis."""
     found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
     return float(found["fx"]), float(found["cx"]), float(found["cy"])
 

@@ -3,11 +3,11 @@
     python -m crosscue.datasets.real.label_pandaset SEQUENCE OUT.json
 
 SEQUENCE is the folder of the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, as for
-``annotate_pandaset``. Each is projected into the front camera and drawn from far to near, which
-says how much of it nearer ones hide. What is hidden by more than half, further than 60 m, or
-neither car nor truck nor person, is a region that is not judged (``iscrowd``). Boxes are stamped
-about 50 ms after the picture, and a projected box is a little wider than what it holds: judge them
-at an overlap of 0.5, no more.
+``annotate_pandaset``. Each box is projected into the front camera and drawn from far to near, which
+yields the fraction that nearer boxes hide. An object that is more than half hidden, further than
+60 m, or neither car nor truck nor person, is a region that is not scored (``iscrowd``). Boxes have
+stamps about 50 ms after the picture, and a projected box is slightly wider than its object. Scores
+should therefore use an overlap of at most 0.5.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SIZE_PX: Final = (1920, 1080)
 REACH_M: Final = 60.0
 MIN_VISIBLE: Final = 0.5
 NEAR_M: Final = 1.0
-"""What reaches nearer to the camera's plane is not projected."""
+"""Boxes nearer to the camera's plane are not projected."""
 _COLUMNS: Final = ("frame", "label", "x_m", "y_m", "z_m", "width_m", "length_m", "height_m")
 _CORNERS: Final = np.array(
     [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
@@ -55,7 +55,7 @@ def write_labels(sequence: Path, output: Path) -> Path:
     """Write the labels.
 
     Raises:
-        LogFormatError: The sequence has no poses, or its boxes are not a table yet.
+        LogFormatError: The sequence has no poses, or no table of boxes.
         OutputError: It cannot be written.
     """
     import pyarrow.parquet as pq
@@ -66,8 +66,8 @@ def write_labels(sequence: Path, output: Path) -> Path:
     path = sequence / "annotations" / "cuboids.parquet"
     if not path.exists():
         raise LogFormatError(
-            f"{path}: not there; the boxes are published as pickles, which are not read; "
-            "docs/reference/formats.md says how to make this table of them"
+            f"{path}: missing; the boxes are published as pickles, which are not read; "
+            "docs/reference/formats.md describes how to convert them to this table"
         )
     table = pq.read_table(path)
     rows: dict[str, Any] = {
@@ -122,7 +122,7 @@ def write_labels(sequence: Path, output: Path) -> Path:
 def _projected(
     rows: dict[str, Any], row: int, poses: Poses, frame: int, camera: Floats
 ) -> _Seen | None:
-    """A box in the picture; None where nothing of it is there."""
+    """Return a box in the picture, or None if it is completely outside."""
     size = np.array([rows[f"{name}_m"][row] for name in ("width", "length", "height")])
     yaw = float(rows["yaw_rad"][row])
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
@@ -141,7 +141,7 @@ def _projected(
 
 
 def _visible(seen: list[_Seen]) -> Iterator[tuple[_Seen, float]]:
-    """Each box with the fraction of it that is in the picture and no nearer one hides."""
+    """Yield each box with its fraction that is in the picture and not hidden by nearer boxes."""
     import cv2
 
     hidden = np.zeros(SIZE_PX[::-1], np.uint8)

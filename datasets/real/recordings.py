@@ -1,9 +1,10 @@
-"""Published recordings with a hash for each file, and where they are kept once fetched.
+"""Fetch published recordings, with a hash for each file, into a cache.
 
-One folder here for each: ``recording.toml`` says where its files are published, ``vehicle.toml``
-and ``truth.json`` are ours. ``$CROSSCUE_DRIVES`` names the folder to keep recordings in, else the
-user's cache; ``$CROSSCUE_DRIVE_MIRROR`` a server to ask instead of the publisher, for
-``MIRROR/NAME/FILE``; ``$CROSSCUE_DATA`` a folder whose ``sequences`` are searched.
+Each recording has a folder here: ``recording.toml`` specifies the URLs of its files;
+``vehicle.toml`` and ``truth.json`` are part of crosscue. ``$CROSSCUE_DRIVES`` names the folder for
+fetched recordings (default: the user's cache). ``$CROSSCUE_DRIVE_MIRROR`` names a server that
+replaces the publisher, with files ``MIRROR/NAME/FILE``. ``$CROSSCUE_DATA`` names a folder whose
+``sequences`` are searched.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class RecordedFile(Settings):
     """One file of a recording."""
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*(/\w[\w.-]*)*$")]
-    """Its path inside the recording."""
+    """Path of the file inside the recording."""
     size_bytes: Annotated[int, Field(gt=0, le=64 * MIB)]
     sha256: Hash
 
@@ -50,35 +51,35 @@ class Recording(Settings):
 
     version: Literal[1]
     name: Annotated[str, Field(pattern=r"^\w+$")]
-    """Of its folder, here and where it is kept."""
+    """Name of its folder, both here and in the cache."""
     about: str
-    """What it shows, in a line."""
+    """Description of its content in one line."""
     licence: str
     attribution: str
-    """Whom to name wherever its pictures are shown."""
+    """Attribution to show with its pictures."""
     url: Annotated[str, Field(pattern="^https?://")]
-    """The folder with its files, at one commit."""
+    """URL of the folder with its files, at one commit."""
     folders: tuple[str, ...]
-    """Where it may be below a folder given with ``--data``, or below ``$CROSSCUE_DATA``."""
+    """Possible subfolders of ``--data`` or ``$CROSSCUE_DATA`` that contain it."""
     files: Annotated[tuple[RecordedFile, ...], Field(min_length=1)]
 
     @property
     def size_bytes(self) -> int:
-        """Of all its files."""
+        """Total size of its files."""
         return sum(file.size_bytes for file in self.files)
 
     @property
     def vehicle(self) -> Path:
-        """Our vehicle file."""
+        """Path of crosscue's vehicle file."""
         return FOLDER / self.name / "vehicle.toml"
 
     @property
     def truth(self) -> Path:
-        """Our annotations."""
+        """Path of crosscue's annotations."""
         return FOLDER / self.name / "truth.json"
 
     def needs(self) -> str:
-        """What it takes to fetch it, for people."""
+        """Number and size of files, and licence, for display."""
         return (
             f"recording {self.name}: {len(self.files)} files, {self.size_bytes / 1e6:.1f} MB, "
             f"{self.licence}"
@@ -86,10 +87,10 @@ class Recording(Settings):
 
 
 def recording(name: str) -> Recording:
-    """A recording that crosscue knows.
+    """Return the recording with this name.
 
     Raises:
-        VehicleError: Its file here is damaged.
+        VehicleError: Its ``recording.toml`` is damaged.
     """
     path = FOLDER / name / "recording.toml"
     text = path.read_text(encoding="utf-8")
@@ -100,7 +101,7 @@ def recording(name: str) -> Recording:
 
 
 def place_of(known: Recording, environment: Mapping[str, str] = os.environ) -> Path:
-    """The folder where a recording is kept, or would be: one for each list of files."""
+    """Return the cache folder of a recording, which is distinct for each list of files."""
     of_files = hashlib.sha256("".join(file.sha256 for file in known.files).encode()).hexdigest()
     asked = environment.get(VARIABLE)
     base = Path(asked) if asked else user_cache(VARIABLE, environment) / "drives"
@@ -113,21 +114,21 @@ def fetch(
     on_progress: Progress = lambda name, done, total: None,
     environment: Mapping[str, str] = os.environ,
 ) -> Path:
-    """Bring a recording into the cache, every file checked; what is there already stays.
+    """Fetch a recording into the cache, and check every file; existing files are kept.
 
     Args:
         known: The recording.
-        given: A folder that holds it; no network is used.
-        on_progress: Called with the file, and the bytes of the whole recording that are there.
-        environment: For the variables named above.
+        given: Folder that contains it; the network is then not used.
+        on_progress: Called with a file, the bytes of the recording fetched so far, and their total.
+        environment: Environment with the variables named above.
 
     Returns:
-        Its folder, to be opened as a log.
+        The folder of the recording, to be opened as a log.
 
     Raises:
-        LogError: ``given`` holds no such recording.
-        UsageError: It holds another recording, or part of it.
-        CrosscueError: A file cannot be had, or is not the published one.
+        LogError: ``given`` does not contain the recording.
+        UsageError: ``given`` contains another recording, or a part of it.
+        CrosscueError: A file cannot be fetched, or is not the published one.
         OutputError: The cache cannot be written.
     """
     place, total, done = place_of(known, environment), known.size_bytes, 0
@@ -161,7 +162,7 @@ def fetch(
 
 
 def _after(before: int, total: int, on_progress: Progress) -> Progress:
-    """Report of a file's bytes as so many more of the whole recording's."""
+    """Return a callback that reports progress of a file as progress of the recording."""
     return lambda name, have, _: on_progress(name, before + have, total)
 
 
@@ -178,7 +179,7 @@ def _folder_in(known: Recording, given: Path | None) -> Path | None:
 
 
 def _folder_below(known: Recording, folder: Path) -> Path | None:
-    """The folder with the recording's first file."""
+    """Return the folder with the recording's first file, or None."""
     for below in (".", *known.folders):
         if (folder / below / known.files[0].name).is_file():
             return folder / PurePosixPath(below)

@@ -1,1 +1,1 @@
-"""Simulated intersections with pictures: plans, actors, a renderer, sensors and truth."""
+"""Simulated intersections with pictures: layouts, actors, a renderer, sensors and truth."""

@@ -1,6 +1,6 @@
-"""The vehicle file of the simulated car.
+"""Vehicle file of the simulated car.
 
-Curves, regions and thresholds were chosen on layouts L alone; none of them has seen A to H.
+Curves, regions and thresholds were chosen on layouts L only, without layouts A to H.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from .mobileye import MOUNTING
 
 STOP_SIGN_M: Final = (0.71690, 2.79455)
-"""Range is focal length times the first over the height in pixels, plus the second.
+"""Parameters of the range: focal length times the first over the height in pixels, plus the second.
 
-Fitted to what the embedded network finds, not to true outlines, since that is what it is used on:
-``crosscue fit ranges --runs --min-score 0.9 --family pinhole-offset`` on L201, L203, L204 and L209,
-187 pairs, residual 1.56 m.
+They were fitted to detections of the embedded network, to which they are applied, not to true
+outlines: ``crosscue fit ranges --runs --min-score 0.9 --family pinhole-offset`` on L201, L203, L204
+and L209, 187 pairs, residual 1.56 m.
 """
 TRAFFIC_LIGHT_M: Final = (1.00036, 4.00404)
-"""The same on L206, L207, L210 and L213: 1162 pairs, residual 3.44 m."""
+"""Parameters fitted likewise on L206, L207, L210 and L213: 1162 pairs, residual 3.44 m."""
 
 
 def vehicle_text(
     camera: Camera, *, mounting_yaw_rad: float, declination_rad: float, heading_rad: float
 ) -> str:
-    """The file's text for a camera and compass; the heading is where the drive begins."""
+    """Return the file's text for a camera and compass, with the heading at the start."""
     stop, light = STOP_SIGN_M, TRAFFIC_LIGHT_M
     return VEHICLE.format(
         mounting_yaw_rad=mounting_yaw_rad,

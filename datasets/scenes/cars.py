@@ -1,4 +1,4 @@
-"""Cars with a real side view: the nose lower than the tail, wheels, glass and lamps."""
+"""Meshes of cars with a realistic side view: a nose below the tail, wheels, glass and lamps."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ SKIRT_M: Final = 0.24
 GLASS: Final[Rgb] = (0.09, 0.11, 0.13)
 TYRE: Final[Rgb] = (0.05, 0.05, 0.055)
 TILL_SHUT_M: Final = 0.012
-"""What is painted on a side stands out so far, against depth ties."""
+"""Offset of painted details from a side, which avoids depth ties."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A kind of car, seen from its right side: x from tail (0) to nose, z up.
+    """Shape of a kind of car, seen from the right: x from tail (0) to nose, z up.
 
     Attributes:
         body: Upper edge of the lower body, tail to nose.
         cabin: Upper edge of the cabin, from belt line to belt line.
-        pillars: x of the posts between side windows.
-        half_width_m: Of the body.
-        roof_half_width_m: Of the roof.
+        pillars: x of the pillars between side windows.
+        half_width_m: Half of the body's width.
+        roof_half_width_m: Half of the roof's width.
         wheels_m: x of both axles.
-        wheel_radius_m: Of a tyre.
+        wheel_radius_m: Radius of a tyre.
     """
 
     body: tuple[tuple[float, float], ...]
@@ -43,12 +43,12 @@ class Shape:
 
     @property
     def length_m(self) -> float:
-        """Bumper to bumper."""
+        """Length from bumper to bumper."""
         return self.body[-1][0]
 
     @property
     def height_m(self) -> float:
-        """Ground to roof."""
+        """Height from ground to roof."""
         return max(z for _, z in self.cabin)
 
 
@@ -94,11 +94,11 @@ PAINTS: Final[tuple[Rgb, ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One car as it stands in a show room.
+    """Appearance of a car.
 
     Attributes:
         kind: Key of ``SHAPES``.
-        paint: Colour, 0 to 1.
+        paint: Red, green and blue, 0 to 1.
     """
 
     kind: str
@@ -106,12 +106,12 @@ class Look:
 
     @property
     def shape(self) -> Shape:
-        """Its measures."""
+        """Shape of its kind."""
         return SHAPES[self.kind]
 
 
 def any_look(rng: Generator) -> Look:
-    """A car as one meets them."""
+    """Draw a random, typical car."""
     kind = str(
         rng.choice(["sedan", "hatchback", "suv", "pickup", "van"], p=[0.4, 0.17, 0.28, 0.09, 0.06])
     )
@@ -119,7 +119,7 @@ def any_look(rng: Generator) -> Look:
 
 
 def car(look: Look, *, lamps_on: bool, brakes_on: bool) -> Mesh:
-    """A car with its middle over the origin, nose along +x."""
+    """Return the mesh of a car with its centre over the origin, nose along +x."""
     shape = look.shape
     parts = [
         _slab(shape.body, SKIRT_M, shape.half_width_m, shape.half_width_m, look.paint),
@@ -137,7 +137,7 @@ def _upper(points: tuple[tuple[float, float], ...]) -> Floats:
 def _slab(
     top: tuple[tuple[float, float], ...], foot_m: float, low: float, high: float, rgb: Rgb
 ) -> Mesh:
-    """A body under the polyline ``top``: sides from ``foot_m`` up, and the skin over it."""
+    """Return a body below the polyline ``top``: sides from ``foot_m`` up, and the upper surface."""
     edge = _upper(top)
     parts = []
     for (xa, za), (xb, zb) in pairwise(edge):
@@ -172,7 +172,7 @@ def _cabin(shape: Shape, paint: Rgb) -> list[Mesh]:
     last = len(edge) - 2
     for k, ((xa, za), (xb, zb)) in enumerate(pairwise(edge)):
         ya, yb = half(za), half(zb)
-        # First and last piece are the rear window and the windscreen.
+        # The first and the last piece are the rear window and the windscreen.
         rgb = GLASS if k in (0, last) else paint
         skin = np.array([(xa, -ya, za), (xb, -yb, zb), (xb, yb, zb), (xa, ya, za)])
         parts.append(quad(skin, rgb))
@@ -228,7 +228,7 @@ def _wheels(shape: Shape) -> list[Mesh]:
                 disc((x, y + side * 0.012, r), out, 0.62 * r, (0.55, 0.56, 0.57)),
                 disc((x, y + side * 0.018, r), out, 0.2 * r, (0.2, 0.2, 0.2)),
             ]
-            # The tread, seen below the bumpers.
+            # The tread, which is visible below the bumpers.
             inner = side * (shape.half_width_m - 0.2)
             parts.append(quad([(x, inner, 0.0), (x, y, 0.0), (x, y, r), (x, inner, r)], TYRE))
     return parts

@@ -1,4 +1,4 @@
-"""What differs from run to run: light, rain, traffic, speed."""
+"""Conditions of a run: light, rain, traffic and speed."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Light = Literal["noon", "overcast", "dusk", "low_sun"]
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """One run.
+    """Conditions of one run.
 
     Attributes:
-        run: Its number, from 1.
-        seed: Everything random about this run comes from it.
+        run: Number of the run, from 1.
+        seed: Seed of all random numbers of the run.
         light: Kind of daylight; ``low_sun`` shines into the camera.
-        rain: 0 (dry) to 1.
+        rain: Amount of rain, 0 (dry) to 1.
         traffic: Factor on the layout's usual traffic.
-        speed_mps: On the approach.
-        sun_turn_rad: Sun's direction from the approach road's, to the left.
-        is_red: The light is red on the approach.
+        speed_mps: Speed on the approach.
+        sun_turn_rad: Direction of the sun relative to the approach road, positive to the left.
+        is_red: True if the light is red on the approach.
     """
 
     run: int
@@ -37,7 +37,7 @@ class Conditions:
     is_red: bool
 
     def tags(self, layout: Layout) -> tuple[str, ...]:
-        """As ``truth.json`` names them."""
+        """Return the conditions as tags of ``truth.json``."""
         tags = [{"noon": "clear", "low_sun": "glare"}.get(self.light, self.light)]
         if self.rain > 0.0:
             tags.append("rain")
@@ -56,10 +56,10 @@ SPEED_MPS: Final = (9.0, 8.0, 10.5, 9.0, 12.0, 8.0, 10.0, 11.0, 9.0, 8.5)
 
 
 def conditions_of(layout: Layout, run: int, seed: int = 0) -> Conditions:
-    """The conditions of a run: ten laid down, those beyond from the seed.
+    """Return the conditions of a run: ten are fixed, further ones are drawn from the seed.
 
     Raises:
-        ValueError: ``run`` below 1.
+        ValueError: ``run`` is below 1.
     """
     if run < 1:
         raise ValueError(f"run: expected 1 or more, got {run}")
@@ -70,7 +70,7 @@ def conditions_of(layout: Layout, run: int, seed: int = 0) -> Conditions:
     if layout.name == "A" and run == 7:
         light = "noon"
     if layout.name == "H":
-        # The source drove H mostly in the rain.
+        # The dissertation's drives of H were mostly in the rain.
         light = "dusk" if light == "dusk" else "overcast"
         rain = 0.0 if run == 1 else max(rain, float(rng.uniform(0.4, 1.0)))
     turn = rng.uniform(-0.18, 0.18) if light == "low_sun" else rng.uniform(-np.pi, np.pi)

@@ -1,4 +1,4 @@
-"""Which cues are truly there in a picture, and how much of them can be seen."""
+"""Ground-truth cues of a picture and their visible fractions."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .layout import Layout
 from .world import Thing
 
 MIN_PIXELS: Final = 12
-"""A smaller thing cannot be recognised."""
+"""Min size of a recognizable object."""
 PAST_REACH_M: Final = 110.0
 LANES_REACH_M: Final = 45.0
 
 
 class Presence(NamedTuple):
-    """One cue in one picture: how many things show it, and how visible the best of them is."""
+    """One cue in one picture: number of objects, and visible fraction of the best of them."""
 
     things: int
     visible: float
@@ -34,12 +34,12 @@ Simulated = Callable[[Layout, Picture], Presence]
 
 
 def present(layout: Layout, picture: Picture) -> dict[str, Presence]:
-    """Every cue's presence in a picture."""
+    """Return the presence of every cue in a picture."""
     return {name: SIMULATED[name](layout, picture) for name in CUES if name in SIMULATED}
 
 
 def _things(shows: Shows, max_m: float = math.inf) -> Simulated:
-    """The things in a picture, large enough to be labelled, that show a cue."""
+    """Return a rule that counts the objects of a cue that are large enough to be labelled."""
 
     def simulated(layout: Layout, picture: Picture) -> Presence:
         found = ABSENT
@@ -116,21 +116,21 @@ SIMULATED: Final[dict[str, Simulated]] = {
     "one_way_right": _sign("one_way_right"),
     "do_not_enter": _sign("do_not_enter"),
 }
-"""A function for every cue; a cue of a plug-in without one is left out of simulated truth."""
+"""Rules by cue; a cue of a plug-in without a rule is omitted from simulated truth."""
 
 
 class CueRuns:
-    """Joins equal presences of consecutive pictures into spans of time."""
+    """Spans of time with equal presence of cues in consecutive pictures."""
 
     def __init__(self, period_ns: int, approach: int | None) -> None:
-        """Begin an approach, or a road without one, whose pictures come every ``period_ns``."""
+        """Begin an approach, or a road without one, with a picture every ``period_ns``."""
         self._period_ns = period_ns
         self._approach = approach
         self._open: dict[str, tuple[int, int, Presence]] = {}
         self._done: list[CueTruth] = []
 
     def add(self, t_ns: int, found: Mapping[str, Presence]) -> None:
-        """Take in the picture of a time; visibility counts in tenths."""
+        """Add the picture of a time; visibility is in tenths."""
         for cue, presence in found.items():
             rounded = Presence(presence.things, round(presence.visible, 1))
             run = self._open.get(cue)
@@ -157,7 +157,7 @@ class CueRuns:
             )
 
     def finished(self) -> tuple[CueTruth, ...]:
-        """All spans, by start and cue."""
+        """Return all spans, sorted by start and cue."""
         for cue in list(self._open):
             self._close(cue)
         return tuple(sorted(self._done, key=lambda run: (run.start_ns or 0, run.cue)))

@@ -1,6 +1,6 @@
-"""A run of a simulated intersection as files: log, vehicle file, DBC file and truth.
+"""Write a run of a simulated intersection as files: log, vehicle file, DBC file and truth.
 
-Written a second at a time: memory holds that second's pictures, however long the drive.
+The log is written in parts of a second, so that memory holds the pictures of one second only.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ from .mobileye import Device
 from .world import World
 
 MADE_OF: Final = SIMULATED
-"""Says which drive a folder holds."""
+"""File that identifies the drive of a folder."""
 CAR_BUS: Final = "/can/car"
 MOBILEYE_BUS: Final = "/can/mobileye"
 IMAGES: Final = "/camera/image/compressed"
 CALIBRATION: Final = "/camera/camera_info"
 SOURCE: Final = "simulated by crosscue, exact"
 FROM_M: Final = 62.0
-"""Drives of few pictures begin so far before the intersection."""
+"""Start of drives with sparse pictures, as the distance before the intersection."""
 SPACING_M: Final = 5.0
 SPACING_S: Final = 1.0
 TOPICS: Final = (
@@ -82,11 +82,11 @@ class SceneFiles:
     """The files of one simulated drive.
 
     Attributes:
-        log: ``drive.mcap``.
-        vehicle: ``vehicle.toml``.
-        truth: ``truth.json``.
-        pictures: How many.
-        seconds: Length of the drive.
+        log: Path of ``drive.mcap``.
+        vehicle: Path of ``vehicle.toml``.
+        truth: Path of ``truth.json``.
+        pictures: Number of pictures.
+        seconds: Duration of the drive.
     """
 
     log: Path
@@ -97,14 +97,14 @@ class SceneFiles:
 
 
 class Imager(NamedTuple):
-    """What a drive's camera records.
+    """Kind of pictures that a drive's camera records.
 
     Attributes:
-        name: Of what, for ``simulated.json``; empty for photographs.
-        pictures: Times and pictures of a run, one after another.
-        encode: From a picture to its bytes.
-        coding: Of these.
-        is_painted: The pictures show the ground's colours.
+        name: Name in ``simulated.json``; empty for photographs.
+        pictures: Function that yields times and pictures of a run.
+        encode: Function that encodes a picture.
+        coding: Coding of the encoded pictures.
+        is_painted: True if the pictures show the ground's colours.
     """
 
     name: str
@@ -115,21 +115,21 @@ class Imager(NamedTuple):
 
 
 def pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
-    """Times and pictures of a run, one after another; nothing is written."""
+    """Yield times and pictures of a run, without writing anything."""
     renderer = Renderer(world, settings.camera, settings.picture)
     for number, t_ns in enumerate(picture_times(world, settings).tolist()):
         yield t_ns, renderer.picture((t_ns - START_NS) * 1e-9, number)
 
 
 def picture_times(world: World, settings: SceneSettings) -> Int64s:
-    """When pictures are grabbed."""
+    """Return the times at which pictures are grabbed."""
     motion = world.approach.motion
     step = 1_000_000_000 // settings.rate_hz
     return np.arange(int(motion.t_ns[0]), int(motion.t_ns[-1]), step, dtype=np.int64)
 
 
 def jpeg(picture: Picture, quality: int) -> bytes:
-    """A picture as JPEG."""
+    """Encode a picture as JPEG."""
     import cv2
 
     bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
@@ -144,7 +144,7 @@ PHOTOGRAPHS: Final = Imager("", pictures, _photograph, "jpeg")
 
 
 def sparse_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
-    """Photographs every ``SPACING_M`` of the last ``FROM_M``, and every ``SPACING_S`` if slower."""
+    """Yield photographs every ``SPACING_M`` of the last ``FROM_M``, or ``SPACING_S`` if slower."""
     renderer, motion = Renderer(world, settings.camera, settings.picture), world.approach.motion
     last_m, last_ns = -math.inf, 0
     for number, t_ns in enumerate(picture_times(world, settings).tolist()):
@@ -158,7 +158,7 @@ def sparse_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int
 
 
 SPARSE_PHOTOGRAPHS: Final = Imager("sparse photographs 1", sparse_pictures, _photograph, "jpeg")
-"""So few that a hundred layouts can be seen by networks."""
+"""Few enough photographs to process a hundred layouts with networks."""
 
 
 def write_scene(
@@ -169,19 +169,19 @@ def write_scene(
     imager: Imager = PHOTOGRAPHS,
     is_calibrated: bool = True,
 ) -> SceneFiles:
-    """Simulate a run and write its files into ``folder``.
+    """Simulate a run and write its files to ``folder``.
 
     Args:
-        folder: Where to.
-        settings: The run.
-        overwrite: Replace the same drive.
-        imager: What its camera records.
-        is_calibrated: The vehicle file states the simulator's own noise; else, as in the published
-            study, that of any car.
+        folder: Folder for the files.
+        settings: Settings of the run.
+        overwrite: Replace an existing drive of the same settings.
+        imager: Kind of pictures that its camera records.
+        is_calibrated: Write the simulator's noise to the vehicle file; otherwise the noise is that
+            of a generic car, as in the published study.
 
     Raises:
-        OutputError: A file is there already, or cannot be written.
-        UsageError: Another drive is there, which ``overwrite`` would destroy.
+        OutputError: A file exists already, or cannot be written.
+        UsageError: A different drive exists, which ``overwrite`` would destroy.
     """
     if overwrite:
         refuse_other_drive(folder, settings, imager)
@@ -210,11 +210,10 @@ def _settings_of(settings: SceneSettings, imager: Imager) -> dict[str, Any]:
 
 
 def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = PHOTOGRAPHS) -> None:
-    """Let a drive be replaced by itself only.
+    """Refuse to replace a drive of other settings.
 
     Raises:
-        UsageError: The folder holds a drive of other settings, or one of which nothing says what
-            it is.
+        UsageError: The folder contains a drive of other or unknown settings.
     """
     if not (folder / "drive.mcap").exists():
         return
@@ -226,7 +225,7 @@ def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = P
 
 
 class _Record:
-    """Gathers the truth of a run while its log is made."""
+    """Recorder of a run's log, which collects the run's truth."""
 
     def __init__(
         self,
@@ -250,7 +249,7 @@ class _Record:
         self._enter_ns = START_NS + round(world.approach.enter_s * 1e9)
 
     def blocks(self) -> Iterator[Block]:
-        """All rows of the log, about in order of their times."""
+        """Yield all rows of the log, approximately in order of their times."""
         device = Device(self.world, np.random.default_rng([self.conditions.seed, 9]))
         others = [
             replace(block, topic=CAR_BUS) if block.topic == "/can" else block
@@ -265,7 +264,7 @@ class _Record:
             until = t_ns + 1_000_000_000 // self.settings.rate_hz
             if len(batch) == self.settings.rate_hz:
                 yield from self._second(batch, _between(others, begin, until), device, late)
-                # Pictures may be far apart: the sensors go on between two batches.
+                # Pictures may be far apart, and the sensors continue between two batches.
                 batch, begin = [], until
         if batch:
             yield from self._second(batch, _between(others, begin, until), device, late)
@@ -298,7 +297,7 @@ class _Record:
             self._ranges.append(f"{t_ns},0,{to_start:.4f},{to_end:.4f}")
 
     def vehicle_text(self, *, is_calibrated: bool) -> str:
-        """The vehicle file that fits."""
+        """Return the text of the vehicle file."""
         text = vehicle_text(
             self.settings.camera,
             mounting_yaw_rad=self._car.mounting_yaw_rad,
@@ -308,7 +307,7 @@ class _Record:
         return with_simulated_noise(text, self._car, self._motion) if is_calibrated else text
 
     def write_truth(self, folder: Path) -> Path:
-        """Truth, objects, trajectory and ranges."""
+        """Write truth, objects, trajectory and ranges, and return the path of the truth file."""
         motion, layout = self._motion, self.layout
         tenth = slice(None, None, 10)
         turned = np.angle(np.exp(1j * motion.heading_rad[tenth]))
@@ -354,7 +353,7 @@ class _Record:
 
 
 def _in_map(motion: TrueMotion, heading_rad: float) -> TrueMotion:
-    """From the intersection's frame to the map: zero where the drive begins."""
+    """Transform a motion from the intersection's frame to the map, whose origin is the start."""
     c, s = np.cos(heading_rad), np.sin(heading_rad)
     x, y = motion.x_m - motion.x_m[0], motion.y_m - motion.y_m[0]
     return replace(
@@ -363,7 +362,7 @@ def _in_map(motion: TrueMotion, heading_rad: float) -> TrueMotion:
 
 
 def _between(blocks: list[Block], begin_ns: int, end_ns: int) -> Iterator[Block]:
-    """Their rows from one time up to another, where there are any."""
+    """Yield the parts of blocks between two times that have rows."""
     for block in blocks:
         part = block.take((block.log_ns >= begin_ns) & (block.log_ns < end_ns))
         if len(part):

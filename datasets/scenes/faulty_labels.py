@@ -1,10 +1,10 @@
-"""Label images of a simulated drive, with the faults of a detector that is simulated too.
+"""Label images of a simulated drive, with the faults of a simulated detector.
 
-No network sees a picture here: masks are the renderer's, and what is missed, found where nothing
-is, or measured wrongly is drawn from the settings of ``Faults``. They are plausible and measured
-nowhere. A fault persists: each object, road and false find has an error that is partly its own for
-the whole drive, partly fades over a second and partly is that of one frame, so that successive
-frames are wrong together, as those of networks are.
+No network is used. Masks come from the renderer, and missed objects, false detections and errors
+are drawn according to ``Faults``, whose values are plausible but were not measured. Faults are
+correlated in time: the error of each object, road and false detection is the sum of a part that is
+constant during the drive, a part that decays over a second, and a part of the single frame.
+Consecutive frames are therefore wrong together, as they are with networks.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ LABELS: Final[dict[Category, str]] = {
     "do_not_enter": "do not enter",
 }
 MOVING_NS: Final = 200_000_000
-"""Between two pictures ..."""
+"""Time between two pictures while the vehicle moves."""
 STANDING_NS: Final = 400_000_000
-"""... and while the car stands."""
+"""Time between two pictures while the vehicle is stationary."""
 STANDS_MPS: Final = 0.3
 ROAD, LEFT, RIGHT, AHEAD, FIRST_PATCH, FIRST_FALSE = 1, 2, 3, 4, 10, 200
 FALSE_SIZE_M: Final[dict[Category, float]] = {
@@ -55,7 +55,7 @@ MIRRORED: Final[dict[Category, Category]] = {
 
 
 class Sight(NamedTuple):
-    """How one class is found: half of those ``half_px`` high are, at best a fraction ``best``."""
+    """Detection rate of a class: ``best`` at most, and one half of it at height ``half_px``."""
 
     best: float
     half_px: float
@@ -63,25 +63,25 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """How well the simulated detector sees; of pictures 640 pixels wide.
+    """Performance of the simulated detector on pictures with a width of 640 pixels.
 
     Attributes:
-        sights: By class, on a clear day.
-        step_fraction: By how much more height, as a fraction, far more are found.
-        own: Fraction of an error's variance that an object keeps for the whole drive.
-        fading: And that fades over ``fade_s``; the rest is that of one frame.
-        fade_s: Seconds.
-        height_sd_fraction: Of a mask's height, the object's own, and as much again in each frame.
-        false_things: Things taken for a sign or light, so many a drive, by class.
-        false_per_frame: Finds of one frame where nothing is, by class.
-        turned_around: Fraction of one-way signs that are read the other way.
-        road_half_m: Half of the side roads are seen from here.
-        ahead_half_m: And of roads beyond an intersection.
-        road_best: At best.
-        lot_as_road: Fraction of the frames in which a lot counts as road ...
-        driveway_as_road: ... or a driveway ...
-        false_road: ... or one of ``false_roads`` places beside the road.
-        false_roads: So many a drive.
+        sights: Detection rates by class, on a clear day.
+        step_fraction: Relative increase in height over which the detection rate rises.
+        own: Fraction of an error's variance that is constant for an object during the drive.
+        fading: Fraction that decays over ``fade_s``; the rest is that of a single frame.
+        fade_s: Decay time in seconds.
+        height_sd_fraction: Relative error of a mask's height, both per object and per frame.
+        false_things: Number of objects mistaken for a sign or light in a drive, by class.
+        false_per_frame: Probability of a false detection of each class in a frame.
+        turned_around: Fraction of one-way signs that are read in the opposite direction.
+        road_half_m: Distance at which half of the side roads are detected.
+        ahead_half_m: Distance at which half of the roads beyond an intersection are detected.
+        road_best: Max detection rate of roads.
+        lot_as_road: Fraction of frames in which a parking lot is detected as road.
+        driveway_as_road: Fraction of frames in which a driveway is detected as road.
+        false_road: Fraction of frames in which one of ``false_roads`` places is detected as road.
+        false_roads: Number of places next to the road that may be detected as road in a drive.
     """
 
     sights: dict[Category, Sight] = field(
@@ -124,14 +124,14 @@ DEFAULTS: Final = Faults()
 
 @dataclass(slots=True)
 class _Errors:
-    """Standard normal numbers that persist, one sequence for each key."""
+    """Standard normal errors that are correlated in time, one sequence for each key."""
 
     faults: Faults
     seed: int
     known: dict[int, tuple[Generator, float, float, float]] = field(default_factory=dict)
 
     def __call__(self, key: int, t_s: float) -> float:
-        """The error at a time; times never fall."""
+        """Return the error at a time; times must not decrease."""
         if key not in self.known:
             rng = np.random.default_rng([self.seed, 12, key])
             self.known[key] = rng, rng.normal(), rng.normal(), t_s
@@ -147,23 +147,23 @@ class _Errors:
         )
 
     def happens(self, key: int, t_s: float, chance: float) -> bool:
-        """Whether something of this chance is so at a time."""
+        """Return whether a random event of the given probability occurs at a time."""
         return 0.5 * math.erfc(self(key, t_s) / math.sqrt(2.0)) < chance
 
 
 @dataclass(frozen=True, slots=True)
 class _False:
-    """A thing that is taken for a sign."""
+    """An object that is mistaken for a sign."""
 
     category: Category
     at_m: tuple[float, float, float]
 
 
 class FaultyLabels:
-    """The simulated detector through one drive."""
+    """Simulated detector during one drive."""
 
     def __init__(self, world: World, settings: SceneSettings, faults: Faults = DEFAULTS) -> None:
-        """Look at nothing yet."""
+        """Draw the constant faults of the drive."""
         self._world, self._faults = world, faults
         picture = PictureSettings(samples=1)
         self._renderer = Renderer(world, settings.camera, picture)
@@ -184,7 +184,7 @@ class FaultyLabels:
         )
 
     def picture(self, t_s: float) -> Picture:
-        """The picture at a time, its colours those of a label image."""
+        """Return the label image at a time as a picture."""
         picture, ground = self._renderer.owners(t_s, self._codes)
         found = [
             one for seen in picture.seen if (one := self._found(seen, picture, t_s)) is not None
@@ -257,7 +257,7 @@ class FaultyLabels:
 
 
 def _beside(world: World, category: Category, rng: Generator) -> tuple[float, float, float]:
-    """Where a thing stands that is taken for a sign."""
+    """Draw the position of an object that is mistaken for a sign."""
     half_m = world.layout.half_width_m
     x, side = float(rng.uniform(-45.0, 25.0)), float(rng.choice([-1.0, 1.0]))
     if category == "traffic_light":
@@ -268,7 +268,7 @@ def _beside(world: World, category: Category, rng: Generator) -> tuple[float, fl
 def _ground_codes(
     world: World, faults: Faults, rng: Generator
 ) -> tuple[NDArray[np.uint8], dict[int, float]]:
-    """The map of what may be taken for road, and how often what is not road counts as it."""
+    """Return a map of areas that may be detected as road, and rates of false areas by code."""
     from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M, along_curve
 
     layout, road = world.layout, world.ground.road
@@ -305,14 +305,14 @@ def _ground_codes(
 
 
 def _stretched(mask: NDArray[np.bool_], factor: float) -> NDArray[np.bool_]:
-    """The mask with another height, by whole rows."""
+    """Return the mask with its height scaled, in complete rows."""
     high = max(round(len(mask) * factor), 1)
     rows = np.minimum((np.arange(high) * len(mask)) // high, len(mask) - 1)
     return mask[rows]
 
 
 def _block(category: Category, x_px: float, y_px: float, height_px: float) -> LabelledObject:
-    """A find without a thing: a rectangle of the shape of its class."""
+    """Return a false detection: a rectangle with the aspect ratio of its class."""
     wide = {"traffic_light": 0.35, "one_way_left": 3.0, "one_way_right": 3.0}.get(category, 1.0)
     high, across = max(round(height_px), 2), max(round(wide * height_px), 2)
     corner = (round(x_px - across / 2), round(y_px - high / 2))
@@ -322,9 +322,9 @@ def _block(category: Category, x_px: float, y_px: float, height_px: float) -> La
 def label_pictures(
     world: World, settings: SceneSettings, faults: Faults = DEFAULTS
 ) -> Iterator[tuple[int, Picture]]:
-    """Times and label images from ``FROM_M`` before the intersection until the car is there.
+    """Yield times and label images from ``FROM_M`` before the intersection up to it.
 
-    A car that stands sees next to nothing new, so fewer are taken then.
+    A stationary vehicle sees almost nothing new, so that there are fewer images then.
     """
     labels, motion = FaultyLabels(world, settings, faults), world.approach.motion
     due_ns = 0
@@ -340,7 +340,7 @@ def label_pictures(
 
 
 def png(picture: Picture, _: PictureSettings) -> bytes:
-    """A picture without loss."""
+    """Encode a picture without loss."""
     import cv2
 
     bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
@@ -361,7 +361,7 @@ NO_FAULTS: Final = Faults(
     false_road=0.0,
     false_roads=0.0,
 )
-"""Every mask is the renderer's, of things that can be seen by two thirds or more."""
+"""Faultless detector: exact masks of all objects that are visible by at least two thirds."""
 
 
 def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
@@ -370,8 +370,8 @@ def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[i
 
 
 PERFECT_LABELS: Final = Imager("perfect labels 1", _perfect_pictures, png, "png", is_painted=False)
-"""What shows how good the rules can get."""
+"""Label images of the faultless detector, which show the best possible result of the rules."""
 LABEL_IMAGES: Final = Imager("faulty labels 1", label_pictures, png, "png", is_painted=False)
-"""What a drive's camera records in place of photographs."""
+"""Label images with faults, which a drive's camera records instead of photographs."""
 DETECTORS: Final = "crosscue.detectors.label_images:objects,crosscue.detectors.label_images:road"
-"""That read them."""
+"""Detectors that read label images."""

@@ -1,11 +1,11 @@
-"""Intersections as plans: the eight of Table 6, and any number of others from seeds.
+"""Layouts of intersections: the eight of Table 6, and any number of others from seeds.
 
-Layouts ``M`` are mixed: thirteen kinds in turn, five of which are not an intersection at all, so
-that every feature of an intersection has positives and negatives in any thirteen in a row.
+Layouts ``M`` are mixed: thirteen kinds in turn, five of which are not intersections, so that every
+feature of an intersection has positives and negatives in any thirteen consecutive layouts.
 
-Local frame: x ahead along the approach road, y to the left, zero on the approach road's middle line
-where the intersection starts (stop line, and stop sign if there is one). The crossroad's near kerb
-is ``NEAR_KERB_M`` beyond; the intersection ends, and traffic lights hang, at ``end_m``.
+Local frame: x ahead along the approach road, y to the left. The origin is on the centre line of the
+approach road at the start of the intersection (stop line, and stop sign if any). The near kerb of
+the crossroad is at ``NEAR_KERB_M``; the intersection ends at ``end_m``, where traffic lights hang.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ SCORED: Final = "ABCDEFGH"
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What does not change from run to run.
+    """Properties of an intersection that are constant in all runs.
 
     Attributes:
         name: Letter of Table 6, or ``L`` or ``M`` and the layout's seed.
-        seed: Everything random about buildings and plants comes from it.
-        control: What the approach road's driver must heed.
-        has_left: There is road to the left; likewise ``has_right`` and ``has_ahead``.
-        one_way: Where the crossroad's traffic goes, if only one way; a sign says so.
-        do_not_enter: Signs forbid the way ahead, or that against the one-way street.
-        ahead_is_closed: The road ahead carries only traffic that comes towards us.
-        half_width_m: Half the approach road, kerb to middle.
-        cross_width_m: Crossroad, kerb to kerb.
-        cross_traffic: Cars a minute and direction on the crossroad, at usual traffic.
-        parked_cross: Cars parked on the crossroad each side of it, about.
-        parked_past: Cars parked along the road past the intersection, about.
-        vegetation: Bushes and branches hide signs and roads.
-        is_town: Shops rather than houses.
-        has_lot: A parking lot beside the approach road.
-        curve_per_m: A gentle curve of the approach road, to the left if positive.
+        seed: Seed of random buildings and plants.
+        control: Traffic control of the approach road.
+        has_left: True if there is a road to the left; likewise ``has_right`` and ``has_ahead``.
+        one_way: Direction of the crossroad's traffic, if it is one-way with a sign.
+        do_not_enter: True if signs forbid the road ahead, or entering the one-way street.
+        ahead_is_closed: True if the road ahead has only oncoming traffic.
+        half_width_m: Half the width of the approach road, from kerb to centre line.
+        cross_width_m: Width of the crossroad, from kerb to kerb.
+        cross_traffic: Cars per minute and direction on the crossroad, at usual traffic.
+        parked_cross: Approximate number of cars parked on each side of the crossroad.
+        parked_past: Approximate number of cars parked along the road past the intersection.
+        vegetation: True if bushes and branches hide signs and roads.
+        is_town: True for shops, False for houses.
+        has_lot: True if there is a parking lot next to the approach road.
+        curve_per_m: Curvature of a gentle curve of the approach road, positive to the left.
     """
 
     name: str
@@ -74,9 +74,10 @@ class Layout:
     curve_per_m: float = 0.0
 
     def aside_m(self, x_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far left of the x axis the road's middle line is.
+        """Return the lateral position of the road's centre line, to the left of the x axis.
 
-        A parabola from ``CURVE_FROM_M`` to a slope of ``CURVE_SLOPE``, and straight from there.
+        It is a parabola from ``CURVE_FROM_M`` to a slope of ``CURVE_SLOPE``, and a straight line
+        from there.
         """
         if self.curve_per_m == 0.0:
             return np.zeros_like(x_m)
@@ -86,15 +87,15 @@ class Layout:
 
     @property
     def is_intersection(self) -> bool:
-        """Does more than one road lead on? Otherwise the road runs straight on or bends."""
+        """True if more than one road continues; otherwise the road is straight or bends."""
         return self.has_left + self.has_right + self.has_ahead > 1
 
     @property
     def features(self) -> dict[str, bool]:
-        """What is true of it, as far as that can be said.
+        """Return the true features of the layout, where known.
 
-        Where no intersection is, one can turn nowhere; a road that runs on is not a direction of
-        travel to choose, so straight is left out, and so is the side to which a road bends.
+        Without an intersection, turning is impossible. A road that merely continues is not a choice
+        of direction, so straight is omitted, and so is the side to which a road bends.
         """
         if self.is_intersection:
             ways = {"left": self.goes_left, "right": self.goes_right, "straight": self.goes_ahead}
@@ -107,32 +108,32 @@ class Layout:
 
     @property
     def has_parking_lane(self) -> bool:
-        """Is there room to park, marked by a white line?"""
+        """True if there is room to park, marked by a white line."""
         return self.half_width_m > 4.6
 
     @property
     def far_kerb_m(self) -> float:
-        """Where the crossroad's far kerb lies."""
+        """Position of the crossroad's far kerb."""
         return NEAR_KERB_M + self.cross_width_m
 
     @property
     def end_m(self) -> float:
-        """Where the intersection ends."""
+        """Position of the end of the intersection."""
         return self.far_kerb_m + 1.5
 
     @property
     def goes_left(self) -> bool:
-        """May one turn left?"""
+        """True if turning left is allowed."""
         return self.has_left and self.one_way != "right"
 
     @property
     def goes_right(self) -> bool:
-        """May one turn right?"""
+        """True if turning right is allowed."""
         return self.has_right and self.one_way != "left"
 
     @property
     def goes_ahead(self) -> bool:
-        """May one drive on?"""
+        """True if driving straight is allowed."""
         return self.has_ahead and not self.ahead_is_closed
 
 
@@ -156,7 +157,7 @@ TABLE_6: Final = {
 
 
 def any_layout(seed: int) -> Layout:
-    """An intersection that is not in Table 6, for training and for breadth."""
+    """Return a random intersection that is not in Table 6, for training and variety."""
     rng = np.random.default_rng([seed, 0x1A])
     arms = str(rng.choice(["all", "t", "no_left", "no_right"], p=[0.5, 0.26, 0.12, 0.12]))
     control = str(rng.choice(["stop_sign", "traffic_light", "none"], p=[0.5, 0.35, 0.15]))
@@ -196,7 +197,7 @@ WITHOUT: Final[Mapping[Kind, tuple[str, ...]]] = {
     "straight": ("left", "right"), "driveways": ("left", "right"), "lot": ("left", "right"),
     "curve": ("left", "right"),
 }  # fmt: skip
-"""Roads that a kind does not have; a bend has one of the sides alone."""
+"""Missing roads by kind; a bend has exactly one of the sides."""
 
 
 CONTROLS: Final[Mapping[Kind, tuple[Control, ...]]] = {
@@ -206,16 +207,16 @@ CONTROLS: Final[Mapping[Kind, tuple[Control, ...]]] = {
     "one_way_t": ("stop_sign",), "straight": ("none",), "bend": ("none",), "driveways": ("none",),
     "lot": ("none",), "curve": ("none",),
 }  # fmt: skip
-"""What a kind's control is drawn from."""
+"""Possible traffic controls by kind."""
 
 
 def mixed_kind(seed: int) -> Kind:
-    """The kind of layout ``M`` and a seed."""
+    """Return the kind of layout ``M`` with a seed."""
     return KINDS[seed % len(KINDS)]
 
 
 def mixed_layout(seed: int) -> Layout:
-    """An intersection of one of the kinds in turn, or a road without one."""
+    """Return an intersection of one of the kinds in turn, or a road without one."""
     rng = np.random.default_rng([seed, 0x4D])
     kind, side = mixed_kind(seed), _side(rng)
     missing = WITHOUT.get(kind, ())
@@ -241,7 +242,7 @@ def mixed_layout(seed: int) -> Layout:
         parked_cross=parked,
         parked_past=int(rng.choice([0, 0, 2, 5])),
         vegetation=bool(rng.random() < 0.15),
-        # Houses have driveways, shops do not.
+        # Only houses have driveways.
         is_town=kind not in ("driveways", "lot") and bool(rng.random() < 0.5),
         has_lot=kind == "lot" or (kind not in ("straight", "curve") and bool(rng.random() < 0.3)),
         curve_per_m=_curve(rng, side) if kind == "curve" else 0.0,
@@ -249,7 +250,7 @@ def mixed_layout(seed: int) -> Layout:
 
 
 def _curve(rng: np.random.Generator, side: Side) -> float:
-    """Of a radius of 130 to 250 m."""
+    """Draw a curvature with a radius of 130 to 250 m."""
     return (1.0 if side == "left" else -1.0) / float(rng.uniform(130.0, 250.0))
 
 
@@ -258,10 +259,10 @@ def _side(rng: np.random.Generator) -> Side:
 
 
 def layout_named(name: str) -> Layout:
-    """``A`` to ``H``, or ``L`` or ``M`` and a seed.
+    """Return the layout named ``A`` to ``H``, or ``L`` or ``M`` with a seed.
 
     Raises:
-        ValueError: No such layout.
+        ValueError: There is no such layout.
     """
     if name in TABLE_6:
         return TABLE_6[name]

@@ -1,7 +1,7 @@
-"""What a Mobileye would say about a world: vehicles ahead and lane lines, with its faults.
+"""Simulate a Mobileye in a world: vehicles ahead and lane lines, with faults.
 
-Reach, field of view, rates of misses and errors are plausible settings, measured nowhere, save that
-places err by a few per cent as the public comment on the protocol says.
+Range, field of view, miss rates and errors are plausible values that were not measured. Only the
+position error of a few per cent comes from the public description of the protocol.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ STANDING, MOVING, ONCOMING, PARKED = 1, 3, 4, 5
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """How well the device sees.
+    """Performance of the device.
 
     Attributes:
-        half_view_rad: Half its field of view.
-        reach_m: Farthest vehicle.
-        min_visible: Fraction of a vehicle that must show.
-        hit: Chance that a vehicle on our road is reported; states last about a second.
-        hit_crossing: The same for one that shows its side.
-        hit_off_road: The same for one in a lot or driveway.
+        half_view_rad: Half of the field of view.
+        reach_m: Max distance of a vehicle.
+        min_visible: Min visible fraction of a vehicle.
+        hit: Probability that a vehicle on the ego road is reported; states last about a second.
+        hit_crossing: Probability for a vehicle seen from the side.
+        hit_off_road: Probability for a vehicle in a lot or driveway.
         place_fraction: Relative error of distance.
-        side_m: Error aside.
+        side_m: Lateral error.
     """
 
     half_view_rad: float = 0.33
@@ -56,10 +56,10 @@ class Faults:
 
 
 class Device:
-    """One Mobileye through one drive; remembers what it is tracking."""
+    """A Mobileye during one drive, with the state of its tracks."""
 
     def __init__(self, world: World, rng: Generator, faults: Faults | None = None) -> None:
-        """Switch on."""
+        """Begin without tracks."""
         self._world = world
         self._rng = rng
         self._faults = Faults() if faults is None else faults
@@ -69,7 +69,7 @@ class Device:
         self._sees_past = False
 
     def frames(self, times_ns: Int64s, pictures: Sequence[Picture], bus: str) -> Block:
-        """CAN frames for pictures grabbed at ``times_ns``."""
+        """Return CAN frames for pictures grabbed at ``times_ns``."""
         rows = [
             row
             for t_ns, picture in zip(times_ns.tolist(), pictures, strict=True)
@@ -112,7 +112,7 @@ class Device:
         elif abs(seen.thing.at[1]) > self._world.layout.half_width_m:
             chance = faults.hit_off_road
         chance *= 1.0 - 0.15 * self._world.conditions.rain
-        # A state is drawn about once a second, so hits and misses come in runs.
+        # A state is drawn about once a second, so that hits and misses occur in runs.
         if number not in self._reports or self._rng.random() < 0.1:
             self._reports[number] = bool(self._rng.random() < chance)
         return self._reports[number]
@@ -175,7 +175,7 @@ class Device:
         return table_block(bus, "lanes", sent, columns)
 
     def _lane_reach(self, x: float) -> float:
-        """How far from the rear axle the lines are followed: to the stop line, or past it."""
+        """Return the end of the lines from the rear axle, at the stop line or past it."""
         layout, conditions = self._world.layout, self._world.conditions
         to_start, to_end = -x, layout.end_m - x
         sight = 58.0 * (1 - 0.35 * conditions.rain) * (0.8 if conditions.light == "dusk" else 1.0)
@@ -189,7 +189,7 @@ class Device:
 
 
 def lane_lines_m(layout: Layout) -> tuple[float, float]:
-    """Where the painted lines left and right of our lane lie."""
+    """Return the lateral positions of the painted lines left and right of the ego lane."""
     return 0.17, 2 * lane_y_m(layout)
 
 

@@ -1,4 +1,4 @@
-"""How the car drives up to an intersection and through it."""
+"""Motion of the car towards an intersection and through it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .conditions import Conditions
 from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
 
 FRONT_M: Final = 3.75
-"""From rear axle to front bumper."""
+"""Distance from rear axle to front bumper."""
 STEP_S: Final = 1.0 / RATE_HZ
 Turn = Literal["left", "right", "ahead"]
 
@@ -25,11 +25,11 @@ class Approach:
     """One approach in the intersection's frame.
 
     Attributes:
-        motion: Rear axle in the local frame, 100 Hz.
-        turn: Where it goes.
-        green_s: When the light turns green, from the start; negative if it always was.
-        enter_s: When the rear axle passes the start of the intersection.
-        inside_s: From when to when any part of the car is on the crossroad.
+        motion: Motion of the rear axle in the local frame, 100 Hz.
+        turn: Direction of travel.
+        green_s: Time from the start at which the light turns green; negative if it always was.
+        enter_s: Time at which the rear axle passes the start of the intersection.
+        inside_s: Interval in which any part of the car is on the crossroad.
     """
 
     motion: TrueMotion
@@ -40,13 +40,13 @@ class Approach:
 
 
 def lane_y_m(layout: Layout) -> float:
-    """Middle of the lane driven, right of the middle line."""
+    """Return the lateral position of the ego lane's centre, right of the road's centre line."""
     parking = PARKING_LANE_M if layout.has_parking_lane else 0.0
     return -(layout.half_width_m - parking) / 2
 
 
 def approach(layout: Layout, conditions: Conditions, rng: Generator) -> Approach:
-    """Drive up from about 88 m, heed sign or light, go through."""
+    """Simulate an approach from about 88 m, with a stop at sign or light, and the crossing."""
     ways: list[Turn] = []
     if layout.goes_ahead:
         ways += ["ahead"] * 4
@@ -76,7 +76,7 @@ def approach(layout: Layout, conditions: Conditions, rng: Generator) -> Approach
 
 
 def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:
-    """For each decimetre of the way."""
+    """Return the curvature for each decimetre of the path."""
     step = 0.1
     straight_on = layout.end_m + 16.0
     if turn == "ahead":
@@ -96,7 +96,7 @@ def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:
 
 
 def _along_road(layout: Layout, start_x: float, end_x: float, step: float) -> Floats:
-    """Curvature of the way that keeps its distance from the middle line."""
+    """Return the curvature of a path with a constant distance from the centre line."""
     if layout.curve_per_m == 0.0:
         return np.zeros(round((end_x - start_x) / step))
     x: Floats = np.arange(start_x, end_x, step / 10.0)
@@ -110,7 +110,7 @@ def _along_road(layout: Layout, start_x: float, end_x: float, step: float) -> Fl
 def _speeds(
     cruise: float, stop_at: float | None, wait_s: float, last: int, slow_from: float | None
 ) -> tuple[Floats, Floats]:
-    """Way and speed at each step: brake at 1.9 m/s2, wait, pull away at 1.6 m/s2."""
+    """Return distance and speed at each step: brake at 1.9 m/s2, wait, accelerate at 1.6 m/s2."""
     end_m = last * 0.1
     at, v, waited = 0.0, cruise, 0.0
     along, speed = [], []

@@ -1,4 +1,4 @@
-"""What to simulate, and the world that follows from it."""
+"""Settings of a simulated run, and the world that they define."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ CAMERA: Final = Camera()
 
 @dataclass(frozen=True, slots=True)
 class SceneSettings:
-    """One run to simulate.
+    """Settings of one simulated run.
 
     Attributes:
-        layout: ``A`` to ``H``, or ``L`` or ``M`` and a seed.
-        run: From 1; ten are laid down, more come from the seed.
-        seed: Everything random about the run comes from it; plan and buildings do not.
-        rate_hz: Pictures a second.
-        camera: Size, lens, mounting.
-        picture: How pictures are made.
+        layout: Name of the layout: ``A`` to ``H``, or ``L`` or ``M`` with a seed.
+        run: Number of the run, from 1; ten are fixed, further ones are drawn from the seed.
+        seed: Seed of all random numbers of the run, except those of layout and buildings.
+        rate_hz: Pictures per second.
+        camera: Size, lens and mounting of the camera.
+        picture: Settings of the rendering.
     """
 
     layout: str = "A"
@@ -37,10 +37,10 @@ class SceneSettings:
     picture: PictureSettings = DEFAULTS
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Check the settings.
 
         Raises:
-            ValueError: Naming what was wanted.
+            ValueError: A setting is out of range; the message states the valid values.
         """
         layout_named(self.layout)
         if self.run < 1 or self.seed < 0:
@@ -50,15 +50,15 @@ class SceneSettings:
 
     @property
     def name(self) -> str:
-        """As its folder is called."""
+        """Name of its folder."""
         return f"{self.layout}-{self.run:02d}"
 
 
 def camera_of_width(width_px: int) -> Camera:
-    """The camera of simulated drives with pictures of another size; they are 9/16 high.
+    """Return the camera of simulated drives for another width; the aspect ratio is 16 to 9.
 
     Raises:
-        UsageError: Not a size that it has.
+        UsageError: The width is not supported.
     """
     if not 64 <= width_px <= 3840 or width_px % 16:
         raise UsageError(f"--width {width_px}: expected a multiple of 16 from 64 to 3840")
@@ -68,7 +68,7 @@ def camera_of_width(width_px: int) -> Camera:
 def world_of(
     settings: SceneSettings, *, is_painted: bool = True
 ) -> tuple[Layout, Conditions, World]:
-    """The world that a run happens in; ``is_painted`` as ``build`` takes it."""
+    """Return layout, conditions and world of a run; see ``build`` for ``is_painted``."""
     layout = layout_named(settings.layout)
     conditions = conditions_of(layout, settings.run, settings.seed)
     return layout, conditions, build(layout, conditions, is_painted=is_painted)

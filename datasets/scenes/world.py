@@ -1,4 +1,4 @@
-"""One run's world: scenery that stands, things that are labelled, cars that drive."""
+"""World of one run: static scenery, labelled objects and moving cars."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ class Thing:
     """One labelled object.
 
     Attributes:
-        number: Its instance, also its place in ``World.things``.
-        category: What it is.
-        role: What it does at the intersection.
-        mesh: Triangles where it is at time zero; a light shows red here.
-        at: x, y, z of its middle at time zero, local frame.
-        heading_rad: Where a car's nose points; where a sign's reader looks.
-        size: Length, width, height, metres.
-        velocity: x and y, metres a second.
-        span_s: From when to when it is there.
-        later: What it looks like from ``later_s`` on, or None.
-        later_s: When that begins.
-        curved: The layout whose curve it follows while it moves, or None.
+        number: Instance number, which is also its index in ``World.things``.
+        category: Class of the object.
+        role: Role of the object at the intersection.
+        mesh: Triangles at time zero; a traffic light is red.
+        at: x, y, z of its centre at time zero, local frame.
+        heading_rad: Direction of a car, or the viewing direction of a sign's reader.
+        size: Length, width and height in metres.
+        velocity: Velocity along x and y in metres per second.
+        span_s: Interval in which it exists.
+        later: Mesh from ``later_s`` on, or None.
+        later_s: Start of ``later``.
+        curved: Layout whose curve it follows while it moves, or None.
     """
 
     number: int
@@ -85,27 +85,27 @@ class Thing:
 
     @property
     def is_fixed(self) -> bool:
-        """Does it neither move nor change?"""
+        """True if it neither moves nor changes."""
         return self.velocity == (0.0, 0.0) and self.span_s == ALWAYS and self.later is None
 
     def is_there(self, t_s: float) -> bool:
-        """Is it in the world at this time?"""
+        """Return whether it exists at this time."""
         return self.span_s[0] <= t_s < self.span_s[1]
 
     def shift(self, t_s: float) -> Floats:
-        """How far it has moved from where ``mesh`` is, (3,)."""
+        """Return the displacement from the mesh's position, shape (3,), in metres."""
         x_m, y_m = self.velocity[0] * t_s, self.velocity[1] * t_s
         if self.curved is not None:
             y_m += float(self.curved.aside_m(np.array(self.at[0] + x_m)))
         return np.array([x_m, y_m, 0.0])
 
     def mesh_at(self, t_s: float) -> Mesh:
-        """Its look at this time."""
+        """Return its mesh at this time."""
         mesh = self.later if self.later is not None and t_s >= self.later_s else self.mesh
         curved = self.curved
         if curved is None:
             return mesh
-        # Sheared about its middle, which ``shift`` moves: it points along the curve.
+        # A shear about its centre, which ``shift`` moves, aligns it with the curve.
         moved_m = self.velocity[0] * t_s
         middle_m = curved.aside_m(np.array(self.at[0] + moved_m))
         return mesh.aside(lambda x_m: curved.aside_m(x_m + moved_m) - middle_m)
@@ -113,18 +113,18 @@ class Thing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """Everything that a camera could see in one run.
+    """Everything visible to a camera in one run.
 
     Attributes:
-        layout: The intersection.
-        conditions: The run.
-        approach: How the car drives.
-        light: Of day.
+        layout: Layout of the intersection.
+        conditions: Conditions of the run.
+        approach: Motion of the car.
+        light: Daylight.
         ground: The painted ground.
-        scenery: What is not labelled, with the fixed things.
-        things: What is labelled.
+        scenery: Unlabelled scenery, and the meshes of the fixed objects.
+        things: Labelled objects.
         atlas: Textures.
-        patches: Paved ground beside the road: driveways and lots.
+        patches: Paved ground next to the road: driveways and lots.
     """
 
     layout: Layout
@@ -152,7 +152,7 @@ class _Site:
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
-        """Is a spot outside all buildings and lots?"""
+        """Return whether a position is outside all buildings and lots."""
         return all(
             not (x0 - margin < x < x1 + margin and y0 - margin < y < y1 + margin)
             for x0, x1, y0, y1 in self.taken
@@ -171,7 +171,7 @@ class _Site:
         later: Mesh | None = None,
         later_s: float = 0.0,
     ) -> None:
-        """Take in a labelled thing, its mesh already in place."""
+        """Add a labelled object, whose mesh is already in position."""
         number = len(self.things)
         owned = None if later is None else later.owned_by(number)
         self.things.append(
@@ -200,7 +200,7 @@ class _Site:
         speed: float = 0.0,
         span_s: tuple[float, float] = ALWAYS,
     ) -> None:
-        """Put a car into the world; a moving one is at (x, y) at time zero."""
+        """Add a car, which is at (x, y) at time zero."""
         moving = speed != 0.0
         mesh = car(look, lamps_on=self.lamps_on and moving, brakes_on=False)
         shape = look.shape
@@ -224,7 +224,7 @@ class _Site:
 
 
 def _along_curve(thing: Thing, layout: Layout) -> Thing:
-    """A thing beside or on a curve; one that moves finds its place at each time."""
+    """Move an object to its position along a curve; a moving object follows the curve."""
     if layout.curve_per_m == 0.0:
         return thing
     if not thing.is_fixed:
@@ -235,12 +235,12 @@ def _along_curve(thing: Thing, layout: Layout) -> Thing:
 
 
 def build(layout: Layout, conditions: Conditions, *, is_painted: bool = True) -> World:
-    """The world of a run; the same from the same layout and conditions.
+    """Build the world of a run, which is determined by layout and conditions.
 
     Args:
-        layout: The intersection.
-        conditions: The run.
-        is_painted: Paint the ground, which takes longer than all else; without, it has no colours.
+        layout: Layout of the intersection.
+        conditions: Conditions of the run.
+        is_painted: Paint the ground, which takes most of the time. Otherwise it has no colours.
     """
     fixed = np.random.default_rng([layout.seed, 1])
     varied = np.random.default_rng([conditions.seed, 2])
@@ -277,7 +277,7 @@ def _painted(site: _Site, light: Daylight) -> Ground:
 
 
 def _lot(site: _Site, fixed: Generator, varied: Generator) -> None:
-    """A parking lot beside the approach road, its cars side on to us."""
+    """Add a parking lot next to the approach road, with cars seen from the side."""
     if not site.layout.has_lot:
         return
     side = float(fixed.choice([-1.0, 1.0]))
@@ -323,7 +323,7 @@ def _buildings(site: _Site, fixed: Generator, varied: Generator) -> None:
 def _row_along(
     site: _Site, fixed: Generator, varied: Generator, x0: float, x1: float, y: float, side: float
 ) -> None:
-    """Buildings beside the road that runs along x, the last ending at ``x1``."""
+    """Add buildings next to the road along x; the last one ends at ``x1``."""
     shop = site.layout.is_town
     at = x1
     while at > x0 + 8.0:
@@ -346,7 +346,7 @@ def _row_along(
 def _row_across(
     site: _Site, fixed: Generator, x: float, out: float, side: float, y0: float, y1: float
 ) -> None:
-    """Buildings beside the crossroad."""
+    """Add buildings next to the crossroad."""
     shop = site.layout.is_town
     at = y0
     while at < y1 - 6.0:
@@ -403,7 +403,7 @@ def _plants(site: _Site, fixed: Generator) -> None:
             site.parts.append(
                 bush(float(x), float(y), 0.9, float(fixed.uniform(0.9, 1.5)), site.atlas, fixed)
             )
-    # Beyond the last houses the view must end in trees, not in nothing.
+    # Trees close the view beyond the last houses.
     for x in (-112.0, 116.0):
         for y in np.arange(-60.0, 60.0, 5.0):
             if abs(y) > w + 3:
@@ -424,7 +424,7 @@ def _plants(site: _Site, fixed: Generator) -> None:
 
 
 def _overgrowth(site: _Site, fixed: Generator) -> None:
-    """Bushes along the right side up to the corner, and branches before the stop sign."""
+    """Add bushes along the right side up to the corner, and branches before the stop sign."""
     w = site.layout.half_width_m
     for x in np.arange(-34.0, 2.5, 2.2):
         y = -(w + float(fixed.uniform(2.0, 3.4)))
@@ -443,7 +443,7 @@ def _overgrowth(site: _Site, fixed: Generator) -> None:
 def _poles(site: _Site, fixed: Generator) -> None:
     layout = site.layout
     side = float(fixed.choice([-1.0, 1.0]))
-    # Behind the sidewalk: before it, a pole would hide the signs for most of the approach.
+    # Poles are behind the sidewalk; before it, they would hide the signs for most of the approach.
     y = side * (layout.half_width_m + 3.4)
     xs = np.arange(-101.0, 100.0, 34.0).tolist()
     if not layout.has_ahead:
@@ -460,7 +460,7 @@ def _poles(site: _Site, fixed: Generator) -> None:
 
 
 def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: float = 0.0) -> None:
-    """A sign on its own post, facing back along the approach road, or turned."""
+    """Add a sign on its own post, facing back along the approach road, or rotated."""
     face = sign_face(category, site.atlas)
     flat = face.corners.reshape(-1, 3)
     wide, high = (float(np.ptp(flat[:, k])) for k in (1, 2))
@@ -483,13 +483,13 @@ def _control(site: _Site, drive: Approach) -> None:
         for side in (-1.0, 1.0):
             _sign(site, "do_not_enter", end + 0.6, side * (w + 0.8), 2.3)
     elif layout.do_not_enter:
-        # Against those who would turn into the one-way street, turned towards us.
+        # For drivers turning into the one-way street; the sign is rotated towards the ego vehicle.
         side = 1.0 if layout.one_way == "right" else -1.0
         _sign(site, "do_not_enter", far + 1.0, side * (w + 3.2), 2.3, side * 0.5)
 
 
 def _lights(site: _Site, drive: Approach) -> None:
-    """Two heads on an arm over the road and one on the pole, all beyond the intersection."""
+    """Add two lights on an arm over the road and one on the pole, beyond the intersection."""
     layout = site.layout
     w, end = layout.half_width_m, layout.end_m
     site.parts.append(mast(end, -(w + 1.5), 1.2))
@@ -549,8 +549,8 @@ def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Gener
     length_s = len(drive.motion) / 100.0
     rate = layout.cross_traffic * conditions.traffic / 60.0
     flows = []
-    # Driving on the right, those who go right use the near half.
-    # Where there is but one arm, nobody drives across; those who turn are not simulated.
+    # Traffic drives on the right, so cars to the right use the near half.
+    # With only one arm there is no crossing traffic; turning cars are not simulated.
     if layout.has_left and layout.has_right:
         if layout.one_way != "left":
             flows.append((-np.pi / 2, near + 0.27 * (far - near)))
@@ -590,7 +590,7 @@ def _stream(
     length_s: float,
     varied: Generator,
 ) -> None:
-    """Cars that follow one another at random, none where it would hit us."""
+    """Add cars that follow one another at random, without collisions with the ego vehicle."""
     at = -9.0
     speed = float(varied.uniform(8.0, 12.0))
     enter, leave = drive.inside_s
@@ -612,9 +612,9 @@ def _stream(
 
 
 def _ahead_of_us(site: _Site, conditions: Conditions, varied: Generator) -> None:
-    """Cars that have left the intersection before we come, driving away."""
+    """Add outgoing cars that left the intersection before the ego vehicle arrives."""
     x = site.layout.far_kerb_m + float(varied.uniform(6.0, 30.0))
-    # All at one speed, or the hinder would drive through the foremost.
+    # All have one speed, so that no car passes through another.
     speed = float(varied.uniform(2.5, 5.0))
     for _ in range(int(varied.poisson(0.8 * conditions.traffic))):
         site.add_car(any_look(varied), "outgoing", x, lane_y_m(site.layout), 0.0, speed, (0.0, 1e9))
@@ -622,7 +622,7 @@ def _ahead_of_us(site: _Site, conditions: Conditions, varied: Generator) -> None
 
 
 def _waiting(site: _Site, drive: Approach, varied: Generator) -> None:
-    """A car that faces us at the red light, and pulls away when it turns green."""
+    """Add an oncoming car that waits at the red light and starts when it turns green."""
     look, lane = any_look(varied), -lane_y_m(site.layout)
     go, speed = drive.green_s + 1.2, 4.5
     x = site.layout.end_m + 4.0 + look.shape.length_m / 2

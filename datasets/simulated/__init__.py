@@ -1,1 +1,1 @@
-"""A simulated drive without camera: vehicle, CAN, gyro, magnetometer, true pose."""
+"""Simulated drives without camera: vehicle, CAN, gyro, magnetometer and true pose."""

@@ -1,8 +1,9 @@
-"""A simulated drive without pictures: a car in town, its CAN, gyro, magnetometer and true pose.
+"""Simulate a drive without pictures: a car in town, its CAN, gyro, magnetometer and true pose.
 
-Everything here is made up from a seed. Sensor errors are of the kinds that the pose filter models
-(quantised wheels, slip, gyro bias and noise) and of one that it does not (magnetic disturbance that
-comes and goes along the road), so that the demo's numbers are not a filter scored on its own model.
+Everything is generated from a seed. Sensor errors are of the kinds that the pose filter models
+(quantized wheel speeds, slip, gyro bias and noise), and of one kind that it does not (magnetic
+disturbance that varies along the road). The demo therefore does not score the filter on its own
+model.
 """
 
 from __future__ import annotations
@@ -28,28 +29,28 @@ FIELD_T: Final = np.array([20e-6, -43e-6])
 START_NS: Final = 1_700_000_000_000_000_000
 RATE_HZ: Final = 100
 TYRE_SD: Final = 0.003
-"""Of a tyre's radius, as a fraction; the same for a whole drive."""
+"""Relative standard deviation of a tyre's radius, which is constant during a drive."""
 SLIP_SD: Final = 0.004
-"""Of a wheel's speed, as a fraction that persists for ``SLIP_TIME_S``."""
+"""Relative standard deviation of a wheel's speed, with a correlation time of ``SLIP_TIME_S``."""
 SLIP_TIME_S: Final = 2.0
 GYRO_SD_RADPS: Final = 0.004
-"""Of a reading, besides the bias."""
+"""Standard deviation of a reading, without the bias."""
 START_SD_M: Final = 0.1
 START_HEADING_SD_RAD: Final = 0.01
-"""How well a calibrated car knows where its drive begins."""
+"""Standard deviation of a calibrated car's heading at the start of the drive."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveSettings:
-    """One simulated drive.
+    """Settings of a simulated drive.
 
     Attributes:
-        seed: Everything random comes from it.
-        blocks: Street blocks driven.
+        seed: Seed of all random numbers.
+        blocks: Number of street blocks.
         block_m: Length of a block.
-        top_speed_mps: Between turns.
-        declination_rad: East of north.
-        mounting_yaw_rad: How the magnetometer is turned in the car.
+        top_speed_mps: Max speed between turns.
+        declination_rad: Magnetic declination, east of north.
+        mounting_yaw_rad: Yaw of the magnetometer in the car.
         gyro_bias_radps: Constant error of the gyro.
     """
 
@@ -64,15 +65,15 @@ class DriveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueMotion:
-    """The car's rear axle, 100 times per second.
+    """Motion of the car's rear axle at 100 Hz.
 
     Attributes:
-        t_ns: Shape (N,), int64.
-        x_m: Shape (N,), east.
-        y_m: Shape (N,), north.
-        heading_rad: Shape (N,), counter-clockwise from east, not wrapped.
-        speed_mps: Shape (N,).
-        yaw_rate_radps: Shape (N,).
+        t_ns: Times, shape (N,), int64.
+        x_m: East, shape (N,).
+        y_m: North, shape (N,).
+        heading_rad: Heading, counter-clockwise from east, not wrapped, shape (N,).
+        speed_mps: Speed, shape (N,).
+        yaw_rate_radps: Yaw rate, shape (N,).
     """
 
     t_ns: Int64s
@@ -87,7 +88,7 @@ class TrueMotion:
 
 
 def drive(settings: DriveSettings) -> TrueMotion:
-    """Where the car really was."""
+    """Return the true motion of the car."""
     rng = np.random.default_rng([settings.seed, 1])
     curvature, limit_mps = _road(settings, rng)
     speed = _speed_along(limit_mps, settings.top_speed_mps)
@@ -112,7 +113,7 @@ def drive(settings: DriveSettings) -> TrueMotion:
 
 
 def _road(settings: DriveSettings, rng: Generator) -> tuple[Floats, Floats]:
-    """Curvature and speed limit for each metre of the way."""
+    """Return curvature and speed limit for each metre of the route."""
     pieces: list[Floats] = []
     limits: list[Floats] = []
     radius_m = 9.0
@@ -129,13 +130,13 @@ def _road(settings: DriveSettings, rng: Generator) -> tuple[Floats, Floats]:
 
 
 def _smoothed(curvature: Floats) -> Floats:
-    # A steering wheel takes time: five metres from straight to full lock keep each turn's angle.
+    # Steering takes time: smoothing over five metres preserves the angle of each turn.
     kernel = np.hanning(7)[1:-1]
     return np.convolve(curvature, kernel / kernel.sum(), mode="same")
 
 
 def _speed_along(limit_mps: Floats, top_mps: float) -> Floats:
-    """The fastest speed at each metre that still brakes in time (2 m/s2)."""
+    """Return the max speed at each metre that allows braking in time (2 m/s2)."""
     speed = np.minimum(limit_mps, top_mps)
     for i in range(len(speed) - 2, -1, -1):
         speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * 2.0))
@@ -144,16 +145,16 @@ def _speed_along(limit_mps: Floats, top_mps: float) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensed:
-    """What the car's sensors said.
+    """Readings of the car's sensors.
 
     Attributes:
-        wheel_t_ns: Shape (W,), 50 Hz.
-        wheels_mps: Shape (W, 4): front left, front right, rear left, rear right.
-        steering_rad: Shape (W,): at the steering wheel, left positive.
-        gyro_t_ns: Shape (G,), 100 Hz.
-        gyro_radps: Shape (G, 3): about forward, left, up.
-        mag_t_ns: Shape (M,), 10 Hz.
-        mag_t: Shape (M, 3), tesla, in the sensor's axes.
+        wheel_t_ns: Times of wheel speeds and steering, shape (W,), 50 Hz.
+        wheels_mps: Speeds front left, front right, rear left, rear right, shape (W, 4).
+        steering_rad: Angle of the steering wheel, positive to the left, shape (W,).
+        gyro_t_ns: Times of the gyro, shape (G,), 100 Hz.
+        gyro_radps: Rates about forward, left, up, shape (G, 3).
+        mag_t_ns: Times of the magnetometer, shape (M,), 10 Hz.
+        mag_t: Field in tesla in the sensor's axes, shape (M, 3).
     """
 
     wheel_t_ns: Int64s
@@ -166,7 +167,7 @@ class Sensed:
 
 
 def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
-    """Simulated readings of ``motion``."""
+    """Return simulated readings for ``motion``."""
     rng = np.random.default_rng([settings.seed, 2])
     half = slice(None, None, 2)
     v, w = motion.speed_mps[half], motion.yaw_rate_radps[half]
@@ -194,10 +195,10 @@ def sense(motion: TrueMotion, settings: DriveSettings) -> Sensed:
 
 
 def with_simulated_noise(text: str, settings: DriveSettings, motion: TrueMotion) -> str:
-    """A vehicle file's text with the noise that these readings really have, so that NEES is honest.
+    """Return a vehicle file's text with the true noise of these readings, for a meaningful NEES.
 
-    The file is that of a car that has just been calibrated: it knows its gyro's bias, and where the
-    drive begins but for an error that its standard deviation states.
+    The file is that of a newly calibrated car. It contains the gyro's bias, and the start of the
+    drive with an error of the specified standard deviation.
     """
     import tomlkit
 
@@ -222,10 +223,10 @@ def with_simulated_noise(text: str, settings: DriveSettings, motion: TrueMotion)
 
 
 def slip_per_sqrt_m(way_m: float, speed_mps: float) -> float:
-    """What the rear wheels' simulated errors amount to over a drive, as a vehicle file states it.
+    """Return the vehicle file's slip for the rear wheels' simulated errors over a drive.
 
-    A wrong radius grows with the way, slip that persists for a while with its root: one number
-    can match both at one length only.
+    The error of a wrong radius grows with the distance, that of correlated slip with its square
+    root. A single parameter can match both at one length only.
     """
     radius = TYRE_SD**2 / 2.0 * way_m
     slip = SLIP_SD**2 / 2.0 * 2.0 * SLIP_TIME_S * speed_mps
@@ -233,7 +234,7 @@ def slip_per_sqrt_m(way_m: float, speed_mps: float) -> float:
 
 
 def _magnetometer(heading_rad: Floats, settings: DriveSettings, rng: Generator) -> Floats:
-    # Angle of magnetic north as seen from the sensor's own forward axis.
+    # Angle of magnetic north from the sensor's forward axis.
     north = np.pi / 2 - settings.declination_rad - heading_rad - settings.mounting_yaw_rad
     disturbed = north + _wander(rng, len(north), 1, rate_hz=10.0, time_s=4.0)[:, 0] * np.deg2rad(8)
     level = FIELD_T[0] * np.stack([np.cos(disturbed), np.sin(disturbed)], axis=1)
@@ -242,7 +243,7 @@ def _magnetometer(heading_rad: Floats, settings: DriveSettings, rng: Generator) 
 
 
 def _wander(rng: Generator, n: int, k: int, *, rate_hz: float, time_s: float) -> Floats:
-    """First-order Gauss-Markov noise with unit variance, shape (n, k)."""
+    """Return first-order Gauss-Markov noise with unit variance, shape (n, k)."""
     keep = float(np.exp(-1.0 / (rate_hz * time_s)))
     kicks = rng.normal(0.0, 1.0, (n, k))
     kicks[1:] *= np.sqrt(1.0 - keep * keep)
@@ -255,7 +256,7 @@ def _wander(rng: Generator, n: int, k: int, *, rate_hz: float, time_s: float) ->
 
 
 def dbc_path() -> Path:
-    """The DBC file of the simulated car's bus."""
+    """Return the path of the DBC file of the simulated car's bus."""
     return Path(str(files("crosscue.datasets.simulated").joinpath("simulated_car.dbc")))
 
 
@@ -291,7 +292,7 @@ heading_sd_rad = 0.05
 
 
 def vehicle_text(settings: DriveSettings, dbc: str) -> str:
-    """The vehicle file that fits the simulated car."""
+    """Return the text of the simulated car's vehicle file."""
     return VEHICLE.format(
         dbc=dbc,
         mounting_yaw_rad=settings.mounting_yaw_rad,

@@ -1,4 +1,4 @@
-"""A simulated drive as files: log, vehicle file, DBC file and truth, as a user would have them."""
+"""Write a simulated drive as files: log, vehicle file, DBC file and truth."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ SOURCE: Final = "simulated by crosscue, exact"
 
 @dataclass(frozen=True, slots=True)
 class DriveFiles:
-    """What was written.
+    """Files of a simulated drive.
 
     Attributes:
-        log: ``drive.mcap``.
-        vehicle: ``vehicle.toml``.
-        truth: ``truth.json``.
-        seconds: Length of the drive.
-        metres: Way driven.
+        log: Path of ``drive.mcap``.
+        vehicle: Path of ``vehicle.toml``.
+        truth: Path of ``truth.json``.
+        seconds: Duration of the drive.
+        metres: Distance driven.
     """
 
     log: Path
@@ -48,10 +48,10 @@ class DriveFiles:
 
 
 def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = False) -> DriveFiles:
-    """Simulate a drive and write its files into ``folder``.
+    """Simulate a drive and write its files to ``folder``.
 
     Raises:
-        OutputError: A file is there already, or cannot be written.
+        OutputError: A file exists already, or cannot be written.
     """
     motion = drive(settings)
     sensed = sense(motion, settings)

@@ -1,4 +1,4 @@
-"""What simulated sensors say, as rows of a log, stored as late as a recorder stores them."""
+"""Convert readings of simulated sensors to rows of a log, with the delays of a recorder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BATCH_ROWS: Final = 1000
 
 
 def sensor_blocks(sensed: Sensed, seed: int) -> list[Block]:
-    """What the sensors said as rows of a log, in batches, in order of the batches' first rows."""
+    """Return readings as rows of a log, in batches, in order of the batches' first rows."""
     rng = np.random.default_rng([seed, 3])
     blocks = [
         *_batches(_can_block(sensed, rng)),
@@ -36,7 +36,7 @@ def _batches(block: Block) -> list[Block]:
 
 
 def _late(t_ns: Int64s, rng: np.random.Generator, min_ms: float, mean_ms: float) -> Int64s:
-    """When the recorder stored what was measured at ``t_ns``; the order is kept."""
+    """Return the times at which the recorder stores measurements of ``t_ns``; order is kept."""
     delay = min_ms + rng.exponential(mean_ms, len(t_ns))
     late: Int64s = np.maximum.accumulate(t_ns + np.rint(delay * 1e6).astype(np.int64))
     return late

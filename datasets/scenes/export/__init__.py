@@ -1,1 +1,1 @@
-"""What simulated scenes are written as: COCO, road masks, contact sheets."""
+"""Export simulated scenes as COCO files, road masks and contact sheets."""

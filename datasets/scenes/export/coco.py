@@ -1,4 +1,4 @@
-"""Labelled objects of a drive as a COCO file, images by ``t_ns``."""
+"""Write the labelled objects of a drive as a COCO file, with images by ``t_ns``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COCO_IDS: Final = {
     "one_way_left": (101, "one way left"), "one_way_right": (102, "one way right"),
     "do_not_enter": (103, "do not enter"),
 }  # fmt: skip
-"""COCO's own numbers and names where COCO has the class."""
+"""Category numbers and names, which are those of COCO if COCO has the class."""
 
 
 @dataclass(slots=True)
@@ -28,7 +28,7 @@ class Objects:
     annotations: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, t_ns: int, picture: Picture, tags: tuple[str, ...], distance_m: float) -> None:
-        """Take in all objects of a picture with enough pixels."""
+        """Add all objects of a picture that have enough pixels."""
         high, wide = picture.owner.shape
         number = len(self.images) + 1
         self.images.append(

@@ -1,4 +1,4 @@
-"""A contact sheet: one small picture of every run, layouts downwards, runs across."""
+"""Render a contact sheet: one small picture of every run, layouts as rows, runs as columns."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.overlay import write_label
 
 BEFORE_M: Final = 25.0
-"""Where the pictures are taken, before the intersection."""
+"""Distance of the pictures before the intersection."""
 SHOWN: Final = 0.7
-"""The middle fraction of each picture, wide and high: the rest is sky, bonnet and kerb."""
+"""Central fraction of each picture's width and height that is shown; the rest is mostly sky."""
 
 
 def contact_sheet(
     runs: Sequence[SceneSettings], columns: int, width_px: int = 192
 ) -> NDArray[np.uint8]:
-    """Pictures of all runs, ``columns`` in a row, each with its name in a corner.
+    """Return pictures of all runs, ``columns`` in a row, each with its name in a corner.
 
     Args:
-        runs: Which, row by row.
-        columns: Pictures in a row.
-        width_px: Of one picture in the sheet; it is drawn as in a drive and shrunk.
+        runs: Runs, row by row.
+        columns: Number of pictures in a row.
+        width_px: Width of a picture in the sheet; it is rendered as in a drive and resized.
     """
     import cv2
 
@@ -53,7 +53,7 @@ def _middle(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def sheet_jpeg(sheet: NDArray[np.uint8], quality: int = 82) -> bytes:
-    """A sheet as JPEG."""
+    """Encode a sheet as JPEG."""
     import cv2
 
     bgr = np.ascontiguousarray(sheet[..., ::-1])

@@ -1,4 +1,4 @@
-"""Pictures of simulated intersections with their road pixels, to train road networks on."""
+"""Render pictures of simulated intersections with road masks, to train road networks."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class RoadFrames:
     """N pictures of one size.
 
     Attributes:
-        pixels: Shape (N, H, W, 3), uint8, blue, green, red.
-        road: Shape (N, H, W), uint8: 0 to 255, the fraction of the pixel that is road.
+        pixels: Pictures, shape (N, H, W, 3), uint8, blue, green, red.
+        road: Fraction of each pixel that is road, 0 to 255, shape (N, H, W), uint8.
     """
 
     pixels: NDArray[np.uint8]
@@ -29,19 +29,19 @@ class RoadFrames:
 
 
 def joined(parts: Sequence[RoadFrames]) -> RoadFrames:
-    """All frames of several."""
+    """Concatenate frames."""
     return RoadFrames(
         np.concatenate([p.pixels for p in parts]), np.concatenate([p.road for p in parts])
     )
 
 
 def frames_of(settings: SceneSettings, count: int, size_px: tuple[int, int]) -> RoadFrames:
-    """Pictures of one run, evenly along the way, a few of them within the intersection.
+    """Render pictures of one run, evenly along the path, a few of them within the intersection.
 
     Args:
-        settings: The run; its camera should be about twice as wide as wanted.
-        count: How many.
-        size_px: Width and height wanted.
+        settings: The run; its camera should be about twice as wide as the result.
+        count: Number of pictures.
+        size_px: Width and height of the result.
     """
     _, conditions, world = world_of(settings)
     rng = np.random.default_rng([conditions.seed, 13])
@@ -63,13 +63,13 @@ def frames_of(settings: SceneSettings, count: int, size_px: tuple[int, int]) -> 
 def rendered(
     runs: Sequence[SceneSettings], count: int, size_px: tuple[int, int]
 ) -> Iterator[RoadFrames]:
-    """``frames_of`` for each run."""
+    """Yield ``frames_of`` for each run."""
     for settings in runs:
         yield frames_of(settings, count, size_px)
 
 
 def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """At another size, each pixel the mean of those it covers."""
+    """Resize a picture; each pixel is the mean of the pixels that it covers."""
     import cv2
 
     return np.asarray(cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), np.uint8)

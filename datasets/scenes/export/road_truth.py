@@ -1,8 +1,8 @@
-"""Which pixels of a picture show road: the truth that road segmentation is held to.
+"""Ground truth of road segmentation: the pixels of a picture that show road.
 
-Road is what cars drive on between the kerbs: the approach, the crossroad, the way ahead, rounded
+Road is the drivable area between the kerbs: the approach, the crossroad, the road ahead and rounded
 corners, with lines, crosswalks and parking lanes. Sidewalks, driveways, parking lots and grass are
-none, nor are pixels of which half or more shows an object that stands on the road or before it.
+not road, and neither are pixels of which half or more shows an object.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from crosscue.datasets.scenes.rendering.camera import View
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
 
 SKY_UP = -0.002
-"""Rays that fall less than this fraction of their length do not meet the ground."""
+"""Vertical component of a ray above which it does not meet the ground."""
 
 
 def road_seen(
     road: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
 ) -> NDArray[np.bool_]:
-    """Road pixels, shape (H, W): as ``ground_seen`` of ``Ground.road``, 0 or 1."""
+    """Return a mask of road pixels, shape (H, W); ``road`` is ``Ground.road``, 0 or 1."""
     return np.asarray(ground_seen(road, depth, samples, view) > 0)
 
 
 def ground_seen(
     codes: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
 ) -> NDArray[np.uint8]:
-    """What each pixel shows of a map of the ground, shape (H, W); 0 where an object hides it.
+    """Return the code of the ground that each pixel shows, shape (H, W); 0 behind objects.
 
     Args:
-        codes: The map, of the size of ``Ground.road``.
-        depth: The samples' buffer of 1/z, 0 where no object is; (H * samples, W * samples).
-        samples: Samples a pixel, across and down.
-        view: The camera.
+        codes: Map of the ground, of the size of ``Ground.road``.
+        depth: Buffer of 1/z of the samples, 0 without object; (H * samples, W * samples).
+        samples: Samples per pixel in each direction.
+        view: View of the camera.
     """
     import cv2
 
@@ -63,7 +63,7 @@ def ground_seen(
 
 
 def _rays(view: View) -> NDArray[np.float64]:
-    """Shape (3, 3): from a pixel's column, row, 1 to its ray's direction in the local frame."""
+    """Return the matrix from a pixel's (column, row, 1) to its ray in the local frame, (3, 3)."""
     f, (cx, cy) = view.camera.focal, view.camera.centre_px
     lens = np.array([[1 / f, 0.0, (0.5 - cx) / f], [0.0, 1 / f, (0.5 - cy) / f], [0.0, 0.0, 1.0]])
     ray: NDArray[np.float64] = view.eye_axes.T @ lens

@@ -1,7 +1,7 @@
-"""Pictures for training: a few of each of many simulated runs, with their objects as COCO.
+"""Render pictures for training: a few of each simulated run, with their objects as COCO.
 
-Consecutive pictures of a drive hardly differ, so a network learns more from eight pictures of a
-hundred intersections than from a thousand pictures of one.
+Consecutive pictures of a drive are very similar, so a network learns more from eight pictures of
+each of a hundred intersections than from a thousand pictures of one.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from crosscue.replay.processes import in_processes
 from .coco import Objects
 
 BEFORE_ENTRY: Final = 0.9
-"""Fraction of the pictures from before the intersection; the others are from within it."""
+"""Fraction of the pictures before the intersection; the others are within it."""
 
 
 def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:
-    """When to take pictures: half evenly along the way, half evenly in time, sorted.
+    """Return the times of pictures: half evenly along the path, half evenly in time, sorted.
 
-    A car that waits at a red light spends most of its time in one place, but others drive by.
+    A car that waits at a red light is mostly in one place, while other cars pass.
     """
     motion, enter_s = world.approach.motion, world.approach.enter_s
     last_s = (len(motion) - 2) / 100.0
@@ -44,7 +44,7 @@ def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:
 
 
 def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
-    """Render and write ``count`` pictures of one run into ``folder``; returns their annotations.
+    """Render and write ``count`` pictures of one run to ``folder``, and return their annotations.
 
     Raises:
         OutputError: A picture cannot be written.
@@ -67,12 +67,12 @@ def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
 def frames(
     runs: Sequence[SceneSettings], count: int, folder: Path, workers: int = 1
 ) -> Iterator[Objects]:
-    """``frames_of`` for each run, in order, several made at a time."""
+    """Yield ``frames_of`` for each run, in order; several runs are rendered in parallel."""
     return in_processes(partial(frames_of, count=count, folder=folder), runs, workers)
 
 
 def joined(parts: Sequence[Objects]) -> Objects:
-    """The annotations of many runs as those of one set, renumbered."""
+    """Merge the annotations of many runs, with new numbers."""
     whole = Objects()
     for part in parts:
         images, annotations = len(whole.images), len(whole.annotations)

@@ -1,1 +1,1 @@
-"""The renderer of simulated scenes: meshes, textures, light, ground, weather."""
+"""Renderer of simulated scenes: meshes, textures, light, ground and weather."""

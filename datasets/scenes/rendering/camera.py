@@ -1,4 +1,4 @@
-"""A pinhole camera behind the windscreen, and where it is at any time."""
+"""Pinhole camera behind the windscreen, and its pose over time."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .mesh import Floats
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Size, lens and mounting.
+    """Size, lens and mounting of a camera.
 
     Attributes:
-        width_px: Of the picture.
-        height_px: Of the picture.
-        focal_px: None for 0.55 picture widths (85 degrees across).
-        x_m: Ahead of the rear axle.
-        z_m: Above the road.
-        pitch_rad: Downwards positive.
+        width_px: Width of the picture.
+        height_px: Height of the picture.
+        focal_px: Focal length; None for 0.55 picture widths (85 degrees across).
+        x_m: Distance ahead of the rear axle.
+        z_m: Height above the road.
+        pitch_rad: Pitch, positive downwards.
     """
 
     width_px: int = 1280
@@ -33,12 +33,12 @@ class Camera:
 
     @property
     def focal(self) -> float:
-        """Focal length, pixels."""
+        """Focal length in pixels."""
         return 0.55 * self.width_px if self.focal_px is None else self.focal_px
 
     @property
     def centre_px(self) -> tuple[float, float]:
-        """Where the optical axis meets the picture."""
+        """Intersection of the optical axis with the picture."""
         return 0.5 * self.width_px, 0.5 * self.height_px
 
 
@@ -47,12 +47,12 @@ class View:
     """A camera at one time.
 
     Attributes:
-        camera: Which.
-        eye_axes: Shape (3, 3): turns local axes into right, down, ahead.
-        at_m: Shape (3,): the camera in the local frame.
+        camera: The camera.
+        eye_axes: Rotation from local axes to right, down, ahead, shape (3, 3).
+        at_m: Position of the camera in the local frame, shape (3,).
         rear_axle: x, y and heading of the car.
-        speed_mps: Of the car.
-        yaw_rate_radps: Of the car.
+        speed_mps: Speed of the car.
+        yaw_rate_radps: Yaw rate of the car.
     """
 
     camera: Camera
@@ -63,7 +63,7 @@ class View:
     yaw_rate_radps: float
 
     def project(self, points_m: Floats) -> Floats:
-        """Pixels and depth, (N, 3), of local points (N, 3); x = y = 0 is the picture's corner."""
+        """Project local points (N, 3) to pixels and depth, (N, 3); the origin is the corner."""
         eye = (points_m - self.at_m) @ self.eye_axes.T
         cx, cy = self.camera.centre_px
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -73,7 +73,7 @@ class View:
 
 
 def view_at(camera: Camera, approach: Approach, t_s: float) -> View:
-    """Where the camera is; the body nods with its acceleration and shakes a little."""
+    """Return the view at a time; the body pitches with acceleration and shakes slightly."""
     motion = approach.motion
     at = np.arange(len(motion)) * 0.01
     x, y, heading, speed, rate = (

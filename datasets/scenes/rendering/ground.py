@@ -1,4 +1,4 @@
-"""The ground as a map seen from above: asphalt, lines, kerbs, sidewalks, driveways, lots, grass."""
+"""Map of the ground from above: asphalt, lines, kerbs, sidewalks, driveways, lots and grass."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Patch:
     """A rectangle of ground.
 
     Attributes:
-        x: From, to.
-        y: From, to.
+        x: Start and end along x.
+        y: Start and end along y.
         kind: ``asphalt`` or ``concrete``.
     """
 
@@ -47,12 +47,12 @@ class Patch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """The map with its smaller copies.
+    """The map at all levels of resolution.
 
     Attributes:
-        texels: Shape (N, 4): colour, and strength of fine grain.
-        levels: Shape (L, 3): offset, width, height.
-        road: Shape (H, W), bool: drivable road of the map's finest level.
+        texels: Colour, and strength of fine grain, shape (N, 4).
+        levels: Offset, width and height of each level, shape (L, 3).
+        road: Mask of drivable road at the finest level, shape (H, W), bool.
     """
 
     texels: Map
@@ -61,7 +61,7 @@ class Ground:
 
 
 class _Canvas:
-    """A map in metres."""
+    """A map with coordinates in metres."""
 
     def __init__(self) -> None:
         wide = round((X_M[1] - X_M[0]) * TEXELS_PER_M)
@@ -69,7 +69,7 @@ class _Canvas:
         self.map = np.zeros((high, wide, 4), np.uint8)
 
     def polygon(self, where: NDArray[np.generic], points: object, value: object) -> None:
-        """Fill a polygon given in metres."""
+        """Fill a polygon with coordinates in metres."""
         import cv2
 
         xy = np.asarray(points, np.float64)
@@ -80,17 +80,17 @@ class _Canvas:
     def rectangle(
         self, where: NDArray[np.generic], x: Sequence[float], y: Sequence[float], value: object
     ) -> None:
-        """Fill a rectangle given in metres."""
+        """Fill a rectangle with coordinates in metres."""
         points = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
         self.polygon(where, points, value)
 
     def line(self, x: Sequence[float], y: Sequence[float], rgb: tuple[int, int, int]) -> None:
-        """Paint on the road."""
+        """Paint a rectangle on the road."""
         self.rectangle(self.map, x, y, (*rgb, 40))
 
 
 def road_mask(layout: Layout) -> NDArray[np.uint8]:
-    """255 where cars may drive, corners rounded; rows by y, columns by x."""
+    """Return a mask with 255 for road, with rounded corners; rows by y, columns by x."""
     canvas = _Canvas()
     mask = np.zeros(canvas.map.shape[:2], np.uint8)
     w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
@@ -111,7 +111,7 @@ def road_mask(layout: Layout) -> NDArray[np.uint8]:
 def _corner(
     canvas: _Canvas, mask: NDArray[np.uint8], at: tuple[float, float], out: tuple[float, float]
 ) -> None:
-    """Round a kerb: the square at the corner less a quarter disc."""
+    """Round a kerb: fill the square at the corner except a quarter disc."""
     angle = np.linspace(0.0, np.pi / 2, 12)
     arc_x = at[0] + out[0] * CORNER_M * (1 - np.cos(angle))
     arc_y = at[1] + out[1] * CORNER_M * (1 - np.sin(angle))
@@ -122,7 +122,7 @@ def _corner(
 def paint(
     layout: Layout, patches: Sequence[Patch], rng: Generator
 ) -> tuple[Map, NDArray[np.bool_]]:
-    """The ground in full light, and where it is road."""
+    """Return the ground in full light, and the mask of road."""
     import cv2
 
     canvas = _Canvas()
@@ -171,7 +171,7 @@ def _put(
     light: NDArray[np.floating],
     grain: int,
 ) -> None:
-    """Colour times light, everywhere or where it is wanted; ``light`` is repeated like a tile."""
+    """Write colour times light everywhere or in a mask; ``light`` is a repeated tile."""
     tile = np.empty((*light.shape, 4), np.uint8)
     for k, value in enumerate(rgb):
         tile[..., k] = np.minimum(value * light, 255.0).astype(np.uint8)
@@ -200,7 +200,7 @@ def _joints(canvas: Map, walk: NDArray[np.bool_]) -> None:
 
 
 def _wear(canvas: _Canvas, layout: Layout, rng: Generator, is_road: NDArray[np.bool_]) -> None:
-    """Darker wheel tracks, repair patches and cracks."""
+    """Draw darker wheel tracks, repair patches and cracks."""
     import cv2
 
     dark: NDArray[np.uint8] = np.zeros(is_road.shape, np.uint8)
@@ -253,7 +253,7 @@ def _lines(canvas: _Canvas, layout: Layout) -> None:
 
 
 def _lines_along(canvas: _Canvas, layout: Layout) -> None:
-    """Of a road that nothing crosses."""
+    """Draw the lines of a road without a crossroad."""
     for y in (-0.17, 0.17):
         canvas.line(X_M, (y - 0.055, y + 0.055), YELLOW)
     if layout.has_parking_lane:
@@ -291,7 +291,7 @@ def _stalls(canvas: _Canvas, patch: Patch) -> None:
 
 
 def with_levels(painted: Map, road: NDArray[np.bool_]) -> Ground:
-    """The map with its smaller copies."""
+    """Return the map with its mipmap levels."""
     import cv2
 
     parts, levels, used = [], [], 0
@@ -308,14 +308,14 @@ def with_levels(painted: Map, road: NDArray[np.bool_]) -> Ground:
 
 
 def unpainted(layout: Layout) -> Ground:
-    """The map of road alone, without any colour."""
+    """Return the map of road only, without colours."""
     nothing = np.zeros((1, 4), np.uint8)
     road = along_curve(layout, road_mask(layout) > 0)
     return Ground(nothing, np.zeros((1, 3), np.int64), road)
 
 
 def along_curve(layout: Layout, of_ground: OfGround) -> OfGround:
-    """A map of the ground, drawn for a straight road, with the road's gentle curve."""
+    """Apply the road's gentle curve to a map of the ground with a straight road."""
     if layout.curve_per_m == 0.0:
         return of_ground
     high, wide = of_ground.shape[:2]
@@ -331,8 +331,8 @@ def cast_shadows(
 
     Args:
         painted: The map.
-        outlines: Convex outlines of solid shadows, metres, (K, 2) each.
-        blobs: Rows of x, y, radius along and across, direction of trees' shadows.
+        outlines: Convex outlines of solids' shadows in metres, (K, 2) each.
+        blobs: Rows of x, y, radius along and across, and direction of trees' shadows.
         remains: Fraction of light in shadow.
     """
     import cv2

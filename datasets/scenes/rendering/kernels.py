@@ -1,7 +1,7 @@
-"""The loops that draw, compiled by Numba on one thread: the same pixels on every machine and run.
+"""Drawing loops, compiled by Numba for one thread, with equal pixels on all machines.
 
 Camera axes are x right, y down, z ahead. Objects are drawn with ``samples`` by ``samples`` samples
-a pixel into a depth buffer of 1/z; ground and sky, which have no edges, once a pixel.
+per pixel into a depth buffer of 1/z. Ground and sky have no edges and are drawn once per pixel.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ NEAR_M: Final = 0.25
 OPAQUE: Final = 110
 MAX_TAPS: Final = 7
 GRAIN_M: Final = 40.0
-"""How far fine grain of the ground is seen."""
+"""Max distance at which fine grain of the ground is visible."""
 HORIZON: Final = -0.002
-"""A ray that points up less than this meets the ground."""
+"""Vertical component of a ray below which it meets the ground."""
 
 
 class Kernels(NamedTuple):
@@ -42,7 +42,7 @@ class Kernels(NamedTuple):
 
 @cache
 def compiled() -> Kernels:
-    """Compile, or load what an earlier process compiled."""
+    """Compile the loops, or load them from the cache of an earlier process."""
     return Kernels(kept(draw), kept(cover), kept(compose), kept(develop))
 
 
@@ -67,10 +67,11 @@ def draw(
     colour: Bytes,
     owner: NDArray[np.int16],
 ) -> None:
-    """Triangles into the sample buffers, in the order given: nearest first spares work.
+    """Draw triangles into the sample buffers, in the given order; nearest first is fastest.
 
-    corners (T, 3, 3) world metres, uv (T, 3, 2) texture widths, tint (T, 3) light times albedo,
-    shift (3,) added to all corners; places (K, 9, 3): offset, width, height of a texture's levels.
+    corners: (T, 3, 3) in world metres. uv: (T, 3, 2) in texture widths. tint: (T, 3), light times
+    albedo. shift: (3,), added to all corners. places: (K, 9, 3): offset, width and height of a
+    texture's levels.
     """
     eye = np.zeros((3, 5))
     polygon = np.zeros((4, 5))
@@ -106,7 +107,7 @@ def draw(
 def _to_eye(
     corner: Float32s, shift: Float32s, eye_axes: Float64s, camera_at: Float64s, eye: Float64s
 ) -> None:
-    """A corner in camera axes, into the first three of ``eye``."""
+    """Transform a corner to camera axes, and write it to the first three elements of ``eye``."""
     x = corner[0] + shift[0] - camera_at[0]
     y = corner[1] + shift[1] - camera_at[1]
     z = corner[2] + shift[2] - camera_at[2]
@@ -115,7 +116,7 @@ def _to_eye(
 
 
 def _clip(eye: Float64s, polygon: Float64s) -> int:
-    """The part of a triangle ahead of the near plane, as 0, 3 or 4 corners."""
+    """Clip a triangle at the near plane, and return the number of corners: 0, 3 or 4."""
     size = 0
     for k in range(3):
         after = (k + 1) % 3
@@ -146,7 +147,7 @@ def _fill(
     colour: Bytes,
     owner: NDArray[np.int16],
 ) -> None:
-    """One triangle (3, 5) of x, y, z, u, v ahead of the camera; texture ``which``, none below 0."""
+    """Draw a triangle (3, 5) of x, y, z, u, v ahead of the camera; ``which`` < 0: no texture."""
     high, wide = depth.shape
     ia, ib, ic = 1.0 / triangle[0, 2], 1.0 / triangle[1, 2], 1.0 / triangle[2, 2]
     xa, ya = focal * triangle[0, 0] * ia + cx, focal * triangle[0, 1] * ia + cy
@@ -209,7 +210,7 @@ def _fill(
 
 
 def _texture_level(triangle: Float64s, area: float, levels: Int64s) -> int:
-    """The level of a texture whose texels are about as large as samples; the first is finest."""
+    """Return the texture level whose texels are about as large as samples; 0 is the finest."""
     wide, high = levels[0, 1], levels[0, 2]
     u0, u1, u2 = triangle[0, 3] * wide, triangle[1, 3] * wide, triangle[2, 3] * wide
     v0, v1, v2 = triangle[0, 4] * high, triangle[1, 4] * high, triangle[2, 4] * high
@@ -223,7 +224,7 @@ def _texture_level(triangle: Float64s, area: float, levels: Int64s) -> int:
 
 
 def _texel(u: float, v: float, place: Int64s) -> int:
-    """Where in the atlas a repeated texture's colour is."""
+    """Return the position in the atlas of a repeated texture's colour."""
     wide, high = place[1], place[2]
     x = min(int((u - math.floor(u)) * wide), wide - 1)
     y = min(int((v - math.floor(v)) * high), high - 1)
@@ -233,7 +234,7 @@ def _texel(u: float, v: float, place: Int64s) -> int:
 def _columns(
     xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, y: float, wide: int
 ) -> tuple[int, int]:
-    """The columns, half open, whose middle is in a triangle at height ``y``."""
+    """Return the half-open range of columns whose centres are in a triangle at height ``y``."""
     x0 = 1e9
     x1 = -1e9
     if (ya <= y) != (yb <= y):
@@ -263,10 +264,10 @@ def cover(
     left: int,
     top: int,
 ) -> int:
-    """Mark the samples that triangles cover, whatever stands before them; how many comes back.
+    """Mark the samples that triangles cover, ignoring occlusion, and return their number.
 
     ``covered`` is a window of the sample buffer whose first sample is (top, left). Triangles that
-    reach behind the camera are left out.
+    extend behind the camera are omitted.
     """
     high, wide = covered.shape
     count = 0
@@ -330,11 +331,11 @@ def compose(
     picture: Bytes,
     mask: NDArray[np.int16],
 ) -> None:
-    """Objects over ground over sky, one pixel after another.
+    """Compose objects, ground and sky, one pixel after another.
 
-    ground: all levels of the ground map, flat (N, 4) with the grain's strength as fourth channel;
-    levels (L, 3): offset, width, height. shadow: (H, W) of the picture, 255 where light is whole.
-    shine: how much a wet road mirrors the sky. mask: object with at least half the pixel, or -1.
+    ground: all levels of the ground map, flat (N, 4), with the grain's strength as fourth channel.
+    levels: (L, 3): offset, width, height. shadow: (H, W), 255 for full light. shine: reflectivity
+    of a wet road. mask: object that covers at least half of the pixel, or -1.
     """
     high, wide, _ = picture.shape
     whole = samples * samples
@@ -387,9 +388,9 @@ def compose(
 def _objects(
     depth: Float32s, colour: Bytes, owner: NDArray[np.int16], top: int, left: int, samples: int
 ) -> tuple[float, float, float, int, int]:
-    """One pixel's samples: their colours added, how many are filled, and the pixel's object.
+    """Return a pixel's sum of sample colours, number of filled samples, and object.
 
-    The object covers at least half of the pixel; -1 for none.
+    The object covers at least half of the pixel; -1 without object.
     """
     whole = samples * samples
     red = 0.0
@@ -426,7 +427,7 @@ def _objects(
 
 
 def _sky(sky: Bytes, wx: float, wy: float, up: float) -> tuple[float, float, float]:
-    """The sky where a ray meets it, or where it would after a mirror on the ground."""
+    """Return the sky's colour in the direction of a ray, or of its reflection on the ground."""
     high, wide, _ = sky.shape
     turn = math.atan2(wy, wx) / (2 * math.pi) + 0.5
     x = min(int(turn * wide), wide - 1)
@@ -444,10 +445,10 @@ def _ground(
     wy: float,
     up: float,
 ) -> tuple[float, float, float, float]:
-    """Colour and strength of the grain around texel (gx, gy), averaged along the ray.
+    """Return colour and strength of the grain around texel (gx, gy), averaged along the ray.
 
     across: width of the pixel in texels. A pixel is longer along the ray than across, so several
-    places are averaged.
+    positions are averaged.
     """
     flat = math.sqrt(wx * wx + wy * wy)
     along = across / (-up)
@@ -478,7 +479,7 @@ def _ground(
 
 
 def _between(ground: Bytes, at: int, wide: int, k: int, fx: float, fy: float) -> float:
-    """Channel ``k`` between four texels, the first at ``at``, by bilinear interpolation."""
+    """Interpolate channel ``k`` bilinearly between four texels, the first at ``at``."""
     return float(
         (1 - fx) * (1 - fy) * ground[at, k]
         + fx * (1 - fy) * ground[at + 1, k]
@@ -488,7 +489,7 @@ def _between(ground: Bytes, at: int, wide: int, k: int, fx: float, fy: float) ->
 
 
 def _grain(grain: Bytes, x_m: float, y_m: float, reach: float, strength: float) -> float:
-    """How much brighter fine grain makes the ground: 2 cm a texel, fading with distance."""
+    """Return the brightness of fine grain on the ground: 2 cm per texel, fading with distance."""
     size = grain.shape[0]
     fade = min(1.0, 8.0 / reach) * (1.0 - reach / GRAIN_M)
     dark = (grain[int(y_m * 50.0) % size, int(x_m * 50.0) % size] - 128.0) / 230.0
@@ -508,7 +509,7 @@ def develop(
     flare: float,
     contrast: float,
 ) -> None:
-    """What lens and sensor add: vignette, glare about the sun, contrast, noise; in place."""
+    """Apply effects of lens and sensor in place: vignette, glare of the sun, contrast, noise."""
     high, wide, _ = picture.shape
     size = noise.shape[0]
     reach = 1.0 / (0.25 * (wide * wide + high * high))

@@ -1,4 +1,4 @@
-"""Daylight: how bright surfaces are, what the sky looks like, how hazy the air is."""
+"""Daylight: brightness of surfaces, the sky, and haze."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ class Daylight:
 
     Attributes:
         to_sun: Unit vector towards the sun, local frame.
-        sun: Colour of direct light; zero where none exists.
+        sun: Colour of direct light; zero without direct light.
         ambient: Colour of the sky's light.
-        haze: Colour that far things fade to, 0 to 255.
-        haze_per_m: 1 over the distance at which half is haze.
-        sky: Shape (SKY_HIGH, SKY_WIDE, 3), rows by the sine of elevation, columns by direction.
-        flare: Strength of the veil about the sun.
-        contrast: What is left of contrast.
-        noise: Noise of the sensor, grey values.
-        shine: How much the road mirrors the sky.
-        lamps_on: Cars drive with lamps on.
+        haze: Colour of distant objects, 0 to 255.
+        haze_per_m: 1 over the distance at which half of the light is haze.
+        sky: Colours of the sky, shape (SKY_HIGH, SKY_WIDE, 3), rows by the sine of elevation,
+            columns by direction.
+        flare: Strength of the glare of the sun.
+        contrast: Factor of contrast.
+        noise: Noise of the sensor in grey values.
+        shine: Reflectivity of the road.
+        lamps_on: True if cars have their lamps on.
     """
 
     to_sun: Floats
@@ -47,9 +48,9 @@ class Daylight:
     lamps_on: bool
 
     def on(self, mesh: Mesh) -> NDArray[np.float32]:
-        """Light times albedo of each triangle, seen from the side that is lit more, (T, 3)."""
+        """Return light times albedo of each triangle, from the brighter side, (T, 3)."""
         normal = mesh.normals()
-        # A billboard's two sides are alike; solids show the side whose corners run anticlockwise.
+        # Both sides of a billboard are equal; solids show the side with counter-clockwise corners.
         direct = np.maximum(normal @ self.to_sun, 0.0)
         from_sky = 0.72 + 0.28 * normal[:, 2]
         light = direct[:, None] * self.sun + from_sky[:, None] * self.ambient
@@ -58,18 +59,18 @@ class Daylight:
 
     @property
     def on_ground(self) -> Floats:
-        """Light on the ground where the sun reaches it."""
+        """Return the light on the ground in the sun."""
         lit: Floats = self.ambient + self.sun * max(self.to_sun[2], 0.0)
         return lit
 
     @property
     def in_shadow(self) -> float:
-        """Fraction of the ground's light that remains in shadow."""
+        """Return the fraction of the ground's light that remains in shadow."""
         return float((self.ambient.sum()) / self.on_ground.sum())
 
 
 def daylight(conditions: Conditions, rng: Generator) -> Daylight:
-    """The light of a run."""
+    """Return the light of a run."""
     high_deg, sun, ambient, haze, zenith, flare, noise, clouds = {
         "noon": (
             52.0,

@@ -1,4 +1,4 @@
-"""Triangles with texture, colour and the object they belong to, and simple solids made of them."""
+"""Triangle meshes with texture, colour and object number, and simple solids."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Mesh:
     """T triangles.
 
     Attributes:
-        corners: Shape (T, 3, 3), metres.
-        uv: Shape (T, 3, 2), in widths and heights of the texture, v downwards.
-        texture: Shape (T,), number in the atlas, -1 for none.
-        albedo: Shape (T, 3): colour 0 to 1, or factor on the texture.
-        glow: Shape (T,): 1 where the surface emits light.
-        instance: Shape (T,): number of the object, ``NOBODY`` for scenery.
+        corners: Corners in metres, shape (T, 3, 3).
+        uv: Texture coordinates in widths and heights of the texture, v downwards, shape (T, 3, 2).
+        texture: Number in the atlas, -1 without texture, shape (T,).
+        albedo: Colour, 0 to 1, or factor on the texture, shape (T, 3).
+        glow: 1 for a surface that emits light, shape (T,).
+        instance: Number of the object, ``NOBODY`` for scenery, shape (T,).
     """
 
     corners: Float32s
@@ -39,24 +39,24 @@ class Mesh:
         return len(self.texture)
 
     def owned_by(self, instance: int) -> Mesh:
-        """The same triangles as one object's."""
+        """Return the triangles with the number of an object."""
         return replace(self, instance=np.full(len(self), instance, np.int32))
 
     def placed(self, x_m: float, y_m: float, yaw_rad: float = 0.0, z_m: float = 0.0) -> Mesh:
-        """Turned about the vertical, then moved."""
+        """Return the mesh rotated about the vertical axis, then translated."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         moved = self.corners @ turn.T + np.array([x_m, y_m, z_m])
         return replace(self, corners=moved.astype(np.float32))
 
     def aside(self, of_x_m: Callable[[Floats], Floats]) -> Mesh:
-        """Each corner moved along y by a function of its x."""
+        """Return the mesh with each corner translated along y by a function of its x."""
         moved = self.corners.copy()
         moved[..., 1] += of_x_m(moved[..., 0].astype(np.float64)).astype(np.float32)
         return replace(self, corners=moved)
 
     def normals(self) -> Floats:
-        """Unit normals, shape (T, 3), counter-clockwise corners facing the viewer."""
+        """Return unit normals, shape (T, 3); corners are counter-clockwise for the viewer."""
         side_a = self.corners[:, 1].astype(np.float64) - self.corners[:, 0]
         side_b = self.corners[:, 2].astype(np.float64) - self.corners[:, 0]
         across = np.cross(side_a, side_b)
@@ -66,7 +66,7 @@ class Mesh:
 
 
 def nothing() -> Mesh:
-    """No triangles."""
+    """Return an empty mesh."""
     return Mesh(
         np.zeros((0, 3, 3), np.float32),
         np.zeros((0, 3, 2), np.float32),
@@ -78,7 +78,7 @@ def nothing() -> Mesh:
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """All triangles of all parts."""
+    """Return one mesh with the triangles of all parts."""
     if not parts:
         return nothing()
     return Mesh(
@@ -99,7 +99,7 @@ def triangles(
     texture: int = -1,
     glow: float = 0.0,
 ) -> Mesh:
-    """Triangles of one colour, corners of shape (T, 3, 3)."""
+    """Return triangles of one colour, with corners of shape (T, 3, 3)."""
     n = len(corners)
     return Mesh(
         np.asarray(corners, np.float32),
@@ -119,7 +119,7 @@ def quad(
     texture: int = -1,
     glow: float = 0.0,
 ) -> Mesh:
-    """Four corners: bottom left, bottom right, top right, top left as the texture is seen."""
+    """Return a quad with corners bottom left, bottom right, top right, top left of its texture."""
     four = np.asarray(corners, np.float64)
     u, v = repeat[0] * 0.9999, repeat[1] * 0.9999
     at = np.array([[0.0, v], [u, v], [u, 0.0], [0.0, 0.0]])
@@ -137,7 +137,7 @@ def box(
     wall_m: tuple[float, float] = (1.0, 1.0),
     glow: float = 0.0,
 ) -> Mesh:
-    """A box without floor; walls repeat their texture every ``wall_m``."""
+    """Return a box without floor; walls repeat their texture every ``wall_m``."""
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
     high = max(1.0, round((z1 - z0) / wall_m[1])) if texture >= 0 else 1.0
     along_x = max(1.0, round((x1 - x0) / wall_m[0])) if texture >= 0 else 1.0
@@ -163,7 +163,7 @@ def box(
 
 
 def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, sides: int = 6) -> Mesh:
-    """A thin pole from ``a`` to ``b``."""
+    """Return a thin pole from ``a`` to ``b``."""
     start, stop = np.asarray(a, np.float64), np.asarray(b, np.float64)
     along = (stop - start) / np.linalg.norm(stop - start)
     helper = np.array([1.0, 0.0, 0.0]) if abs(along[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
@@ -189,7 +189,7 @@ def disc(
     glow: float = 0.0,
     sides: int = 14,
 ) -> Mesh:
-    """A flat disc facing along ``normal``."""
+    """Return a flat disc facing along ``normal``."""
     middle, n = np.asarray(centre, np.float64), np.asarray(normal, np.float64)
     helper = np.array([0.0, 0.0, 1.0]) if abs(n[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     e1 = np.cross(helper, n)

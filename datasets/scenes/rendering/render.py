@@ -1,4 +1,4 @@
-"""Pictures of a world, with which object each pixel belongs to."""
+"""Render pictures of a world, with the object of each pixel."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from .mesh import Floats, Mesh
 from .textures import smooth_noise
 
 MAX_ABOUT: Final = 3
-"""An object's picture is measured at most so many pictures about the picture itself."""
+"""Max distance from the picture, in picture sizes, at which an object's outline is measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class PictureSettings:
-    """How pictures are made.
+    """Settings of rendering.
 
     Attributes:
-        samples: Samples a pixel, across and down, on edges of objects.
-        exposure_s: While the shutter is open a turning camera smears the picture.
-        blur_px: Standard deviation of the lens's blur at 1280 pixels width.
-        jpeg_quality: 1 to 100.
+        samples: Samples per pixel in each direction, for edges of objects.
+        exposure_s: Exposure time, during which a rotating camera blurs the picture.
+        blur_px: Standard deviation of the lens's blur for a width of 1280 pixels.
+        jpeg_quality: JPEG quality, 1 to 100.
     """
 
     samples: int = 2
@@ -47,11 +47,11 @@ class Seen:
 
     Attributes:
         thing: The object.
-        mask: Shape (H, W), bool, of its box's pixels alone.
-        box_px: x0, y0, x1, y1 of the visible part, half open, whole pixels.
-        visible: Fraction of the object within the picture that nothing hides.
+        mask: Mask of the pixels of its box, shape (H, W), bool.
+        box_px: x0, y0, x1, y1 of the visible part, half open, in integer pixels.
+        visible: Visible fraction of the object's part within the picture.
         in_picture: Fraction of the object that is within the picture.
-        distance_m: From the rear axle along the car's axis.
+        distance_m: Distance from the rear axle along the car's axis.
     """
 
     thing: Thing
@@ -67,12 +67,12 @@ class Picture:
     """One camera frame with its truth.
 
     Attributes:
-        t_s: From the start of the drive.
-        rgb: Shape (H, W, 3), uint8.
-        view: The camera.
-        owner: Shape (H, W), int16: number of the thing, -1 for none.
-        seen: Every labelled object with at least one pixel.
-        road: Shape (H, W), bool: road, by the rule of ``road_truth``; None where not asked for.
+        t_s: Time from the start of the drive.
+        rgb: Pixels, shape (H, W, 3), uint8.
+        view: View of the camera.
+        owner: Number of each pixel's object, -1 without object, shape (H, W), int16.
+        seen: All labelled objects with at least one pixel.
+        road: Mask of road as in ``road_truth``, shape (H, W), bool; None if not requested.
     """
 
     t_s: float
@@ -84,12 +84,12 @@ class Picture:
 
 
 class Renderer:
-    """Draws one world; holds what does not change from picture to picture."""
+    """Renderer of one world, with the data shared by all pictures."""
 
     def __init__(
         self, world: World, camera: Camera | None = None, settings: PictureSettings = DEFAULTS
     ) -> None:
-        """Light the scenery and get the buffers."""
+        """Compute the light on the scenery, and allocate the buffers."""
         self.world = world
         self.camera = Camera() if camera is None else camera
         self.settings = settings
@@ -117,7 +117,7 @@ class Renderer:
         self._noise = np.clip(rng.normal(0.0, 32.0, (512, 512)), -127, 127).astype(np.int8)
 
     def picture(self, t_s: float, number: int = 0, *, with_road: bool = False) -> Picture:
-        """The camera's picture at a time; ``number`` seeds its noise."""
+        """Return the camera's picture at a time; ``number`` seeds its noise."""
         view = self._drawn(t_s)
         rgb, owner = self._composed(view, t_s)
         self._finish(rgb, view, number)
@@ -128,13 +128,13 @@ class Renderer:
         return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
 
     def owners(self, t_s: float, codes: NDArray[np.uint8]) -> tuple[Picture, NDArray[np.uint8]]:
-        """A picture without colours, and what of a map of the ground its pixels show.
+        """Return a picture without colours, and the codes of the ground in its pixels.
 
-        For a camera with one sample a pixel and a world that need not be painted.
+        The camera must have one sample per pixel. The world need not be painted.
 
         Args:
-            t_s: From the start of the drive.
-            codes: As ``ground_seen`` takes them.
+            t_s: Time from the start of the drive.
+            codes: Map of the ground for ``ground_seen``.
         """
         view = self._drawn(t_s)
         owner = self._owner.copy()
@@ -143,7 +143,7 @@ class Renderer:
         return Picture(t_s, black, view, owner, self._seen(owner, view, t_s)), ground
 
     def _drawn(self, t_s: float) -> View:
-        """Everything that stands or drives, in the buffers."""
+        """Draw all static and moving objects into the buffers, and return the view."""
         view = view_at(self.camera, self.world.approach, t_s)
         self._depth.fill(0.0)
         self._owner.fill(-1)
@@ -213,7 +213,7 @@ class Renderer:
         return rgb, owner
 
     def _shadows(self, view: View, t_s: float) -> NDArray[np.uint8]:
-        """Shadows of the cars that move, straight below and away from the sun."""
+        """Return the shadows of moving cars, directly below them and away from the sun."""
         import cv2
 
         light = self.world.light
@@ -237,7 +237,7 @@ class Renderer:
         return shade
 
     def _finish(self, rgb: NDArray[np.uint8], view: View, number: int) -> None:
-        """Rain, lens and sensor, in place."""
+        """Apply rain, lens and sensor effects in place."""
         import cv2
 
         from .weather import drops, streaks
@@ -286,7 +286,7 @@ class Renderer:
     def _fractions(
         self, thing: Thing, t_s: float, view: View, pixels: int, corners: Floats
     ) -> tuple[float, float]:
-        """Visible fraction of what is in the picture, and the fraction that is in the picture."""
+        """Return the visible fraction of the part in the picture, and that part's fraction."""
         wide, high = self.camera.width_px, self.camera.height_px
         ahead = corners[corners[:, 2] > 0.3]
         if len(ahead) < len(corners):
@@ -313,7 +313,7 @@ class Renderer:
 
 
 def distance_m(thing: Thing, t_s: float, view: View) -> float:
-    """From the rear axle to a thing's middle, along the car's axis."""
+    """Return the distance from the rear axle to an object's centre, along the car's axis."""
     x, y, heading = view.rear_axle
     middle = np.array(thing.at) + thing.shift(t_s)
     return float((middle[0] - x) * np.cos(heading) + (middle[1] - y) * np.sin(heading))
@@ -330,7 +330,7 @@ def _corners(thing: Thing, t_s: float) -> Floats:
 def _cut_out(
     owner: NDArray[np.int16], number: int, corners: Floats
 ) -> tuple[NDArray[np.bool_], tuple[int, int, int, int]]:
-    """Mask within its box, searched only where the object can be."""
+    """Return an object's mask within its box, and the box, searching only near its corners."""
     high, wide = owner.shape
     x0, y0, x1, y1 = 0, 0, wide, high
     if (corners[:, 2] > 0.3).all():

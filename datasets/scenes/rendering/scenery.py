@@ -1,4 +1,4 @@
-"""Buildings, trees, poles, signs and lights as meshes."""
+"""Meshes of buildings, trees, poles, signs and lights."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ WOOD: Rgb = (0.34, 0.27, 0.21)
 
 @dataclass(slots=True)
 class Shadows:
-    """What casts shadows.
+    """Objects that cast shadows.
 
     Attributes:
-        solids: Footprint (K, 2) and height of each.
+        solids: Footprint (K, 2) and height of each solid.
         crowns: x, y, radius and height of each tree's crown.
     """
 
@@ -29,7 +29,7 @@ class Shadows:
     crowns: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def outlines(self, to_sun: Floats) -> list[Floats]:
-        """Convex shadows of the solids on the ground."""
+        """Return convex shadows of the solids on the ground."""
         import cv2
 
         slide = -to_sun[:2] / max(float(to_sun[2]), 0.12)
@@ -40,7 +40,7 @@ class Shadows:
         return found
 
     def blobs(self, to_sun: Floats) -> list[Floats]:
-        """Shadows of crowns: x, y, half axes along and across, direction."""
+        """Return shadows of crowns: x, y, half axes along and across, direction."""
         slide = -to_sun[:2] / max(float(to_sun[2]), 0.12)
         turn = float(np.arctan2(slide[1], slide[0]))
         longer = min(4.0, 1.0 / max(float(to_sun[2]), 0.2))
@@ -53,7 +53,7 @@ class Shadows:
 def building(
     x: tuple[float, float], y: tuple[float, float], atlas: Atlas, rng: Generator, *, is_shop: bool
 ) -> tuple[Mesh, float]:
-    """A shop with a flat roof or a house with a gable; its height comes second."""
+    """Return a shop with a flat roof or a house with a gable, and its height."""
     storeys = int(rng.integers(2, 5)) if is_shop else 2
     high = 3.2 * storeys if is_shop else float(rng.uniform(5.2, 6.2))
     front = atlas.number[f"front_{int(rng.integers(5, 8) if is_shop else rng.integers(5))}"]
@@ -108,7 +108,7 @@ def _gable(
 
 
 def tree(x: float, y: float, atlas: Atlas, rng: Generator) -> tuple[Mesh, float, float]:
-    """A tree; radius and height of its crown come second."""
+    """Return a tree, and radius and height of its crown."""
     radius = float(rng.uniform(1.6, 3.0))
     middle = float(rng.uniform(4.2, 5.6))
     trunk = tube((x, y, 0.0), (x + rng.normal(0, 0.15), y, middle), 0.16, WOOD)
@@ -120,7 +120,7 @@ def tree(x: float, y: float, atlas: Atlas, rng: Generator) -> tuple[Mesh, float,
 
 
 def bush(x: float, y: float, radius: float, high: float, atlas: Atlas, rng: Generator) -> Mesh:
-    """A bush standing on the ground."""
+    """Return a bush on the ground."""
     return crown(x, y, high / 2, radius, high / 2, 8, atlas, rng)
 
 
@@ -134,7 +134,7 @@ def crown(
     atlas: Atlas,
     rng: Generator,
 ) -> Mesh:
-    """Bunches of leaves turned any way within an ellipsoid."""
+    """Return randomly oriented bunches of leaves within an ellipsoid."""
     parts = []
     for _ in range(count):
         spot = rng.normal(0.0, 1.0, 3)
@@ -167,7 +167,7 @@ def crown(
 
 
 def sign_face(kind: str, atlas: Atlas, width_m: float | None = None) -> Mesh:
-    """The front of a sign, its middle at the origin, facing -x; the stop sign an octagon."""
+    """Return a sign's face, centred at the origin, facing -x; the stop sign is an octagon."""
     wide = WIDTH_M[kind] if width_m is None else width_m
     high = (
         wide / 3 if kind.startswith("one_way") else wide * 1.25 if kind == "speed_limit" else wide
@@ -186,13 +186,13 @@ def sign_face(kind: str, atlas: Atlas, width_m: float | None = None) -> Mesh:
 
 
 def sign_back(face: Mesh) -> Mesh:
-    """The grey back of a sign, behind its face."""
+    """Return the grey back of a sign, behind its face."""
     moved = face.placed(0.02, 0.0)
     return triangles(moved.corners[:, ::-1], STEEL)
 
 
 def post(x: float, y: float, high: float) -> Mesh:
-    """A sign's post."""
+    """Return a sign's post."""
     return tube((x + 0.06, y, 0.0), (x + 0.06, y, high), 0.035, STEEL, 5)
 
 
@@ -204,7 +204,7 @@ HEAD_M = (0.36, 1.06)
 
 
 def light_head(state: str) -> Mesh:
-    """A traffic light's head, its middle at the origin, facing -x, one lamp lit."""
+    """Return a traffic light's head, centred at the origin, facing -x, with one lamp on."""
     wide, high = HEAD_M
     case: Rgb = (0.10, 0.105, 0.09)
     parts = [box((0.0, 0.24), (-wide / 2, wide / 2), (-high / 2, high / 2), case)]
@@ -229,7 +229,7 @@ def light_head(state: str) -> Mesh:
 
 
 def mast(x: float, y: float, arm_to_y: float, high: float = 6.3) -> Mesh:
-    """A pole with an arm over the road."""
+    """Return a pole with an arm over the road."""
     return joined(
         [
             tube((x + 0.3, y, 0.0), (x + 0.3, y, high + 0.3), 0.13, STEEL, 8),
@@ -239,7 +239,7 @@ def mast(x: float, y: float, arm_to_y: float, high: float = 6.3) -> Mesh:
 
 
 def utility_pole(x: float, y: float) -> Mesh:
-    """A wooden pole with a cross-arm."""
+    """Return a wooden pole with a cross-arm."""
     return joined(
         [
             tube((x, y, 0.0), (x, y, 9.5), 0.15, WOOD),
@@ -249,7 +249,7 @@ def utility_pole(x: float, y: float) -> Mesh:
 
 
 def wire(a: tuple[float, float, float], b: tuple[float, float, float]) -> Mesh:
-    """A sagging wire, thick enough to be seen."""
+    """Return a sagging wire that is thick enough to be visible."""
     start, stop = np.array(a), np.array(b)
     fraction = np.linspace(0, 1, 9)[:, None]
     points = start + fraction * (stop - start)

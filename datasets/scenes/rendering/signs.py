@@ -1,6 +1,6 @@
-"""Our own drawings of the signs a US driver meets, as pictures with transparency (RGBA).
+"""Load drawings of US road signs, as pictures with transparency (RGBA).
 
-They are read from files, as each version of OpenCV has letters of its own.
+They are read from files because fonts differ between versions of OpenCV.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ WIDTH_M: Final[Mapping[str, float]] = {
 
 
 def sign(name: str) -> Rgba:
-    """One of ``WIDTH_M``, 128 pixels wide."""
+    """Return a sign named in ``WIDTH_M``, with a width of 128 pixels."""
     import cv2
 
     path = files("crosscue.datasets.scenes.rendering").joinpath("drawings", f"{name}.png")

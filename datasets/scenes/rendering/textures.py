@@ -1,4 +1,4 @@
-"""Pictures on surfaces: signs, leaves, house fronts, packed into one buffer with smaller copies."""
+"""Textures of surfaces: signs, leaves and house fronts, in one buffer with all mipmap levels."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .signs import WIDTH_M, Rgba, sign
 
 LEVELS: Final = 9
 FRONT_M: Final = (8.0, 6.0)
-"""Width and height of wall that one house-front texture covers."""
+"""Width and height of the wall that one house-front texture covers."""
 
 
 @dataclass(slots=True)
 class Atlas:
-    """Textures by name, each with its copies at half the size, a quarter, and so on.
+    """Textures by name, each with mipmap levels at half the size, a quarter, and so on.
 
     Attributes:
-        number: From name to row of ``places``.
+        number: Row of ``places`` by name.
     """
 
     number: dict[str, int] = field(default_factory=dict)
@@ -30,7 +30,7 @@ class Atlas:
     _used: int = 0
 
     def add(self, name: str, rgba: Rgba) -> int:
-        """Take in a texture; its number comes back."""
+        """Add a texture, and return its number."""
         import cv2
 
         place = np.zeros((LEVELS, 3), np.int64)
@@ -48,12 +48,12 @@ class Atlas:
         return self.number[name]
 
     def packed(self) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """All texels (N, 4) and places (K, LEVELS, 3): offset, width, height."""
+        """Return all texels (N, 4) and places (K, LEVELS, 3): offset, width, height."""
         return np.concatenate(self._texels), np.stack(self._places)
 
 
 def make_atlas(rng: Generator) -> Atlas:
-    """Every texture a scene uses."""
+    """Return an atlas of all textures of a scene."""
     atlas = Atlas()
     for name in WIDTH_M:
         atlas.add(name, sign(name))
@@ -68,7 +68,7 @@ def make_atlas(rng: Generator) -> Atlas:
 
 
 def smooth_noise(rng: Generator, size: int, cells: int) -> NDArray[np.float64]:
-    """Noise in [0, 1] of shape (size, size) that tiles, with about ``cells`` blobs a side."""
+    """Return tileable noise in [0, 1], shape (size, size), with about ``cells`` blobs per side."""
     import cv2
 
     coarse = rng.random((cells, cells)).astype(np.float32)
@@ -81,7 +81,7 @@ def smooth_noise(rng: Generator, size: int, cells: int) -> NDArray[np.float64]:
 
 
 def leaves(rng: Generator, size: int = 128) -> Rgba:
-    """A bunch of leaves: many small ellipses, dark ones first, on nothing."""
+    """Return a bunch of leaves: many small ellipses, dark ones first, on transparency."""
     import cv2
 
     canvas = np.zeros((size, size, 4), np.uint8)
@@ -103,7 +103,7 @@ def leaves(rng: Generator, size: int = 128) -> Rgba:
 
 
 def front(rng: Generator, *, is_shop: bool, size: int = 256) -> Rgba:
-    """Eight by six metres of wall with two storeys of windows."""
+    """Return a wall of eight by six metres with two storeys of windows."""
     import cv2
 
     walls = [
@@ -146,7 +146,7 @@ def front(rng: Generator, *, is_shop: bool, size: int = 256) -> Rgba:
 
 
 def roof(rng: Generator, size: int = 64) -> Rgba:
-    """Shingles."""
+    """Return a texture of shingles."""
     base = np.array([92, 88, 88]) * rng.uniform(0.7, 1.2) + rng.normal(0, 8, 3)
     canvas = np.full((size, size, 4), 255, np.uint8)
     light = 0.85 + 0.3 * rng.random((size // 4, size // 8))
@@ -157,7 +157,7 @@ def roof(rng: Generator, size: int = 64) -> Rgba:
 
 
 def bark(rng: Generator, size: int = 32) -> Rgba:
-    """A tree's trunk."""
+    """Return a texture of a tree's trunk."""
     canvas = np.full((size, size, 4), 255, np.uint8)
     stripes = 0.7 + 0.6 * rng.random((1, size, 1)) + 0.15 * rng.random((size, size, 1))
     canvas[..., :3] = np.clip(np.array([84, 70, 58]) * stripes, 0, 255)

@@ -1,4 +1,4 @@
-"""Rain before the camera: streaks in the air and drops on the windscreen."""
+"""Draw rain in front of the camera: streaks in the air and drops on the windscreen."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def streaks(rgb: NDArray[np.uint8], rain: float, speed_mps: float, rng: Generator) -> None:
-    """Falling drops as short bright lines, in place."""
+    """Draw falling drops as short bright lines, in place."""
     import cv2
 
     high, wide = rgb.shape[:2]
@@ -27,7 +27,7 @@ def streaks(rgb: NDArray[np.uint8], rain: float, speed_mps: float, rng: Generato
 
 
 def drops(rgb: NDArray[np.uint8], rain: float, rng: Generator) -> None:
-    """Drops on the glass show the scene upside down and blurred, in place."""
+    """Draw drops on the glass, which show the scene upside down and blurred, in place."""
     import cv2
 
     high, wide = rgb.shape[:2]
