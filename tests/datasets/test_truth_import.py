@@ -429,7 +429,7 @@ LATE = {"end_ns": START_NS + 10**12}
         (_truth(cues=[{"cue": "Zebra!", "present": True, "t_ns": START_NS}]), "cues.0.cue"),
         (
             _truth(cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 7}]),
-            "at none of 1 moments",
+            "at any of 1 moments",
         ),
         (_truth(log_sha256={"a": "b"}), "by its hash"),
         (_truth(pose="../secret.tum"), "secret.tum"),
