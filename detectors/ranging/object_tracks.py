@@ -309,7 +309,7 @@ class ObjectTracks:
             (away, i, j)
             for j, track in enumerate(self.tracks)
             for i in range(len(boxes_px))
-            if (away := _away(track, boxes_px[i], float(heights_px[i]))) < NEAR_HEIGHTS
+            if (away := _cost_of(track, boxes_px[i], float(heights_px[i]))) < NEAR_HEIGHTS
         ]
         boxes: list[int] = []
         tracks: set[int] = set()
@@ -403,7 +403,7 @@ def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return inside / (both - inside) if both > inside else 0.0
 
 
-def _away(track: Track, box_px: NDArray[np.float64], height_px: float) -> float:
+def _cost_of(track: Track, box_px: NDArray[np.float64], height_px: float) -> float:
     """Distance of a box from the predicted box, in heights; infinite if the heights differ."""
     if abs(math.log(height_px / track.height_px)) > math.log(GROWTH):
         return math.inf

@@ -34,7 +34,7 @@ from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
 from .features import Features, Match, Matcher
 from .sighting import Sighting
 
-FALLEN_SHARE: Final = 0.8
+FALLEN_FRACTION: Final = 0.8
 """Fraction of the peak score below which the peak is over."""
 
 
@@ -278,7 +278,7 @@ class LandmarkSearch:
             if here.score >= peak.score:
                 self._peak = here
                 return None
-            if here.score >= FALLEN_SHARE * peak.score:
+            if here.score >= FALLEN_FRACTION * peak.score:
                 return None
             # The remaining matches of this landmark are not a new peak.
             here = here._replace(score=math.inf)

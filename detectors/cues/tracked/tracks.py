@@ -204,7 +204,7 @@ class CarTracks:
         """
         used: set[int] = set()
         again: list[_Track] = []
-        for cost, sure in ((_astray, True), (_away, True), (_astray, False)):
+        for cost, sure in ((_cost_moving, True), (_cost_standing, True), (_cost_moving, False)):
             pairs = sorted(
                 (away, i, j)
                 for j, track in enumerate(self._tracks)
@@ -274,7 +274,7 @@ def _steady_motion(
     return found
 
 
-def _astray(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
+def _cost_moving(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
     """Cost of a box by its overlap with the predicted box; infinite if it does not match.
 
     A car that was seen only once has no prediction.
@@ -286,7 +286,7 @@ def _astray(track: _Track, box_px: NDArray[np.float64], one: Observation) -> flo
     return 1.0 - overlap if overlap > MIN_OVERLAP and 1.0 / GROWTH < grown < GROWTH else math.inf
 
 
-def _away(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
+def _cost_standing(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
     """Distance of a box from the position of a standing car, across the line of sight.
 
     It is infinite if the box cannot be the same car.
