@@ -143,6 +143,7 @@ __all__ = [
     "UsageError",
     "VehicleError",
     "WorkerError",
+    "WrappedLog",
     "cannot_write",
     "file_sha256",
     "installed",
@@ -302,3 +303,34 @@ def report_missing(log: Log, ledger: Ledger) -> None:
     """Call ``log.report_missing`` if the log supports it."""
     if isinstance(log, KnowsItsEnd):
         log.report_missing(ledger)
+
+
+class WrappedLog(Closing):
+    """A log that wraps another log; subclasses change how it is read or closed."""
+
+    def __init__(self, log: Log) -> None:
+        """Wrap ``log``."""
+        self._log: Final = log
+
+    @property
+    def path(self) -> Path:
+        """Path of the log."""
+        return self._log.path
+
+    @property
+    def format(self) -> str:
+        """Format of the log."""
+        return self._log.format
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Topics of the log."""
+        return self._log.topics
+
+    def report_missing(self, ledger: Ledger) -> None:
+        """Report missing rows of the log; see ``KnowsItsEnd``."""
+        report_missing(self._log, ledger)
+
+    def close(self) -> None:
+        """Close the log."""
+        self._log.close()

@@ -36,10 +36,10 @@ from crosscue.replay.base import (
     Selection,
     Topic,
     UsageError,
+    WrappedLog,
     cannot_write,
     is_remote,
     one_line,
-    report_missing,
 )
 from crosscue.replay.files.partial_file import is_still
 from crosscue.replay.formats import known_formats
@@ -228,32 +228,17 @@ def matches(pattern: str) -> tuple[str, ...]:
     return tuple(one if "://" in one else f"{scheme}://{one.lstrip('/')}" for one in found)
 
 
-class RemoteLog(Closing):
+class RemoteLog(WrappedLog):
     """A downloaded log; closing it releases its local copy."""
 
     def __init__(
         self, url: str, log: Log, fetched: Fetched, why: str = "its format needs a local file"
     ) -> None:
         """Wrap ``log``, which was downloaded completely for the reason ``why``."""
+        super().__init__(log)
         self._why: Final = why
         self.url: Final = url
-        self._log: Final = log
         self._fetched: Final = fetched
-
-    @property
-    def path(self) -> Path:
-        """Path of the local copy."""
-        return self._log.path
-
-    @property
-    def format(self) -> str:
-        """Format of the downloaded log."""
-        return self._log.format
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Topics of the downloaded log."""
-        return self._log.topics
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Read the rows; see ``Log.read``."""
@@ -261,14 +246,10 @@ class RemoteLog(Closing):
             ledger.notice(f"downloaded completely: {self._why}")
         return self._log.read(ledger, selection)
 
-    def report_missing(self, ledger: Ledger) -> None:
-        """Report missing rows; see ``KnowsItsEnd``."""
-        report_missing(self._log, ledger)
-
     def close(self) -> None:
         """Close the log and release its local copy."""
         try:
-            self._log.close()
+            super().close()
         finally:
             self._fetched.close()
 

@@ -17,13 +17,11 @@ from crosscue.replay.base import (
     DIFFERS,
     EVERYTHING,
     Block,
-    Closing,
     Ledger,
     Log,
     LogError,
     Selection,
-    Topic,
-    report_missing,
+    WrappedLog,
 )
 
 from .seal import HASH, Check, Seal, seal_over, seal_path
@@ -71,31 +69,16 @@ def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -
         raise type(error)(f"{error}; its seal differs: {'; '.join(found_odd)}") from None
 
 
-class SealedLog(Closing):
+class SealedLog(WrappedLog):
     """Log that checks its seal; see ``crosscue.replay.base.Log`` and the head of this module."""
 
     def __init__(self, log: Log, seal: Seal, folders: Path | None = None) -> None:
         """Wrap ``log``; ``folders`` is the seal file if it belongs to a folder around the log."""
+        super().__init__(log)
         self.seal: Final = seal
         self.folders: Final = folders
-        self._log: Final = log
         self._touched: Final = log.touched if isinstance(log, Touching) else None
         self._opening: Final = {} if self._touched is None else self._touched.of_opening()
-
-    @property
-    def path(self) -> Path:
-        """Path of the log."""
-        return self._log.path
-
-    @property
-    def format(self) -> str:
-        """Format of the log."""
-        return self._log.format
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Topics of the log."""
-        return self._log.topics
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Yield the log's blocks; a log that records its reads is checked before each block."""
@@ -118,7 +101,7 @@ class SealedLog(Closing):
         """Report missing parts of the log, and files that are missing, new or of another size."""
         for sentence in Check(self.path, self.seal).oddities:
             ledger.drop("", CHANGED, None, sentence)
-        report_missing(self._log, ledger)
+        super().report_missing(ledger)
 
     def _checked(
         self, touched: Touched, check: Check, ledger: Ledger, selection: Selection
@@ -129,10 +112,6 @@ class SealedLog(Closing):
                 _check_blocks(check, touched.taken(heard))
                 yield block
             _check_blocks(check, touched.taken(heard))
-
-    def close(self) -> None:
-        """Close the log."""
-        self._log.close()
 
 
 def _check_blocks(check: Check, blocks: Blocks) -> None:
