@@ -1,4 +1,4 @@
-"""A detector that says only where the boxes are."""
+"""Tests of the base class of box detectors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Corner(BoxDetector):
     side_px: int = 4
 
     def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
-        """One in a frame that is not black."""
+        """Return one box in a frame that is not black."""
         if frame.pixels.any():
             yield "corner", 0.5, (0, 0, self.side_px, self.side_px)
 

@@ -1,4 +1,4 @@
-"""Labels without masks train boxes; the mask head keeps its weights and no masks are invented."""
+"""Annotations without masks train boxes; the mask head's weights remain unchanged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
 
 
 def _without_masks(path: Path, every: int = 1) -> None:
-    """Leave only the box of each annotation, or of every ``every``-th."""
+    """Remove the mask of each annotation, or of every ``every``-th."""
     tree = json.loads(path.read_text())
     for row in tree["annotations"][::every]:
         row.pop("segmentation", None)
@@ -114,7 +114,7 @@ def test_precision_of_masks_is_asked_only_of_objects_that_have_one(tmp_path: Pat
 
     found = []
     for number, picture in enumerate(whole.pictures):
-        # The masks of what has only a box in the mixed set are all wrong: half of the object.
+        # Objects with only a box in the mixed set have wrong masks here: half of the object.
         masks = []
         for k, one in enumerate(picture.objects):
             mask = mask_of(one, picture.size_px)

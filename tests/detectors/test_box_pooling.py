@@ -1,4 +1,4 @@
-"""Boxes cut out of a pyramid: as torchvision cuts them, wherever they are."""
+"""RoIAlign compared with torchvision's, for boxes at any position."""
 
 from __future__ import annotations
 

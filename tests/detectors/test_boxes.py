@@ -1,4 +1,4 @@
-"""Suppression of double boxes."""
+"""Tests of non-maximum suppression."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The catalog's law: every entry is a whole card; fetching is checked and resumes."""
+"""Tests of the catalog: every entry is a complete card; downloads are verified and resumed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def server() -> Iterator[Served]:
 
 @pytest.fixture
 def card(server: Served, cache: Path, monkeypatch: pytest.MonkeyPatch) -> ModelCard:
-    """The catalog has one model, ``net``, whose weights the server has."""
+    """A catalog with one model, ``net``, whose weights are on the server."""
     whole = entries.entry("yolox-nano")
     file = WeightFile(
         name="net.onnx", url=f"{server.base}/net.onnx", size_bytes=len(CONTENT), sha256=SHA256
@@ -68,7 +68,7 @@ def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> Non
 
 @pytest.mark.parametrize("name", [name for name in places.names() if "rcnn" in name])
 def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> None:
-    """URL, beginning of the hash, network and classes, as the installed package has them."""
+    """Compare URL, start of the hash, network and classes with the installed package."""
     card = entries.entry(name)
     assert card.network is not None
     weights = get_model_weights(card.network.architecture).DEFAULT
@@ -92,7 +92,7 @@ def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> No
 
 @pytest.mark.parametrize("name", places.names())
 def test_every_entry_at_hand_runs(name: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the very file of its hash, from the data folder."""
+    """With the file of exactly this hash, from the data folder."""
     monkeypatch.setenv(fetch.DATA, str(shared("weights").parent))
     monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9")
     try:

@@ -1,4 +1,4 @@
-"""Pictures for people: boxes where they belong, road tinted, the cues' line within the picture."""
+"""Drawn pictures: boxes at their position, tinted road, the cues' line within the picture."""
 
 from __future__ import annotations
 

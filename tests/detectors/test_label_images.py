@@ -1,4 +1,4 @@
-"""What is drawn into a label image is what the detectors read from it."""
+"""The detectors read from a label image what was drawn into it."""
 
 import numpy as np
 import pytest

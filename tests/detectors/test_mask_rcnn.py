@@ -1,4 +1,4 @@
-"""Mask R-CNN as a detector: as torchvision's own loop, whatever the batch, memory and picture."""
+"""Mask R-CNN detector: equal to torchvision's loop for any batch size, memory and picture."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_what_is_found_is_what_torchvision_finds_above_the_score() -> None:
 
 
 class _Bare(torch.nn.Module):
-    """Torchvision's transform without scaling: pictures and masks as they are."""
+    """Torchvision's transform without scaling, so that pictures and masks are unchanged."""
 
     def forward(self, images: list[Tensor], targets: None) -> tuple[Any, None]:
         from torchvision.models.detection.image_list import ImageList
@@ -164,7 +164,7 @@ def test_what_is_cut_off_does_not_shift_what_is_found() -> None:
 
 @dataclass
 class _Small:
-    """A back end whose device holds so many pictures at a time."""
+    """A back end whose device has memory for a limited number of pictures."""
 
     within: Parts
     max_count: int
@@ -270,8 +270,8 @@ def test_a_mask_laid_into_its_box_is_the_one_torchvision_pastes(
     )
     theirs = pasted[0, 0].numpy() > 0.5
 
-    # Torchvision rounds the widened box to whole pixels, so the outline may be a pixel elsewhere;
-    # beyond the picture's top and left it rounds towards zero, which is another pixel.
+    # Torchvision rounds the widened box to whole pixels, so the outline can differ by a pixel.
+    # Beyond the picture's top and left it rounds towards zero, which is another pixel.
     kernel = np.ones((3, 3) if box[:2].min() > 1 else (5, 5), np.uint8)
     wide = cv2.dilate(theirs.astype(np.uint8), kernel)
     narrow = cv2.erode(theirs.astype(np.uint8), kernel, borderValue=1)
@@ -367,7 +367,7 @@ def test_a_checkpoint_that_describes_itself_badly_is_refused(
 
 
 class _Hostile:
-    """Unpickling it makes a folder."""
+    """An object whose unpickling creates a folder."""
 
     def __init__(self, where: Path) -> None:
         self.where = where
@@ -411,7 +411,7 @@ def test_a_flipped_bit_is_never_another_network(at: float, bit: int) -> None:
     with TemporaryDirectory() as name:
         path = Path(name) / "flipped.safetensors"
         path.write_bytes(content)
-        # A bit of the sum's own name leaves a file without a sum, as older ones are: whole.
+        # A flipped bit in the checksum's name yields a file without checksum, which is valid.
         if SUM.encode() in content:
             with pytest.raises(VehicleError, match="flipped"):
                 load_checkpoint(path)
@@ -503,7 +503,7 @@ def test_coco_weights_give_the_levels_that_torchvisions_own_network_gives(
     with torch.device("meta"):
         empty = make(weights=None, weights_backbone=None).state_dict()
     torch.manual_seed(0)
-    # Variances so small that an epsilon of 1e-5 is seen.
+    # Variances so small that an epsilon of 1e-5 has an effect.
     state = {
         key: torch.full(value.shape, 1e-4)
         if key.endswith("running_var")

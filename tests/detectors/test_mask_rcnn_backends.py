@@ -1,4 +1,4 @@
-"""Mask R-CNN behind each back end: what torchvision's own network finds, whatever runs it."""
+"""Mask R-CNN back ends: each returns the detections of torchvision's network."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SCORE = 0.4
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Torch's own threads wait by spinning, which is slow where other tests run beside."""
+    """Torch's threads wait by spinning, which is slow if other tests run in parallel."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -54,13 +54,13 @@ def _one_thread() -> Iterator[None]:
 
 
 def _needs(backend: str) -> None:
-    # Not by importing it: that would load its telemetry, which only our own import keeps out.
+    # Without importing it, which would load its telemetry; crosscue's own import prevents that.
     if find_spec(backend) is None:
         pytest.skip(f"the extra {backend} is not installed")
 
 
 def _detector(checkpoint: Checkpoint, backend: str, **changes: Any) -> MaskRcnnDetector:
-    """Without calibration, so that scores are the network's own."""
+    """A checkpoint without calibration, so that scores are the network's."""
     _needs(backend)
     bare = Checkpoint(Facts(plan=checkpoint.facts.plan), checkpoint.network, checkpoint.sha256)
     asked = {"score": SCORE, "proposals": 1000, "backend": backend, **changes}
@@ -85,7 +85,7 @@ def _simulated() -> tuple[Frame, ...]:
 
 @cache
 def _torchvision(network: Any, objectness: float = 0.0) -> Any:
-    """A copy that examines as many places as torchvision's own loop and keeps its scores."""
+    """A copy with torchvision's number of proposals and uncalibrated scores."""
     own = copy.deepcopy(network).eval()
     own.rpn._pre_nms_top_n["testing"] = own.rpn._post_nms_top_n["testing"] = 1000
     own.rpn.score_thresh = objectness
@@ -97,7 +97,7 @@ def _torchvision(network: Any, objectness: float = 0.0) -> Any:
 def _found_by_torchvision(
     checkpoint: Checkpoint, frame: Frame, objectness: float = 0.0
 ) -> Detections:
-    """Torchvision's own modules in torchvision's own order, above the score."""
+    """Run torchvision's modules in torchvision's order; keep detections above the score."""
     from torchvision.models.detection.image_list import ImageList
 
     plan = checkpoint.facts.plan
@@ -125,7 +125,7 @@ def _found_by_torchvision(
 
 
 def _assert_equal(ours: Detections, theirs: Detections) -> None:
-    """The same classes, boxes within half a pixel, masks but for a few pixels of their rim."""
+    """Assert equal classes, boxes within half a pixel, and masks except for a few edge pixels."""
     assert len(ours) == len(theirs)
     free = set(range(len(ours)))
     for i, label in enumerate(theirs.labels):
@@ -246,7 +246,7 @@ def test_a_rough_look_loses_nothing_that_reaches_the_score(noise: float) -> None
     network = build_network(plan_of()).eval()
     heads = network.roi_heads
     with torch.no_grad():
-        # A first layer that thin matrices stand in for, and with noise one that they cannot.
+        # A first layer that thin matrices approximate, and one with noise that they do not.
         first = heads.box_head.fc6.weight
         thin = torch.randn(256, 8) @ torch.randn(8, first.shape[1])
         first.copy_(0.02 * (thin + 10.0 * noise * torch.randn(first.shape)))

@@ -1,4 +1,4 @@
-"""Model cards end to end with networks made here: placement, batches, tiles, masks, sizes."""
+"""Model cards end to end with generated networks: placement, batches, tiles, masks, sizes."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_network_gets_scaled_pixels_with_the_pad_around_them() -> None:
 
 
 def test_tiles_find_what_the_whole_picture_loses(tmp_path: Path) -> None:
-    """A bright box of 6 pixels vanishes when 1024 become 128, and stays in a tile."""
+    """A bright box of 6 pixels vanishes if 1024 pixels become 128, but remains in a tile."""
     given = "width_px = 128\nheight_px = 64"
     small = frame(1024, 512, (701, 251, 707, 257))
     found = {}
@@ -125,7 +125,7 @@ def test_a_label_means_what_the_card_says(tmp_path: Path) -> None:
 
 
 def test_a_mask_is_as_large_as_the_camera_s_picture(tmp_path: Path) -> None:
-    """Two prototypes' worth of mask: the left half of a box that fills the middle."""
+    """A mask of two prototypes: the left half of a box in the centre."""
     boxes = np.zeros((1, 2 + 4 + 32, 40), np.float32)
     boxes[0, :7, 3] = [32, 16, 32, 16, 0.9, 0.0, 1.0]
     prototypes = np.full((1, 32, 8, 16), -9.0, np.float32)

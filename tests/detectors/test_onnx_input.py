@@ -1,4 +1,4 @@
-"""The input shape of an ONNX file, read from bytes put together by hand and from real files."""
+"""The input shape of an ONNX file, read from hand-made bytes and from real files."""
 
 from __future__ import annotations
 

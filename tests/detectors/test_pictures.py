@@ -1,4 +1,4 @@
-"""Encoded pictures to pixels: every camera's, at the smallest scale that serves."""
+"""Decoding of pictures of all encodings, at the smallest sufficient scale."""
 
 import struct
 import zlib

@@ -1,4 +1,4 @@
-"""Proposals are chosen as torchvision chooses them."""
+"""The selection of proposals is equal to torchvision's."""
 
 from __future__ import annotations
 

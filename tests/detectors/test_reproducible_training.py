@@ -1,4 +1,4 @@
-"""The same seed gives the same weights, bit for bit, in processes of their own."""
+"""The same seed yields the same weights, bit for bit, in separate processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ for line in ({ROAD!r}, {MASKS!r}):
 
 
 def _road_set(folder: Path, numbers: list[int]) -> None:
-    """Pictures and masks, made in this order, which is often that of the folder's entries."""
+    """Pictures and masks, created in this order, which is often that of the folder's entries."""
     for name in ("images", "masks"):
         (folder / "set" / name).mkdir(parents=True)
     for number in numbers:

@@ -1,4 +1,4 @@
-"""The road network: learns, goes on after an interruption, and refuses files that are not its."""
+"""The road network: it learns, resumes after an interruption, and rejects other files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CPU = torch.device("cpu")
 
 
 def scenes(n: int, seed: int = 0) -> tuple[Bytes, Bytes]:
-    """Grey trapezoids on green: the simplest road there is."""
+    """Grey trapezoids on green, as the simplest road."""
     rng = np.random.default_rng(seed)
     pixels = np.zeros((n, 48, 80, 3), np.uint8)
     road = np.zeros((n, 48, 80), np.uint8)
@@ -201,7 +201,7 @@ def test_own_pictures_with_masks_train_too(
     recipe = load_road(out).facts.recipe
     assert (recipe["pictures"], recipe["steps"], recipe["stopped_at"]) == (9, 4, 2)
     assert not out.with_suffix(".state").exists()
-    assert run(argv) == 1  # it is there already
+    assert run(argv) == 1  # it already exists
 
 
 def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Path) -> None:

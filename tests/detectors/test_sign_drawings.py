@@ -1,4 +1,4 @@
-"""The sign drawings are these, whatever the version of OpenCV and its fonts."""
+"""The sign drawings do not depend on OpenCV's version and fonts."""
 
 import hashlib
 

@@ -1,4 +1,4 @@
-"""Signs against our own drawings: found, told apart, nothing seen twice; thresholds by labels."""
+"""Sign detection: signs are found, distinguished and not duplicated; thresholds by labels."""
 
 import json
 from pathlib import Path
@@ -188,7 +188,7 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
 
 
 def coco(folder: Path, seeds: range) -> Path:
-    """Left and right one-way signs in turn, as a COCO file with its folder of pictures."""
+    """Alternating left and right one-way signs, as a COCO file with its folder of pictures."""
     kinds: tuple[Kind, Kind] = ("one way left", "one way right")
     (folder / "images").mkdir(parents=True)
     images, annotations = [], []
@@ -318,7 +318,7 @@ def test_a_file_that_is_no_coco_is_reported(
 ) -> None:
     (tmp_path / "coco.json").write_text(text)
 
-    status = 1 if "images" in text else 4  # a sound file of nothing, else no such file
+    status = 1 if "images" in text else 4  # a valid file without data, otherwise a missing file
     assert run(["fit", "signs", str(tmp_path / "coco.json"), "--label", "stop"]) == status
     assert "coco.json: no " in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""Weights of torchvision's networks: found by their tensors, run as torchvision runs them."""
+"""Weights of torchvision's networks: recognised by their tensors, with torchvision's results."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def _found(card: Path, score: float) -> Detections:
 
 def _theirs(model: Any) -> dict[str, Any]:
     planes = torch.from_numpy(_picture()[:, :, ::-1].copy()).permute(2, 0, 1).contiguous()
-    # As many threads as ours: sums in another order differ in the last digits.
+    # The same number of threads, because the order of sums affects the last digits.
     with torch.inference_mode(), threads_of(1, torch.device("cpu")):
         (found,) = model([planes.float() / 255.0])
-    # What lies beyond the picture's edge has no area left.
+    # Boxes beyond the picture's edge have no area.
     is_seen = (found["boxes"][:, 2:] > found["boxes"][:, :2]).all(dim=1)
     return {key: value[is_seen].numpy() for key, value in found.items()}
 
@@ -90,7 +90,7 @@ def test_boxes_and_masks_are_those_of_torchvision_itself(
     assert list(found.labels) == [NAMES[i - first] for i in theirs["labels"]]
     for text, mask, box in zip(found.masks, theirs.get("masks", []), theirs["boxes"], strict=False):
         want = mask[0] > 0.5
-        # Torchvision's masks reach a pixel beyond their box, ours end with it.
+        # Torchvision's masks extend a pixel beyond their box, crosscue's do not.
         x0, y0 = np.floor(box[:2]).astype(int)
         x1, y1 = np.ceil(box[2:]).astype(int)
         ours = rle.decode(text, (200, 120)) if text else np.zeros_like(want)
@@ -100,7 +100,7 @@ def test_boxes_and_masks_are_those_of_torchvision_itself(
 
 @pytest.mark.slow
 def test_weights_whose_normalisation_was_frozen_add_nothing_to_variances(tmp_path: Path) -> None:
-    """As torchvision runs its COCO weights, and users' own that were trained further."""
+    """Equal to torchvision, for its COCO weights and for fine-tuned ones."""
     from torchvision.ops import misc
 
     model = network("fasterrcnn_resnet50_fpn", min_size=SIZE[1], max_size=SIZE[0])
@@ -109,7 +109,7 @@ def test_weights_whose_normalisation_was_frozen_add_nothing_to_variances(tmp_pat
         if isinstance(module, torch.nn.BatchNorm2d):
             frozen = misc.FrozenBatchNorm2d(module.num_features, eps=0.0)
             frozen.load_state_dict(module.state_dict())
-            # Variances so small that an epsilon of 1e-5 is seen.
+            # Variances so small that an epsilon of 1e-5 has an effect.
             frozen.running_var.fill_(1e-4)
             frozen.weight.fill_(1e-2)
             parent, _, last = name.rpartition(".")
@@ -190,7 +190,7 @@ def test_coco_s_classes_are_known_and_others_are_asked_for(
 
 
 class _Runs:
-    """A pickle that makes a file when it is read."""
+    """A pickle that creates a file when it is read."""
 
     def __init__(self, place: Path) -> None:
         self.place = place
@@ -243,7 +243,7 @@ def test_what_is_no_network_of_torchvision_s_is_one_line(
 
 
 def _bomb() -> bytes:
-    """An archive of zeros that says it unpacks to more than a file may hold."""
+    """An archive of zeros that declares an unpacked size above the limit."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data.pkl", b"\0" * 1000)

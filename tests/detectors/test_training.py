@@ -1,4 +1,4 @@
-"""Training on COCO annotations: what is read, what is learnt from, and going on after a kill."""
+"""Training on COCO annotations: reading, samples, and resumption after a kill."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _changed(folder: Path, **rows: Any) -> LabelledSet:
 
 
 def _with(row: dict[str, Any]) -> Any:
-    """A change that lays ``row`` over the first annotation."""
+    """A change that updates the first annotation with ``row``."""
     return lambda rows: [{**rows[0], **row}, *rows[1:]]
 
 
@@ -499,7 +499,7 @@ def test_what_is_of_no_wanted_class_is_looked_at_too_but_not_learnt_as_one(tmp_p
 
     samples = [sampler(number) for number in range(40)]
 
-    # The two bars are in the left and the right half, too far apart for one window.
+    # The two bars are in the left and the right half, so no window contains both.
     assert len(labelled.pictures[0].decoys_px) == 1
     is_bright = [bool((one.pixels[0] > 1.0).sum() > 200) for one in samples]
     has_car = [len(one.labels) > 0 for one in samples]

@@ -1,4 +1,4 @@
-"""Approaches in drives: opening and closing, the gate, dissent, and evidence that is refused."""
+"""Tests of approaches: opening and closing, the gate, dissent, and rejected evidence."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from support.fusion import NONE_SEEN, SECOND_NS, drive, light, sign
 
 FRAME_NS = SECOND_NS // 10
 PLAIN = RangeFilter(sd_fraction=0.0, fade_m=0.0, begin_after=1)
-"""As in the source, so that ranges can be worked out by hand."""
+"""Settings of the dissertation, with which ranges can be computed by hand."""
 
 
 def approaches(fusion: Fusion | None = None, range_filter: RangeFilter = PLAIN) -> Approaches:
@@ -433,5 +433,5 @@ def test_errors_of_whole_drives_are_as_large_as_the_ranges_say() -> None:
         (row,) = step.ranges
         nees.append((row.range_m - truth_m) ** 2 / row.var_m2)
 
-    # the gate at 16 refuses one good measurement in 16 000
+    # The gate at 16 rejects one good measurement in 16,000.
     assert np.mean(nees) == pytest.approx(1.0, abs=4 * math.sqrt(2 / 300))

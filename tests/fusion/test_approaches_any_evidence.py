@@ -1,4 +1,4 @@
-"""Laws of the approach loop that hold whatever comes in."""
+"""Properties of approaches that hold for any evidence."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_a_frame_that_comes_twice_changes_nothing(
 
 
 def test_a_range_less_sure_than_any_range_is_long_is_refused() -> None:
-    """Squares of such variances overflow in the filter."""
+    """The squares of these variances would overflow in the filter."""
     fusion = Fusion()
     approaches = Approaches(graph_of(fusion), fusion, RangeFilter())
 

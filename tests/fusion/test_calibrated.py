@@ -1,4 +1,4 @@
-"""Messages that were learned: what observations and repeats say, and how well the fit recovers."""
+"""Tests of fitted messages: single and repeated observations, and recovery by the fit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LEARNED = Calibrated(
 
 
 def said(*looks: Situation, learned: Calibrated = LEARNED) -> list[float]:
-    """What each observation adds to the log odds of left."""
+    """Change of the log odds of left by each observation."""
     speaker = CalibratedMessageModel(len(GRAPH.features), voices_of(GRAPH, learned))
     return [speaker(look)[LEFT] for look in looks]
 
@@ -186,7 +186,7 @@ def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:
 
     for one in fit.fades:
         if one.is_learned:
-            # ten metres a second, so way and time report the same here
+            # At 10 m/s, fades over distance and over time are equivalent here.
             scale_m = one.fade.way_m or (one.fade.time_s or 0.0) * 10.0
             assert scale_m == pytest.approx(FADE_M, rel=0.35)
     assert sum(one.is_learned for one in fit.fades) == 3

@@ -1,4 +1,4 @@
-"""Messages and marginals against the equation, enumeration of all cases, and a library."""
+"""Messages and marginals compared with the equation, with enumeration, and with a library."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DISSENT = 0.49
 def heard(
     graph: FactorGraph, frames: Iterable[Mapping[str, int]], *, near: bool = False
 ) -> dict[str, float]:
-    """Probabilities of an established approach after some frames."""
+    """Probabilities of an established approach after the frames."""
     speaker = source_speaker(graph, DISSENT)
     belief = begin(graph)
     for counts in frames:
@@ -62,7 +62,7 @@ def enumerated(graph: FactorGraph, frames: Sequence[Mapping[str, int]]) -> dict[
 def sent(
     graph: FactorGraph, frames: Iterable[Mapping[str, int]]
 ) -> Iterable[tuple[CueNode, Edge, int]]:
-    """Every cue's detections along every edge."""
+    """Yield every cue's detections along every edge."""
     cues = {cue.name: cue for cue in graph.cues}
     for counts in frames:
         for edge in graph.edges:

@@ -1,4 +1,4 @@
-"""A range weighed by somebody else is taken up along the way: never twice, never in leaps."""
+"""Tests of following a tracker's range over distance: without double counting and jumps."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_one_that_cannot_be_about_the_same_place_replaces_the_belief() -> None:
 
 @pytest.mark.parametrize("take_up_m", [0.0, 3.0, 10.0, 40.0])
 def test_its_errors_are_as_large_as_it_says(take_up_m: float) -> None:
-    """The other's range is the mean of all measurements so far: the later, the better."""
+    """The tracker's range is the mean of all measurements so far, so later ones are better."""
     rng = np.random.default_rng(5)
     settings = SETTINGS.model_copy(update={"take_up_m": take_up_m, "gate_nis": None})
     squares = []

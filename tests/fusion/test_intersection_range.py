@@ -1,4 +1,4 @@
-"""The scalar filter against answers worked out by hand, the printed equations, and chance."""
+"""Scalar filter compared with hand-computed results, the printed equations, and simulation."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_steps_agree_with_equations_8_to_12_as_printed(
             gain = var_m2 / (var_m2 + sensor_var_m2)
             mean_m, var_m2 = mean_m + gain * (measured_m - mean_m), (1.0 - gain) * var_m2
 
-    # The mean passes through hundreds of metres, so its rounding is absolute.
+    # The mean reaches hundreds of metres, so its rounding error is absolute.
     assert belief.mean_m == pytest.approx(mean_m, rel=1e-12, abs=1e-11)
     assert belief.var_m2 == pytest.approx(var_m2, rel=1e-11)
 

@@ -1,4 +1,4 @@
-"""One frame is not evidence, nor is the same frame again; what stays is believed a few times."""
+"""Tests of persistence: single and repeated frames do not count, lasting cues count a few times."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def frames_of(
 
 
 def strongest(steps: Sequence[Step]) -> float:
-    """How far any feature was ever believed or disbelieved, from 0.5."""
+    """Maximum distance of any feature's probability from 0.5."""
     said = [abs(p - 0.5) for step in steps for p in step.probabilities.values()]
     return max(said, default=0.0)
 
@@ -113,7 +113,7 @@ def test_more_frames_over_the_same_way_are_hardly_more_evidence(frames: int, way
         for _ in range(frames)
     )
 
-    # An unbroken view of a way is worth half as many independent ones as it has fading lengths.
+    # Continuous observation counts as half as many independent ones as there are fading lengths.
     assert message * (1.0 - 1e-9) <= total <= message * (1.0 + way_m / 20.0) + 1e-9
 
 

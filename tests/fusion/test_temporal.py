@@ -1,4 +1,4 @@
-"""The belief over time: exact against enumeration, and the laws that it keeps."""
+"""Hidden Markov model: compared with enumeration, and its invariants."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ def learned(**changes: object) -> Temporal:
 
 Frame = tuple[dict[str, int], float, list[MeasuredRange]]
 State = tuple[int, int]
-"""A cell, and a way: left, none of them, or no intersection."""
+"""A cell, and outgoing roads: left, none, or no intersection."""
 CELLS, LEFT, NO_WAY, NOWHERE = 5, 0, 1, 2
 P_WAY: Final = (0.7, 0.3)
 
 
 def enumerated(about: Temporal, frames: list[Frame]) -> Floats:
-    """Probabilities of intersection and left by summing over every path of states."""
+    """Probabilities of intersection and left by a sum over all paths of states."""
     states = list(itertools.product(range(CELLS), range(3)))
     total = np.zeros(3)
     for path in itertools.product(states, repeat=len(frames)):
@@ -111,7 +111,7 @@ def path_weight(about: Temporal, frames: list[Frame], path: tuple[State, ...]) -
 
 def prior(about: Temporal, state: State) -> float:
     cell, way = state
-    # Of the cells, the first lies behind the rear axle.
+    # The first cell is behind the rear axle.
     place = 1.0 / (CELLS - 1) if cell > 0 else 0.0
     return place * (1.0 - about.ahead if way == NOWHERE else about.ahead * P_WAY[way])
 
@@ -292,7 +292,7 @@ SEQUENCE = st.lists(
     min_size=1,
     max_size=40,
 )
-"""Counts, way and its variance, a sign's range, whether the picture is new."""
+"""Counts, distance and its variance, a sign's range, and whether the picture is new."""
 
 
 @given(SEQUENCE, st.floats(0.0, 0.2))
@@ -315,7 +315,7 @@ def test_what_a_run_writes_keeps_the_bounds_and_the_hysteresis(
             continue
         intersection = step.probabilities["intersection"]
         assert 0.0 < step.probabilities["left"] <= intersection + 1e-12 < 1.0
-        # Established above 0.9, withdrawn below 0.5, and as before in between.
+        # Established above 0.9, withdrawn below 0.5, and unchanged in between.
         limit = fusion.withdrawn if was else fusion.established
         if abs(intersection - limit) > 1e-9:
             assert step.established == (intersection > limit)

@@ -1,4 +1,4 @@
-"""What is counted along drives: rates that come back, and an exponent that notices repetition."""
+"""Fit of the hidden Markov model: it recovers rates, and its exponent reflects repetition."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STAYS, APPEARS = 0.8, 0.15
 
 
 def drive(number: int, *, is_ahead: bool, left: bool) -> AnnotatedDrive:
-    """Thirty frames two metres apart; a left road is seen as a chain, another cue repeats it."""
+    """Thirty frames at intervals of two metres; one cue is a chain, another one repeats it."""
     rng = np.random.default_rng([number, 3])
     n = 30
     road = np.zeros(n, np.int64)

@@ -1,4 +1,4 @@
-"""Laws of the compass and of its fit. The fields here are simulated."""
+"""Properties of the compass and of its fit. The magnetic fields are simulated."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def readings(
     sd_t: float = 0.0,
     seed: int = 0,
 ) -> Floats:
-    """What the magnetometer of a car with this heading and attitude would read."""
+    """Simulate the magnetometer of a car with this heading and attitude."""
     north = math.pi / 2 - compass.declination_rad - heading_rad - compass.mounting_yaw_rad
     level = np.column_stack(
         [LEVEL_T * np.cos(north), LEVEL_T * np.sin(north), np.full(len(north), -DOWN_T)]

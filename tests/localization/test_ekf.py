@@ -1,4 +1,4 @@
-"""Laws of the pose filter, and filterpy beside it."""
+"""Properties of the pose filter, and comparison with filterpy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def belief(
 
 
 def slope(function: Callable[[Floats], Floats], at: Floats) -> Floats:
-    """Central differences, angles taken the shorter way."""
+    """Central differences, with wrapped angles."""
     columns = []
     for i in range(len(at)):
         step = np.zeros(len(at))

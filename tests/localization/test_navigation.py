@@ -1,4 +1,4 @@
-"""Equation 4 and its memory: laws of angles, and what repeated decisions cost."""
+"""Tests of eq. 4 and its memory: invariances of angles, and the cost of repeated decisions."""
 
 import math
 
@@ -67,7 +67,7 @@ def test_a_repeated_decision_costs_more_each_time_until_another_wins() -> None:
     memory, headings, bearings = empty_memory(), np.array([0.0, math.pi / 2]), np.array([0.1, 0.1])
     taken = []
     for visit in range(6):
-        # Each time the car believes itself a little elsewhere; the place is the same.
+        # The estimated position differs slightly each time; the place is the same.
         x, y = 3.0 * visit, -2.0 * visit
         place = recognise(memory, x, y, RADIUS_M)
         penalties = np.array([penalty(memory, place, h, SAME_RAD, EACH_RAD) for h in headings])

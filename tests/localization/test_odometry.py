@@ -1,4 +1,4 @@
-"""Laws of dead reckoning from wheel speeds."""
+"""Properties of dead reckoning from wheel speeds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def both_wheels(speed_mps: float, n: int = 101) -> WheelSpeeds:
 
 
 def on_circle(radius_m: float, speed_mps: float, n: int = 101) -> WheelSpeeds:
-    """Four wheels rolling without slip about a point beside the rear axle, to the left."""
+    """Four wheels rolling without slip about a point to the left of the rear axle."""
     yaw = speed_mps / radius_m
     left, right = radius_m - TRACK_M / 2, radius_m + TRACK_M / 2
     front = [math.hypot(left, BASE_M) * yaw, math.hypot(right, BASE_M) * yaw]
@@ -123,7 +123,7 @@ def test_a_larger_right_tyre_is_corrected() -> None:
 
 
 def test_a_gyro_faster_than_the_wheels_is_integrated_not_sampled() -> None:
-    """A bump between two wheel rows, seen by the gyro alone, is not lost."""
+    """A bump between two wheel rows that only the gyro measures is not lost."""
     bump = np.zeros(11)
     bump[5] = 1.0
     rate = TurnSignal(times(11, 10_000_000), bump, "yaw rate")
@@ -179,7 +179,7 @@ def test_a_gap_is_reported_and_makes_unsure() -> None:
 
 
 def test_a_gap_contains_what_a_car_may_do_meanwhile() -> None:
-    """Brake at the limit and speed up again: within three of the stated deviations."""
+    """Brake at the limit and accelerate again: the error is within three stated s.d."""
     t_ns = np.array([0, 4_000], np.int64) * 1_000_000
     made = integrate(WheelSpeeds(t_ns, np.full((2, 2), 15.0)), CAR).increments
     true_m = 15.0 * 4.0 - 3.0 * 2.0**2
@@ -204,7 +204,7 @@ def test_variances_do_not_depend_on_the_sampling_rate(kind: str) -> None:
 
 
 def test_rounding_of_the_wheel_speed_is_in_the_variance() -> None:
-    """Simulated: random true speeds, rounded; the distance is off by as much as claimed."""
+    """Simulated: random true speeds, rounded; the distance's error matches its variance."""
     rng = np.random.default_rng(8)
     car = replace(CAR, wheel_step_mps=0.5, slip_per_sqrt_m=0.0)
     misses, claims = [], []
@@ -220,7 +220,7 @@ def test_rounding_of_the_wheel_speed_is_in_the_variance() -> None:
 
 
 def test_speed_readings_alone_lead_to_the_distances_variance() -> None:
-    """White speed errors of the stated variance add up to the stated variance of the way."""
+    """White speed errors of the stated variance yield the stated variance of the distance."""
     for rate_hz in (10.0, 100.0):
         dt_s = 1.0 / rate_hz
         t_ns = times(round(rate_hz) + 1, round(dt_s * 1e9))
@@ -334,7 +334,7 @@ def test_windows_give_the_same_increments_bit_for_bit(
 
 
 def test_waiting_rows_stay_few() -> None:
-    """A window's rest is what the next one needs, however long the drive."""
+    """The pending rows of a window do not grow with the length of the drive."""
     pending = Pending()
     for k in range(50):
         t_ns = times(100) + k * 2_000_000_000

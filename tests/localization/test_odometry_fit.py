@@ -1,4 +1,4 @@
-"""Laws of odometry fitted to known positions, on simulated drives."""
+"""Properties of the fit of odometry to known positions, on simulated drives."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LEVER = (1.5, -0.4)
 
 
 def positions(truth: Truth, sd_m: float, rng: np.random.Generator, lever: bool = True) -> Fixes:
-    """A position of the antenna each second."""
+    """Positions of the antenna, one per second."""
     rows = slice(0, None, 20)
     x, y, heading = truth.xyh[rows].T
     ahead, left = LEVER if lever else (0.0, 0.0)
@@ -38,14 +38,14 @@ def positions(truth: Truth, sd_m: float, rng: np.random.Generator, lever: bool =
 
 
 def wrong_gyro(truth: Truth, rng: np.random.Generator) -> TurnSignal:
-    """A gyro that reports too much, and something at rest."""
+    """A gyro with a scale error and a bias."""
     right = gyro(truth, CAR, rng)
     values = right.values / TRUE["yaw_rate_scale"] + TRUE["gyro_bias_radps"]
     return TurnSignal(right.t_ns, values, "yaw rate")
 
 
 def known(truth: Truth, rng: np.random.Generator, sd_m: float = 0.5) -> KnownDrive:
-    """The drive of a car whose wheels report too little and whose gyro is biased."""
+    """Drive of a car whose wheels report too low speeds and whose gyro is biased."""
     car = wheels(truth, CAR, rng)
     car = replace(car, wheels_mps=car.wheels_mps / TRUE["wheel_scale"])
     return KnownDrive(car, wrong_gyro(truth, rng), positions(truth, sd_m, rng), LEVER)

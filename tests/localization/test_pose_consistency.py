@@ -1,6 +1,6 @@
-"""The track over columns: equal to the filter's functions, whole in windows, errors as claimed.
+"""Tests of pose tracks: equal to the filter's functions, independent of windows, and consistent.
 
-All drives here are simulated, with exactly the noise that the filter assumes.
+All drives are simulated, with exactly the noise that the filter assumes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ EVERY_READING = TrackSettings(heading_interval_m=0.0, heading_gate_nis=None)
 
 
 def begin(truth: Truth, rng: np.random.Generator, heading_sd: float = 0.05) -> PoseBelief:
-    """A start that is off by as much as it says."""
+    """A start whose errors match its covariance."""
     x, y, heading = truth.xyh[0] + rng.normal(0.0, [1.0, 1.0, heading_sd])
     speed = truth.speed_mps[0] + rng.normal(0.0, 1.0)
     return start_belief(int(truth.t_ns[0]), x, y, heading, speed, 1.0, heading_sd, 1.0)
@@ -90,7 +90,7 @@ def test_simulated_errors_are_as_large_as_claimed() -> None:
 
 
 def test_simulated_compass_errors_that_last_need_an_interval() -> None:
-    """An error that fades over 2 s, read at 10 Hz: overconfident unless readings are thinned."""
+    """An error that decays over 2 s, read at 10 Hz: overconfident unless readings are thinned."""
     thinned = TrackSettings(heading_interval_m=0.0, heading_interval_s=4.0, heading_gate_nis=None)
 
     def mean_nees(settings: TrackSettings) -> float:
@@ -104,7 +104,7 @@ def test_simulated_compass_errors_that_last_need_an_interval() -> None:
 def reference(
     belief: PoseBelief, made: Increments, settings: TrackSettings, headings: Headings
 ) -> PoseBelief:
-    """The track by the filter's own functions, one at a time."""
+    """Compute the track step by step with the filter's functions."""
     waiting = list(zip(headings.t_ns, headings.heading_rad, headings.var_rad2, strict=True))
     for k in range(len(made)):
         start, stop = int(made.start_ns[k]), int(made.stop_ns[k])
@@ -164,7 +164,7 @@ def cut(t_ns: Int64s, low: int, high: int) -> slice:
 def test_windows_give_the_same_track_bit_for_bit(
     cuts: list[int], seed: int, hole: int, every_interval: bool
 ) -> None:
-    """Gyro on its own clock and with a hole, headings between samples, rows at frame times."""
+    """Gyro with a separate clock and a gap, headings between samples, rows at frame times."""
     rng = np.random.default_rng(seed)
     truth = drive(rng, seconds=12.0)
     zero = int(truth.t_ns[0])

@@ -1,4 +1,4 @@
-"""GNSS positions weighed into the pose: as landmarks are, at their own times. Simulated."""
+"""Updates of the pose with GNSS positions: equal to those with landmarks. Simulated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_position_is_weighed_in_as_the_antennas() -> None:
     wanted = update_camera_position(belief, np.array([5.5, 5.2]), COV, LEVER_M, None).belief
 
     assert found is not None
-    # The landmark's update is linear in the heading; this one turns the lever with it.
+    # The landmark's update is linear in the heading; this one rotates the lever.
     np.testing.assert_allclose(found.mean, wanted.mean, atol=2e-4)
     np.testing.assert_allclose(found.cov, wanted.cov, atol=2e-3)
 

@@ -1,4 +1,4 @@
-"""The batch smoother: exact where all is linear, never worse than the filter, honest. Simulated."""
+"""Batch smoother: exact in the linear case, never worse than the filter, consistent. Simulated."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def straight(n: int, slip: float) -> Increments:
 
 
 def test_along_a_straight_line_it_is_the_least_squares_solution() -> None:
-    """Heading known, slip along: positions are a chain of Gaussians, solved by hand here."""
+    """With known heading and slip only, positions are a chain of Gaussians, solved by hand."""
     slip, fix_var, start_var = 0.5, 4.0, 9.0
     made = straight(10, slip)
     start = start_belief(0, 3.0, 0.0, 0.0, 10.0, math.sqrt(start_var), 1e-4, 1.0)
@@ -104,17 +104,17 @@ def one(seed: int) -> tuple[Truth, PoseBelief, Increments, Headings, Fixes]:
 
 
 class FixLooks:
-    """Hands the fixes to the filter."""
+    """Provides the fixes as measurements of the filter."""
 
     def __init__(self, fixes: Fixes) -> None:
         self.fixes = fixes
 
     def times_ns(self) -> list[int]:
-        """Of the fixes."""
+        """Times of the fixes."""
         return [int(t) for t in self.fixes.t_ns]
 
     def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """Weigh one in."""
+        """Update with one fix."""
         i = int(np.searchsorted(self.fixes.t_ns, belief.t_ns))
         return update_camera_position(belief, self.fixes.xy_m[i], self.fixes.cov_m2[i]).belief
 
@@ -127,7 +127,7 @@ def errors(truth: Truth, t_ns: Int64s, xyh: Floats) -> Floats:
 
 @pytest.mark.slow
 def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> None:
-    """Seeds 0 to 29: at the end both know the same; in the middle the smoother knows more."""
+    """Seeds 0 to 29: at the end both are equal; in the middle the smoother is better."""
     nees, filter_m2, smoother_m2, ends = [], [], [], []
     for seed in range(30):
         truth, first, made, headings, fixes = one(seed)
@@ -151,7 +151,7 @@ def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> Non
 
 @pytest.mark.slow
 def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() -> None:
-    """Position is held a hundred million times more loosely than each step: seed 5, 24 km."""
+    """The position's information is 1e-8 of each step's: seed 5, 24 km."""
     rng, n = np.random.default_rng(5), 12_000
     settings = OdometrySettings(
         track_width_m=TRACK_M, slip_per_sqrt_m=2e-3, wheel_turn_rad_per_sqrt_m=3e-3, max_gap_s=2.0
@@ -167,7 +167,7 @@ def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() 
     sd_m = math.sqrt(found.cov[0, 1, 1])
     assert 20.0 < sd_m < 60.0
     assert found.xyh[0, 1] == pytest.approx(end.y_m[-1], abs=0.02 * sd_m)
-    # Along the way a filter that linearises at noisy headings falls short by a little.
+    # During the drive, a filter that linearises at noisy headings is slightly worse.
     assert found.xyh[0, 0] == pytest.approx(end.x_m[-1], abs=10.0)
     assert sd_m == pytest.approx(math.sqrt(end.cov_xyh[-1, 3]), rel=0.1)
 

@@ -1,4 +1,4 @@
-"""Whatever could have been a cue is counted: used, or skipped with its reason."""
+"""All candidates of cues are counted: used, or skipped with a reason."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -35,7 +35,7 @@ FRAMES = st.lists(st.lists(BOX, max_size=5), min_size=1, max_size=4)
 
 
 def _found(t_ns: int, *things: tuple[str, float, float]) -> Detections:
-    """Things 40 px high at the left, each with a label, score and width."""
+    """Objects 40 px high at the left, each with a label, score and width."""
     boxes = np.array([(5.0, 5.0, 5.0 + width, 45.0) for _, _, width in things]).reshape(-1, 4)
     scores = np.array([score for _, score, _ in things], np.float64)
     labels = tuple(label for label, _, _ in things)

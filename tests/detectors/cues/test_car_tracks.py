@@ -1,4 +1,4 @@
-"""Cars followed on the road: what stands never crosses, whatever the camera does."""
+"""Tracking of cars on the road: a standing car never crosses, for any motion of the camera."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WAY_M = 0.8
 
 @dataclass(frozen=True)
 class Car:
-    """A car seen from the side, as a board across the road; it may move."""
+    """A car seen from the side, as a rectangle across the road; it can move."""
 
     ahead_m: float
     right_m: float
@@ -50,7 +50,7 @@ def drive(
     seed: int = 0,
     tracks: CarTracks | None = None,
 ) -> Iterator[list[CarMotion]]:
-    """What is known of the cars after each frame of a drive."""
+    """Motions of the cars after each frame of a drive."""
     rng = np.random.default_rng(seed)
     tracks = tracks or CarTracks(CAMERA, RULES)
     x = y = heading = time_s = 0.0
@@ -90,7 +90,7 @@ def found(boxes: np.ndarray[tuple[int, int], np.dtype[np.float64]], noses: list[
 
 
 def mask(box: np.ndarray[tuple[int], np.dtype[np.float64]], nose: int) -> bytes:
-    """A wedge whose lower end is the nose; nothing where it is unknown."""
+    """A wedge whose lower end is the nose; empty if the nose is unknown."""
     x0, y0, x1, y1 = (round(value) for value in box.tolist())
     if not nose or min(x0, y0) < 0 or x1 >= SIZE[0] or y1 >= SIZE[1]:
         return b""
@@ -218,7 +218,7 @@ def test_more_frames_show_that_a_far_car_aside_stands(
 
 @given(bearing=st.floats(-0.9, 0.9))
 def test_a_car_along_the_street_is_not_parked_across_it(bearing: float) -> None:
-    # Its length is foreshortened, its width is not: what its outline is long at this bearing.
+    # Length of its outline at this bearing: its length is foreshortened, its width is not.
     long = (CAR_LENGTH_M * abs(bearing) + 1.8) / CAR_HEIGHT_M
     car = CarMotion(1, 10, 30.0, bearing, 0.0, 0.1, 0.0, 0.5, True, long, 1.0)
 
@@ -226,7 +226,7 @@ def test_a_car_along_the_street_is_not_parked_across_it(bearing: float) -> None:
 
 
 def past(car: Car, steps: Sequence[Motion], place: Place | None) -> Ways | None:
-    """What counts past the intersection after the last step."""
+    """Counts of cars past the intersection after the last step."""
     tracks = CarTracks(CAMERA, RULES)
     for _ in drive([car], steps, tracks=tracks):
         pass

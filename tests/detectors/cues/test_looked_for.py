@@ -1,4 +1,4 @@
-"""A cue that no detector can report is not looked for, which is not the same as found none."""
+"""A cue that no detector can report is not evaluated, which differs from a count of zero."""
 
 from pathlib import Path
 

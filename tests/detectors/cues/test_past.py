@@ -1,4 +1,4 @@
-"""Lane lines and vehicles past an intersection: from a Mobileye's bus to counts."""
+"""Counts of lane lines and vehicles past an intersection, from a Mobileye's bus."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_a_further_end_never_has_more_vehicles_past_it_and_sides_are_alike(
 
 
 def said(n: int, rng: np.random.Generator) -> Samples:
-    """Bursts ten a second, each opened by a row without a place, then up to three vehicles."""
+    """Ten bursts per second, each with a row without a position and up to three vehicles."""
     t_ns, values = [], []
     for burst in range(n):
         for row in [[burst, *[NAN] * 7], *[obstacle(9.0, 1.0, burst=burst)] * rng.integers(0, 4)]:
@@ -255,7 +255,7 @@ def windows_of(folder: Path, vehicle: Vehicle) -> list[Window]:
 
 @pytest.mark.slow
 def test_on_a_simulated_drive_lines_and_vehicles_past_it_are_counted(tmp_path: Path) -> None:
-    """L303 has a road ahead with cars on it: both cues come up before the car is there."""
+    """L303 has a road ahead with cars on it; both cues are positive before the intersection."""
     tiny = SceneSettings(layout="L303", camera=replace(Camera(), width_px=192, height_px=108))
     files = write_scene(tmp_path, tiny)
     ranges = np.loadtxt(tmp_path / "ranges.csv", delimiter=",", skiprows=1)

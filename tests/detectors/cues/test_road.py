@@ -1,4 +1,4 @@
-"""Fractions of road in regions: scaled with the picture, left for right in a mirror."""
+"""Fractions of road in regions: invariant to scale, and exchanged by a mirror image."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Regions on the ground: the ego road is not a side road; regions too far away are not seen."""
+"""Ground regions: the ego road is not a side road; regions too far away are not seen."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DEPTH_M = 16.0
 def pictured(
     right_m: float, left_m: float, place: Place | None = None, *, legs: str = "", ahead: bool = True
 ) -> RoadMask:
-    """A level road from so far right to so far left of the ego vehicle, and legs at a place."""
+    """A level road of given width about the ego vehicle, with side roads at a place."""
     width, height = MASK
     y, x = np.mgrid[0:height, 0:width] + 0.5
     scale = SIZE[0] / width

@@ -1,4 +1,4 @@
-"""Crossing and parked cars: the source's rules of shape, association, motion and nose."""
+"""Crossing and parked cars: the dissertation's rules of shape, association, motion and nose."""
 
 from dataclasses import replace
 
@@ -149,7 +149,7 @@ def test_runs_are_written_as_coco_writes_them() -> None:
     corner = np.array([[True]])
 
     assert rle.encode(corner, (0, 0), (2, 2)) == b"013"  # none, one, three
-    # 40 = 8 + 32: five bits "8" with the mark for more (8 + 32 + 48 = 'X'), then 1 ('1').
+    # 40 = 8 + 32: five bits "8" with the continuation bit (8 + 32 + 48 = 'X'), then 1 ('1').
     assert rle.encode(corner, (0, 40), (1, 41)) == b"X11"
 
 

@@ -1,4 +1,4 @@
-"""Each layout from constant tensors whose boxes are known, in an input that is not square.
+"""Decoding of each layout from constant tensors with known boxes, in a non-square input.
 
 The table's law: every decoder has a sample here; it gives the sample's boxes; it refuses outputs of
 another shape in words; and ``recognise`` finds it from the file's declared shapes.

@@ -1,4 +1,4 @@
-"""The ground in the picture of a camera that is mounted at any angle."""
+"""Projection of the ground for a camera mounted at any angle."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def test_the_mounting_is_a_turn_as_scipy_has_it(yaw: float, pitch: float, roll: 
 
 
 def test_signs_are_those_of_the_vehicle_file() -> None:
-    """A camera that points to the left sees what is ahead on its right, and so on."""
+    """A camera that points to the left sees objects ahead on its right, and so on."""
     x, y = plane().ahead_px()
 
     assert plane(yaw_rad=0.1).ahead_px()[0] == pytest.approx(x + 900.0 * math.tan(0.1))
     assert plane(pitch_rad=0.1).ahead_px()[1] == pytest.approx(y - 900.0 * math.tan(0.1))
-    # Its right side down, the horizon runs up to the right ... of a level one's middle.
+    # With its right side down, the horizon rises to the right, about a level camera's centre.
     left, right = plane(roll_rad=0.1).horizon_px(np.array([0.0, 1280.0]))
     assert right < y < left
 

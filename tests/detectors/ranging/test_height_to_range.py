@@ -1,4 +1,4 @@
-"""Curves from heights to ranges: exact without errors, and not swayed by wrong masks."""
+"""Curves from heights to ranges: exact without errors, and robust to wrong masks."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ TRUE: dict[Family, tuple[float, ...]] = {
 
 
 def pairs(family: Family, seed: int, sd: float, pairs: int = 300) -> tuple[Floats, Floats]:
-    """Heights of 12 to 400 px and ranges of a true curve, off by ``sd`` of the range."""
+    """Heights of 12 to 400 px and ranges of a true curve, with a relative error of ``sd``."""
     rng = np.random.default_rng(seed)
     height_px = np.exp(rng.uniform(np.log(12.0), np.log(400.0), pairs))
     curve = RangeCurve(family=family, parameters=TRUE[family], residual_sd_m=1.0)

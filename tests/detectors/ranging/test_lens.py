@@ -1,4 +1,4 @@
-"""A lit lens is told from a housing seen from behind: drawn ones, and real ones judged by eye."""
+"""Lit lenses and housings seen from behind are distinguished, in drawings and real pictures."""
 
 from collections import Counter
 from dataclasses import replace
@@ -38,7 +38,7 @@ def test_a_housing_from_behind_is_dark_also_before_a_coloured_wall() -> None:
     behind = housing(None)
     assert lens_of(behind, BOX) == "dark"
 
-    # A box drawn wide shows some of a red wall on either side: high and narrow, no lens.
+    # A wide box shows a red wall on either side, which is high and narrow, and no lens.
     red = behind.copy()
     red[:, :20], red[:, 44:] = BGR["red"], BGR["red"]
     assert lens_of(red, BOX + np.array([-3.0, 0.0, 3.0, 0.0])) == "dark"
@@ -82,7 +82,7 @@ def test_only_lights_are_looked_at_in_the_pixels_that_there_are_and_the_cache_ke
 
 @pytest.mark.parametrize("colour", ["red", "yellow", "green"])
 def test_real_lit_lights_are_seldom_another_colour(colour: Lens) -> None:
-    """60 crops each from LISA, all lit, 32 px across and squeezed: a hard case, as is said."""
+    """60 crops each from LISA, all lit, 32 px across and distorted: a difficult case."""
     files = sorted((shared("signs/traffic_light_state_crops") / colour).glob("*.jpg"))
     found = Counter(_whole(cv2.imread(str(file))) for file in files)
 

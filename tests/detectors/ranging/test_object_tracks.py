@@ -1,4 +1,4 @@
-"""Objects followed through frames: each keeps its own heights, wherever boxes come from."""
+"""Tracking of objects over frames: each track has only the heights of its object."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Range and height from growth: exact where nothing errs, honest about its own error where it does.
+"""Range and height from growth: exact without errors, and consistent with errors.
 
 Tracks are simulated by the model itself: sizes from the prior, errors of successive frames alike.
 """
@@ -20,7 +20,7 @@ NO_ERRORS = HeightErrors(fraction=1e-5, edges_px=0.0)
 
 
 def alike(travelled_m: Floats, over_m: float, rng: np.random.Generator) -> Floats:
-    """Standard normal errors that resemble each other by exp(-distance / over_m)."""
+    """Standard normal errors with autocorrelation exp(-distance / over_m)."""
     errors = [float(rng.normal())]
     for step_m in np.abs(np.diff(travelled_m)).tolist():
         rho = float(np.exp(-step_m / over_m))
@@ -76,7 +76,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says(gone_m: float, step_m:
     sigmas = np.array([_sigmas(one, m) for one, (_, m) in zip(found, pairs, strict=True)])
     assert 0.93 <= float(np.mean(np.abs(sigmas) < 1.96)) <= 0.97
     off = np.array([one.mean_m / m - 1.0 for one, (_, m) in zip(found, pairs, strict=True)])
-    # A posterior that leans to the far side has its mean a little beyond its median.
+    # The mean of a posterior skewed to the far side is slightly beyond its median.
     assert abs(float(np.median(off))) < 0.06
     assert abs(float(sigmas.mean())) < 0.15
 

@@ -1,4 +1,4 @@
-"""Standard sizes: what a box's shape says of a light, and what others of its make say."""
+"""Size priors of lights, from the aspect of the box and from others of the same make."""
 
 import numpy as np
 import pytest

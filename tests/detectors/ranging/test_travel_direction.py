@@ -1,4 +1,4 @@
-"""Where a camera goes is seen in what it sees."""
+"""Tests of the direction of travel from two pictures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CENTER_PX = (320.0, 200.0)
 
 
 def street(camera: Floats, looks: Rotation) -> Bytes:
-    """Dots in space, x right, y down, z ahead, as a camera sees them from a place."""
+    """Points in space (x right, y down, z ahead), projected to a camera at a position."""
     rng = np.random.default_rng(4)
     dots = np.stack(
         [rng.uniform(-12, 12, 400), rng.uniform(-6, 3, 400), rng.uniform(8, 40, 400)], 1
@@ -34,7 +34,7 @@ def street(camera: Floats, looks: Rotation) -> Bytes:
 def test_the_axis_is_beside_and_below_the_way_by_its_mounting(
     left_deg: float, below_deg: float
 ) -> None:
-    # About y (down): positive turns z towards x, to the right. About x (right): z turns upwards.
+    # A positive rotation about y (down) turns z towards x, to the right; about x, upwards.
     looks = Rotation.from_euler("yx", [-left_deg, -below_deg], degrees=True)
     before, after = (street(np.array([0.0, 0.0, z]), looks) for z in (0.0, 0.7))
 

@@ -1,4 +1,4 @@
-"""The landmark database: what goes in comes out, the ellipse is a query, damage is refused."""
+"""Landmark database: round trip, queries by ellipse, and rejection of damaged files."""
 
 from __future__ import annotations
 
@@ -355,7 +355,7 @@ def _in_child(
 
 
 def test_a_writer_killed_half_way_leaves_what_was_there(tmp_path: Path) -> None:
-    """Its pages are on the disk already (a tiny cache spills): reading rolls them back."""
+    """Its pages are already on disk, because of a tiny cache; reading rolls them back."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     before = path.stat().st_size
 
@@ -370,7 +370,7 @@ def test_a_writer_killed_half_way_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_fills_up_is_reported_and_leaves_what_was_there(tmp_path: Path) -> None:
-    """The kernel refuses to let the file grow, as a full disk would."""
+    """The kernel limits the file's size, with the effect of a full disk."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
 
     done = _in_child(path, 200, max_bytes=200_000)

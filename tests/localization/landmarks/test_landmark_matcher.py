@@ -1,4 +1,4 @@
-"""The matcher: the same place is told from others, whatever the view; some pictures are real."""
+"""Matcher: it distinguishes the same place from others; some pictures are real."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_raw_pictures_are_grey_whatever_their_colours() -> None:
 
 
 def test_real_street_pictures_match_their_neighbours_and_no_other_street() -> None:
-    """KITTI, frames about 1 m apart, through a turn of 98 degrees."""
+    """KITTI, frames at intervals of about 1 m, in a turn of 98 degrees."""
     folder = shared("sequences", "kitti_seq2_right_turn_98deg", "image_l")
     seen = [ORB.describe(grey_of(read_picture(folder / f"{i:06d}.png"))) for i in (0, 3, 47, 50)]
 
@@ -196,7 +196,7 @@ def test_real_street_pictures_match_their_neighbours_and_no_other_street() -> No
 
 
 def test_real_pictures_of_other_days_mostly_do_not_match() -> None:
-    """Two of eight known pairs stand out: ORB does not see through seasons and restyling."""
+    """Two of eight known pairs are distinct: ORB is not robust to seasons and restyling."""
     folder = shared("place_recognition")
     orb = OrbMatcher(OrbSettings(features=1000))
     seen = {p.stem: orb.describe(grey_of(read_picture(p))) for p in folder.rglob("*.jpg")}

@@ -1,4 +1,4 @@
-"""Landmarks in the pose filter: consistent, symmetric, once per visit. All drives are simulated."""
+"""Updates with landmarks: consistent, symmetric, once per visit. All drives are simulated."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_camera_ahead_of_the_axle_is_no_bias(tmp_path: Path) -> None:
-    """Heading errors swing the camera: the covariance swings along."""
+    """Heading errors rotate the camera's position, and its covariance includes this."""
     runs = [run(tmp_path, seed, (5.0, 1.0)) for seed in range(SEEDS)]
 
     nis = np.array([s.nis for _, _, looks in runs for s in looks.search.sightings])
@@ -212,7 +212,7 @@ def straight(length_m: float = 400.0, speed_mps: float = 10.0) -> Truth:
 def follow(
     path: Path, truth: Truth, marks: dict[str, Floats], options: LandmarkSettings, **start: float
 ) -> tuple[Advance, PlaceLooks]:
-    """Drive without noise past landmarks at their true places."""
+    """Simulate a drive without noise past landmarks at their true positions."""
     if not path.exists():
         with LandmarkWriter(path, "nearness") as writer:
             for name, xy in marks.items():
@@ -235,7 +235,7 @@ def follow(
 
 
 def test_a_landmark_counts_once_at_its_best(tmp_path: Path) -> None:
-    """Odometry starts 8 m off; what is weighed in is where the car was at the peak, carried on."""
+    """Odometry starts 8 m off; the measurement is the position at the peak, moved ahead."""
     done, looks = follow(
         tmp_path / "lm.sqlite", straight(), {"gate": np.array([100.0, 0.0])}, SETTINGS, x_m=8.0
     )
@@ -286,7 +286,7 @@ def test_a_second_visit_counts_only_after_a_while(tmp_path: Path) -> None:
 
 
 def test_only_landmarks_inside_the_ellipse_are_compared(tmp_path: Path) -> None:
-    """A twin that looks the same, a hundred metres off, is not even asked."""
+    """An identical landmark at a distance of 100 m is not compared."""
     place = np.array([100.0, 0.0])
     path = tmp_path / "twins.sqlite"
     with LandmarkWriter(path, "nearness") as writer:
@@ -316,7 +316,7 @@ def test_no_landmarks_at_all_leave_the_track_as_it_was(tmp_path: Path) -> None:
 
 
 def test_a_lost_car_is_found_again_by_a_landmark(tmp_path: Path) -> None:
-    """Lost above 100 m of major axis: a start that is off by tens of metres, one landmark."""
+    """A start with an error of tens of metres, lost above 100 m of major axis, and one landmark."""
     done, looks = follow(
         tmp_path / "lm.sqlite",
         straight(),

@@ -1,4 +1,4 @@
-"""Random cities can always be driven: from wherever one may go, every goal can be reached."""
+"""Random cities are connected: every goal can be reached from every reachable place."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def stream(seed: int, purpose: int = 7) -> Stream:
 
 
 def reachable(streets: Streets, start: int, *, backward: bool = False) -> set[int]:
-    """Intersections that can be driven to from ``start``, or from which it can be reached."""
+    """Intersections that can be reached from ``start``, or from which it can be reached."""
     seen, queue = {start}, deque([start])
     while queue:
         node = queue.popleft()

@@ -1,4 +1,4 @@
-"""The compiled drive is the plain one; its filter is consistent; it is lost as physics says."""
+"""Simulated drives: equal with and without compilation, consistent, and lost as predicted."""
 
 import importlib.util
 import math
@@ -166,7 +166,7 @@ def test_parts_of_the_seeds_give_the_same_bytes_as_all_at_once() -> None:
     ids=["30 degrees", "20 degrees", "10 degrees", "landmarks"],
 )
 def test_errors_are_as_large_as_the_filter_says(settings: Drive) -> None:
-    """As far as 400 drives can tell; 20,000 show 4 % too much at 20 to 30 degrees."""
+    """Within the resolution of 400 drives; 20,000 show 4 % too much at 20 to 30 degrees."""
     rows = many(settings, 400)
     low, high = mean_band(3, 400)
 
@@ -174,7 +174,7 @@ def test_errors_are_as_large_as_the_filter_says(settings: Drive) -> None:
 
 
 def test_a_heading_off_by_five_degrees_is_more_than_a_linear_filter_admits() -> None:
-    """Without a compass the true errors are on an arc, the filter's ellipse is straight."""
+    """Without a compass the true errors are on an arc, but the filter's ellipse is straight."""
     rows = many(Drive(sensors=Sensors(compass_2sigma_deg=None)), 400)
     _, high = mean_band(3, 400)
 
@@ -183,7 +183,7 @@ def test_a_heading_off_by_five_degrees_is_more_than_a_linear_filter_admits() -> 
 
 @pytest.mark.parametrize("compass_deg", [20.0, 30.0])
 def test_straight_driving_spreads_as_r_ds_d(compass_deg: float) -> None:
-    """N readings bound the summed heading, whatever the heading's own noise."""
+    """N readings bound the summed heading, regardless of the heading's noise."""
     interval_m, way_m = 2.0, 4000.0
     r = math.radians(compass_deg / 2.0) ** 2
     for slip in (1e-4, 1e-3):
@@ -196,7 +196,7 @@ def test_straight_driving_spreads_as_r_ds_d(compass_deg: float) -> None:
 
 
 def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None:
-    """Few turns: the mean is near 25^2 / (r ds), turns and the start's uncertainty beside."""
+    """With few turns the mean is near 25^2 / (r ds), apart from turns and the start."""
     city = City(
         smallest_km2=400.0,
         largest_km2=400.0,
@@ -206,7 +206,7 @@ def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None
         longest_block_m=1000.0,
         goal_at_least_m=250.0,
     )
-    # Slip enough that the start's heading is soon forgotten.
+    # The slip is large enough for the start's heading to lose its effect soon.
     sensors = Sensors(compass_2sigma_deg=60.0, compass_interval_m=4.0, slip_per_sqrt_m=0.03)
     rows = many(Drive(city=city, sensors=sensors), 200)
     lost = rows[(rows[:, FIELD["outcome"]] == Outcome.LOST) & (rows[:, FIELD["turns"]] == 0)]

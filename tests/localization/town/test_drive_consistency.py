@@ -1,7 +1,7 @@
-"""The simulator's filter is as wrong as it says: NEES and NIS in their chi-square bands.
+"""Consistency of the simulator's filter: NEES and NIS are within their chi-square bands.
 
-Here the wheels' encoders are fine enough to be not a source of error, because the filter does not
-know of their steps. docs/studies.md reports where the filter is overconfident, and by how much.
+The wheel encoders' resolution is too fine to be a source of error here, because the filter ignores
+it. docs/studies.md reports where the filter is overconfident, and by how much.
 """
 
 import math
@@ -34,7 +34,7 @@ def fine(compass_2sigma_deg: float | None, *, goals: int = 1) -> Drive:
 
 
 def compass_innovations(settings: Drive, traced: Traced) -> tuple[Floats, Floats]:
-    """Innovations of the compass, and the variances that the filter gave them."""
+    """Innovations of the compass, and the filter's variances of them."""
     sensors, track_m = settings.sensors, settings.car.track_width_m
     assert sensors.compass_2sigma_deg is not None
     left, right, compass = traced.steps[1:, 4:7].T
@@ -97,7 +97,7 @@ def test_landmark_innovations_are_as_large_as_the_filter_says() -> None:
 
 
 def test_without_a_compass_errors_lie_on_an_arc() -> None:
-    """Over-sure as an ellipse in x, y and heading; honest as a turn and a shift."""
+    """Overconfident as an ellipse in x, y and heading; consistent as a rotation and a shift."""
     settings = fine(None)
     ends = [drive_traced(settings, seed).steps[-1] for seed in range(400)]
     rows = drive_many(settings, np.arange(400, dtype=np.uint64))

@@ -1,4 +1,4 @@
-"""Simulated drives: the same from the same seed, honest about their errors, lost as predicted."""
+"""Simulated drives: reproducible by seed, consistent in their errors, and lost as predicted."""
 
 import numpy as np
 
