@@ -1,4 +1,4 @@
-"""What an error says must fit into a line of ours."""
+"""Messages of any error fit into one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cues and features of one's own as lines of the vehicle file, and what is refused."""
+"""User-defined cues and features in the vehicle file, and refused settings."""
 
 from __future__ import annotations
 

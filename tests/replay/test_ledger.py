@@ -1,4 +1,4 @@
-"""In file = used + skipped + dropped, whatever happens in whatever order."""
+"""The identity in file = used + skipped + dropped holds for any order of events."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Several logs at a time: all are closed, whatever happens to one of them."""
+"""Several open logs are all closed, even if one of them fails."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from support.memory_log import MemoryLog
 
 
 class Opened:
-    """Opens made-up logs, refuses one, and remembers which were closed."""
+    """Opens synthetic logs, refuses one, and records which were closed."""
 
     def __init__(self) -> None:
         self.closed: list[str] = []
 
     def __call__(self, path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
-        """A log, unless its name is ``broken``."""
+        """Open a log, unless its name is ``broken``."""
         if str(path) == "broken":
             raise LogError("broken: not a log")
         closed = self.closed

@@ -1,4 +1,4 @@
-"""Work side by side: the same results in the same order, whatever the number of processes."""
+"""Parallel work returns the same results in the same order for any number of processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from crosscue.replay.processes import in_processes
 
 
 def slow_square(number: int) -> tuple[int, int]:
-    """The first ones take longest."""
+    """Work that takes longest for the first items."""
     time.sleep(0.05 * max(0, 3 - number))
     return number * number, os.getpid()
 

@@ -1,4 +1,4 @@
-"""Logs on object stores, tried with fsspec's store in memory."""
+"""Logs on object stores, tested with fsspec's store in memory."""
 
 import uuid
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from support.can_files import read_back as read_file
 
 @pytest.fixture
 def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """An empty bucket's URL; what is fetched goes under ``tmp_path/store``."""
+    """Return an empty bucket's URL; downloads are stored in ``tmp_path/store``."""
     monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
     name = f"bucket-{uuid.uuid4().hex}"
     system = import_module("fsspec").filesystem("memory")

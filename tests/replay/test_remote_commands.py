@@ -1,4 +1,4 @@
-"""Commands on parts of logs at URLs: what they transfer, counted by the server."""
+"""Commands on parts of remote logs, with the transferred bytes counted by the server."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from support.rosbag_files import rows_of, write_bag
 
 MS = 1_000_000
 FIXED_BYTES = 192 << 10
-"""Head and tail of a log, of which its identity is made, and what is read ahead of records."""
+"""Bytes for the head and tail of a log, which determine its identity, and for the read-ahead."""
 BRIGHT = "support.detecting:build"
 COMMANDS = {
     "info": ["info"],
@@ -39,7 +39,7 @@ COMMANDS = {
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Wheel speeds, yaw rates and ten pictures of noise each second, in chunks of 100 kB."""
+    """Write wheel speeds, yaw rates and ten noise images per second, in chunks of 100 kB."""
     folder = tmp_path_factory.mktemp("drive")
     path = folder / "large_chunks.mcap"
     rng = np.random.default_rng(5)
@@ -75,7 +75,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """A web server; whole logs are kept under ``tmp_path/store``."""
+    """Start a web server; complete logs are stored in ``tmp_path/store``."""
     pytest.importorskip("aiohttp", reason="aiohttp, by which fsspec reads from the web, is missing")
     monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
     with serving() as served:
@@ -145,7 +145,7 @@ def test_a_log_at_a_url_gives_what_it_gives_on_disk(
     for one in files:
         here, there = tmp_path / "here" / one, tmp_path / "there" / one
         if one.name == "skipped.parquet":
-            # Its rows name the log.
+            # Its rows contain the log's name.
             tables = (pq.read_table(path).drop(["log"]) for path in (here, there))
             assert next(tables).equals(next(tables))
             continue
@@ -161,7 +161,7 @@ def test_a_log_at_a_url_gives_what_it_gives_on_disk(
 def test_a_replay_of_a_long_part_fetches_nothing_twice(
     drive: Path, tmp_path: Path, web: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Memory holds a tenth of it, so that the rest goes through the temporary file.
+    # A tenth of it fits into memory, so the rest uses the temporary file.
     monkeypatch.setattr("crosscue.replay.remote.ranges.KEPT_BYTES", 1 << 20)
     monkeypatch.setattr("crosscue.replay.remote.ranges.PIECE", 512 << 10)
     web.files["drive.mcap"] = drive.read_bytes()

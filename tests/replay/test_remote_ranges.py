@@ -1,4 +1,4 @@
-"""Parts of remote logs: the same rows as of the file itself, for the bytes of that part."""
+"""Parts of remote logs: the same rows as from a local file, with only the part transferred."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MS = 1_000_000
 
 
 def mcap_log(path: Path, seconds: int = 40) -> Path:
-    """A hundred vectors and 50 kB of noise each second, in chunks of 100 kB."""
+    """Write a hundred vectors and 50 kB of noise per second, in chunks of 100 kB."""
     rng = np.random.default_rng(3)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=100_000, compression=CompressionType.ZSTD)
@@ -46,7 +46,7 @@ def mcap_log(path: Path, seconds: int = 40) -> Path:
 
 @pytest.fixture
 def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """A web server; whole logs are kept under ``tmp_path/store``."""
+    """Start a web server; complete logs are stored in ``tmp_path/store``."""
     pytest.importorskip("aiohttp", reason="aiohttp, by which fsspec reads from the web, is missing")
     monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
     monkeypatch.setattr(remote_ranges, "WAITS_S", (0.0, 0.0))

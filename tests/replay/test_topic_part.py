@@ -1,4 +1,4 @@
-"""One topic over a span of time: the rows that a whole reading gives there, and no others."""
+"""One topic over a time range: exactly the rows of a complete pass in that range."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from crosscue.replay.logs.topic_part import read_topic
 
 
 def stored(path: Path) -> Path:
-    """200 vectors on /speed (20 of them a chunk), and as many messages of no known type."""
+    """Write 200 vectors on /speed (20 per chunk), and as many messages of an unknown type."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1200)
         writer.start(profile="ros2")

@@ -1,4 +1,4 @@
-"""The vehicle file is checked at the door, and the error says where to look."""
+"""A vehicle file is validated when loaded, and the error names the line."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Which crosscue it was."""
+"""Versions and the commit of crosscue."""
 
 import subprocess
 from pathlib import Path
@@ -9,7 +9,7 @@ from crosscue.replay.versions import commit, versions, versions_and_commit
 
 
 def _git(folder: Path, *words: str) -> str:
-    """What git prints; its own settings do not count."""
+    """Run git without user settings, and return its output."""
     identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main"]
     command = ["git", *identity, *words]
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
@@ -17,7 +17,7 @@ def _git(folder: Path, *words: str) -> str:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository of one commit."""
+    """Create a repository with one commit."""
     folder = tmp_path_factory.mktemp("checkout")
     _git(folder, "init")
     _git(folder, "commit", "--allow-empty", "-m", "first")

@@ -1,4 +1,4 @@
-"""Compressed bombs: what declares or produces too much is refused, within bounded memory."""
+"""Decompression bombs are refused, within bounded memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from support.rosbag_files import record as bag_record
 
 BOMB_BYTES = 1 << 30
 MAX_MB = 200
-"""What a process that refuses a bomb may take in all, Python and its libraries included."""
+"""Memory limit of a process that refuses a bomb, including Python and its libraries."""
 PIECE = bytes(1 << 20)
 
 
@@ -42,14 +42,14 @@ def with_bz2() -> bytes:
 
 
 def mcap(body: bytes, compression: str, declared: int) -> bytes:
-    """A recording of one sound chunk and a bomb."""
+    """Write a recording with a valid chunk and a bomb."""
     sound = ChunkOf([schema(1), channel(1, 1, "/a"), message(1, 1, b"\0\1\0\0\1\0\0\0")])
     head = struct.pack("<QQQI", 1, 1, declared, 0) + text(compression)
     return MAGIC + header() + sound.coded() + record(6, head + struct.pack("<Q", len(body)) + body)
 
 
 def bag(body: bytes, compression: str, declared: int) -> bytes:
-    """A ROS 1 bag of one bomb and a connection."""
+    """Write a ROS 1 bag with a bomb and a connection."""
     names = {
         b"topic": b"/a",
         b"type": b"std_msgs/String",

@@ -1,4 +1,4 @@
-"""Bombs of every other kind: BLF, MF4, zstd in ROS 2 bags, pictures; refused in bounded memory."""
+"""Bombs in BLF, MF4, zstd in ROS 2 bags and images are refused, within bounded memory."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .test_bombs import BOMB_BYTES, MAX_MB, PIECE, with_zstd
 
 SIDE_PX = 60_000
 MAX_WITH_DETECTOR_MB = 500
-"""OpenCV and the table of detectors are loaded, too; the pictures ask for 10 GB."""
+"""Memory limit with OpenCV and the table of detectors loaded; the images declare 10 GB."""
 
 
 def _deflated(size: int) -> bytes:
@@ -61,7 +61,7 @@ def _in_db3(content: Callable[[], bytes]) -> Callable[[Path], Path]:
 
 
 def _honest() -> bytes:
-    """A frame that says how much is in it."""
+    """Return a zstd frame that declares its size."""
     import zstandard
 
     packer = zstandard.ZstdCompressor().compressobj(size=BOMB_BYTES)
@@ -77,7 +77,7 @@ def _packed_file(folder: Path) -> Path:
 
 
 def _in_wal(folder: Path) -> Path:
-    """The bomb was written last, and its recorder was killed: it stands in the -wal alone."""
+    """Write a bag of a killed recorder whose last row, the bomb, is only in the -wal file."""
     bag = write_folder(folder / "bag", rows_of(40))
     (path,) = bag.glob("*.db3")
     killed = folder / "killed"
@@ -96,7 +96,7 @@ def _in_wal(folder: Path) -> Path:
 
 
 def _mf4(size: int, declared: int) -> Callable[[Path], Path]:
-    """A log whose second compressed block is another one, put at the file's end."""
+    """Replace a log's second compressed block by another one at the file's end."""
 
     def make(folder: Path) -> Path:
         sound = unsorted(made(200), virtual=True, is_finalized=True, stretch=500, coding=0).content

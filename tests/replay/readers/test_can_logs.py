@@ -1,4 +1,4 @@
-"""Laws that hold for every format of CAN log."""
+"""Properties of all formats of CAN logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vector ASC logs: headers, times, and lines off the common pattern."""
+"""Vector ASC logs: headers, times, and unusual lines."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def test_what_is_no_blf_log_is_refused_in_one_line(
 
 
 def _peer(path: Path) -> list[can.Message]:
-    """As python-can reads it; it counts channels from 0."""
+    """Read a log with python-can, which counts channels from 0."""
     peer = list(can.BLFReader(path))
     for message in peer:
         assert isinstance(message.channel, int)

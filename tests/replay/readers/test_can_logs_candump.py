@@ -1,4 +1,4 @@
-"""candump and BUSMASTER logs: every line is used, skipped or lost."""
+"""candump and BUSMASTER logs: every line is used, skipped or dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MDF 4 logs: bus logging and signals, held against python-can and asammdf."""
+"""MDF 4 logs: bus logging and signals, compared with python-can and asammdf."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REAL = ("can", "css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4")
 
 
 def _bus_log(path: Path, frames: Sequence[Sent], compression: int = 0) -> Path:
-    """As python-can writes it, through asammdf."""
+    """Write a log with python-can, which uses asammdf."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         writer = can.MF4Writer(path, compression_level=compression)
@@ -53,7 +53,7 @@ def _bus_log(path: Path, frames: Sequence[Sent], compression: int = 0) -> Path:
 
 
 def _signals(path: Path, count: int = 1000, compression: int = 0) -> Path:
-    """A log with two groups of signals: plain, converted, signed and big ones."""
+    """Write a log with two groups of signals: plain, converted, signed and big-endian."""
     times = np.arange(count) * 0.01
     signal: Any = asammdf.Signal
     linear = {"a": 0.5, "b": -10.0}
@@ -132,7 +132,7 @@ def test_signals_equal_what_asammdf_gives_on_a_log_of_many_layouts(tmp_path: Pat
 
 
 def _peer(path: Path) -> list[can.Message]:
-    """As python-can reads it, which warns of what it leaves out."""
+    """Read a log with python-can, which warns of omitted data."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with can.MF4Reader(path) as reader:

@@ -1,4 +1,4 @@
-"""MDF 4 logs as loggers leave them: unfinalized, unsorted, with virtual channels, cut anywhere."""
+"""MDF 4 logs that are unfinalized, unsorted, truncated, or have virtual channels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ asammdf = pytest.importorskip("asammdf")
 
 Key = tuple[int, int, bool, bool]
 Frames = dict[Key, list[tuple[float, int, bytes]]]
-"""By bus, identifier, kind of identifier and direction: seconds, data length, payload."""
+"""Seconds, data lengths and payloads by bus, identifier, kind of identifier and direction."""
 
 REAL = [
     (("css_unfinalized", "00000000_00000048_00000001.MF4"), {1: 1_026}),
@@ -37,7 +37,7 @@ REAL = [
 
 
 def _peer(path: Path) -> Frames:
-    """Data frames as asammdf gives them after finalizing the file."""
+    """Read the data frames with asammdf after it has finalized the file."""
     found: Frames = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -157,7 +157,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def _frames(count: int, seed: int = 1, *, virtual: bool) -> list[Sent]:
-    """The older layout holds data frames only."""
+    """The older layout contains only data frames."""
     return [f for f in made(count, seed) if virtual or f.kind == 0]
 
 

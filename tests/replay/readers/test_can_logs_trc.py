@@ -1,4 +1,4 @@
-"""PEAK TRC logs: versions, start times, and lines off the common pattern."""
+"""PEAK TRC logs: versions, start times, and unusual lines."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
     ("name", "missing"),
     [
         ("passat-idling.trc", 0),
-        # Filtered after they were recorded; happy.trc is two such logs in one.
+        # Filtered after the recording; happy.trc consists of two such logs.
         ("happy.trc", 11_458),
         ("test_motorola.trc", 99_976 - 2_863),
     ],
@@ -166,20 +166,20 @@ def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
 def test_real_logs_read_as_python_can_reads_them(name: str, missing: int) -> None:
     path = shared("can", "rusefi_trc", name)
 
-    # It rounds the start time to microseconds.
+    # python-can rounds the start time to microseconds.
     same_as_python_can(path, can.TRCReader(path), "can/{}", within_ns=800, missing=missing)
 
 
 @dataclass(frozen=True)
 class Holes:
-    """A log with rows taken out."""
+    """A log without some of its rows."""
 
     text: str
     missing: int
 
 
 def _without(version: str, count: int, deleted: set[int]) -> Holes:
-    """A log of ``count`` rows without those at ``deleted``; the last one left hides later ones."""
+    """A log of ``count`` rows without those at ``deleted``; missing last rows are not detected."""
     is_old = version < "1.2"
     frames = [replace(f, bus="1") if is_old else f for f in made(count, fd=version > "2")]
     lines = trc(frames, version).decode().splitlines(keepends=True)

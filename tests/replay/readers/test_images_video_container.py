@@ -1,4 +1,4 @@
-"""Videos: the picture at a time is the one that was filmed then, and what is cut is reported."""
+"""Videos: images have the times at which they were filmed, and truncation is reported."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_each_time_shows_the_picture_filmed_then(
 
 
 def _number_in(block: Block) -> int:
-    """The number that is painted in a decoded picture."""
+    """Return the number that is drawn in a decoded image."""
     rows = block.rows
     assert isinstance(rows, Images)
     assert (rows.coding, rows.pixel_format) == (("raw",), ("rgb8",))
@@ -77,7 +77,7 @@ def _number_in(block: Block) -> int:
 
 
 def _blank_packet(path: Path, which: int) -> None:
-    """Overwrite the bytes of one stored picture with zeros."""
+    """Overwrite the bytes of one stored image with zeros."""
     with av.open(str(path)) as container:
         packet = [bytes(p) for p in container.demux(video=0) if p.size][which]
     data = path.read_bytes()

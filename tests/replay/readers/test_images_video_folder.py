@@ -1,4 +1,4 @@
-"""Folders of pictures: every picture is given, skipped or lost with a word, and paired honestly."""
+"""Folders of images: every image is used, skipped or dropped, and paired with the right time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FIVE = "0.5\n1.5\n2.5\n3.5\n4.5\n"
 
 
 def shades(blocks: list[Block]) -> list[tuple[float, bytes]]:
-    """Seconds and bytes of every picture."""
+    """Times in seconds and bytes of every image."""
     rows = []
     for block in blocks:
         assert isinstance(block.rows, Images)
@@ -245,7 +245,7 @@ def test_a_time_file_of_another_folder_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture
 def nobody() -> Iterator[Path]:
-    """A folder open to all, while this process has no more rights than anybody."""
+    """Yield a folder with public access; restore this process's user afterwards."""
     open_to_all = Path(tempfile.mkdtemp(dir=tempfile.gettempdir()))
     open_to_all.chmod(0o755)
     was = os.geteuid()

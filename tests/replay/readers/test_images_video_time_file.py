@@ -1,4 +1,4 @@
-"""Time files: every way of writing times, to the last digit, and every bad line by its number."""
+"""Time files: every notation of times is exact, and errors name the invalid line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MCAP files that are odd but say what they mean: every message comes out, nothing is made up."""
+"""MCAP files that are unusual but valid: exactly their messages are read."""
 
 from __future__ import annotations
 

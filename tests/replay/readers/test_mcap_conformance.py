@@ -23,7 +23,7 @@ def suite() -> list[Conformance]:
 
 
 def without_summary(coded: bytes) -> bytes:
-    """The same file up to its data end record, with an empty summary."""
+    """Return the file up to its data end record, with an empty summary."""
     footer_at = len(coded) - 8 - 29
     summary_at = struct.unpack_from("<Q", coded, footer_at + 9)[0] or footer_at
     return coded[:summary_at] + record(2, struct.pack("<QQI", 0, 0, 0)) + MAGIC

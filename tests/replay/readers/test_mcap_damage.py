@@ -1,4 +1,4 @@
-"""Damaged, cut and hostile MCAP files: what can be read comes out, the rest is reported, always."""
+"""Damaged, truncated and hostile MCAP files: readable messages are read, losses are reported."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from support.mcap_files import (
 
 
 def bare_records() -> list[bytes]:
-    """A recording without chunks, record by record."""
+    """Return the records of a recording without chunks."""
     return [part for part in sound_parts("", is_chunked=False) if isinstance(part, bytes)]
 
 
 def messages_of(reading: Reading) -> Counter[tuple[str, Message]]:
-    """All messages given, with their topics."""
+    """Count all messages read, with their topics."""
     return Counter((t, one) for t, messages in reading.messages.items() for one in messages)
 
 
@@ -82,7 +82,7 @@ def test_a_cut_at_any_byte_keeps_all_that_came_before(tmp_path: Path) -> None:
 
         reading = read_back(path)
 
-        # Message indexes are between the chunks, so this many whole chunks at the least.
+        # Message indexes are between the chunks, so at least this many chunks are complete.
         whole = sum(at >= end + 200 * (k + 1) for k, end in enumerate(ends))
         assert reading.count() >= 5 * whole, at
         assert not reading.ledger.is_whole, at
@@ -172,7 +172,7 @@ def test_any_damaged_byte_of_a_chunk_header_is_repaired_by_the_index(
     path.write_bytes(coded)
     truth = read_back(path)
     begin, name = coded.index(third.coded()), len(compression)
-    # Kind, length, both times, size; not the checksum; compression and stored size.
+    # Kind, length, both times, size, compression and stored size, but not the checksum.
     for at in (*range(37 - 4), *range(37, 49 + name)):
         damaged = bytearray(coded)
         damaged[begin + at] ^= 0x41
@@ -242,7 +242,7 @@ def chunk_record(body: bytes, size: int, compression: str, length: int | None = 
 
 
 def nested_zeros(size: int) -> bytes:
-    """A zstd frame without a declared size that decompresses to ``size`` zeros."""
+    """Return a zstd frame without a declared size that decompresses to ``size`` zeros."""
     packer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
     out = b"".join(packer.compress(bytes(1 << 20)) for _ in range(size >> 20))
     return out + packer.flush()
@@ -340,7 +340,7 @@ def test_a_wrong_section_checksum_gives_what_is_sound_and_says_what_cannot_be_kn
 
 
 def spans(reading: Reading) -> list[tuple[int, int]]:
-    """The damaged spans that an account names."""
+    """Return the damaged ranges in an account."""
     found = (re.search(r"bytes (\d+) to (\d+)", d.detail) for d in reading.ledger.details)
     return [(int(m[1]), int(m[2])) for m in found if m]
 
@@ -356,7 +356,7 @@ def test_one_flipped_byte_outside_chunks_costs_two_messages_at_most(
     path.write_bytes(coded)
     truth = messages_of(read_back(path))
     rng = np.random.default_rng(3)
-    begin = coded.index(records[4])  # behind the schema and the channels
+    begin = coded.index(records[4])  # after the schema and the channels
     end = begin + sum(map(len, records[4:]))
     for at in rng.integers(begin, end, 40).tolist():
         damaged = bytearray(coded)
@@ -369,7 +369,7 @@ def test_one_flipped_byte_outside_chunks_costs_two_messages_at_most(
         assert (given - truth).total() <= 1, at  # the row with the flip, where it cannot be known
         details = " ".join(drop.detail for drop in reading.ledger.drops())
         if "seems to consist of other records" in details:
-            # Without any checksum or count, nothing reports this from a message that holds records.
+            # Without a checksum or count, this looks like a message that contains records.
             assert not is_checked, at
             assert not has_summary, at
             continue

@@ -1,4 +1,4 @@
-"""Files of any content and shape: ours and the mcap package read the very same messages."""
+"""Files of random contents: the reader and the mcap package read the same messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the MCAP reader gives of sound files: the very messages, whatever the file's shape."""
+"""The MCAP reader reads exactly the messages of valid files of any structure."""
 
 from __future__ import annotations
 

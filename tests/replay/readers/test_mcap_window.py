@@ -1,4 +1,4 @@
-"""A part of an MCAP log: what walking through all of it gives, at the cost of that part alone."""
+"""A part of an MCAP log: the same rows as from a complete pass, with only the part read."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BOUND = st.none() | st.integers(-5, 70) | st.just(LATE)
 
 
 def walked(path: Path, selection: Selection) -> Reading:
-    """The same, every chunk's head and indexes being read."""
+    """Read the part by a complete pass over all chunks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mcap_pass, "find_window", lambda *_: "a test")
         return read_back(path, selection)
@@ -44,7 +44,7 @@ def walked(path: Path, selection: Selection) -> Reading:
 
 @st.composite
 def files(draw: st.DrawFn) -> McapFile:
-    """Chunks that overlap in time, some without message index, and messages between them."""
+    """Write chunks that overlap in time, some without message index, and messages between them."""
     parts: list[bytes | ChunkOf] = [*DEFINED]
     for _ in range(draw(st.integers(0, 8))):
         rows = [message(*row) for row in draw(ROWS)]
@@ -88,7 +88,7 @@ def chunk(k: int, topic: int = 0, times: tuple[int, int] | None = None) -> Chunk
 
 
 def spoilt(path: Path, is_kept: Callable[[int], bool], chunks: list[ChunkOf]) -> None:
-    """Overwrite all chunks and message indexes but those kept."""
+    """Overwrite all chunks and message indexes except those kept."""
     coded = bytearray(McapFile([*DEFINED, *chunks]).coded())
     for k, one in enumerate(chunks):
         if not is_kept(k):
@@ -125,7 +125,7 @@ def test_chunks_without_the_topic_are_not_looked_at(tmp_path: Path) -> None:
 def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:
     coded = bytearray(McapFile([*DEFINED, *map(chunk, range(9))]).coded())
     at = coded.index(chunk(4).coded()) + PREFIX.size
-    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # its head now reports another beginning
+    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # its header now states another start
     path = tmp_path / "x.mcap"
     path.write_bytes(coded)
 

@@ -1,4 +1,4 @@
-"""ROS 1 bags: everything in the file, or a word about it."""
+"""ROS 1 bags: every message of the file is read or reported as lost."""
 
 from __future__ import annotations
 
@@ -300,7 +300,7 @@ def test_messages_outside_chunks_are_read(tmp_path: Path) -> None:
 
 
 def _loose(count: int, begin: int) -> list[tuple[Row, bytes]]:
-    """Messages outside chunks: of two connections, of several lengths."""
+    """Messages outside chunks, of two connections and several lengths."""
     made = []
     for i in range(begin, begin + count):
         conn, t_ns = i % 2, START_NS + 10_000_000 * i
@@ -310,7 +310,7 @@ def _loose(count: int, begin: int) -> list[tuple[Row, bytes]]:
 
 
 def _unindexed(path: Path) -> tuple[Path, list[tuple[int, int, Row]]]:
-    """An unindexed bag of loose messages and chunks; from which byte to which each row lies."""
+    """Write an unindexed bag of messages and chunks; return it and the byte range of each row."""
     parts: list[bytes] = [connection(0, b"/a"), connection(1, b"/b")]
     places: list[tuple[int, int, Row]] = []
     at = bag(path, *parts).stat().st_size

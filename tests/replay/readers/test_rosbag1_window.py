@@ -1,4 +1,4 @@
-"""A span of time of a ROS 1 bag: what walking through all of it gives, at the span's cost."""
+"""A time range of a ROS 1 bag: the same rows as from a complete pass, with only the range read."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def stamp(t_ns: int) -> bytes:
 
 
 def walked(path: Path, selection: Selection) -> Reading:
-    """The same, every chunk's head and index records being read."""
+    """Read the range by a complete pass over all chunks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rosbag1_pass, "find_bag_window", lambda *_: "a test")
         return read_rows(path, selection)
@@ -75,7 +75,7 @@ def test_chunks_outside_the_span_are_not_looked_at(tmp_path: Path) -> None:
     rows = rows_of(1000)
     path = write_bag(tmp_path / "a.bag", rows)
     content = bytearray(path.read_bytes())
-    # All that lies before the middle but the bag's header, and well before the span.
+    # Everything before the middle except the bag's header, and well before the range.
     content[5000 : len(content) // 3] = b"\xff" * (len(content) // 3 - 5000)
     path.write_bytes(content)
 
@@ -110,7 +110,7 @@ def test_a_wrong_time_in_the_index_is_found_out(tmp_path: Path) -> None:
     content = path.read_bytes()
     ends = [row for row in rows if content.count(b"end_time=" + stamp(row.log_ns)) == 1]
     last, middle = ends[len(ends) // 2], rows.index(ends[len(ends) // 2]) - 1
-    # The chunk is said to end one message earlier than it does, and is still in order.
+    # The index states an end one message too early, and the chunks are still in order.
     changed = content.replace(
         b"end_time=" + stamp(last.log_ns), b"end_time=" + stamp(rows[middle].log_ns)
     )

@@ -1,4 +1,4 @@
-"""ROS 2 SQLite bags: every row SQLite can reach, and a word about each that it cannot."""
+"""ROS 2 SQLite bags: every row is read or reported as lost."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ os._exit(9)
 
 
 def make(path: Path, *rows: tuple[object, ...], tables: str = TABLES) -> Path:
-    """A database with ``rows`` of topic id, timestamp and payload."""
+    """Write a database with ``rows`` of topic id, timestamp and payload."""
     with sqlite3.connect(path) as db:
         db.executescript(tables)
         db.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
@@ -148,7 +148,7 @@ def test_a_write_ahead_log_is_read_and_nothing_touched(tmp_path: Path, has_shm: 
 
 @pytest.fixture(scope="module")
 def wal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database of a killed recorder: 40 transactions, the last 39 only in the write-ahead log."""
+    """Write 40 transactions of a killed recorder, the last 39 only in the write-ahead log."""
     folder = tmp_path_factory.mktemp("wal")
     db = sqlite3.connect(tmp_path_factory.mktemp("live") / "a.db3", isolation_level=None)
     db.execute("PRAGMA journal_mode=wal")
@@ -354,7 +354,7 @@ def test_a_row_whose_time_the_index_disputes_is_not_given(tmp_path: Path) -> Non
     path = db3_of(tmp_path / "bag", rows)
     content = path.read_bytes()
     stamp = rows[150].log_ns.to_bytes(8, "big")
-    # The time stands twice: in the row and in the index. The row comes with its payload.
+    # The time is stored in the row and in the index. The row is read with its payload.
     in_row = content.index(stamp + rows[150].payload)
     path.write_bytes(content[: in_row + 7] + bytes([stamp[7] ^ 1]) + content[in_row + 8 :])
     reading = read_rows(path)
@@ -477,6 +477,6 @@ def test_payloads_of_topics_not_asked_for_are_not_fetched(tmp_path: Path) -> Non
 
     assert reading.rows == (Row("/a", 1, b"wanted"),)
     accounts = reading.ledger.accounts
-    # That one of them is not a blob is not examined.
+    # One of them is not a blob, which is not checked.
     assert accounts["/b"].skipped == {"topic not selected": 2}
     assert accounts[""].skipped == {"message without a topic": 1}

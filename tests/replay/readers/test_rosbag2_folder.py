@@ -1,4 +1,4 @@
-"""ROS 2 bag folders: what is in the folder counts, not what metadata.yaml says."""
+"""ROS 2 bag folders: the files take precedence over metadata.yaml."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STORAGES: tuple[Storage, ...] = ("sqlite3", "mcap")
 
 
 def joined(folder: Path, *parts: list[Row], storage: Storage = "sqlite3") -> Path:
-    """A folder whose storage files ``part_0``, ``part_1``, ... hold the rows of each part."""
+    """Write a folder whose storage files ``part_0``, ``part_1``, ... have the rows of each part."""
     folder.mkdir()
     suffix = "db3" if storage == "sqlite3" else "mcap"
     for i, rows in enumerate(parts):
@@ -34,7 +34,7 @@ def joined(folder: Path, *parts: list[Row], storage: Storage = "sqlite3") -> Pat
 
 
 def listing(folder: Path, *names: str, counts: dict[str, int] | None = None) -> None:
-    """A metadata.yaml that lists ``names``, with message counts by topic."""
+    """Write a metadata.yaml that lists ``names``, with message counts by topic."""
     files = "".join(f"  - {name}\n" for name in names)
     topics = "".join(
         f"  - topic_metadata: {{name: {name}, type: std_msgs/msg/String, serialization_format: cdr,"
@@ -190,7 +190,7 @@ def test_topics_that_the_metadata_leaves_out_or_describes_otherwise_are_read(
     rows = rows_of(300)
     folder = write_folder(tmp_path / "bag", rows)
     path = folder / "metadata.yaml"
-    # Other QoS text for one topic, another topic renamed away.
+    # A different QoS text for one topic, and another topic renamed.
     text = path.read_text().replace("offered_qos_profiles: []", "offered_qos_profiles: '- x: 1'", 1)
     path.write_text(text.replace("name: /gps/fix", "name: /gone"))
     reading = read_rows(folder)

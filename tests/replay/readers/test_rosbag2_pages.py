@@ -1,4 +1,4 @@
-"""Rows straight out of a SQLite file's pages are those that SQLite gives."""
+"""Rows read directly from a SQLite file's pages equal those read through SQLite."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Stored = tuple[int, int, int, bytes]
 
 
 def stored_rows(path: Path) -> list[Stored]:
-    """The rows as the standard library gives them."""
+    """Read the rows with the standard library."""
     db = sqlite3.connect(path)
     rows = db.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
     db.close()
@@ -44,7 +44,7 @@ def stored_rows(path: Path) -> list[Stored]:
 
 
 def rows_in_pages(path: Path, topics: frozenset[int] | None = None) -> list[Stored]:
-    """The rows as they come out of the pages."""
+    """Read the rows from the pages."""
     database = open_database(path, DEFAULT_LIMITS)
     try:
         return [row for lot in page_rows(database, topics, DEFAULT_LIMITS) for row in plain(lot)]
@@ -59,7 +59,7 @@ def plain(lot: PageRows) -> Iterator[Stored]:
 
 
 def empty(path: Path, page_bytes: int, reserved: int, auto_vacuum: int = 0) -> sqlite3.Connection:
-    """A database without tables whose pages keep ``reserved`` bytes at their ends to themselves."""
+    """Create a database without tables whose pages have ``reserved`` bytes at their ends."""
     db = sqlite3.connect(path, isolation_level=None)
     db.execute(f"PRAGMA page_size={page_bytes}")
     db.execute(f"PRAGMA auto_vacuum={auto_vacuum}")
@@ -67,14 +67,14 @@ def empty(path: Path, page_bytes: int, reserved: int, auto_vacuum: int = 0) -> s
     db.close()
     head = bytearray(path.read_bytes())
     head[20] = reserved
-    # Where the first page's cells begin.
+    # The start of the first page's cells.
     head[105:107] = ((page_bytes - reserved) & 0xFFFF).to_bytes(2, "big")
     path.write_bytes(head)
     return sqlite3.connect(path, isolation_level=None)
 
 
 def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index: bool) -> None:
-    """Rows of all kinds that a plain table can hold, some of them deleted again."""
+    """Return rows of all kinds that a table can have, some of them deleted."""
     db.executescript(TOPICS + MESSAGES + (INDEX if has_index else ""))
     chance = random.Random(seed)
     db.execute("BEGIN")
@@ -218,7 +218,7 @@ def test_a_write_ahead_log_is_left_to_sqlite(tmp_path: Path) -> None:
 
 
 def outcome(path: Path, selection: Selection = EVERYTHING) -> object:
-    """All that reading gave and said."""
+    """Return all rows and the account of a pass."""
     try:
         reading = read_rows(path, selection)
     except CrosscueError as error:
@@ -260,7 +260,7 @@ def test_hostile_pages_end_the_reading_without_an_error(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     for _ in range(400):
         copy = bytearray(whole)
-        # Most of what a page says of itself stands at its beginning.
+        # Most of the structure of a page is described at its start.
         at = int(rng.integers(2, len(whole) // 512)) * 512 + int(rng.integers(0, 24))
         copy[at] = int(rng.integers(0, 256))
         path.write_bytes(copy)

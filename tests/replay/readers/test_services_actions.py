@@ -1,4 +1,4 @@
-"""Service events and actions in bags: recognised, counted, and never called damaged."""
+"""Service events and actions in bags are recognised and counted, and not reported as damage."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ Storage = Literal["sqlite3", "mcap"]
 
 
 def payload(topic: str, i: int) -> bytes:
-    """One message as a recorder stores it."""
+    """Return a message as a recorder stores it."""
     head = b"\x00\x01\x00\x00"
     if topic == SERVICE:  # event, stamp, client, number; one request; no response
         fixed = struct.pack("<B3xiI16sq", 1, i, 0, bytes(range(16)), i)
@@ -75,7 +75,7 @@ def payload(topic: str, i: int) -> bytes:
 
 
 def bag(folder: Path, storage: Storage, texts: dict[str, str]) -> Path:
-    """A bag of one service, one action and a topic of its own, as its folder."""
+    """Write a bag folder with a service, an action and a topic."""
     with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         links = {
             name: writer.add_connection(name, TYPES[name], msgdef=text, rihs01="RIHS01_0")
@@ -88,7 +88,7 @@ def bag(folder: Path, storage: Storage, texts: dict[str, str]) -> Path:
 
 
 def texts(service: str, feedback: str) -> dict[str, str]:
-    """A definition for each topic."""
+    """Return a definition for each topic."""
     return {
         SERVICE: SERVICE_TEXTS[service],
         FEEDBACK: FEEDBACK_TEXTS[feedback],
@@ -98,7 +98,7 @@ def texts(service: str, feedback: str) -> dict[str, str]:
 
 
 def opened(folder: Path, as_folder: bool) -> Path:
-    """The folder, or the storage file in it alone."""
+    """Return the folder, or the only storage file in it."""
     return folder if as_folder else next(p for p in folder.iterdir() if p.suffix != ".yaml")
 
 

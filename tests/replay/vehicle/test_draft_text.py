@@ -1,4 +1,4 @@
-"""A drafted vehicle file names topics as the log does, and holds the camera's calibration."""
+"""A drafted vehicle file quotes the names of topics and includes the camera's calibration."""
 
 import tomllib
 

@@ -1,4 +1,4 @@
-"""The signals of a vehicle may be on several buses, each section naming its own."""
+"""The signals of a vehicle may be on several buses, one per section of the vehicle file."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def frames(
 
 @pytest.fixture
 def log() -> MemoryLog:
-    """Wheels on one bus, the yaw rate on another, where frames of 100 mean something else."""
+    """Write wheels on one bus, and the yaw rate on another, where identifier 100 differs."""
     speed, yaw = np.full(N, 10.0), np.deg2rad(YAW_RATE_DEGPS)
     left, right = speed - 0.775 * yaw, speed + 0.775 * yaw
     other = np.full(N, 77.0)
@@ -132,7 +132,7 @@ def test_a_draft_names_every_bus_and_that_of_each_signal(log: MemoryLog, dbc: Pa
     assert can.yaw_rate.bus == "chassis"
     assert "# body: 1 identifiers, 1 of them" in text
     assert "# chassis: 2 identifiers, 2 of them" in text
-    # The same names on the other bus are listed with what is wrong there.
+    # The same names on the other bus are listed with their contradictions.
     assert "not chosen: Wheels.WheelSpeedRL, Wheels.WheelSpeedRR on chassis" in text
     assert len(observe([log], None).buses) == 2
 
@@ -140,7 +140,7 @@ def test_a_draft_names_every_bus_and_that_of_each_signal(log: MemoryLog, dbc: Pa
 def test_the_file_of_another_bus_is_left_out_with_why(
     log: MemoryLog, dbc: Path, tmp_path: Path
 ) -> None:
-    """Buses may use one identifier differently; the file with the wheels is kept."""
+    """Two buses use one identifier for different messages; the file with the wheels is kept."""
     radar = tmp_path / "radar.dbc"
     radar.write_text('VERSION ""\nBU_: A\nBO_ 100 Track: 8 A\n SG_ Far : 0|8@1+ (1,0) [0|0] "" A\n')
 

@@ -1,4 +1,4 @@
-"""A first vehicle file names signals that agree, and says what is wrong with those that do not."""
+"""A drafted vehicle file has consistent signals, and states why others are rejected."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def wheels(
 def chosen(
     *signals: tuple[Candidate, Series], yaw_rate: Floats | None = None, with_gnss: bool = True
 ) -> Choices:
-    """What is chosen of these signals on one bus."""
+    """Return the choice from these signals on one bus."""
     course = np.cumsum(YAW_RATE if yaw_rate is None else yaw_rate) * 0.05
     each = slice(None, None, 20)
     track = Track.of_course("fix", T_NS[each], SPEED[each], course[each])
