@@ -49,5 +49,5 @@ def road_fractions(road: RoadMask, regions: Regions) -> RoadFractions:
     for polygon in (regions.left, regions.straight, regions.right):
         inside = region_mask(polygon, (height, width))
         count = int(np.count_nonzero(inside))
-        fractions.append(np.count_nonzero(is_road & inside) / count if count else 0.0)
+        fractions.append(float(np.count_nonzero(is_road & inside) / count) if count else 0.0)
     return RoadFractions(*fractions)

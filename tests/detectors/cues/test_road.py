@@ -26,6 +26,12 @@ def test_a_picture_full_of_road_is_all_road_and_an_empty_one_none() -> None:
     assert road_fractions(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadFractions(0, 0, 0)
 
 
+def test_fractions_are_plain_numbers_as_a_manifest_takes_them() -> None:
+    found = road_fractions(_mask(np.eye(90, 160, dtype=np.bool_)), Regions())
+
+    assert [type(one) for one in (found.left, found.straight, found.right)] == [float] * 3
+
+
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 999))
 def test_the_mirror_image_swaps_left_and_right(seed: int) -> None:
