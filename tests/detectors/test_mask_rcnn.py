@@ -455,7 +455,7 @@ def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_a_device_that_is_not_there_is_named() -> None:
-    with pytest.raises(VehicleError, match="device cuda: not there"):
+    with pytest.raises(VehicleError, match="device cuda: not available"):
         chosen_device("cuda", "detector road")
     assert chosen_device("cpu", "detector road").type == "cpu"
 

@@ -251,7 +251,7 @@ def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[st
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
 def test_a_device_that_is_not_there_is_reported() -> None:
-    with pytest.raises(VehicleError, match="detector road: device cuda: not there"):
+    with pytest.raises(VehicleError, match="detector road: device cuda: not available"):
         build(device="cuda")
 
 
