@@ -283,4 +283,4 @@ def test_a_cue_of_ones_own_may_not_take_a_name_that_is_there(
     arguments = ["estimate", str(drive / "run"), "--vehicle", str(tmp_path / "v.toml")]
     assert run(arguments) != 0
 
-    assert "a cue of this name is there already" in capsys.readouterr().err
+    assert "a cue of this name already exists" in capsys.readouterr().err
