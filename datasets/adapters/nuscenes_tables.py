@@ -52,7 +52,7 @@ class RowsOf:
                 if start < 0:
                     between += ahead[at:]
                     break
-                self._see_between(between + ahead[at:start], passed + at)
+                self._check_between(between + ahead[at:start], passed + at)
                 between = ""
                 try:
                     row, at = decode(ahead, start)
@@ -63,9 +63,9 @@ class RowsOf:
                 if isinstance(row, dict):
                     yield row
         self.is_cut = "]" not in between
-        self._see_between(between, passed)
+        self._check_between(between, passed)
 
-    def _see_between(self, text: str, place: int) -> None:
+    def _check_between(self, text: str, place: int) -> None:
         """Report unexpected text between rows as the remains of a damaged row."""
         rest = text.strip(_BETWEEN)
         if rest:

@@ -79,7 +79,7 @@ def _recognised(path: Path) -> str:
         content = read_at_most(path, MAX_BYTES)
         tree = None if content is None else json_tree(content)
     except (OSError, ValueError) as error:
-        raise AnnotationError(f"{path}: not readable as JSON ({error}); give labels") from None
+        raise AnnotationError(f"{path}: not readable as JSON ({error}); expected labels") from None
     if isinstance(tree, list):
         return "labelstudio"
     return "fiftyone" if isinstance(tree, dict) and "labels" in tree else "coco"

@@ -83,7 +83,7 @@ class Boxes:
         self.visible: Final[Floats] = _visible(frame, boxes_px, depth_m)[kept]
         self.outline_px: Final[Floats] = boxes_px[kept]
         self.at_m: Final[Floats] = at[kept]
-        """From the camera, along the map's axes."""
+        """Positions relative to the camera, along the map's axes."""
 
     def across(self, motion: str, *, to_left: bool) -> NDArray[np.bool_]:
         """Return a mask of the vehicles across the road with this motion, by heading."""

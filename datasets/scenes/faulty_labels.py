@@ -152,7 +152,7 @@ class _Errors:
 
 
 @dataclass(frozen=True, slots=True)
-class _False:
+class _FalseObject:
     """An object that is mistaken for a sign."""
 
     category: Category
@@ -173,7 +173,7 @@ class FaultyLabels:
         rng = np.random.default_rng([seed, 13])
         self._frame_rng = np.random.default_rng([seed, 14])
         self._false = [
-            _False(category, _beside(world, category, rng))
+            _FalseObject(category, _beside(world, category, rng))
             for category, rate in faults.false_things.items()
             for _ in range(int(rng.poisson(rate)))
         ]

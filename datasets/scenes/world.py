@@ -570,7 +570,7 @@ def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Gener
             varied,
         )
         if not layout.ahead_is_closed:
-            _ahead_of_us(site, conditions, varied)
+            _outgoing(site, conditions, varied)
         if drive.green_s >= 0.0 and varied.random() < 0.7 * conditions.traffic:
             _waiting(site, drive, varied)
     if layout.control == "traffic_light" and drive.green_s < 0.0:
@@ -611,7 +611,7 @@ def _stream(
             site.add_car(look, role, x, lane, heading, speed, (at - 16.0, at + 9.0))
 
 
-def _ahead_of_us(site: _Site, conditions: Conditions, varied: Generator) -> None:
+def _outgoing(site: _Site, conditions: Conditions, varied: Generator) -> None:
     """Add outgoing cars that left the intersection before the ego vehicle arrives."""
     x = site.layout.far_kerb_m + float(varied.uniform(6.0, 30.0))
     # All have one speed, so that no car passes through another.

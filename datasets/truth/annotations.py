@@ -149,7 +149,7 @@ def place(annotations: Annotations, log: LogPictures) -> Placed:
     """Find the frame of each picture: by its time, its file name, or its number.
 
     Raises:
-        SchemaError: Pictures belong to no frame, two to the same, or are of another size.
+        SchemaError: A picture belongs to no frame, two belong to one frame, or sizes differ.
     """
     if not annotations.pictures:
         raise SchemaError(f"{annotations.where}: no picture in it; nothing to import")
@@ -270,12 +270,10 @@ def meanings(
     cues = (*CUES, *own_cues)
     for label, cue in own.items():
         if label not in annotations.labels:
-            raise UsageError(
-                f"--map {label}={cue}: no such label; {_there_are(annotations.labels)}"
-            )
+            raise UsageError(f"--map {label}={cue}: no such label; {_choices(annotations.labels)}")
         if cue and cue not in cues:
             raise UsageError(
-                f"--map {label}={cue}: no such cue; {_there_are(cues)}; --vehicle names your own"
+                f"--map {label}={cue}: no such cue; {_choices(cues)}; --vehicle names your own"
             )
     found: dict[str, str | None] = {}
     for label in annotations.labels:
@@ -299,7 +297,7 @@ def meanings(
     return found
 
 
-def _there_are(names: Sequence[str]) -> str:
+def _choices(names: Sequence[str]) -> str:
     return f"there are: {', '.join(names)}"
 
 

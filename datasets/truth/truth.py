@@ -222,7 +222,7 @@ def load(path: Path) -> Truth:
         content = read_at_most(path, MAX_BYTES)
         if content is None:
             raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
-        tree = json_tree(content, object_pairs_hook=_no_twins)
+        tree = json_tree(content, object_pairs_hook=_unique_keys)
         truth = Truth.model_validate(tree)
     except ValidationError as error:
         raise AnnotationError(explain(error, None, str(path), Truth)) from None
@@ -289,7 +289,7 @@ def _check_cues(truth: Truth, path: Path) -> None:
             )
 
 
-def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     keys = [key for key, _ in pairs]
     if len(set(keys)) != len(keys):
         raise ValueError(f"duplicate key in {keys}")

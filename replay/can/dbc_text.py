@@ -265,7 +265,7 @@ def _message(parsed: _Message, found: _Found) -> CanMessage:
     if parsed.name in _KEYWORDS or len(names) < len(parsed.signals):
         raise _UnusualError
     switches = found.switches.get(stored, {})
-    _refuse_rings(switches)
+    _refuse_cycles(switches)
     multiplexers = [one.name for one in parsed.signals if one.marker.endswith("M")]
     only = multiplexers[0] if len(multiplexers) == 1 else None
     signals = []
@@ -342,7 +342,7 @@ def _branch(
     return multiplexer if is_brought else None, frozenset(ids)
 
 
-def _refuse_rings(switches: dict[str, tuple[str, list[int]]]) -> None:
+def _refuse_cycles(switches: dict[str, tuple[str, list[int]]]) -> None:
     for name in switches:
         above, steps = name, 0
         while above in switches:

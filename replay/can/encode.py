@@ -97,11 +97,11 @@ def _presence(
                 rows &= is_one_of(selector, tuple(signal.branches))
         present[signal.name] = rows
         if switches_on(message, signal) and rows.any():
-            _refuse_strange(message, signal, _column(message, columns, signal)[rows])
+            _refuse_unknown(message, signal, _column(message, columns, signal)[rows])
     return present
 
 
-def _refuse_strange(message: CanMessage, multiplexer: CanSignal, selector: Column) -> None:
+def _refuse_unknown(message: CanMessage, multiplexer: CanSignal, selector: Column) -> None:
     known = tuple(sorted(known_values(message, multiplexer)))
     strange = ~is_one_of(selector, known)
     if strange.any():

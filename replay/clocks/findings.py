@@ -172,7 +172,7 @@ def _offset_words(offset_ns: int, log_ns: int) -> str:
             return f"{words}: looks like {meaning}"
     hours, rest_s = divmod(abs(nearest_s), 3600)
     if 0 < hours <= 14 and rest_s <= 2:
-        return f"{words}: looks like local time taken for UTC"
+        return f"{words}: looks like local time interpreted as UTC"
     return words
 
 

@@ -283,18 +283,18 @@ class _TopicWatch:
         self._waiting.append({clock: c.copy() for clock, c in columns.items() if c is not None})
         self._waiting_rows += len(block)
         if self._waiting_rows >= _BATCH_ROWS:
-            self._take_in()
+            self._process()
 
     def finish(self, topic: str) -> ClockReport:
         """Return the report; no block may follow."""
-        self._take_in()
+        self._process()
         reports = {clock: watch.finish() for clock, watch in self._stamps.items()}
         log = reports[Clock.LOG]
         publish, header = reports.get(Clock.PUBLISH), reports.get(Clock.HEADER)
         used, why = choose(self._count, log, publish, header)
         return ClockReport(topic, self._count, used, why, log, publish, header)
 
-    def _take_in(self) -> None:
+    def _process(self) -> None:
         for clock in Clock:
             given = [times for times in self._waiting if clock in times]
             if given:

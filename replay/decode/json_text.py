@@ -60,7 +60,7 @@ def json_decoder(topic: Topic) -> Callable[[Block, Ledger], Block]:
 
 
 def _object(text: bytes) -> dict[str, Any]:
-    value = json_tree(text.decode("utf-8"), parse_constant=_refuse, object_pairs_hook=_once)
+    value = json_tree(text.decode("utf-8"), parse_constant=_refuse, object_pairs_hook=_unique_keys)
     if not isinstance(value, dict):
         raise ValueError(f"expected an object, got {type(value).__name__}")
     return value
@@ -70,7 +70,7 @@ def _refuse(word: str) -> float:
     raise ValueError(f"{word} is not JSON")
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError("an object has a duplicate key")

@@ -88,8 +88,8 @@ def _descriptor(topic: Topic) -> Descriptor:
         _add(pool, files)
         return pool.FindMessageTypeByName(name)
     except (DecodeError, TypeError, KeyError, ValueError, RecursionError) as error:
-        said = one_line(error, 120)
-        raise SchemaError(f"{name}: its protobuf descriptor cannot be used: {said}") from None
+        words = one_line(error, 120)
+        raise SchemaError(f"{name}: its protobuf descriptor cannot be used: {words}") from None
 
 
 def _files(schema: bytes) -> list[Any]:

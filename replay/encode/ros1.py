@@ -178,10 +178,10 @@ class _Transcriber(Walker):
         for k, byte in enumerate(ENCAPSULATION):
             buffer[start[ok] + k] = byte
         for job in self.jobs:
-            self._do(job, buffer, start + HEAD)
+            self._copy(job, buffer, start + HEAD)
         return Messages(buffer, start[ok], stop[ok])
 
-    def _do(self, job: _Job, buffer: Bytes, body: Int64s) -> None:
+    def _copy(self, job: _Job, buffer: Bytes, body: Int64s) -> None:
         keep: slice | NDArray[np.bool_] = slice(None)
         if self.damaged:
             keep = self.found.ok[job.rows]

@@ -43,7 +43,7 @@ def template_of(
         texts: Strings by path; others are empty.
         counts: Lengths of sequences of numbers by path; others are empty.
     """
-    making = _Making()
+    making = _Builder()
     for step in plan.steps:
         if isinstance(step, Run):
             making.run(step)
@@ -55,7 +55,7 @@ def template_of(
 
 
 @dataclass(slots=True)
-class _Making:
+class _Builder:
     body: bytearray = field(default_factory=bytearray)
     places: dict[str, int] = field(default_factory=dict)
     items: dict[str, int] = field(default_factory=dict)

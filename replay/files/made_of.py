@@ -52,14 +52,14 @@ def refuse_another(place: Path, doing: str, there: object, mine: Mapping[str, An
         theirs, settings = _name(there), there["settings"]
     except (AssertionError, KeyError, TypeError):
         raise UsageError(
-            f"{place}: nothing says what it is made of; {doing} would destroy it: give another name"
+            f"{place}: its inputs are not recorded; {doing} would destroy it; choose another name"
         ) from None
     ours = _name(mine)
     other = difference(settings, mine["settings"])
     but = "" if other is None else f" ({other})"
     raise UsageError(
-        f"{place}: is made of {theirs}, not of {ours}{but}; {doing} would destroy it: give another "
-        "name, or the same input and settings"
+        f"{place}: was made from {theirs}, not from {ours}{but}; {doing} would destroy it; choose "
+        "another name, or the same input and settings"
     )
 
 

@@ -107,7 +107,7 @@ class Message:
 
     Attributes:
         name: Name in this table.
-        says: Short description of its content.
+        about: Short description of its content.
         table: Table of its columns.
         ids: Identifier of each instance (obstacle slot, lane side, position of a sign).
         lengths: Valid payload lengths.
@@ -118,7 +118,7 @@ class Message:
     """
 
     name: str
-    says: str
+    about: str
     table: str
     ids: tuple[int, ...]
     lengths: tuple[int, ...]

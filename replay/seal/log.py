@@ -131,13 +131,13 @@ def _report(check: Check, ledger: Ledger) -> None:
     spans = list(check.damaged())
     for span in spans:
         ledger.drop("", DIFFERS, None, f"{span.name}: bytes {span.start} to {span.stop}")
-    said = f"sealed at {seal.sealed_at} ({HASH})"
+    state = f"sealed at {seal.sealed_at} ({HASH})"
     if check.checked < seal.blocks:
-        said += f": {check.checked} of {seal.blocks} blocks of 1 MiB were read and checked"
+        state += f": {check.checked} of {seal.blocks} blocks of 1 MiB were read and checked"
     else:
-        said += f": all {seal.blocks} blocks of 1 MiB were checked"
+        state += f": all {seal.blocks} blocks of 1 MiB were checked"
     bad = "some differ" if spans else "none differs"
-    ledger.integrity = f"{ledger.integrity}; {said}, {bad}"
+    ledger.integrity = f"{ledger.integrity}; {state}, {bad}"
 
 
 def sealed_sentence(log: Log) -> str:

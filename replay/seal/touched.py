@@ -63,7 +63,7 @@ class Touched:
         return heard
 
 
-class _Noted(FileIO):
+class _RecordedFile(FileIO):
     """File that records which of its bytes are read."""
 
     def __init__(self, path: Path, touched: Touched) -> None:
@@ -93,4 +93,4 @@ def open_noted(path: Path, touched: Touched, buffering: int = 1 << 13) -> Buffer
     Raises:
         OSError: It cannot be opened.
     """
-    return BufferedReader(_Noted(path, touched), buffering)
+    return BufferedReader(_RecordedFile(path, touched), buffering)

@@ -154,5 +154,5 @@ def test_a_drive_of_which_nothing_says_what_it_is_is_not_overwritten(
     (tmp_path / "A-01" / "drive.mcap").write_bytes(b"recorded")
 
     assert cli.run(["simulate", "A", "-o", str(tmp_path), "--width", "64", "--overwrite"]) == 2
-    assert "nothing says what it is made of" in capsys.readouterr().err
+    assert "its inputs are not recorded" in capsys.readouterr().err
     assert (tmp_path / "A-01" / "drive.mcap").read_bytes() == b"recorded"

@@ -56,7 +56,7 @@ def test_gaps_are_reported_with_the_longest_and_its_place() -> None:
         (37 * SECOND_NS, "37.000 s ahead of log time: looks like TAI, without leap seconds"),
         (18 * SECOND_NS, "looks like GPS time counted from 1970"),
         (-(315_964_800 - 18) * SECOND_NS, "looks like GPS time counted from 1980"),
-        (7200 * SECOND_NS, "looks like local time taken for UTC"),
+        (7200 * SECOND_NS, "looks like local time interpreted as UTC"),
         (-5 * SECOND_NS, "is 5.000 s behind log time"),
         (12 * SECOND_NS - START_NS, "counts from boot or start, log time counts from 1970"),
     ],

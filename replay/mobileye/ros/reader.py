@@ -84,7 +84,7 @@ class RosMobileye:
         self._bursts = RosBursts(topics.get("ObstacleData", ""), ledger, settings)
         self._bursts.has_status = "ObstacleStatus" in topics
         self._clock = CounterClock(settings.min_latency_ns)
-        self._votes = {name: LaneSignVotes(says, settings.ros_lane_sign) for name, says in _SIDED}
+        self._votes = {name: LaneSignVotes(label, settings.ros_lane_sign) for name, label in _SIDED}
         self._waiting: dict[str, list[Block]] = {name: [] for name, _ in _SIDED}
         self._mounting = mounting_of(settings, bus, ledger)
 

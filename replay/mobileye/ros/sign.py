@@ -19,8 +19,8 @@ CLEAR_OF_MIDDLE_M: Final = 0.3
 class LaneSignVotes:
     """Votes of all usable lanes next to the vehicle for the sign that puts them on their side."""
 
-    def __init__(self, says: str, sign: LaneSign) -> None:
-        self._says = says
+    def __init__(self, label: str, sign: LaneSign) -> None:
+        self._label = label
         self.is_decided = sign != "auto"
         self.is_left_positive = sign == "left"
         self._right = self._left = 0
@@ -47,12 +47,12 @@ class LaneSignVotes:
         if not total:
             return []
         against = self._right if self.is_left_positive else self._left
-        said = "left" if self.is_left_positive else "right"
+        side = "left" if self.is_left_positive else "right"
         if 2 * against > total:
             return [
-                f"{self._says} are read as positive to the {said}, but most of them are then on "
+                f"{self._label} are read as positive to the {side}, but most of them are then on "
                 "the wrong side; check ros_lane_sign"
             ]
         if self._was_set or not self.is_left_positive:
             return []
-        return [f"{self._says} in the messages are positive to the left, unlike on the wire"]
+        return [f"{self._label} in the messages are positive to the left, unlike on the wire"]

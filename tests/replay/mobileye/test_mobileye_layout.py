@@ -182,13 +182,13 @@ def test_describe_lists_every_field_once() -> None:
     ],
 )
 def test_a_table_that_cannot_be_is_refused(text: str, message: str) -> None:
-    head = '[[message]]\nname = "m"\nsays = ""\ntable = "t"\nid = 1\nlengths = [4]\n'
+    head = '[[message]]\nname = "m"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\n'
     with pytest.raises(SchemaError, match=re.escape(message)):
         parse(head + text)
 
 
 def test_two_messages_with_one_identifier_are_refused() -> None:
-    one = '[[message]]\nname = "{}"\nsays = ""\ntable = "t"\nid = 1\nlengths = [4]\nfields = []\n'
+    one = '[[message]]\nname = "{}"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\nfields = []\n'
     with pytest.raises(SchemaError, match="two messages have the same identifier"):
         parse(one.format("a") + one.format("b"))
 
