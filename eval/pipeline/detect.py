@@ -30,10 +30,11 @@ from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.detection_range import detection_range
 from crosscue.detectors.registry import knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
-from crosscue.detectors.runner import FrameResult, Named, Runner
+from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
 from crosscue.eval.pipeline.progress import OnFrames, no_progress
 from crosscue.eval.runs.folder import (
+    Account,
     DetectCounts,
     DetectManifest,
     DetectorRow,
@@ -138,98 +139,166 @@ def detect_into(
         OutputError: The disk is full.
     """
     began = time.monotonic()
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    camera = camera_of(topics, vehicle)
-    if camera is None:
-        raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
+    camera = _only_camera(logs, vehicle)
     named = [Named(choice.name, make(choice)) for choice in choices]
     _refuse_uncounted(named, vehicle)
-    log, topic = logs[camera[0]], camera[1]
-    ledger = Ledger(log_names(logs)[camera[0]])
-    planned = pictures_only(camera)
-    narrowed = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
-    clocks = probe_clocks(log, planned, vehicle, camera[0], narrowed)
-    timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
-    clock = timeline.clock(camera[0])
-    extractor = Extractor(
-        planned, vehicle, camera[0], ledger, clocks, shift_at=shift_of(timeline, camera[0])
-    )
-    is_sign = [choice.kind == "signs" for choice in choices]
+    reading = _Reading(logs, camera, vehicle, selection, timeline)
     with ResultCache(cache) as results:
         runner = Runner(
             named,
             results,
-            topic.name,
+            reading.topic.name,
             vehicle.camera.depth_bits,
-            lambda t_ns, reason, why: ledger.spoil(
-                topic.name, reason, 1, why, int(clock.log_times(np.array([t_ns]))[0])
-            ),
+            reading.spoil,
             vehicle.cues.traffic_light_labels,
             is_one_size=vehicle.camera.focal_px is not None,
         )
-        drawer = Drawer(run.path / "pictures", draw)
         tables = _Tables(
-            run, topic.name, vehicle, named, drawer, CuePass(vehicle), is_sign, timeline, clock
-        )
-        with tables:
-            extractor.on_pictures = lambda block: _through(
-                runner,
-                block,
-                tables,
-                lambda: on_frames(runner.counts.frames, _declared(topic, selection)),
-            )
-            for block in ledger.handing_on(TimedLog(log, clock).read(ledger, narrowed)):
-                for _ in extractor(block):
-                    pass
-            for _ in extractor.finish():
-                pass
-        if not runner.counts.frames:
-            raise empty_result(_no_frames(topic, ledger), logs, selection)
-        made = account(reading_of([ledger]), detecting_of(topic.name, ledger, runner.counts.frames))
-        write_skipped(run, [ledger], made.reading, timeline=timeline)
-        seconds = time.monotonic() - began
-        notices = (
-            *gaps_text(timeline.segments),
-            *_simulated_only(choices, logs),
-            *_without_thresholds(named, vehicle),
-            *_without_masks(tables.boxes_only, vehicle),
-            *tables.notices,
-        )
-        write_manifest(
             run,
-            DetectManifest(
-                versions=versions_and_commit(),
-                logs=log_rows(logs, run),
-                selection=part_of(selection),
-                settings=vehicle,
-                camera=topic.name,
-                camera_log=camera[0],
-                time=time_segments(timeline),
-                detectors=_detector_rows(named, choices, tables),
-                clocks=(clock_rows(extractor.clocks, extractor.watch.reports()),),
-                account=made,
-                counts=DetectCounts(
-                    frames=runner.counts.frames,
-                    decoded=runner.counts.decoded,
-                    ran=runner.counts.ran,
-                    from_cache=runner.counts.from_cache,
-                    objects=tables.objects,
-                    cues=tables.cue_frames,
-                ),
-                notices=notices,
-                timings=DetectTimings(seconds=seconds),
-            ),
+            reading.topic.name,
+            vehicle,
+            named,
+            Drawer(run.path / "pictures", draw),
+            CuePass(vehicle),
+            [choice.kind == "signs" for choice in choices],
+            reading.timeline,
+            reading.clock,
         )
+        _run_detectors(reading, runner, tables, on_frames)
+        frames = runner.counts.frames
+        if not frames:
+            raise empty_result(_no_frames(reading.topic, reading.ledger), logs, selection)
+        made = account(
+            reading_of([reading.ledger]), detecting_of(reading.topic.name, reading.ledger, frames)
+        )
+        write_skipped(run, [reading.ledger], made.reading, timeline=reading.timeline)
+        seconds = time.monotonic() - began
+        manifest = _manifest(reading, choices, runner.counts, tables, made, seconds)
+        write_manifest(run, manifest)
     return DetectOutcome(
         run,
-        ledger,
+        reading.ledger,
         runner.counts,
         tables.objects,
         tables.cue_frames,
-        notices,
+        manifest.notices,
         seconds,
         made,
-        timeline.has_gaps,
+        reading.timeline.has_gaps,
+    )
+
+
+def _only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:
+    """Return the index of the camera's log, and its topic.
+
+    Raises:
+        VehicleError: The drive has no camera or several.
+    """
+    camera = camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    if camera is None:
+        raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
+    return camera
+
+
+class _Reading:
+    """The camera of a drive, with its ledger, time segments and chosen clock."""
+
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        camera: tuple[int, Topic],
+        vehicle: Vehicle,
+        selection: Selection,
+        timeline: Timeline | None,
+    ) -> None:
+        self.logs = logs
+        self.number, self.topic = camera
+        self.vehicle = vehicle
+        self.selection = selection
+        self.ledger = Ledger(log_names(logs)[self.number])
+        self._log = logs[self.number]
+        self._narrowed = Selection(
+            frozenset({self.topic.name}), selection.start_ns, selection.end_ns
+        )
+        planned = pictures_only(camera)
+        clocks = probe_clocks(self._log, planned, vehicle, self.number, self._narrowed)
+        self.timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
+        self.clock = self.timeline.clock(self.number)
+        self.extractor = Extractor(
+            planned,
+            vehicle,
+            self.number,
+            self.ledger,
+            clocks,
+            shift_at=shift_of(self.timeline, self.number),
+        )
+
+    def spoil(self, t_ns: int, reason: str, why: str) -> None:
+        """Count the picture at a drive time as dropped."""
+        log_ns = int(self.clock.log_times(np.array([t_ns]))[0])
+        self.ledger.spoil(self.topic.name, reason, 1, why, log_ns)
+
+    def pass_pictures(self, on_pictures: Callable[[Block], None]) -> None:
+        """Read the camera's log and pass every block of pictures to ``on_pictures``."""
+        self.extractor.on_pictures = on_pictures
+        timed = TimedLog(self._log, self.clock)
+        for block in self.ledger.handing_on(timed.read(self.ledger, self._narrowed)):
+            for _ in self.extractor(block):
+                pass
+        for _ in self.extractor.finish():
+            pass
+
+
+def _run_detectors(reading: _Reading, runner: Runner, tables: _Tables, on_frames: OnFrames) -> None:
+    """Run the detectors over all pictures and write the tables."""
+    declared = _declared(reading.topic, reading.selection)
+
+    def detect(block: Block) -> None:
+        for result in runner(block):
+            tables.add(result)
+            on_frames(runner.counts.frames, declared)
+
+    with tables:
+        reading.pass_pictures(detect)
+
+
+def _manifest(
+    reading: _Reading,
+    choices: Sequence[Choice],
+    counts: Counts,
+    tables: _Tables,
+    made: Account,
+    seconds: float,
+) -> DetectManifest:
+    """Return the manifest of the detect stage."""
+    extractor, vehicle = reading.extractor, reading.vehicle
+    return DetectManifest(
+        versions=versions_and_commit(),
+        logs=log_rows(reading.logs, tables.run),
+        selection=part_of(reading.selection),
+        settings=vehicle,
+        camera=reading.topic.name,
+        camera_log=reading.number,
+        time=time_segments(reading.timeline),
+        detectors=_detector_rows(tables.detectors, choices, tables),
+        clocks=(clock_rows(extractor.clocks, extractor.watch.reports()),),
+        account=made,
+        counts=DetectCounts(
+            frames=counts.frames,
+            decoded=counts.decoded,
+            ran=counts.ran,
+            from_cache=counts.from_cache,
+            objects=tables.objects,
+            cues=tables.cue_frames,
+        ),
+        notices=(
+            *gaps_text(reading.timeline.segments),
+            *_simulated_only(choices, reading.logs),
+            *_without_thresholds(tables.detectors, vehicle),
+            *_without_masks(tables.boxes_only, vehicle),
+            *tables.notices,
+        ),
+        timings=DetectTimings(seconds=seconds),
     )
 
 
@@ -348,12 +417,6 @@ def _without_masks(boxes_only: Mapping[str, Set[str]], vehicle: Vehicle) -> list
         for name, labels in boxes_only.items()
     }
     return [f"{name}: no masks: {'; '.join(rules)}" for name, rules in affected.items() if rules]
-
-
-def _through(runner: Runner, block: Block, tables: _Tables, on_frame: Callable[[], None]) -> None:
-    for result in runner(block):
-        tables.add(result)
-        on_frame()
 
 
 @dataclass(slots=True)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.pipeline.scene.outcome import SceneOutcome
@@ -18,6 +18,7 @@ from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, give
 from crosscue.eval.runs.folder import (
     MANIFEST,
     UNATTRIBUTED,
+    Account,
     ApproachRow,
     DetectManifest,
     EstimateCounts,
@@ -105,105 +106,138 @@ def estimate_into(
     found = earlier if detected is None else run.drive_manifest().detected
     kept = None if found is None else _camera_skips(run, found.camera)
     reading = _Reading(logs, vehicle, selection, landmarks, timeline, found)
-    timeline = reading.timeline
     if found is not None:
-        refuse_other_segments(run, timeline)
-    stage = PoseStage(
-        vehicle,
-        turn_signal_of(reading.planned, vehicle),
-        positions=fused_positions(vehicle),
-        timeline=timeline,
-    )
-    if reading.camera is not None and landmarks is not None:
-        at = reading.camera[0]
-        looks = looking(landmarks, vehicle, reading.ledgers[at])
-        stage.landmarks, reading.extractors[at].on_pictures = looks, looks.see
+        refuse_other_segments(run, reading.timeline)
+    stage = _pose_stage(reading)
     if detected is None:
         begin_again(run, found)
     tally = _pose(reading, stage, run, on_time)
     silent = silent_roles(reading.planned, stage.received)
-    if Signal.WHEEL_SPEEDS in silent:
-        raise empty_result(silent[Signal.WHEEL_SPEEDS], logs, selection)
-    if not tally.rows and found is None and landmarks is None:
-        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they yielded no pose")
-        what = f"no detector has run over a camera, and of the wheel speeds: {why}"
-        raise empty_result(what, logs, selection)
+    _refuse_empty(reading, silent, tally)
     scene = None if found is None else _scene(run, vehicle, found, reading)
-    accounts = reading_of(reading.ledgers)
-    if found is not None:
-        accounts = joined_accounts(accounts, found.account.reading, found.camera)
-    frames = None if scene is None or found is None else (found.counts.frames, scene.frames)
-    made = account(
-        accounts,
-        {} if found is None else found.account.detecting,
-        estimating_of(stage, frames),
-    )
-    write_skipped(run, reading.ledgers, made.reading, kept, timeline)
-    before = 0.0 if detected is None else detected.seconds
-    seconds = time.monotonic() - began
-    notices = _notices(reading, stage, silent, found, landmarks)
-    write_manifest(
-        run,
-        EstimateManifest(
-            versions=versions_and_commit(),
-            logs=_hashed(logs, run, found) if reported is None else tuple(reported),
-            selection=part_of(selection),
-            settings=vehicle,
-            sources=_sources(reading.planned, logs),
-            clocks=tuple(
-                clock_rows(each.clocks, each.watch.reports()) for each in reading.extractors
-            ),
-            account=made,
-            counts=EstimateCounts(**stage.counts()),
-            time=time_segments(timeline),
-            landmarks=None if landmarks is None else _landmarks_used(landmarks, run),
-            notices=notices,
-            pose=PoseSummary(
-                rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
-            ),
-            scene=None if scene is None else scene_summary(scene),
-            detect=found,
-            timings=EstimateTimings(seconds=seconds + before, detect_seconds=before),
-        ),
-    )
+    made = _account(reading, stage, scene)
+    write_skipped(run, reading.ledgers, made.reading, kept, reading.timeline)
+    results = _Results(stage, tally, scene, made, _notices(reading, stage, silent))
+    detect_s = 0.0 if detected is None else detected.seconds
+    seconds = time.monotonic() - began + detect_s
+    rows = _hashed(logs, run, found) if reported is None else tuple(reported)
+    timings = EstimateTimings(seconds=seconds, detect_seconds=detect_s)
+    write_manifest(run, _manifest(run, reading, results, rows, timings))
     return Outcome(
         run,
         reading.ledgers,
         tally.rows,
         tally.travelled_m,
         tally.major_axis_m,
-        notices,
-        seconds + before,
-        _driven_s(timeline, tally),
+        results.notices,
+        seconds,
+        _driven_s(reading.timeline, tally),
         stage.landmarks.counts(),
         made,
         detected,
         scene,
-        timeline.segments,
+        reading.timeline.segments,
     )
 
 
-def _notices(
-    reading: _Reading,
-    stage: PoseStage,
-    silent: Mapping[Signal, str],
-    found: DetectManifest | None,
-    landmarks: LandmarkDatabase | None,
-) -> tuple[str, ...]:
+def _pose_stage(reading: _Reading) -> PoseStage:
+    """Return the pose stage, connected to the search for landmarks if there is one."""
+    vehicle, landmarks = reading.vehicle, reading.landmarks
+    stage = PoseStage(
+        vehicle,
+        turn_signal_of(reading.planned, vehicle),
+        positions=fused_positions(vehicle),
+        timeline=reading.timeline,
+    )
+    if reading.camera is not None and landmarks is not None:
+        at = reading.camera[0]
+        looks = looking(landmarks, vehicle, reading.ledgers[at])
+        stage.landmarks, reading.extractors[at].on_pictures = looks, looks.see
+    return stage
+
+
+def _refuse_empty(reading: _Reading, silent: Mapping[Signal, str], tally: PoseTally) -> None:
+    """Refuse a drive whose planned wheel speeds have no row, or that has nothing to estimate from.
+
+    Raises:
+        EmptyResultError: The selected part contains nothing to estimate from.
+        LogError: Damage has left no row.
+    """
+    what = silent.get(Signal.WHEEL_SPEEDS)
+    if what is None and not tally.rows and reading.found is None and reading.landmarks is None:
+        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they yielded no pose")
+        what = f"no detector has run over a camera, and of the wheel speeds: {why}"
+    if what is not None:
+        raise empty_result(what, reading.logs, reading.selection)
+
+
+def _account(reading: _Reading, stage: PoseStage, scene: SceneOutcome | None) -> Account:
+    """Return the account of the run, with the detect stage's part if it has run."""
+    accounts, found = reading_of(reading.ledgers), reading.found
+    if found is None or scene is None:
+        return account(accounts, {}, estimating_of(stage, None))
+    return account(
+        joined_accounts(accounts, found.account.reading, found.camera),
+        found.account.detecting,
+        estimating_of(stage, (found.counts.frames, scene.frames)),
+    )
+
+
+def _notices(reading: _Reading, stage: PoseStage, silent: Mapping[Signal, str]) -> tuple[str, ...]:
     """Return the notices of the run, gaps first."""
     return (
         *gaps_text(reading.timeline.segments),
         *_missing(reading.planned),
         *silent.values(),
-        *_no_camera(landmarks, reading.camera),
-        *_no_mobileye(found, reading.planned),
-        *_no_scene(found, reading),
-        *_of_detecting(found),
+        *_no_camera(reading.landmarks, reading.camera),
+        *_no_mobileye(reading.found, reading.planned),
+        *_no_scene(reading.found, reading),
+        *_of_detecting(reading.found),
         *stage.notices,
         *stage.doubts(),
         *chain.from_iterable(
             clock_changes(each.clocks, each.watch.reports()) for each in reading.extractors
         ),
+    )
+
+
+class _Results(NamedTuple):
+    """Results of the estimate stage."""
+
+    stage: PoseStage
+    tally: PoseTally
+    scene: SceneOutcome | None
+    account: Account
+    notices: tuple[str, ...]
+
+
+def _manifest(
+    run: RunFolder,
+    reading: _Reading,
+    results: _Results,
+    rows: tuple[LogRow, ...],
+    timings: EstimateTimings,
+) -> EstimateManifest:
+    """Return the manifest of the run."""
+    tally, scene, landmarks = results.tally, results.scene, reading.landmarks
+    return EstimateManifest(
+        versions=versions_and_commit(),
+        logs=rows,
+        selection=part_of(reading.selection),
+        settings=reading.vehicle,
+        sources=_sources(reading.planned, reading.logs),
+        clocks=tuple(clock_rows(each.clocks, each.watch.reports()) for each in reading.extractors),
+        account=results.account,
+        counts=EstimateCounts(**results.stage.counts()),
+        time=time_segments(reading.timeline),
+        landmarks=None if landmarks is None else _landmarks_used(landmarks, run),
+        notices=results.notices,
+        pose=PoseSummary(
+            rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
+        ),
+        scene=None if scene is None else scene_summary(scene),
+        detect=reading.found,
+        timings=timings,
     )
 
 
@@ -260,6 +294,10 @@ class _Reading:
     ) -> None:
         topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
         self.logs = logs
+        self.vehicle = vehicle
+        self.selection = selection
+        self.landmarks = landmarks
+        self.found = found
         self.has_camera = any(role_of(topic) is Role.CAMERA for _, topic in topics)
         self.planned = plan(topics, vehicle)
         self.camera = None if landmarks is None else camera_of(topics, vehicle)
