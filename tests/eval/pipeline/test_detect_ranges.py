@@ -207,4 +207,4 @@ def test_runs_and_drives_come_in_pairs(tmp_path: Path, capsys: pytest.CaptureFix
     assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--runs", here]) == 2
     assert "1 runs for 2 drives" in capsys.readouterr().err
     assert run(["fit", "ranges", "--cue", "stop_sign"]) == 2
-    assert "give a TABLE, or --truth" in capsys.readouterr().err
+    assert "expected a TABLE, or --truth" in capsys.readouterr().err
