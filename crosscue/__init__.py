@@ -24,7 +24,7 @@ def _broken_links(folder: Path) -> list[str]:
 if _missing := _broken_links(Path(__file__).parent):
     raise ImportError(
         f"crosscue/{_missing[0]} is not a folder: this checkout has no symbolic links (a Windows "
-        "checkout, or a zip download unpacked without them); expected links to the folders beside "
+        "checkout, or a zip download unpacked without them); expected links to the folders next to "
         "crosscue/; try 'git config core.symlinks true' and 'git checkout -- crosscue', or "
         "'pip install' a wheel"
     )

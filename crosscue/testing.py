@@ -67,7 +67,7 @@ def check_reader(
     """
     whole, ledger = _read(log)
     _expect(sum(map(len, whole.values())) > 2, f"{log}: expected three rows or more, for a test")
-    _expect(ledger.is_whole, f"{log}: a whole log has drops: {[*ledger.drops()]}")
+    _expect(ledger.is_whole, f"{log}: an undamaged log has drops: {[*ledger.drops()]}")
     _expect(_read(log)[0] == whole, f"{log}: read again, its rows differ")
     _check_topics(log, whole, ledger)
     for name, rows in whole.items():
@@ -256,7 +256,7 @@ def _check_spans(log: Path, whole: Rows) -> None:
 
 
 def _check_skips(ledger: Ledger, reason: str) -> None:
-    _expect(ledger.is_whole, f"{ledger.log}: a part of a whole log has drops")
+    _expect(ledger.is_whole, f"{ledger.log}: a part of an undamaged log has drops")
     for name, account in ledger.accounts.items():
         declared = account.declared
         _expect(

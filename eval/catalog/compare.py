@@ -361,7 +361,7 @@ def _compare_table(name: str, first: RunFolder, second: RunFolder) -> TableChang
     if before.schema.remove_metadata() != after.schema.remove_metadata():
         return TableChange(name, _schemas(before, after), rows_before, rows_after, {})
     if rows_before != rows_after:
-        return TableChange(name, "another number of rows", rows_before, rows_after, {})
+        return TableChange(name, "different number of rows", rows_before, rows_after, {})
     columns = {}
     for column in before.column_names:
         change = _compare_column(before[column], after[column])
@@ -377,8 +377,8 @@ def _schemas(before: pa.Table, after: pa.Table) -> str:
     columns = [[f"{one.name} {one.type}" for one in table.schema] for table in (before, after)]
     for old, new in zip_longest(*columns, fillvalue="nothing"):
         if old != new:
-            return f"other columns: {old} and {new}"
-    return "other columns: may be null or not"
+            return f"different columns: {old} and {new}"
+    return "different columns: null values allowed in one only"
 
 
 def _compare_column(before: pa.ChunkedArray, after: pa.ChunkedArray) -> ColumnChange | None:
@@ -531,7 +531,7 @@ def _judged_lines(one: PairedMetric) -> Iterator[str]:
     label = "WORSE" if one.verdict == "worse" else one.verdict
     yield f"{label:11}{visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
     ends = "too few drives" if math.isnan(one.low) else f"95 % {one.low:+.3g} to {one.high:+.3g}"
-    seen = "" if not math.isfinite(one.could_see) else f"; could have seen {one.could_see:.3g}"
+    seen = "" if not math.isfinite(one.could_see) else f"; detectable: {one.could_see:.3g}"
     allowed = f"; allowed {one.allowed:.3g}" if one.allowed else ""
     drives = f"{one.drives} drive" + ("s" if one.drives != 1 else "")
     more = f"; {one.more_drives:,} more would decide" if one.more_drives else ""

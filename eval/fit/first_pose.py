@@ -73,7 +73,7 @@ def _started(
         if found is None:
             raise VehicleError(
                 f"{start}: does not show the first pose: expected a track and wheel speeds in the "
-                f"first {READ_S:.0f} s, and a car that moves; try another part of the log"
+                f"first {READ_S:.0f} s, and a moving vehicle; try another part of the log"
             )
         return _changed(vehicle, found)
     if vehicle.gnss.use not in ("start", "fuse") or vehicle.start.heading_rad is not None:

@@ -125,11 +125,11 @@ class ImportedTruth:
         return asdict(self) | {"truth": str(self.truth), "objects": str(self.objects)}
 
     def __repr__(self) -> str:
-        lines = [f"pictures   {self.pictures} with {self.things} things, placed {self.rule}"]
+        lines = [f"pictures   {self.pictures} with {self.things} objects, matched {self.rule}"]
         lines += [f"           {cue}: present in {count}" for cue, count in self.cues.items()]
         if not self.cues:
             lines.append("           no label is a cue; only objects were imported")
-        lines += [f"not taken  {count} {kind}" for kind, count in self.ignored.items()]
+        lines += [f"ignored    {count} {kind}" for kind, count in self.ignored.items()]
         lines.append(f"written to {visible(str(self.truth))}")
         lines.append(f"           {visible(str(self.objects))}")
         return "\n".join(lines)

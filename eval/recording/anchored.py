@@ -90,9 +90,9 @@ class Anchored:
 
     def _region(self, side: str, corners: NDArray[np.float64], fraction: float) -> None:
         is_road = fraction > self.manifest.settings.cues.road_fraction
-        said = "not seen" if np.isnan(fraction) else f"{100.0 * fraction:.0f} %"
+        text = "not seen" if np.isnan(fraction) else f"{100.0 * fraction:.0f} %"
         colour = REGION_WITH_ROAD if is_road else REGION
-        self.marks.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {said}")
+        self.marks.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {text}")
 
     def _car(self, car: CarMotion, size_px: tuple[int, int], place: Place | None) -> None:
         cars, camera = self.manifest.settings.cars, self.manifest.settings.camera

@@ -108,7 +108,7 @@ def _cues() -> rrb.View:
 def _ahead() -> rrb.View:
     return rrb.Spatial2DView(
         origin="ahead",
-        name="Ahead of the car (m)",
+        name="Ahead of the vehicle (m)",
         visual_bounds=rrb.VisualBounds2D(x_range=[-ASIDE_M, ASIDE_M], y_range=[-FAR_M, BEHIND_M]),
     )
 
@@ -116,7 +116,7 @@ def _ahead() -> rrb.View:
 def _belief() -> rrb.View:
     return rrb.TimeSeriesView(
         origin="/".join(BELIEF),
-        name="Probability: is it there?",
+        name="Probability of each feature",
         axis_x=rrb.TimeAxis(view_range=_whole()),
         axis_y=rrb.ScalarAxis(range=(-0.03, 1.03)),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightBottom),

@@ -15,10 +15,10 @@ COLOURS: Final = (
     "- camera: cars blue, stop signs red, traffic lights yellow, sign windows magenta, what is "
     "too uncertain to be a cue grey; road hatched in teal, regions of interest green while they "
     "hold road (on the ground only where a detector looks for road; grey ones hold none or are not "
-    "seen); arrows: orange cars cross, violet ones are parked and point where their nose does, "
+    "seen); arrows: orange cars cross, violet ones are parked and point to their front, "
     "white ones go along the road, green ones beyond the intersection; an arrow on the road is the "
     "way of one second, with the ego vehicle's own motion removed",
-    "- ahead of the car: red bar the start, yellow bar the end of the intersection with its "
+    "- ahead of the vehicle: red bar the start, yellow bar the end of the intersection with its "
     "2-sigma band, green the truth; blue dots and white lines are the Mobileye's",
     "- map: blue the estimated path, orange its 2-sigma ellipse, green the truth",
 )
@@ -30,7 +30,7 @@ def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
     logs = [f"- {inert(log.name)}" for log in manifest.logs]
     notices = [f"- {inert(sentence)}" for sentence in (*manifest.notices, *more)]
     dropped = sum(not log.is_whole for log in manifest.account.reading)
-    whole = (
+    losses = (
         "nothing is known to be dropped"
         if not dropped
         else f"{dropped} log(s) with losses: see manifest"
@@ -38,7 +38,7 @@ def notes(run: RunFolder, more: Sequence[str]) -> rr.TextDocument:
     lines = [
         f"# {inert(run.path.name)}",
         "",
-        f"Logs ({whole}):",
+        f"Logs ({losses}):",
         *logs,
         "",
         "Notes:",

@@ -35,8 +35,8 @@ def write_detector_page(
         OutputError: The file cannot be written.
     """
     figure = draw_reliability(calibration) if has_figures else None
-    whole = {**content, "figure": figure, "calibration": calibration}
-    write_page(path, TEMPLATE, whole, {"number": _number, "ends": _ends})
+    values = {**content, "figure": figure, "calibration": calibration}
+    write_page(path, TEMPLATE, values, {"number": _number, "ends": _ends})
 
 
 def draw_reliability(calibration: Sequence[Reliability]) -> str | None:

@@ -77,8 +77,8 @@ def write_history_page(
         OutputError: The file cannot be written.
     """
     drawn = [(one, draw_chart(one, versions)) for one in charts]
-    whole = {**content, "versions": versions, "charts": drawn}
-    write_page(path, TEMPLATE, whole, {"number": _number, "short": _short})
+    values = {**content, "versions": versions, "charts": drawn}
+    write_page(path, TEMPLATE, values, {"number": _number, "short": _short})
 
 
 def draw_chart(one: Chart, versions: Sequence[str]) -> Markup:

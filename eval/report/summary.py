@@ -267,8 +267,8 @@ def poses_summary(poses: Sequence[PoseScore]) -> str:
     lines = [_line("pose", f"{len(poses)} drives, {lost} lost; means over drives (95 %)")]
     for name, unit, values in (
         ("APE, rms", " m", [one.ape["none"].translation_m.rmse for one in poses]),
-        ("NEES of x, y", ", 2 is honest", [one.nees_xy.mean for one in poses]),
-        ("NEES of x, y, heading", ", 3 is honest", [one.nees_xyh.mean for one in poses]),
+        ("NEES of x, y", ", 2 is consistent", [one.nees_xy.mean for one in poses]),
+        ("NEES of x, y, heading", ", 3 is consistent", [one.nees_xyh.mean for one in poses]),
     ):
         found = mean(np.array(values), drives)
         ends = TOO_FEW if math.isnan(found.low) else f"{found.low:.2f} to {found.high:.2f}"
@@ -304,7 +304,7 @@ def _nees_lines(result: PoseScore) -> list[str]:
         if math.isnan(n.mean):
             continue
         lines.append(
-            f"NEES of {name}: mean {n.mean:.2f} (honest for one drive: {n.band_low:.2f} to "
+            f"NEES of {name}: mean {n.mean:.2f} (consistent for one drive: {n.band_low:.2f} to "
             f"{n.band_high:.2f}), {100 * n.fraction_inside_95:.0f} % inside 95 %"
         )
     return lines

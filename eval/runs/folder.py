@@ -236,7 +236,9 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
         raise RunError(f"{path}: holds files already; give another folder or --overwrite")
     if leftovers and not _looks_like_run(leftovers):
         names = ", ".join(sorted(entry.name for entry in leftovers)[:3])
-        raise RunError(f"{path}: holds files that are no run's ({names}); give another folder")
+        raise RunError(
+            f"{path}: holds files that do not belong to a run ({names}); give another folder"
+        )
     return RunFolder(path)
 
 
@@ -456,12 +458,12 @@ def _refuse_if_held(path: Path, text: bytes, *, is_ours: bool | None) -> None:
         # No holder is named: it has just locked the file, or died before signing.
         pid = host = started = ""
     if host not in ("", socket.gethostname()):
-        raise RunError(f"{path}: held by process {pid} on {host}; delete the file if that is over")
+        raise RunError(f"{path}: held by process {pid} on {host}; delete the file if it has ended")
     is_other = pid.isdigit() and int(pid) != os.getpid()
     is_alive = is_other and started == _started(int(pid))
     if is_ours is False or (is_ours is None and is_alive):
         who = f"process {pid} on {host}" if pid else "another process"
-        raise RunError(f"{path.parent}: {who} is writing it; wait or stop that")
+        raise RunError(f"{path.parent}: {who} is writing it; wait or stop it")
 
 
 def signature() -> str:

@@ -66,7 +66,7 @@ def estimate_mounting(
         speed: Speed of the vehicle, m/s; without it there is no estimate.
     """
     if intrinsics is None or speed is None or len(speed) < 2:
-        lacks = "focal_px" if intrinsics is None else "the car's speed"
+        lacks = "focal_px" if intrinsics is None else "the vehicle's speed"
         return Estimate(None, None, 0, f"pitch and yaw not estimated: needs {lacks}")
     number = next(i for i, topic in enumerate(log.topics) if topic.name == camera)
     seen, bends = 0, 0

@@ -293,7 +293,7 @@ def test_cvat_for_images(tmp_path: Path, log: Path, capsys: pytest.CaptureFixtur
 
     argv = ["truth", "import", str(tmp_path / "a.xml"), "--log", str(log), "-o", str(tmp_path)]
     assert cli.run(argv) == 0
-    assert "not taken  1 polyline" in capsys.readouterr().out
+    assert "ignored    1 polyline" in capsys.readouterr().out
     found = {(one.cue, one.t_ns): one.present for one in load(tmp_path).cues}
     assert found == {
         ("stop_sign", START_NS + STEP_NS): True,

@@ -162,8 +162,8 @@ def test_tables_that_cannot_be_compared_row_by_row_say_why(tmp_path: Path) -> No
     found = {one.name: one for one in compare_runs(open_run(good), open_run(worse)).tables}
     # A number that is missing in both is not a difference.
     assert set(found) == {"cues", "frames", "range"}
-    assert found["frames"].what == "another number of rows"
-    assert found["cues"].what == "other columns: count int64 and nothing"
+    assert found["frames"].what == "different number of rows"
+    assert found["cues"].what == "different columns: count int64 and nothing"
     assert found["range"].what == "only in the first run"
 
 

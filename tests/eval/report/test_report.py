@@ -191,7 +191,7 @@ def test_a_log_that_is_gone_is_an_error_unless_pictures_are_left_out(
     assert cli.run([*argv, "--logs", str(tmp_path / "moved")]) == 3
     assert "Its picture" not in (run.file("score") / "report.html").read_text()
     assert cli.run([*argv, "--without-images"]) == 3
-    assert "Its picture is not at hand." in (run.file("score") / "report.html").read_text()
+    assert "Its picture is not available." in (run.file("score") / "report.html").read_text()
 
 
 def test_the_same_scores_give_the_same_bytes(tmp_path: Path) -> None:
