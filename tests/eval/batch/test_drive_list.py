@@ -1,4 +1,4 @@
-"""Which drives a command line means."""
+"""Drives that a command line names."""
 
 import re
 import uuid
@@ -22,14 +22,14 @@ def _touch(folder: Path, *names: str) -> Path:
 
 
 def _simulated(folder: Path, *names: str) -> Path:
-    """As ``crosscue simulate`` writes."""
+    """Write a drive folder as ``crosscue simulate`` does."""
     for name in names:
         _touch(folder / name, "drive.mcap", "vehicle.toml", "truth.json", "objects.json", "car.dbc")
     return folder
 
 
 def _names(drives: tuple[DriveInput, ...]) -> list[str]:
-    """What a person reads of the names."""
+    """Return the readable part of the names."""
     assert all(re.fullmatch(r".*-[0-9a-f]{8}", one.name, re.DOTALL) for one in drives)
     return [one.name[:-9] for one in drives]
 

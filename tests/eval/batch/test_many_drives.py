@@ -1,4 +1,4 @@
-"""Many drives side by side: each costs only itself, and nothing is done twice."""
+"""Many drives in parallel: a failure affects only its drive, and nothing is done twice."""
 
 import json
 import os
@@ -217,7 +217,7 @@ def run(args):
     return 0
 
 if __name__ == "__main__":
-    # Whoever started the tests in a shell's background has made them deaf to this signal.
+    # Tests started in the background of a shell ignore this signal.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.exit(_guarded(types.SimpleNamespace(run=run), argparse.Namespace(verbose=False)))
 """

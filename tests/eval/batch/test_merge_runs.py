@@ -1,4 +1,4 @@
-"""Runs of many drives as one."""
+"""Merging of the runs of many drives."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A Ray cluster takes nothing over, reports nobody, and does what one process does.
+"""A Ray cluster handles no signals, sends no statistics, and yields the results of one process.
 
 One cluster on this machine serves all tests that need one: starting it takes longer than they do.
 """
@@ -42,7 +42,7 @@ STUDY = LandmarkStudy(
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """Joined, and left at the end."""
+    """Connect to the cluster, and disconnect at the end."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
         patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")

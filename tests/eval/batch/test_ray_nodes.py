@@ -69,7 +69,7 @@ def test_a_lost_node_costs_its_running_drives_only(cluster: Any, tmp_path: Path)
             found[done.job.name] = done
         names = [path.read_text() for path in begun if path.exists()]
         if not lost and any(names):
-            # The node that a drive waits on is lost; whatever runs on the other goes on.
+            # The node of a waiting drive is lost; drives on the other node continue.
             lost = next(filter(None, names))
             (node,) = [one for one in cluster.worker_nodes if one.node_id == lost]
             cluster.remove_node(node, allow_graceful=False)
@@ -79,7 +79,7 @@ def test_a_lost_node_costs_its_running_drives_only(cluster: Any, tmp_path: Path)
     assert lost
     assert [found[job.name].error for job in jobs] == [None] * 5
     attempts = [found[job.name].attempts for job in jobs]
-    # Those that ran on it were begun twice, all others once.
+    # Drives that ran on it were started twice, all others once.
     assert [attempts[i] for i in (0, 2, 4)].count(1) >= 2
     assert sum(attempts) == 6
     here = made_jobs(tmp_path, words, "here")

@@ -1,4 +1,4 @@
-"""Many drives by the command line: failures are reported, a second start does what is missing."""
+"""Many drives on the command line: failures are reported, a second start does what is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What many drives leave behind: a table of all, and a failure for a drive's own vehicle file."""
+"""Output of many drives: merged tables, and a failure for an invalid vehicle file of one drive."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
     before = (run_path / "pose.parquet").read_bytes()
     (said,) = open_run(run_path).drive_manifest().logs
     assert said.path == url
-    # Read by ranges, the log leaves nothing in the store that an estimate could lean on.
+    # A log that is read by ranges leaves no local copy that an estimate could use.
     assert not store.exists()
     assert run(["estimate", str(run_path), "-q"]) == 0
 

@@ -1,4 +1,4 @@
-"""Shards of many drives: disjoint, whole, and stable by identity."""
+"""Shards of many drives: disjoint, complete, and stable by identity."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""How far a batch has come, and what is known of its failures."""
+"""Progress of a batch, and details of its failures."""
 
 import json
 import math
@@ -26,7 +26,7 @@ WORDS = ("plain", "damaged", "bug", "loss")
 
 @pytest.fixture
 def batch(tmp_path: Path) -> list[Job]:
-    """Four drives that have been worked on, two of which failed, and one that is planned."""
+    """Four processed drives, two of which failed, and one planned drive."""
     jobs = made_jobs(tmp_path, WORDS)
     write_plan(tmp_path / "runs", [*(job.name for job in jobs), "later"], "all")
     run_many(jobs, letters, in_turn)
@@ -49,7 +49,7 @@ def test_every_planned_drive_is_in_one_state(batch: list[Job], tmp_path: Path) -
     }
     found = crosscue.batch_status(folder)
     assert [found.count(state) for state in DriveState] == [2, 0, 2, 0, 1]
-    # Four drives ended a moment ago, and nobody works on the last.
+    # Four drives have just ended, and no worker processes the last.
     assert found.pace.per_hour > 4.0
     assert math.isnan(found.pace.left_s)
 

@@ -1,4 +1,4 @@
-"""The runs below a folder as tables."""
+"""Tables of the runs below a folder."""
 
 import json
 from pathlib import Path

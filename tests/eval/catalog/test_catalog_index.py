@@ -1,4 +1,4 @@
-"""The index of a catalog: it saves reading, and never decides what a catalog says."""
+"""The index of a catalog: it saves reading, and never changes the content of a catalog."""
 
 import errno
 import os
@@ -29,7 +29,7 @@ def runs(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the runs whose manifests get read."""
+    """Names of the runs whose manifests are read."""
     names: list[str] = []
     rows_of = records.rows_of
 
@@ -92,7 +92,7 @@ def test_a_failed_run_is_a_row_with_its_status_and_reason(runs: Path, read: list
     log = runs.parent / "drive.mcap"
     log.touch()
     attempt(fails, Job("sunday", (str(log),), runs / "a/sunday", ""))
-    # One whose earlier run still stands, and what only looks like a failure.
+    # A failed drive whose earlier run still exists, and a file that only looks like a failure.
     attempt(fails, Job("monday", (str(log),), runs / "a/monday", ""))
     (runs / "b/failure.log").write_text("the coffee machine is out of order\n")
 
@@ -110,7 +110,7 @@ def test_a_failed_run_is_a_row_with_its_status_and_reason(runs: Path, read: list
     read.clear()
     assert crosscue.catalog(runs).query("select count(*) as n from runs").to_pylist() == [{"n": 5}]
     assert read == []
-    # Done at last, it is a run like the others.
+    # Once complete, it is a run like the others.
     add_run(runs / "a/sunday", "sunday")
     (runs / "a/sunday/failure.log").unlink()
     assert crosscue.catalog(runs).select("outcome = 'failed'") == ()

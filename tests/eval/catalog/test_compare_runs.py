@@ -1,4 +1,4 @@
-"""``crosscue compare``: what differs, what of it is worse, and the exit status."""
+"""``crosscue compare``: differences, verdicts and the exit status."""
 
 import json
 from pathlib import Path
@@ -29,12 +29,12 @@ WORSE_CUES = {**CUES, "stop_sign": {frame: int(frame >= 3) for frame in range(40
 
 
 def _settings(established: float) -> Vehicle:
-    """As a manifest has them."""
+    """Values in the form of a manifest."""
     return Vehicle(version=1, fusion=Fusion(established=established))
 
 
 def _pair(tmp_path: Path, *, scored: bool = True, drives: int = 1) -> tuple[Path, Path]:
-    """Good drives, and the same with seven false stop signs each, established elsewhere."""
+    """Good drives, and the same drives with seven false stop signs each."""
     false_signs = {
         "frames": frame_table(50),
         "cues": cue_table(WORSE_CUES),
@@ -93,14 +93,14 @@ def test_what_every_drive_shows_is_decided(
     assert "WORSE      cues.stop_sign.precision: 1 -> 0.945946" in text
     assert "better     cues.stop_sign.recall: 0.857143 -> 1" in text
     assert "drives     6 in both runs" in text
-    # The recall is better, so turning the comparison round finds that worse.
+    # The recall is better, so the reversed comparison finds it worse.
     assert cli.run(["compare", str(worse), str(good), "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert (found["worse"], found["better"]) == (
         ["cues.stop_sign.recall"],
         ["cues.stop_sign.precision"],
     )
-    # A tolerance is how much worse a metric may be; the last that fits counts.
+    # A tolerance is the allowed loss of a metric; the last one that matches applies.
     narrow = ["10%", "cues.stop_*=0.01"]
     for tolerances, status in ((["10%"], 0), (["0.01"], 1), (narrow, 1), (narrow[::-1], 0)):
         argv = ["compare", str(good), str(worse), "-q", "--tolerance", *tolerances]

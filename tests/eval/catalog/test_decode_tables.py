@@ -136,5 +136,5 @@ def test_the_ford_bus_decodes_from_the_command_line(
 
     assert "id not in the database" in capsys.readouterr().out
     speed = pq.read_table(tmp_path / "out" / "can0_WheelSpeed.parquet")
-    # 28 to 76 km/h, as the recording says, on tyres of about 0.33 m.
+    # 28 to 76 km/h, as recorded, on tyres of about 0.33 m.
     assert 8.0 < np.mean(speed["WhlRl_W_Meas"].to_numpy()) * 0.33 < 22.0

@@ -1,4 +1,4 @@
-"""A metric over versions: what the page and the command show of it."""
+"""A metric over versions, on the page and in the command's output."""
 
 import json
 import math
@@ -25,7 +25,7 @@ MODELS = ("m0", "m1", "m2", "m3")
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight drives under four models, of which the third finds fewer signs; one has no score."""
+    """Eight drives with four models, the third of which finds fewer signs; one run has no score."""
     folder = tmp_path_factory.mktemp("fleet")
     chance = np.random.default_rng(2)
     for at, model in enumerate(MODELS):
@@ -50,7 +50,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Words(HTMLParser):
-    """Text of a page, and what it would load."""
+    """Parser of a page's text and of the resources that it would load."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,11 +58,11 @@ class Words(HTMLParser):
         self.loaded: list[str] = []
 
     def handle_data(self, data: str) -> None:
-        """Keep it."""
+        """Keep the text."""
         self.text += f" {data.strip()}"
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note what would be loaded."""
+        """Keep the addresses that would be loaded."""
         self.loaded += [tag] if tag in ("script", "link", "img", "iframe") else []
 
 
@@ -111,7 +111,7 @@ def test_one_version_has_points_and_no_change(
 
     assert len(found["versions"]) == 1
     assert all(not one["changes"] for one in found["metrics"])
-    # Four runs of each drive: the latest stands for it.
+    # Four runs of each drive: the latest one represents it.
     assert found["left_out"]["replaced by a later run of the same drive"] == 31 - found["drives"][0]
 
 

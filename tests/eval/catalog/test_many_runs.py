@@ -1,4 +1,4 @@
-"""Many runs against many: paired by drive, whatever their folders are called."""
+"""Comparison of two sets of runs: paired by drive, for any folder names."""
 
 import json
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ DUSK = "cues.stop_sign.by_condition.dusk.recall"
 
 
 def scored_runs(folder: Path, right: Sequence[int], first: int = 0) -> list[Path]:
-    """A run of each drive, so many of 20 signs found, and half of them at dusk."""
+    """A run of each drive with the given number of 20 signs found, half of them at dusk."""
     found = []
     for number, count in enumerate(right, first):
         run = create(folder / f"{folder.name}-{number}", overwrite=False)

@@ -1,4 +1,4 @@
-"""Runs compared drive by drive: false alarms by simulation, and differences that are seen."""
+"""Paired comparison of runs: simulated false alarms, and detectable differences."""
 
 import math
 
@@ -28,7 +28,7 @@ METRICS: dict[str, Kind] = {
 def drawn(
     chance: np.random.Generator, drives: int, shift: float = 0.0, hard: Floats | None = None
 ) -> list[DriveMetric]:
-    """Metrics of one run that depend on each other and on how hard each drive is."""
+    """Metrics of one run that depend on each other and on the difficulty of each drive."""
     hard = chance.normal(0.0, 1.0, drives) if hard is None else hard
     found = []
     for drive in range(drives):
@@ -66,7 +66,7 @@ def test_what_did_change_raises_no_alarm_about_what_did_not() -> None:
     assert (corrected[:, 0] <= FALSE_ALARMS).all()
     false = (corrected[:, 1:] <= FALSE_ALARMS).any(axis=1).mean()
     assert false == pytest.approx(FALSE_ALARMS, abs=2.0 * math.sqrt(FALSE_ALARMS / TIMES))
-    # Never less powerful than judging every metric by the largest of all.
+    # At least as powerful as judging every metric by the largest difference of all.
     assert (corrected <= single + 1e-9).all()
     assert (single[:, 1:] <= FALSE_ALARMS).any(axis=1).mean() < false
 

@@ -1,4 +1,4 @@
-"""The page about queries: its questions are asked, and its columns are those of the catalog."""
+"""The page on queries: its queries run, and its columns are those of the catalog."""
 
 import re
 from pathlib import Path
@@ -30,7 +30,7 @@ QUESTIONS: Final = re.findall(r"```sql\n(.*?)```", PAGE.read_text(encoding="utf-
 
 @pytest.fixture(scope="module")
 def catalog(tmp_path_factory: pytest.TempPathFactory) -> crosscue.Catalog:
-    """Small runs of everything that is asked for: one approach each, in rain, at 30 m or nearer."""
+    """Small runs with data for all queries: one approach each, in rain, at 30 m or nearer."""
     folder = tmp_path_factory.mktemp("fleet")
     runs = runs_below(folder / "runs")
     signs = detected("front", {"signs": "objects"})

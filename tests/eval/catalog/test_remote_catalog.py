@@ -1,4 +1,4 @@
-"""A catalog of runs on an object store: what it says, and how little it fetches."""
+"""A catalog of runs on an object store: its content, and how little it fetches."""
 
 import io
 import os
@@ -29,7 +29,7 @@ class _Counted(io.BytesIO):
 
 
 class CountedStore(MemoryFileSystem):  # type: ignore[misc]
-    """A store in memory that counts what is read of its objects."""
+    """A store in memory that counts the bytes read from its objects."""
 
     protocol = "counted"
     store: dict[str, Any] = {}  # noqa: RUF012 (as its base has it)
@@ -72,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def url(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The same on a store."""
+    """The same runs on a store."""
     fsspec.register_implementation("counted", CountedStore, clobber=True)
     before = os.environ.get("XDG_CACHE_HOME")
     os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))

@@ -1,4 +1,4 @@
-"""Which runs a command line means."""
+"""Runs that a command line names."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What went wrong in runs: found at the right moment, ranked, and picked from many causes."""
+"""Failures of runs: found at the right moment, ranked, and selected from many causes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_sign_in_plain_view_that_was_not_found_at_first_is_missed_until_it_is(
     (sign,) = [one for one in found.failures if one.what == "stop_sign"]
     assert (sign.kind, sign.level, sign.frames) == ("missed", "frames", 5)
     assert (sign.start_ns, sign.end_ns) == (at(5), at(9))
-    # Nearest to it, it should have been easiest; the run begins at its first frame.
+    # Detection should be easiest at the nearest frame; the run starts at its first frame.
     assert (sign.t_ns, sign.at_s, sign.distance_m) == (at(9), 0.9, 31.0)
     assert (sign.intersection, sign.conditions) == ("A", ("rain",))
     assert sign.cause == "not detected"
@@ -76,7 +76,7 @@ def test_a_right_range_is_no_failure_and_one_sure_of_itself_and_off_is(tmp_path:
 
     table = pq.read_table(path)
     var = table["var_m2"].to_numpy().copy()
-    # Half a metre off with an s.d. of 0.1 m: five times as far as claimed.
+    # An error of half a metre with an s.d. of 0.1 m is five standard deviations.
     var[5:8] = 0.01
     column = table.schema.get_field_index("var_m2")
     pq.write_table(table.set_column(column, "var_m2", pa.array(var)), path)

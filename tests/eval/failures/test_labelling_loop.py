@@ -1,4 +1,4 @@
-"""The labelling loop: failing frames go out with detections, come back corrected, and are used."""
+"""The labelling loop: failing frames are exported with detections, corrected, imported and used."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from support.scoring import at, truth_folder
 
 @pytest.fixture(scope="module")
 def worst(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A table of what went wrong in the made-up run, beside the run."""
+    """A table of the failures of the synthetic run, next to the run."""
     folder = tmp_path_factory.mktemp("loop")
     run, truth = scene_run(folder), truth_folder(folder / "truth")
     manifest = run.drive_manifest()
@@ -40,7 +40,7 @@ def exported(worst: Path) -> Path:
 
 
 def corrected(exported: Path, to: Path, change: Callable[[dict[str, object]], None]) -> Path:
-    """The export after a person has worked on each box."""
+    """The export after each box has been corrected."""
     tree = json.loads(exported.read_text())
     for box in tree["annotations"]:
         change(box)
@@ -60,7 +60,7 @@ def test_pictures_go_out_once_as_recorded_with_what_detectors_found(
     assert {one.size_px for one in labels.pictures} == {SIZE}
     for one in labels.pictures:
         assert (exported.parent / "images" / one.name).read_bytes()[:2] == b"\xff\xd8"
-        # The car, and not the thing that no cue is made of.
+        # The car, but not the object that no cue uses.
         assert one.t_ns is not None
         x = 20.0 + (one.t_ns - at(0)) // 100_000_000
         assert [thing.box_px for thing in one.things] == [(x, 40.0, x + 40.0, 52.0)]
@@ -92,7 +92,7 @@ def test_a_corrected_box_comes_back_with_its_time_and_is_trained_and_fitted_with
     fitted = crosscue.fit_detector(worst.parent / "run", drive.objects, detector="finder")
     assert [one.name for one in fitted.classes] == ["car"]
     assert fitted.fitted_to + fitted.held_out == len(objects.pictures)
-    # And one step of training with the same file.
+    # One step of training uses the same file.
     settings = crosscue.MaskRcnnTrainingSettings(
         data=found.coco, images=found.images, classes=("car",), steps=1, batch=1, check_images=1
     )

@@ -18,7 +18,7 @@ from support.scoring import truth_folder
 
 
 class Links(HTMLParser):
-    """Where a page leads, and what it shows."""
+    """Parser of a page's links and content."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Links(HTMLParser):
         self.feed(page.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Keep what an element refers to."""
+        """Keep the addresses that an element refers to."""
         self.scripts += tag == "script"
         for name, value in attrs:
             if name in ("href", "src") and value is not None and "://" not in value:
@@ -111,7 +111,7 @@ def test_without_the_script_pages_reach_every_failure_by_each_facet(tmp_path: Pa
     for facet in FACETS:
         pages = list((tmp_path / "by").glob(f"{facet}-*.html"))
         assert set(listed(pages)) == set(wanted)
-        # A failure under two conditions is in the lists of both.
+        # A failure with two conditions is in the lists of both.
         assert facet == "condition" or listed(pages) == wanted
         assert all(Links(page).scripts == 0 for page in pages)
 

@@ -1,4 +1,4 @@
-"""Thresholds with a bound that holds, calibrations, and a card that changes what a cue is."""
+"""Thresholds with valid bounds, calibrations, and a card that changes a cue."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_bound_is_clopper_and_pearson_s() -> None:
 
 
 def probability(scores: np.ndarray) -> np.ndarray:
-    """Made up: how often a detection with such a score is right."""
+    """Probability that a detection with this score is right, in the simulation."""
     return 1.0 / (1.0 + np.exp(-12.0 * (scores - 0.45)))
 
 
@@ -115,7 +115,7 @@ def test_the_source_s_thresholds_are_its_network_s_only() -> None:
         0, (64, 48), boxes, np.array([0.92, 0.96]), ("car", "car"), (b"", b"")
     )
     assert found.with_min_scores(SOURCE_SCORES).are_sure(None).tolist() == [False, True]
-    # Another network's scores mean something else: nothing is said of them, so one half.
+    # The scores of another network differ in meaning: without a calibration, one half.
     assert found.are_sure(None).tolist() == [True, True]
     assert found.with_min_scores(SOURCE_SCORES).are_sure(0.5).tolist() == [True, True]
 
@@ -126,7 +126,7 @@ SIZE = (64, 48)
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Simulated: pictures with one bright box each, the brighter the more often a traffic light."""
+    """Simulated pictures with one bright box each; brighter ones are more often traffic lights."""
     folder = tmp_path_factory.mktemp("lights")
     (folder / "log").mkdir()
     (folder / "labels").mkdir()
@@ -153,7 +153,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def detected(folder: Path, card: str) -> crosscue.Run:
-    """Detections of a card, in the folder of its name."""
+    """Detections of a card's network, in the folder of the card's name."""
     return crosscue.detect_drive(
         folder / "log", folder / card.replace("net", "run"), detectors=[f"{folder}/{card}.toml"]
     )
@@ -175,7 +175,7 @@ def test_a_fitted_card_makes_cues_as_precise_as_asked(drive: Path) -> None:
     assert before.scores[0].right + before.scores[0].wrong == PICTURES
     precise, imprecise = after.scores[1].precision.value, before.scores[1].precision.value
     assert imprecise < 0.9 < 0.95 <= precise
-    # The cue counts what is above the card's threshold, in the run's own tables.
+    # The cue counts detections above the card's threshold, in the run's own tables.
     cues = run["cues"].to_pydict()
     counts = [
         n for cue, n in zip(cues["cue"], cues["count"], strict=True) if cue == "traffic_light"

@@ -1,4 +1,4 @@
-"""Where a drive begins: from GNSS, a truth file, or three numbers; and GNSS as truth."""
+"""The first pose of a drive from GNSS, a truth file or three numbers; and GNSS as truth."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_a_truth_that_cannot_show_the_heading_is_refused(tmp_path: Path) -> None
 
 
 LONG_WHEELS = Vehicle(version=1, odometry=Odometry(wheel_scale=1.05, slip_per_sqrt_m=1.0))
-"""Wheels that report five per cent too much: 12 m over the drive."""
+"""Scale error of the wheels, five per cent: 12 m over the drive."""
 
 
 def test_fused_positions_hold_a_pose_that_odometry_alone_loses(tmp_path: Path) -> None:

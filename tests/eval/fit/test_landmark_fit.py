@@ -1,4 +1,4 @@
-"""The threshold's fit: rates as wanted, intervals that hold, pairs from tables and drives."""
+"""Fit of the threshold: required rates, valid intervals, pairs from tables and drives."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_the_fitted_half_keeps_the_wanted_rate_and_no_lower_threshold_would(want
 
 
 def test_held_out_pairs_keep_about_the_wanted_rate() -> None:
-    """Over 40 simulated fits the true rate at the threshold is the wanted one, on average."""
+    """Over 40 simulated fits, the mean true rate at the threshold is the required one."""
     true_rates = [np.exp(-fit_landmarks(made(seed), 0.02).min_score / 5.0) for seed in range(40)]
 
     assert np.mean(true_rates) == pytest.approx(0.02, rel=0.1)
@@ -111,7 +111,7 @@ def test_intervals_hold_their_share_and_mirror(of: int, data: st.DataObject) -> 
 def test_pairs_from_a_table_fit_a_threshold_and_write_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Eight simulated walls, each seen again, against all eight."""
+    """Eight simulated walls, each observed again, compared with all eight."""
     for i in range(8):
         (tmp_path / f"a{i}.png").write_bytes(encoded(wall(i, 320, 240)))
         again = seen_from(wall(i, 320, 240), 6.0, 1.1, 5.0, i)

@@ -22,7 +22,7 @@ Drives = tuple[list[Path], list[Path]]
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
-    """Run folders and truth files: with a road to the left, without, and at no intersection."""
+    """Run folders and truth files: with and without a road to the left, and no intersection."""
     folder = tmp_path_factory.mktemp("drives")
     rng = np.random.default_rng(4)
     runs, truths = [], []

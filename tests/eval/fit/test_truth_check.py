@@ -1,4 +1,4 @@
-"""``truth check`` and ``score`` hold a truth to the same rule where a log's clock was set back."""
+"""``truth check`` and ``score`` apply the same rule to a truth if a log's clock was set back."""
 
 from __future__ import annotations
 

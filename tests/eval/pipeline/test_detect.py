@@ -1,4 +1,4 @@
-"""From a camera log to a run folder of detections and cues, by the command line."""
+"""From a camera log to a run folder of detections and cues, on the command line."""
 
 import json
 from pathlib import Path
@@ -111,7 +111,7 @@ def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
 def test_rules_that_used_boxes_for_masks_are_named(
     tmp_path: Path, counted: str, said: str | None
 ) -> None:
-    """A detector of boxes alone serves eq. 15 by boxes and eq. 16 not at all."""
+    """With a detector of boxes alone, eq. 15 uses boxes and eq. 16 is not evaluated."""
     log, out, vehicle = _folder(tmp_path, 1), tmp_path / "run", tmp_path / "car.toml"
     vehicle.write_text(f"version = 1\n{counted}\n")
 
@@ -382,7 +382,7 @@ def test_networks_of_simulated_scenes_warn_on_any_other_log(tmp_path: Path) -> N
     arguments = ["detect", str(log), "--detectors", "road", "--no-cache", "-q"]
     vehicle.write_text(f'version = 1\nname = "{SIMULATED_CAR}"\n')
 
-    # A vehicle file may be copied or left out; the file beside the log is of the log.
+    # A vehicle file may be copied or left out; the file next to the log belongs to it.
     assert run([*arguments, "-o", str(tmp_path / "real"), "--vehicle", str(vehicle)]) == 0
     (tmp_path / SIMULATED).write_text("{}")
     assert run([*arguments, "-o", str(tmp_path / "simulated")]) == 0

@@ -1,4 +1,4 @@
-"""Heights in pixels to ranges: the curve that made the pairs comes back, with its scatter."""
+"""From heights in pixels to ranges: the fit recovers the curve of the pairs and its scatter."""
 
 import json
 from pathlib import Path

@@ -38,7 +38,7 @@ WALL_M = 40.0
 
 
 def view(way_m: float, noise: float, seed: int) -> Bytes:
-    """What the camera sees after so much way: the next wall, the larger the nearer."""
+    """Picture of the next wall after a distance; it is larger when the wall is nearer."""
     number, into_m = divmod(way_m, WALL_M)
     scale = 0.6 * (WALL_M + 15.0) / (WALL_M + 15.0 - into_m)
     return seen_from(_wall(int(number) + 100), 0.0, scale, noise, seed)
@@ -64,7 +64,7 @@ def frames(folder: Path, drive: DriveFiles, every_ns: int, noise: float, seed: i
 
 @dataclass(frozen=True, slots=True)
 class Town:
-    """What all tests here share."""
+    """Data shared by all tests of this module."""
 
     drive: DriveFiles
     vehicle: Path

@@ -1,4 +1,4 @@
-"""Which light or sign yields the range, and what happens where nothing can."""
+"""Choice of the light or sign that yields the range, and frames in which none can."""
 
 from collections.abc import Sequence
 

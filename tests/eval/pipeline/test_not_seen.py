@@ -1,4 +1,4 @@
-"""What no cue spoke of is not seen, which is another thing than improbable."""
+"""Features without an observation are reported as not seen, which differs from improbable."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from support.gap_drive import Clock, GreyNumber, replayed, write_drive
 
 @pytest.fixture(scope="module", params=[True, False], ids=["signs alone", "anything"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A drive to a stop sign and nothing else, by a detector with labels and by one without."""
+    """A drive to a single stop sign, with a detector that states its labels or does not."""
     folder = tmp_path_factory.mktemp("drive")
     with pytest.MonkeyPatch.context() as patch:
         if request.param:

@@ -1,4 +1,4 @@
-"""Ranges to a real crossing: falling, inside their own interval, and not far off."""
+"""Ranges to a real intersection: decreasing, inside their own interval, and accurate."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def columns(drive: RunFolder, reference: str) -> tuple[Floats, Floats, Floats]:
-    """Ranges, their standard deviations and the way gone of each row."""
+    """Ranges, their standard deviations and the distance travelled, by row."""
     table = drive.table("range")
     pose = drive.table("pose", ["t_ns", "travelled_m"])
     gone = dict(zip(pose["t_ns"].to_pylist(), pose["travelled_m"].to_pylist(), strict=True))
@@ -59,7 +59,7 @@ def test_the_range_falls_and_holds_the_truth(drive: RunFolder, reference: str) -
 
     assert len(range_m) >= 65
     steps_m, moved_m = np.diff(range_m), np.diff(gone_m)
-    # While it stands, wheels and poses go back by millimetres.
+    # While the vehicle stands, wheels and poses move back by millimetres.
     assert (steps_m <= np.maximum(-moved_m, 0.0) + 0.01).all()
     assert (np.abs(range_m - true_m) < 1.96 * sd_m).all()
     assert (np.abs(range_m / true_m - 1.0) < 0.1).all()

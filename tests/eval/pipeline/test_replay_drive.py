@@ -175,7 +175,7 @@ def test_the_real_minute_from_the_command_line(
     segment, dbc = shared(*SEGMENT), shared("comma2k19", "toyota_2017.dbc")
     car, run = tmp_path / "car.toml", tmp_path / "run"
 
-    # One array of this recording is cut, and whoever reads it reports that: exit status 3.
+    # One array of this recording is truncated, which readers report: exit status 3.
     assert cli.run(["vehicle", "init", str(segment), "--dbc", str(dbc), "-o", str(car)]) == 3
     assert cli.run(["fit", "compass", str(segment), "--vehicle", str(car), "-o", str(car)]) == 3
     assert "hard iron: headings cover" in capsys.readouterr().out

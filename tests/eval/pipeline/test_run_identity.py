@@ -1,4 +1,4 @@
-"""Runs know what they are made of: nothing else overwrites them, merging loses none of them."""
+"""Runs record their inputs: no other run overwrites them, and merging loses none of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from support.trees import tree
 
 pytestmark = pytest.mark.slow
 PART = ("--to", "4", "-q")
-"""A few seconds of each drive are enough to tell runs apart."""
+"""A few seconds of each drive are enough to distinguish runs."""
 
 DRIVES: int = 4
 REFUSAL: str = f"format 1, this crosscue reads {FORMAT_VERSION}: replay again"
@@ -137,7 +137,7 @@ def test_logs_are_found_again_only_as_what_they_were(
     estimate = ["estimate", str(place / "run"), "--vehicle", vehicle, "-q"]
     assert run(estimate) == 0
 
-    # Moved together, nothing has to be said.
+    # If run and logs move together, no option is needed.
     (tmp_path / "one").rename(tmp_path / "two")
     estimate[1] = str(tmp_path / "two" / "run")
     assert run(estimate) == 0
@@ -163,7 +163,7 @@ def _merged(argv: list[str], out: Path, status: int) -> dict[str, bytes]:
 def test_shards_merged_in_any_way_are_the_single_batch(
     drives: Path, tmp_path: Path, seed: int
 ) -> None:
-    """A property over random splits, orders, overlaps, and numbers of workers."""
+    """Check a property over random splits, orders, overlaps and numbers of workers."""
     chance = random.Random(seed)
     logs = [str(path) for path in sorted(drives.glob("*/drive.mcap"))]
     single = tmp_path / "single"

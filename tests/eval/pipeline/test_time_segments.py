@@ -45,7 +45,7 @@ def _drive(seconds: int = 20, rows_a_block: int = 7) -> list[Block]:
 
 
 def _moved(blocks: Sequence[Block], at_ns: int, by_ns: int) -> list[Block]:
-    """The clock of a log is set by so much at a time."""
+    """Set the clock of a log by the given amount at a time."""
     return [
         Block(b.topic, np.where(b.log_ns >= at_ns, b.log_ns + by_ns, b.log_ns), b.rows)
         for b in blocks
@@ -63,7 +63,7 @@ def _replay(path: Path, blocks: Sequence[Block], vehicle: Vehicle | None = None)
 
 
 def _distance(outcome: Outcome, segment: int = 0) -> float:
-    """Travelled in one segment, from its odometry."""
+    """Return the distance travelled in one segment, from its odometry."""
     table = outcome.run.table("measurements")
     rows = zip(*(table[n].to_pylist() for n in ("kind", "segment", "distance_m")), strict=True)
     return sum(abs(float(d)) for kind, n, d in rows if kind == "odometry" and n == segment)
@@ -236,7 +236,7 @@ def test_a_clock_set_back_by_hardly_a_row_invents_no_distance(tmp_path: Path, by
     moved = _moved(blocks, BEGIN + 8 * SECOND, by_ms * 1_000_000)
     set_back = _replay(tmp_path / "moved", moved)
 
-    # Wheel speeds of 5.9 m/s that overlap for up to 0.3 s cannot all be put in their place.
+    # Wheel speeds of 5.9 m/s that overlap for up to 0.3 s cannot all be assigned.
     assert straight - 3.0 < set_back.travelled_m <= straight
 
 

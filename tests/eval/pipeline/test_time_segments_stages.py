@@ -36,12 +36,12 @@ from support.gap_landmarks import STEP_M, PlaceByNumber
 from support.landmark_drive import there
 
 PAUSE: Final = Clock(pause_s=(4.0, 10.0))
-"""Longer than ``time.restart_after_s``: the pose stays where the car was last seen."""
+"""Longer than ``time.restart_after_s``: the pose stays at its last estimate."""
 MATCHER: Final = "support.gap_landmarks:matcher"
 
 
 def _two_logs(folder: Path, wheels: Clock, camera: Clock, run: str) -> Outcome:
-    """Wheels in one log, pictures in another, each with a clock of its own."""
+    """Wheels in one log and pictures in another, each with its own clock."""
     paths = [
         write_drive(folder, wheels, name=f"{run}_bus.mcap", topics=[BUS]),
         write_drive(folder, camera, name=f"{run}_camera.mcap", topics=[CAMERA]),
@@ -89,7 +89,7 @@ def test_a_wheel_log_that_jumps_alone_is_a_gap_and_no_distance(tmp_path: Path) -
     frames = whole.run.table("frames")
     assert frames["t_ns"].equals(frames["log_t_ns"])
     assert frames["t_ns"].to_pylist() == straight.run.table("frames")["t_ns"].to_pylist()
-    # The odometry's second half begins at 9 s; pictures up to a second before are of it.
+    # The odometry's second half begins at 9 s; pictures up to a second earlier belong to it.
     assert frames["segment"].to_pylist() == [0] * 80 + [1] * 60
 
 
@@ -122,7 +122,7 @@ def test_a_part_of_a_log_has_the_gaps_within_it(
 def test_a_moment_that_comes_twice_is_read_twice(tmp_path: Path) -> None:
     log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0))
 
-    # From the log's first message; 3 s to 6 s come twice.
+    # From the log's first message; 3 s to 6 s occur twice.
     ended, run = _replayed_part(tmp_path, log, "run", "--from", "4", "--to", "5")
 
     assert ended == 3
@@ -185,7 +185,7 @@ def test_compare_names_the_rows_whose_segment_differs(
 
 
 def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
-    """Past a landmark every 4 m, each picture knowing where it was taken."""
+    """Drive past a landmark every 4 m; each picture encodes where it was taken."""
     log = write_drive(folder, clock)
     with (folder / "car.toml").open("a") as file:
         file.write(f'[landmarks]\nmatcher = "{MATCHER}"\nrevisit_m = 10.0\n')
@@ -201,7 +201,7 @@ def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
 
 
 def _off_m(run: RunFolder) -> Floats:
-    """How far each pose is from the true one; only for clocks that were not set."""
+    """Distance of each pose from the true one; only for clocks that were not set."""
     true_m = SPEED_MPS * (_column(run, "pose", "log_t_ns") - BEGIN) / SECOND
     off_m: Floats = np.hypot(_column(run, "pose", "x_m") - true_m, _column(run, "pose", "y_m"))
     return off_m
@@ -224,7 +224,7 @@ def test_landmarks_find_the_car_again_after_a_gap(marked: Outcome, tmp_path: Pat
     assert later
     assert all(float(name) > START_M - 15.0 for name in later)
     assert _off_m(marked.run)[-1] < 2.0
-    # The way from pose to pose is measured motion; a correction by a landmark is not.
+    # The displacement between poses is measured motion; a correction by a landmark is not.
     assert _column(marked.run, "pose", "travelled_m")[-1] == pytest.approx(
         _column(without, "pose", "travelled_m")[-1], abs=1e-6
     )
@@ -240,7 +240,7 @@ def test_the_pose_filter_grows_by_what_a_car_could_have_done(tmp_path: Path) -> 
     gap_s = float(np.diff(pose["t_ns"])[0]) * 1e-9
     limits = load(tmp_path / "car.toml").time
 
-    # As docs/explanation/time_segments.md says: speeding up or braking all the while, or turning.
+    # As in docs/explanation/time_segments.md: accelerating, braking or turning all the time.
     off_m = 0.5 * limits.max_accel_mps2 * gap_s**2
     off_m += 0.5 * SPEED_MPS * gap_s * limits.max_turn_rate_radps * gap_s
     off_m = min(off_m, SPEED_MPS * gap_s + 0.5 * limits.max_accel_mps2 * gap_s**2)
@@ -256,6 +256,6 @@ def test_the_smoother_crosses_a_gap(marked: Outcome) -> None:
     score = score_smoother(marked.run, marked.run.path.parent / "truth.json", {})
 
     assert score.poses == 14
-    # It knows afterwards where the car came out.
+    # Afterwards the position after the gap is known.
     assert score.smoother_rmse_m < score.filter_rmse_m
     assert score.smoother_end_m < 2.0

@@ -1,4 +1,4 @@
-"""The odometry a run has stored, read as ways between times."""
+"""Motion between two times, read from the stored odometry of a run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SECOND = 1_000_000_000
 
 
 def _odometer() -> Odometer:
-    """10 m/s for two seconds, a gap of two crossed at that speed, and two seconds more."""
+    """10 m/s for two seconds, a gap of two seconds crossed at that speed, and two more seconds."""
     start = np.array([0, 1, 2, 4, 5]) * SECOND
     stop = np.array([1, 2, 4, 5, 6]) * SECOND
     way = np.array([10.0, 10.0, 20.0, 10.0, 10.0])

@@ -1,4 +1,4 @@
-"""What is anchored to the road is drawn where the road is, and arrows go where the car goes."""
+"""Overlays anchored to the road are drawn on the road, and arrows follow the motion of cars."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ BOX = (700.0, 380.0, 740.0, 400.0)
 
 
 def car(right_mps: float, ahead_mps: float) -> CarMotion:
-    """One below and to the right of the optical axis, 40 m away."""
+    """A car below and to the right of the optical axis, 40 m away."""
     seen = CarMotion(1, 10, 40.0, 0.1, right_mps, 0.1, ahead_mps, 0.1, True, 2.0, 0.0)
     return seen._replace(box_px=BOX)
 

@@ -1,4 +1,4 @@
-"""A recording of a part of a run holds that part, whole, and nothing else."""
+"""A recording of a part of a run holds exactly that part."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_moment_opens_two_seconds_before_it_with_all_that_was_there(
         if not chunk.is_static and chunk.entity_path == "/camera/picture":
             column = chunk.to_record_batch().column("drive")
             times.update(column.cast("int64").to_pylist())
-    # The run ends before 4 s behind the moment.
+    # The run ends less than 4 s after the moment.
     assert times == {at(frame) for frame in range(10, 50)}
 
 

@@ -1,4 +1,4 @@
-"""The recording of a run: what it holds, read back from the file; nothing in it is active."""
+"""The recording of a run, read back from the file; it has no active content."""
 
 from collections import Counter
 from pathlib import Path
@@ -88,7 +88,7 @@ def test_a_cue_comes_and_goes_with_its_frames(tmp_path: Path) -> None:
 
     states = _cells(path, "/cues/road_left", "state")
     assert states == [None, ["found"], None] or states == [[], ["found"], []]
-    # Nothing, found in the last frames, and nothing again behind the last one.
+    # Not found, found in the last frames, and not found after the last one.
     assert _rows(path)["/cues/cross_traffic_right"] == 3
 
 

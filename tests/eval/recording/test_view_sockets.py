@@ -1,4 +1,4 @@
-"""The viewer in a browser: heard on this machine only, and gone with the command."""
+"""The viewer in a browser: it listens on this machine only, and ends with the command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PORTS = (9090, 9876)
 
 
 def _group(leader: int) -> list[int]:
-    """Processes of a session, whoever started them."""
+    """Processes of a session, independent of their parent."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         try:
@@ -35,7 +35,7 @@ def _group(leader: int) -> list[int]:
 
 
 def _listening(pids: list[int]) -> Iterator[tuple[str, int]]:
-    """Address in the kernel's writing, and port."""
+    """Address in the kernel's notation, and port."""
     sockets = set()
     for pid in pids:
         for link in Path(f"/proc/{pid}/fd").glob("*"):

@@ -1,4 +1,4 @@
-"""The report page: nothing in it is active, coverage comes first, what was wrong is shown."""
+"""The report page: it has no active content, coverage is first, and mistakes are shown."""
 
 import base64
 import json
@@ -38,7 +38,7 @@ HOSTILE = '<script>alert(1)</script>"onload="x'
 
 
 class _Page(HTMLParser):
-    """Elements, what they load, and their handlers."""
+    """Parser of elements, the resources that they load, and their handlers."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class _Page(HTMLParser):
 
 
 def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
-    """A run in which a car is said to cross that does not, from frame 21 on."""
+    """A run with a false crossing car from frame 21 on."""
     run = scene_run(folder, **more)
     reported = truth(
         [*good_truth().truth.cues, span("cross_traffic_right", 0, 40, present=False, count=0)],

@@ -41,7 +41,7 @@ def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
 
 
 def _crosses(rows: Sequence[tuple[int, Any]], gap: Gap) -> bool:
-    """Does a line run from before the gap to after it?"""
+    """Return whether a line crosses the gap."""
     before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
     return bool(np.isfinite(before[-1][0]))
 

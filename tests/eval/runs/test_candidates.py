@@ -1,4 +1,4 @@
-"""What a person reads of detections that became neither cue nor range."""
+"""Sentences on detections that were used neither for a cue nor for a range."""
 
 from crosscue.detectors.cues.candidates import NO_CURVE
 from crosscue.eval.runs.candidates import CandidateRow, candidate_lines

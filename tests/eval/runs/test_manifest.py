@@ -1,4 +1,4 @@
-"""The manifest is a typed record: what is written is what is read, and nothing else is taken."""
+"""The manifest is a typed record: reading returns what was written, and other keys are refused."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""One account per run: it adds up, it is printed once, and every place shows the same numbers."""
+"""The account of a run: it balances, is printed once, and is the same everywhere."""
 
 import json
 from collections import Counter
@@ -31,7 +31,7 @@ BRIGHT = "support.detecting:build"
 
 @pytest.fixture(scope="module")
 def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """A drive whose log is cut: its folder, its log, its vehicle file."""
+    """A drive whose log is truncated: its folder, its log and its vehicle file."""
     folder = tmp_path_factory.mktemp("drive")
     files = write_drive(folder / "drive", DriveSettings(seed=3, blocks=1, block_m=60.0))
     content = files.log.read_bytes()
@@ -40,7 +40,7 @@ def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
 
 
 def _agrees(run: Path, printed: dict[str, Any]) -> Account:
-    """The run's account, after every place that shows it was held against it."""
+    """Return the run's account after comparing it with every place that shows it."""
     folder = open_run(run)
     found = folder.drive_manifest().account
     check(found)

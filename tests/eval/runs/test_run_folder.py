@@ -1,4 +1,4 @@
-"""A run folder holds whole files or none, and one writer at a time."""
+"""A run folder holds only complete files, and has one writer at a time."""
 
 import errno
 import json
@@ -81,7 +81,7 @@ def test_where_the_kernel_keeps_no_locks_the_text_reports_who_holds_it(
     run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {ticks}")
     with pytest.raises(RunError, match=f"process {parent} "), locked(run):
         pass
-    # The same number, but begun at another time: used again by another program.
+    # The same process id with another start time: the id was reused.
     run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {int(ticks) + 1}")
     with locked(run):
         pass

@@ -1,4 +1,4 @@
-"""Tags of runs: what users call them stays beside what they are made of."""
+"""Tags of runs: they are stored apart from the run's inputs and results."""
 
 import json
 from pathlib import Path

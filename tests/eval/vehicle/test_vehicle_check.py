@@ -1,4 +1,4 @@
-"""A vehicle file is held against a drive: signals, and intrinsics against pictures."""
+"""Check of a vehicle file against a drive: signals, and intrinsics against pictures."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_intrinsics_of_other_pictures_contradict(tmp_path: Path, camera: str, sa
 
     found = crosscue.check_vehicle(drive, vehicle)
 
-    # The made pictures are tiny, with the published intrinsics of 1920 x 1080.
+    # The generated pictures are tiny, with the published intrinsics of 1920 x 1080.
     assert any(says in text for text in found.contradictions)
     assert f"WRONG    {found.contradictions[0]}" in repr(found)
 
