@@ -1,4 +1,4 @@
-"""Labelled boxes in four formats: the same boxes, and one line for what cannot be read."""
+"""Labelled boxes in four formats: the same boxes, and one line for unreadable labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""comma2k19 segments: the real one, and what becomes of damaged arrays."""
+"""comma2k19 segments: the real one, and the treatment of damaged arrays."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def test_every_row_of_the_real_segment_is_accounted_for() -> None:
     accounts = ledger.accounts
     assert sum(accounts[f"can/{bus}"].used for bus in (0, 1, 128, 129)) == 135_468
     assert rows == sum(account.found for account in accounts.values())
-    # One array of the published example is cut; the rest is whole.
+    # One array of the published example is truncated; the rest is complete.
     damaged = {name: a.dropped.total() for name, a in accounts.items() if not a.is_whole}
     assert damaged == {"imu/magnetometer_uncalibrated": 64}
 
@@ -159,7 +159,7 @@ OTHERS: dict[str, NDArray[np.generic]] = {
     "complex": np.zeros((40, 3), np.complex128),
     "no row": np.zeros((0, 3)),
 }
-"""Arrays that another stream, or another writer, might have put in a file's place."""
+"""Arrays that another stream or another writer might have stored under a file's name."""
 
 
 def _segment(folder: Path) -> Path:

@@ -1,4 +1,4 @@
-"""WGS 84 conversions against values anyone can check, and against themselves."""
+"""WGS 84 conversions against known values, and against their inverses."""
 
 from __future__ import annotations
 

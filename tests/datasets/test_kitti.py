@@ -141,7 +141,7 @@ def test_the_tracking_layouts_period_is_what_its_speeds_and_positions_show(
     (file,) = (drive / "oxts").glob("*.txt")
     rows = [line.split() for line in file.read_text().splitlines()]
     for row in rows:
-        # East, north, ahead, left and up: slower by as much as frames are further apart.
+        # East, north, ahead, left and up: slower in proportion to the time between frames.
         row[6:11] = [repr(float(value) * 100.0 / period_ms) for value in row[6:11]]
     file.write_text("".join(f"{' '.join(row)}\n" for row in rows))
 
@@ -337,7 +337,7 @@ def test_the_real_sequence_turns_74_degrees_and_its_speeds_fit_its_positions(
     steps_m = np.diff(track.xyz_m[:, :2], axis=0)
     speed_mps = np.array(column(by_topic["oxts/ins_speed"], "speed_mps"))
     assert speed_mps.sum() * 0.1 == pytest.approx(321.0, abs=0.5)
-    # The true frame rate is 9.65 Hz: positions are 3.6 % further apart than speeds at 10 Hz say.
+    # The true frame rate is 9.65 Hz: positions are 3.6 % further apart than speeds at 10 Hz imply.
     period_s = np.hypot(*steps_m.T).sum() / ((speed_mps[1:] + speed_mps[:-1]) / 2).sum()
     assert period_s == pytest.approx(0.1036, abs=0.0003)
     assert "103.7 ms each" in ledger.notices[0]

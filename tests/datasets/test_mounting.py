@@ -1,4 +1,4 @@
-"""How a body sits in its car, found by how it travels."""
+"""The mounting of a body in its car, estimated from its travel."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from crosscue.datasets.truth.tum import Trajectory, planar
 
 
 def _body(kappa_per_m: NDArray[np.float64], speed_mps: float, ahead_m: float) -> Trajectory:
-    """A body turned by 0.02 rad, so far ahead of the rear axle of a car that does not slip."""
+    """A body rotated by 0.02 rad, ahead of the rear axle of a car that does not slip."""
     heading = np.cumsum(kappa_per_m * speed_mps * 0.1)
     x, y = (np.cumsum(speed_mps * 0.1 * part(heading)) for part in (np.cos, np.sin))
     t_ns = np.arange(len(heading), dtype=np.int64) * 100_000_000

@@ -1,4 +1,4 @@
-"""nuScenes on tables made to its published schema: no drive of the set itself is at hand."""
+"""nuScenes on generated tables with its published schema, without a drive of the data set."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_truth_is_the_rear_axle_and_the_boxes_it_sees(tmp_path: Path) -> Non
     assert truth.objects is not None
     pictures = read_coco(tmp_path / "truth" / truth.objects).pictures
     assert [one.t_ns for one in pictures] == [(FIRST_US + 500_000 * i) * 1000 for i in range(3)]
-    # The third box lies behind the car.
+    # The third box is behind the car.
     assert {thing.label for one in pictures for thing in one.things} == {"car", "person"}
     first = json.loads((tmp_path / "truth" / truth.objects).read_text())["annotations"][0]
     assert first["motion"] == "parked"

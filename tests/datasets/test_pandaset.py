@@ -1,4 +1,4 @@
-"""PandaSet sequences: streams, odometry and truth agree with what was driven."""
+"""PandaSet sequences: streams, odometry and truth agree with the drive."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_poses_out_of_order_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_real_sequence(tmp_path: Path) -> None:
-    """80 pictures in 8 s; the car stands first and has gone 21.5 m in the end."""
+    """80 pictures in 8 s; the car is stationary at first and has moved 21.5 m in the end."""
     path = shared("sequences", "pandaset_002")
 
     found, ledger = rows(path)

@@ -1,4 +1,4 @@
-"""A phone on the dashboard: axes, clocks and units, and what damage costs."""
+"""A phone on the dashboard: axes, clocks and units, and the effects of damage."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_damaged_line_of_the_phone_is_lost_from_each_of_its_topics(tmp_path: P
     assert rows == 3 * 60 + 2 * 59 + 6
     assert ledger.topic("phone/gyro").dropped.total() == 1
     assert ledger.topic("phone/magnetometer").dropped.total() == 1
-    # The line may have held a new position, or none.
+    # The line may or may not have contained a new position.
     assert ledger.topic("phone/gnss").dropped_unknown
 
 

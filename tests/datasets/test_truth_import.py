@@ -24,7 +24,7 @@ FRAMES = 6
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six pictures, ten a second."""
+    """Six pictures at 10 Hz."""
     folder = tmp_path_factory.mktemp("log")
     for number in range(FRAMES):
         cv2.imwrite(str(folder / f"{number:06d}.png"), np.zeros((HIGH, WIDE, 3), np.uint8))
@@ -123,7 +123,7 @@ DAMAGED = {
     "expected a list",
     "expected a unique id",
 }
-"""What is wrong with the file whatever its log is: it cannot be read, exit status 4."""
+"""Faults of the file that do not depend on its log: it cannot be read, exit status 4."""
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path
     (tmp_path / "a.xml").write_text(_video(_track_box(1) + _track_box(3) + _track_box(5, 1)))
 
     assert _import(tmp_path / "a.xml", log, tmp_path / "truth.json") == 0
-    # Frames 1, 3 and 5 of the video; in 5 the sign has left.
+    # Frames 1, 3 and 5 of the video; the sign is no longer visible in 5.
     assert [(one.t_ns, one.present) for one in load(tmp_path / "truth.json").cues] == [
         (START_NS + STEP_NS, True),
         (START_NS + 3 * STEP_NS, True),

@@ -1,4 +1,4 @@
-"""TUM files: what is written is what is read, and what is not a pose is refused by line."""
+"""TUM files: poses are read back as written, and invalid lines are refused by number."""
 
 from __future__ import annotations
 

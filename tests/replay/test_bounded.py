@@ -1,4 +1,4 @@
-"""Files of settings and annotations are read whole or refused; none has no end."""
+"""Files of settings and annotations are read completely or refused, even endless ones."""
 
 import tempfile
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""CRC-32: whichever library computes it, it is zlib's."""
+"""CRC-32: every library computes the value of zlib."""
 
 from __future__ import annotations
 

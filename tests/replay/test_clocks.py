@@ -1,4 +1,4 @@
-"""Clocks: what was put into simulated streams comes out of the report."""
+"""Clocks: the report recovers the faults of simulated streams."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_jumps_are_counted_and_placed(
     for step, (row, by_ns) in zip(header.jump_steps, jumps.items(), strict=True):
         assert step.at_log_ns == log_ns[row]
         assert abs(step.by_ns - by_ns) < 10 * MS
-    # A clock set back by over three periods is seen to go back; by less it might be late rows.
+    # A clock set back by over three periods is detected; a smaller step might be late rows.
     assert header.resets == sum(by_ns < -160 * MS for by_ns in jumps.values())
     assert header.line is not None
     assert header.line.drift_ppm == pytest.approx(40.0, abs=60.0)
@@ -184,7 +184,7 @@ def test_duplicates_are_counted_exactly(rows: list[int], repeats: int, rows_per_
 def test_late_rows_are_counted_exactly_and_make_no_gaps(
     stretches: dict[int, tuple[int, int]], rows_per_block: int
 ) -> None:
-    """A few rows are stored so many places late; stamps stay as they were."""
+    """A few rows are stored later by a number of places, with unchanged stamps."""
     order = np.arange(2000)
     for place, (n, late) in stretches.items():
         row = 100 + 110 * place

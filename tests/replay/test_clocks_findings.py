@@ -1,4 +1,4 @@
-"""What is wrong with clocks is said, and nothing is said of a healthy log."""
+"""Faults of clocks are reported, and nothing is reported for a healthy log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The identity of a log: one for each log, wherever it is, and cheap for a large one."""
+"""The identity of a log: unique, independent of its path, and fast for a large log."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _with_index(kind: str, start: int) -> bytearray:
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
 def test_the_whole_index_of_a_large_log_counts(tmp_path: Path, kind: str) -> None:
-    # Between the last sample and the tail, in which nothing but the index is hashed.
+    # Between the last sample and the tail, where only the index is hashed.
     place = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
     for start, counts in ((place - 10, True), (place + 1, False)):
         content = _with_index(kind, start)

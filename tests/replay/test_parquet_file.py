@@ -1,4 +1,4 @@
-"""Reading a table leaves nothing behind that could end the process badly."""
+"""Reading a table leaves no state that could abort the process on exit."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ for _ in range(3):
 
 @pytest.mark.slow
 def test_a_process_that_has_read_a_table_ends_well(tmp_path: Path) -> None:
-    # Read through one of Python's files, 26 processes of 60 were aborted at their end.
+    # With reads through a Python file, 26 of 60 processes were aborted on exit.
     columns = {f"column_{i}": np.arange(2000.0) for i in range(30)}
     pq.write_table(
         pa.table(columns), tmp_path / "many.parquet", row_group_size=200, write_page_checksum=True

@@ -1,4 +1,4 @@
-"""Half-written files: swept when nobody holds them, left alone while somebody does."""
+"""Partial files: removed when no process holds them, and kept while one does."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _partials(folder: Path) -> list[str]:
 
 @contextmanager
 def _child(code: str) -> Iterator[subprocess.Popen[str]]:
-    """A process that says a line when it has begun, and lives until it is killed."""
+    """A process that prints a line when it has started, and runs until it is killed."""
     lines = f"{code}\nprint('begun', flush=True)\nimport time; time.sleep(60)\n"
     with subprocess.Popen(
         [sys.executable, "-c", lines], stdout=subprocess.PIPE, text=True
@@ -59,7 +59,7 @@ def test_a_file_of_a_killed_process_is_swept_and_one_of_a_living_process_is_not(
         process.send_signal(signal.SIGKILL)
         process.wait()
 
-    # The process number may be in use again by now; nothing examines it.
+    # The process number may be in use again by now; it is not examined.
     sweep(tmp_path, again=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.txt"]
 
@@ -143,7 +143,7 @@ def test_a_run_whose_holder_died_is_free_though_its_number_is_in_use(tmp_path: P
         process.wait()
     text = run.file(".lock").read_text()
     assert text.startswith(f"{process.pid} ")
-    # As if that number now belonged to the program that started us.
+    # As if that number now belonged to the parent process.
     run.file(".lock").write_text(text.replace(str(process.pid), str(os.getppid()), 1))
 
     with locked(run):

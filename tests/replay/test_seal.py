@@ -1,4 +1,4 @@
-"""Seals: a changed byte is seen in every format, by every reader, and located."""
+"""Seals: a changed byte is detected and located in every format by every reader."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _flip(path: Path, at: int) -> None:
 
 
 def _said(log: Path) -> str:
-    """All that reading a log says of its losses."""
+    """All reports of losses from reading a log."""
     try:
         _, ledger = read(log)
     except LogError as error:
@@ -115,7 +115,7 @@ def test_a_flipped_byte_anywhere_is_reported_with_its_block(
 
 def test_the_block_is_named_to_one_mib_and_its_rows_are_delivered(long_log: Path) -> None:
     rows = sum(len(block) for block in read(long_log)[0])
-    # A digit of a payload: the line stays a right one, and no reader can see it.
+    # A digit of a payload: the line remains valid, and no reader can detect it.
     at = long_log.read_bytes().index(b"#AA", 2 * MIB) + 2
     text = bytearray(long_log.read_bytes())
     text[at : at + 1] = b"B"
@@ -330,7 +330,7 @@ def test_a_flipped_byte_in_the_seal_is_not_taken_for_one_in_the_log(tmp_path: Pa
         except LogError:
             refused += 1
 
-    # Only a blank between two words may change without harm.
+    # Only a blank between two words may change harmlessly.
     assert refused > 0.6 * len(whole) / 7
 
 
@@ -422,11 +422,11 @@ def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, 
 
 
 _PICTURES = {"kitti-raw": "image_02/data", "pandaset": "camera/front_camera"}
-"""Where pictures lie."""
+"""Positions of pictures."""
 
 
 def _in_window(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:
-    """A log, a window at its beginning, and files or parts of it: are they read for the window?"""
+    """A log, a window at its beginning, and whether the window reads files or parts of it."""
     if kind == "images":
         times = "".join(f"{0.5 * i:.1f}\n" for i in range(12))
         log = picture_folder(folder / "front", 12, times)
@@ -473,7 +473,7 @@ def test_a_window_checks_only_what_it_reads(tmp_path: Path, kind: str) -> None:
     checked, none = losses(window)
     assert 0 < checked < total
     assert not none
-    # A byte of a payload, or one that no decoder reads: only the seal can see it.
+    # A byte of a payload, or one that no decoder reads: only the seal can detect it.
     if not files:
         at = int(log.stat().st_size * 0.6)
         _flip(log, at)

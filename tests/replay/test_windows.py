@@ -1,4 +1,4 @@
-"""Windows hold every sample once, in order of time, however the logs are cut into blocks."""
+"""Windows contain every sample once, in order of time, for any division of logs into blocks."""
 
 from collections.abc import Iterator
 
@@ -81,7 +81,7 @@ def test_a_sensor_that_falls_silent_does_not_hold_up_the_rest() -> None:
 
 
 class _Watched(list[Block]):
-    """Notes how far it has been read."""
+    """Records how far it was read."""
 
     def __init__(self, blocks: list[Block], read: list[int]) -> None:
         super().__init__(blocks)

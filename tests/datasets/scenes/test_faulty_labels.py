@@ -1,4 +1,4 @@
-"""Without faults, a simulated detector finds what can be seen, and nothing else."""
+"""Without faults, a simulated detector finds exactly the visible objects."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Layouts M: every feature is there and not there in any thirteen in a row."""
+"""Layouts M: every feature is present and absent in any thirteen consecutive layouts."""
 
 from dataclasses import replace
 

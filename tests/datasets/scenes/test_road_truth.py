@@ -1,4 +1,4 @@
-"""Road pixels of simulated pictures: what is on the map's road and nothing stands before."""
+"""Road pixels of simulated pictures: those on the map's road that no object hides."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_point_of_the_ground_is_road_where_the_map_says_so(layout: str, x_m: f
     column, row = column[inside].astype(int), row[inside].astype(int)
     texel = ((points[inside, :2] - [X_M[0], Y_M[0]]) * TEXELS_PER_M).astype(int)
     on_road = of.ground.road[texel[:, 1], texel[:, 0]]
-    # A pixel is over a metre long so far away: points that near to a kerb are left out.
+    # A pixel at this distance is over a metre long, so points that close to a kerb are omitted.
     kerb = int(1.5 * TEXELS_PER_M)
     clear = np.ones_like(on_road)
     for dx, dy in ((kerb, 0), (-kerb, 0), (0, kerb), (0, -kerb)):
@@ -42,7 +42,7 @@ def test_a_point_of_the_ground_is_road_where_the_map_says_so(layout: str, x_m: f
     seen = shown.road[row, column]
 
     assert not seen[clear & ~on_road].any()
-    # Something may stand before the road.
+    # An object may hide the road.
     assert seen[clear & on_road].mean() > 0.9
     assert on_road.any()
     assert not on_road.all()

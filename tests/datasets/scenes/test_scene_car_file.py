@@ -46,5 +46,5 @@ def test_a_stop_sign_measures_the_way_to_the_start(x_m: float) -> None:
     assert curve is not None
     height = np.array([float(sign.box_px[3] - sign.box_px[1])])
 
-    # The curve is one for what a network finds; a true outline may differ from that by its error.
+    # The curve is fitted to detections of a network, from which a true outline may differ.
     assert range_of(height, curve)[0] == pytest.approx(-x_m, abs=2.0 * curve.residual_sd_m)

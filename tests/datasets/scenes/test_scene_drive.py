@@ -1,4 +1,4 @@
-"""A simulated drive as files: it passes through the same readers as a real one, and truth fits."""
+"""A simulated drive as files: the readers of real drives read it, and its truth fits."""
 
 from __future__ import annotations
 
@@ -173,10 +173,12 @@ def test_the_mobileye_reports_vehicles_that_are_there(files: SceneFiles) -> None
             *(table.rows[name].tolist() for name in names), strict=True
         ):
             middle_m = x_m + long_m / 2
-            # The field of view holds for the vehicle's middle, the place for its near end.
+            # The field of view refers to the vehicle's centre, the position to its near end.
             assert abs(np.arctan2(y_m, middle_m - 3.75)) < Faults().half_view_rad + 0.15
             true_m = cars[int(grabbed[np.argmin(np.abs(grabbed - t_ns))])].get(number - 1)
-            if true_m is not None:  # else too few pixels for an annotation at this size
+            if (
+                true_m is not None
+            ):  # otherwise there are too few pixels for an annotation at this size
                 assert abs(middle_m - true_m) < 1.5 + 0.12 * x_m
                 found += 1
     assert found > 20

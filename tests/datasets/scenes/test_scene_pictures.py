@@ -70,7 +70,7 @@ def test_a_sign_is_as_large_and_where_a_pinhole_camera_shows_it(x_m: float) -> N
     view = view_at(camera, world("D").approach, when_at(world("D"), x_m))
     x0, y0, x1, y1 = sign.box_px
     _, y_m, z_m = sign.thing.at
-    pitch = float(np.arcsin(-view.eye_axes[2, 2]))  # the body nods when it brakes
+    pitch = float(np.arcsin(-view.eye_axes[2, 2]))  # the body pitches when it brakes
     depth_m = -view.at_m[0] * np.cos(pitch) - (z_m - view.at_m[2]) * np.sin(pitch)
 
     assert y1 - y0 == pytest.approx(camera.focal * 0.76 / depth_m, abs=1.6)
@@ -151,7 +151,7 @@ def test_the_nose_is_the_end_with_the_smaller_height(kind: str, nose_left: bool)
 
 
 def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
-    """A car 15 m ahead, seen side on."""
+    """A car 15 m ahead, seen from the side."""
     mesh = car(Look(kind, (0.5, 0.5, 0.5)), lamps_on=False, brakes_on=False)
     placed = mesh.placed(15.0, 0.0, np.pi / 2 if nose_left else -np.pi / 2)
     covered = np.zeros((216, 384), np.uint8)

@@ -1,4 +1,4 @@
-"""What a database file says is understood, and what is doubtful about it is said."""
+"""Database files are read correctly, and doubtful contents are reported."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ ARXML = """<?xml version="1.0" encoding="UTF-8"?>
 <SYSTEM-SIGNAL><SHORT-NAME>speed_of_wheel</SHORT-NAME></SYSTEM-SIGNAL>
 </ELEMENTS></AR-PACKAGE></AR-PACKAGES></AUTOSAR>
 """
-"""One frame with one signal, in as few elements as AUTOSAR needs for it."""
+"""One frame with one signal, in the fewest elements that AUTOSAR allows."""
 
 
 def write(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:
@@ -176,7 +176,7 @@ def test_a_dbc_file_cut_anywhere_is_refused_or_reported(tmp_path: Path) -> None:
         except SchemaError:
             continue
         reported += 1
-        # After a whole line of the closing section a cut cannot be seen.
+        # A truncation after a complete line of the closing section cannot be detected.
         is_hidden = text[:cut].endswith(";\n")
         assert is_hidden or database.messages == whole.messages or database.notices
     assert reported > 10

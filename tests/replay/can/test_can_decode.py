@@ -38,14 +38,14 @@ varied = partial(
 
 
 def payloads(message: CanMessage, seed: int) -> NDArray[np.uint8]:
-    """Random bytes, and the two extremes."""
+    """Random bytes, and both extremes."""
     drawn = np.random.default_rng(seed).integers(0, 256, (ROWS, message.length), dtype=np.uint8)
     drawn[0], drawn[1] = 0, 255
     return drawn
 
 
 def read_back(message: CanMessage, folder: Path) -> tuple[CanDatabase, Message]:
-    """The message as our reader and cantools understand the DBC text that defines it."""
+    """The message as read by crosscue and by cantools from the DBC text that defines it."""
     text = dbc_text([message])
     path = folder / "layout.dbc"
     path.write_text(text, encoding="utf-8")
@@ -65,7 +65,7 @@ def decode_all(
 
 
 def by_cantools(message: Message, payload: NDArray[np.uint8]) -> list[dict[str, Any] | None]:
-    """What cantools makes of each row; None where it refuses a multiplexer's value."""
+    """Values of each row from cantools; None where it refuses a multiplexer's value."""
     rows: list[dict[str, Any] | None] = []
     for row in payload:
         try:
@@ -129,7 +129,7 @@ def _is_integral(signal: CanSignal) -> bool:
 
 
 def invertible(message: CanMessage) -> CanMessage:
-    """The same bits, scaled so that float64 can tell neighbouring values apart."""
+    """The same bits, scaled so that neighbouring values are distinct in float64."""
     return replace(
         message,
         signals=tuple(

@@ -1,4 +1,4 @@
-"""Real buses: what is decoded equals what others decoded, and every frame is accounted for."""
+"""Real buses: decoded values equal those of other decoders, and every frame is accounted for."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_every_decodable_frame_of_a_real_bus_equals_cantools(bus: str, engine: E
 
 
 def apart(message: Message, has_overlaps: bool) -> list[Message]:
-    """The message, or one for each signal: cantools shifts what lies after an overlap."""
+    """The message, or one per signal, because cantools shifts signals after an overlap."""
     if not has_overlaps:
         return [message]
     return [
@@ -122,12 +122,12 @@ def rows_of(block: Block, arbitration_id: int, is_extended: bool, length: int) -
 
 
 def assert_same_columns(ours: Block, theirs: Message, frames: CanFrames) -> None:
-    # Every frame with new bytes; one that repeats another's cannot differ from it.
+    # Every frame with new bytes; a frame with repeated bytes cannot differ.
     _, first, inverse = np.unique(frames.data, axis=0, return_index=True, return_inverse=True)
     assert isinstance(ours.rows, Table)
     decoded = [theirs.decode_simple(frames.data[i].tobytes(), decode_choices=False) for i in first]
     for name in theirs.signal_tree:
         assert isinstance(name, str)
-        # NumPy 2.0 gives a column here, 2.1 a row.
+        # NumPy 2.0 returns a column here, 2.1 a row.
         expected = np.array([row[name] for row in decoded])[inverse.reshape(-1)]
         np.testing.assert_array_equal(ours.rows[name], expected)

@@ -1,4 +1,4 @@
-"""Frames are grouped alike whether each kind is found or all are sorted, and taken alike."""
+"""Searching for each message and sorting all frames yield equal groups and equal columns."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _database(folder: Path) -> CanDatabase:
 
 
 def _frames(count: int) -> CanFrames:
-    """Frames of all messages of the database, of others and of all kinds, mixed."""
+    """Frames of all kinds, mixed, of all messages of the database and of others."""
     rng = np.random.default_rng(7)
     identifier = rng.choice(np.array([*IDS, 5, 0x12345], np.uint32), count)
     return CanFrames(

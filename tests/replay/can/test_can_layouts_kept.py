@@ -1,4 +1,4 @@
-"""Layouts of CAN databases: read straight from the text, kept for the next start."""
+"""Layouts of CAN databases: read directly from the text, and cached for the next start."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _by_cantools(source: DatabaseText) -> list[CanMessage]:
 
 
 def _spelled(messages: list[CanMessage]) -> list[str]:
-    """With types, since 1 and 1.0 decode to other columns; sets have no order."""
+    """Include types, because 1 and 1.0 decode to different columns; sort sets."""
     return [
         repr(replace(m, signals=()))
         + "".join(repr((replace(s, branches=frozenset()), sorted(s.branches))) for s in m.signals)
@@ -134,7 +134,7 @@ def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
         try:
             theirs = _by_cantools(source)
         except SchemaError:
-            continue  # a statement is broken that decoding has no use for
+            continue  # a statement is broken that decoding does not use
         assert _spelled(quick) == _spelled(theirs), source.text
         compared += 1
     assert compared > 20
@@ -166,7 +166,7 @@ def test_what_is_unusual_is_left_to_cantools(old: str, new: str) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of its own."""
+    """Use a separate cache."""
     monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -178,7 +178,7 @@ def _file(tmp_path: Path, text: str = EXTENDED, name: str = "x.dbc") -> Path:
 
 
 def _parses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Fills up with the names of the files that are parsed from now on."""
+    """Collect the names of the files that are parsed from now on."""
     parsed: list[str] = []
     read = database._read_layout
 

@@ -17,7 +17,7 @@ SPEED = CanMessage("Speed", 0x100, False, 2, (CanSignal("kph", 0, 16, scale=0.01
 TWIN = CanMessage("Twin", 0x739, True, 8, (CanSignal("raw", 0, 16),))
 TEN_SLOTS = MobileyeSettings(slots=10, is_shared_bus=True)
 FRAME = st.tuples(
-    # The car's, a stranger's, the device's first obstacle, and one of thirteen slots, not ten.
+    # Frames of the car, of an unknown device, the first obstacle, and slot 11, beyond the ten.
     st.sampled_from([0x100, 0x123, 0x738, 0x739, 0x757]),
     st.sampled_from([DATA, DATA, DATA, REMOTE, ERROR]),
     st.booleans(),

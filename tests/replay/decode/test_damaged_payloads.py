@@ -1,4 +1,4 @@
-"""Of any messages with one damaged, exactly that one is dropped; a type nobody knows is skipped."""
+"""Exactly the damaged one of several messages is dropped; messages of unknown types are skipped."""
 
 import json
 from base64 import b64encode

@@ -68,7 +68,7 @@ def schema_of(name: str, fields: Any) -> bytes:
             each.label = F.LABEL_REPEATED
     stamp = descriptor_pb2.FileDescriptorProto()
     timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
-    # The importing file comes first, on purpose: order in a set promises nothing.
+    # The importing file is first on purpose, because the order in a set is undefined.
     return bytes(descriptor_pb2.FileDescriptorSet(file=[file, stamp]).SerializeToString())
 
 

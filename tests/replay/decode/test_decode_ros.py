@@ -1,4 +1,4 @@
-"""Our walk through ROS messages says what rosbags says, and refuses what rosbags refuses."""
+"""The parser of ROS messages agrees with rosbags, and refuses what rosbags refuses."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ QUICK = settings(max_examples=40, deadline=None)
 
 
 def plain(topic: Topic) -> RosDecoder:
-    """The generic decoder even of a type that has standard columns."""
+    """The generic decoder, even for a type with standard columns."""
     decoder = must_decode(topic)
     assert isinstance(decoder, RosDecoder)
     return replace(decoder, kind=Kind((), generic))
@@ -143,7 +143,7 @@ def test_a_decoder_that_knows_a_layout_says_what_one_that_walks_says(
     )
     learned = plain(topic)
     learned(block_of("/t", [raw]), Ledger("made"))
-    # The first bytes hold lengths more often than the rest.
+    # The first bytes contain lengths more often than the rest.
     for at in {*range(min(8, len(raw))), *rng.integers(0, max(len(raw), 1), 8).tolist()}:
         if at >= len(raw):
             continue

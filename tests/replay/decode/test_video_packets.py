@@ -1,4 +1,4 @@
-"""Packets of a video become pictures with their own times, as every other camera's do."""
+"""Packets of a video are decoded to pictures with their own times, like those of other cameras."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def packets(path: Path) -> tuple[Topic, list[Block]]:
 
 
 def shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Ledger]:
-    """From time to the number that the picture shows, through the extractor."""
+    """The number shown in each picture, by time, read through the extractor."""
     found: dict[int, int] = {}
 
     def see(block: Block) -> None:

@@ -22,14 +22,14 @@ MS = 1_000_000
 
 
 def camera(n: int, period_ms: int = 66, drift: float = 0.0) -> tuple[Int64s, Int64s]:
-    """Image times on the log's clock, and what the device's counter says of them."""
+    """Image times on the log's clock, and the device's counter at these times."""
     image_ns = 10**18 + np.arange(n, dtype=np.int64) * period_ms * MS
     device_ns = (np.arange(n) * period_ms * MS * (1 + drift)).astype(np.int64) + 77 * MS
     return image_ns, device_ns // MS & 0xFF
 
 
 def off_by(image_ns: Int64s, truth_ns: Int64s) -> Int64s:
-    """Error beyond the constant that cannot be known."""
+    """Error without the unknown constant."""
     error = image_ns - truth_ns
     return error - np.int64(np.median(error))
 
@@ -100,7 +100,7 @@ def test_dropped_frames_and_gaps_longer_than_a_wrap_are_bridged() -> None:
 
 @pytest.mark.parametrize("drift", [-100e-6, 100e-6])
 def test_an_hour_of_drift_does_not_lose_a_wrap(drift: float) -> None:
-    """100 parts in a million are 360 ms an hour: more than the counter can hold."""
+    """100 parts per million are 360 ms per hour, more than the counter can hold."""
     image_ns, counter_ms = camera(54_000, drift=drift)
     log_ns = image_ns + np.random.default_rng(2).integers(0, 8 * MS, 54_000)
     found = unwrap(counter_ms, log_ns)

@@ -1,4 +1,4 @@
-"""Frames of a bus to tables: what belongs together is joined, and nothing else."""
+"""Frames of a bus are decoded to tables: frames that belong together are joined, no others."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def stack(parts: list[Table]) -> Table:
 
 
 def frames_in(tables: dict[str, Table]) -> int:
-    """How many frames the rows were made from."""
+    """Number of frames that yielded the rows."""
     weight = {"obstacles": 3, "lanes": 2, "next_lanes": 2}
     return sum(weight.get(name, 1) * len(table) for name, table in tables.items())
 
@@ -124,7 +124,7 @@ def test_a_log_that_ends_within_a_burst_is_not_called_damaged() -> None:
 
 
 def test_a_lost_status_frame_does_not_mix_two_images() -> None:
-    """Slot 0 comes again with other content: from there on it is another image."""
+    """Slot 0 is repeated with other content: frames from there on belong to another image."""
     sent = [status(2, 0), *triple(0, 7), *triple(0, 8), *triple(1, 9), status(0, 99)]
     tables, ledger = decode(frames(sent, [*range(0, 10 * MS, MS), 99 * MS]))
 
@@ -133,7 +133,7 @@ def test_a_lost_status_frame_does_not_mix_two_images() -> None:
 
 
 def test_frames_long_after_their_status_frame_belong_to_another_image() -> None:
-    """All of one slot, the next status frame and the A of the next image are lost."""
+    """One complete slot, the next status frame and the A of the next image are lost."""
     a, b, c = triple(0, 7)
     sent = [status(1, 0), a, b, c]
     tables, ledger = decode(frames(sent, [0, MS, 67 * MS, 68 * MS]))
@@ -239,7 +239,7 @@ def test_without_a_calibrated_mounting_a_notice_says_so() -> None:
 
 
 def test_distances_count_from_the_rear_axle() -> None:
-    """An obstacle 24 m ahead and 28 m right of a device 3 m ahead, turned 90 degrees left."""
+    """An obstacle 24 m ahead and 28 m right of a device 3 m ahead, rotated by 90 degrees left."""
     sent = [status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]]
     turned = MobileyeSettings(mounting=Mounting(3.0, 0.5, radians(90)))
     tables, _ = decode(frames(sent), turned)
@@ -411,7 +411,7 @@ def test_image_time_is_the_time_of_obstacles_and_status() -> None:
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 400), max_size=6))
 @settings(max_examples=25, deadline=None)
 def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[int]) -> None:
-    """Also not on a damaged log: frames dropped, doubled and swapped."""
+    """The law also holds for a damaged log with frames dropped, duplicated and swapped."""
     rng = np.random.default_rng(seed)
     drive = random_drive(8, rng)
     index = np.sort(rng.choice(len(drive), size=len(drive), replace=True))
@@ -448,7 +448,7 @@ def test_losing_frames_never_makes_a_row_that_was_not_there(seed: int) -> None:
 @given(seed=st.integers(0, 100_000))
 @settings(max_examples=40, deadline=None)
 def test_any_bytes_at_any_time_are_accounted_for(seed: int) -> None:
-    """Random payloads, lengths, kinds and times under ids of the table and others."""
+    """Random payloads, lengths, kinds and times with ids of the table and others."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 400))
     ids = rng.choice([0x738, *range(0x739, 0x760), *range(0x766, 0x77C), *range(0x700, 0x731)], n)
@@ -469,7 +469,7 @@ def test_any_bytes_at_any_time_are_accounted_for(seed: int) -> None:
 
 
 def rows_of(table: Table | None) -> set[tuple[str, ...]]:
-    """Rows without what counts bursts."""
+    """Rows without burst numbers."""
     if table is None:
         return set()
     skip = ("burst", "t_ns")

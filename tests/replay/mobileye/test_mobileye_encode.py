@@ -1,4 +1,4 @@
-"""Tables to frames and back, both ways round."""
+"""Tables encoded as frames and decoded again are equal, and vice versa."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def assert_same_frames(got: Block, want: Block) -> None:
 def test_encoding_what_was_decoded_gives_the_same_frames(
     revision: str, how: MobileyeSettings, seed: int
 ) -> None:
-    """Whole bursts with lanes; lanes are too wild to be turned exactly, so only moved there."""
+    """Complete bursts with lanes; random lanes cannot be rotated exactly and are only moved."""
     drive = random_drive(5, np.random.default_rng(seed), revision, has_lanes=how is STRAIGHT)
     assert_same_frames(encode_tables(decode(drive, how), how, "can1"), drive)
 
 
 def plain_messages() -> list[tuple[Message, str]]:
-    """Every message that stands alone, in each of its variants."""
+    """Every message that belongs to no burst, in each of its variants."""
     joined = ("status", "obstacles", "lanes", "next_lanes")
     return [
         (message, variant)
@@ -110,7 +110,7 @@ def settings_for(variant: str) -> MobileyeSettings:
 
 
 def scene(seed: int, n: int) -> tuple[Columns, list[int]]:
-    """Objects as the table ``obstacles``, within what the device can say."""
+    """Objects as the table ``obstacles``, within the range of the device."""
     rng = np.random.default_rng(seed)
     image_ns = [10**18 + k * 66 * MS for k in range(10)]
     t_ns = np.array([image_ns[k] for k in np.sort(rng.integers(0, 10, n))], dtype=np.int64)

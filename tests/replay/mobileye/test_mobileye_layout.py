@@ -1,4 +1,4 @@
-"""The layout table: consistent in itself, and right on frames whose values are known."""
+"""The layout table: consistent, and correct for frames with known values."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_what_hangs_on_the_variant_is_missing_where_that_is_unknown() -> None:
 def test_real_angles_are_the_bearing_with_the_opposite_sign(
     angle_raw: int, bearing_deg: float
 ) -> None:
-    """From three real recordings: angle sent, and bearing of the place sent beside it."""
+    """From three real recordings: the angle sent, and the bearing of the position sent with it."""
     f = next(f for f in layout()["obstacle_c"].fields if f.name == "angle_rad")
     words = place(np.array([angle_raw]), f.start, f.bits, False)
     values = values_of(layout()["obstacle_c"], words, np.array([-1], dtype=np.int8))
@@ -144,7 +144,7 @@ def test_real_angles_are_the_bearing_with_the_opposite_sign(
 
 
 def test_the_two_ends_of_one_lane_have_opposite_signs_on_the_wire() -> None:
-    """Real pair of messages: 0x737 is left-positive, the LKA lane right-positive; columns agree."""
+    """Real messages: 0x737 is left-positive, the LKA lane right-positive; columns agree."""
     c1_lka = np.array([0.01367])
     lka = columns_of(layout()["lane_b"], {"c1": c1_lka, **_rest("lane_b", "c1")})
     details = columns_of(layout()["lane_details"], {"c1": -c1_lka, **_rest("lane_details", "c1")})

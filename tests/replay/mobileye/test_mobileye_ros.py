@@ -1,4 +1,4 @@
-"""Messages from a bag give the columns that frames give."""
+"""Messages from a bag and frames yield the same columns."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_messages_give_the_very_same_columns_as_frames(seed: int) -> None:
     for name, table in can.items():
         assert list(table.columns) == list(bag[name].columns)
         if name == "next_lanes":
-            continue  # which lane a message is, it does not say
+            continue  # a message does not identify its lane
         one, other = by_time(table), by_time(bag[name])
         for column in table.columns:
             assert one[column].dtype == other[column].dtype, column
@@ -87,7 +87,7 @@ def test_messages_give_the_very_same_columns_as_frames(seed: int) -> None:
 
 
 def test_bytes_of_a_bag_give_the_same_columns_as_frames() -> None:
-    """All the way: messages as rosbags writes them, through our own decoder of messages."""
+    """End to end: messages as written by rosbags, decoded by crosscue's decoder of messages."""
     drive = random_drive(6, np.random.default_rng(8))
     ledger = Ledger("log")
     decoded = []
@@ -142,7 +142,7 @@ def test_high_beam_comes_in_one_message_for_two_frames() -> None:
 @given(seed=st.integers(0, 10_000), cut=st.integers(0, 60), order=st.permutations(range(5)))
 @settings(max_examples=20, deadline=None)
 def test_how_topics_interleave_changes_nothing(seed: int, cut: int, order: list[int]) -> None:
-    """A reader may give a block of one topic long before the others."""
+    """A reader may yield a block of one topic long before the others."""
     messages = messages_of(random_drive(12, np.random.default_rng(seed)))
     pieces = [piece for m in messages for piece in (m.take(np.s_[:cut]), m.take(np.s_[cut:]))]
     firsts, seconds = pieces[0::2], pieces[1::2]
@@ -178,7 +178,7 @@ def test_no_obstacle_messages_at_all_are_reported_too() -> None:
     _, ledger = from_bag([statuses, obstacles.take(np.s_[:0])])
     assert (
         ledger.topic("/parsed_tx/obstacle_data").dropped.total() == 6
-    )  # the last burst may be cut
+    )  # the last burst may be incomplete
 
 
 def test_whole_obstacles_without_their_status_keep_their_own_time() -> None:
@@ -217,7 +217,9 @@ def lane_drive(seconds: int, mirrored: bool) -> list[Block]:
 def test_the_left_lane_lies_on_the_left_whatever_the_messages_mean(
     mirrored: bool, seconds: int
 ) -> None:
-    assert 4 * VOTES_WANTED > 15 * 4  # one second does not decide, its end does
+    assert (
+        4 * VOTES_WANTED > 15 * 4
+    )  # one second is not enough to decide, but the end of the log decides
     how = replace(AS_ON_WIRE, ros_lane_sign="auto")
     bag, ledger = from_bag(lane_drive(seconds, mirrored), how)
 

@@ -1,4 +1,4 @@
-"""``crosscue convert``: what goes in comes out, or is counted; a file is whole or not there."""
+"""``crosscue convert``: each row is written or counted; a file is complete or does not exist."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_an_empty_file_is_a_valid_one(tmp_path: Path) -> None:
 
 
 class FailingFile:
-    """A file on a disk that is full from its nth write on."""
+    """A file on a disk that is full from the nth write on."""
 
     def __init__(self, inner: Any, nth: int) -> None:
         self.inner, self.left = inner, nth
@@ -229,7 +229,7 @@ def test_ranges_are_copied_exactly(lengths: list[int]) -> None:
 
 
 def made_source(path: Path, compression: CompressionType = CompressionType.ZSTD) -> None:
-    """A file by the mcap package: two ROS 2 topics, one whose definition is broken, one foreign."""
+    """A file by the mcap package: two ROS 2 topics, one broken definition, one unsupported type."""
     rng = np.random.default_rng(0)
     store = ros2_store()
     with path.open("wb") as stream:
@@ -405,7 +405,7 @@ def test_real_bags_hold_the_same_messages_afterwards(
 
 
 def _rosbags_values(path: Path) -> dict[str, list[tuple[int, str]]]:
-    """All messages as texts, without the header counter that only ROS 1 has."""
+    """All messages as strings, without the header counter of ROS 1."""
     found: dict[str, list[tuple[int, str]]] = {}
     with AnyReader([path]) as reader:
         for connection, t_ns, raw in reader.messages():
@@ -416,7 +416,7 @@ def _rosbags_values(path: Path) -> dict[str, list[tuple[int, str]]]:
 
 def _values_of(value: Any) -> str:
     if hasattr(value, "__msgtype__"):
-        # Constants belong to the definition; the header's counter is ROS 1's alone.
+        # Constants belong to the definition; only ROS 1 has the header's counter.
         hidden = ("__msgtype__", "seq")
         names = [f.name for f in fields(value) if f.name not in hidden and not f.name.isupper()]
         return "{" + ", ".join(_values_of(getattr(value, name)) for name in names) + "}"

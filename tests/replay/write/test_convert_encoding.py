@@ -1,4 +1,4 @@
-"""Columns written as ROS 2 messages come back as the same columns, and rosbags reads them too."""
+"""Columns written as ROS 2 messages are read back unchanged, also by rosbags."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def there_and_back(topic: str, rows: Rows, ledger: Ledger | None = None) -> list
 
 
 def _rosbags_reads(outgoing: Outgoing) -> list[Any]:
-    """All messages as rosbags reads them with the definition that we store."""
+    """All messages as rosbags reads them with the stored definition."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(outgoing.type.schema.decode(), outgoing.type.name))
     rows = outgoing.block.rows

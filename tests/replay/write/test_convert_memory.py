@@ -1,4 +1,4 @@
-"""Memory of `convert`: what costs it is how a log is built, not how long it is."""
+"""Memory of `convert` depends on the structure of a log, not on its length."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from support.data import shared
 from support.every_format import EVERY_FORMAT
 
 TABLES = ("comma2k19", "kitti-raw", "images")
-"""Formats with columns of their own: their types are chosen by ``convert``."""
+"""Formats with their own columns, whose types are chosen by ``convert``."""
 COLUMNS = {
     "CAN/wheel_speed": 4,
     "CAN/speed": 1,

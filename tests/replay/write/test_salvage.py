@@ -1,4 +1,4 @@
-"""``convert --salvage``, and what plain ``convert`` and ``info`` say of a damaged log."""
+"""``convert --salvage``, and the reports of plain ``convert`` and ``info`` on a damaged log."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def cdr(i: int) -> bytes:
 
 @pytest.fixture
 def damaged(tmp_path: Path) -> tuple[Path, int]:
-    """A recording without chunks, one of whose 600 records begins with zeros now; and where."""
+    """A recording without chunks in which one of 600 records begins with zeros; its position."""
     records = [schema(1), channel(1, 1, "/a")]
     records += [message(1, 10**18 + i * 10**6, cdr(i)) for i in range(600)]
     coded = bytearray(McapFile(records, data_crc=True).coded())
@@ -112,7 +112,7 @@ def test_a_chunk_over_max_chunk_is_refused_with_both_numbers(
 
     said = capsys.readouterr()
     text = " ".join((said.out + said.err).split())
-    # Of a log without one chunk below the limit there is nothing to convert.
+    # A log with no chunk below the limit has nothing to convert.
     assert status == (3 if command == "info" else 4)
     assert "the limit is 1048" in text
 
