@@ -23,7 +23,7 @@ from crosscue.replay.base import (
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.vehicle.drafting.camera import Intrinsics, Measured
 from crosscue.replay.vehicle.drafting.series import Series
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 DEGREE: Final = np.pi / 180.0
 WIDTH_PX: Final = 960
@@ -69,6 +69,11 @@ def estimate_mounting(
         lacks = "focal_px" if intrinsics is None else "the vehicle's speed"
         return Estimate(None, None, 0, f"pitch and yaw not estimated: needs {lacks}")
     number = next(i for i, topic in enumerate(log.topics) if topic.name == camera)
+    first = next(_grey(log, number), None)
+    focal_px, center_px, _, size_px = intrinsics
+    known = Camera(focal_px=focal_px, center_px=center_px, size_px=size_px)
+    if first is not None and (why := known.mismatch(first[2])) is not None:
+        return Estimate(None, None, 0, f"pitch and yaw not estimated: {why}")
     seen, bends = 0, 0
     found: list[Travel] = []
     for before, after, way_m, focal_px, center_px in _pairs(log, number, intrinsics, speed):
@@ -114,7 +119,7 @@ def _pairs(
     way_m = _way_m(speed)
     waiting: deque[tuple[float, Bytes]] = deque()
     first_ns: int | None = None
-    for t_ns, grey, scale in _grey(log, number):
+    for t_ns, grey, size_px in _grey(log, number):
         first_ns = t_ns if first_ns is None else first_ns
         if t_ns - first_ns > LOOKED_AT_NS:
             return
@@ -127,6 +132,7 @@ def _pairs(
         while len(waiting) > 1 and here_m - waiting[1][0] >= APART_M:
             waiting.popleft()
         if waiting and here_m - waiting[0][0] >= APART_M and waiting[0][1].shape == grey.shape:
+            scale = grey.shape[1] / size_px[0]
             focal_px = intrinsics.focal_px * scale
             center_px = (intrinsics.center_px[0] * scale, intrinsics.center_px[1] * scale)
             yield waiting[0][1], grey, here_m - waiting[0][0], focal_px, center_px
@@ -138,8 +144,8 @@ def _way_m(speed: Series) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.abs(steps))])
 
 
-def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, float]]:
-    """Yield undamaged pictures in order of time, small and grey, with their scale."""
+def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, tuple[int, int]]]:
+    """Yield undamaged pictures in order of time, small and grey, with their full size."""
     import cv2
 
     view = View(is_grey=True, min_width_px=WIDTH_PX)
@@ -155,4 +161,4 @@ def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, float]]:
                 height = round(pixels.shape[0] * WIDTH_PX / pixels.shape[1])
                 small = cv2.resize(pixels, (WIDTH_PX, height), interpolation=cv2.INTER_AREA)
                 pixels = np.asarray(small, np.uint8)
-            yield t_ns, pixels, pixels.shape[1] / size_px[0]
+            yield t_ns, pixels, size_px

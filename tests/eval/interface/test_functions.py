@@ -98,6 +98,8 @@ def test_a_draft_has_the_published_intrinsics_and_what_no_log_shows_as_comments(
     text = crosscue.draft_vehicle(pandaset_drive(tmp_path / "002", 4)).text
 
     assert "focal_px = 1970  # published with the data set\ncenter_px = [970.5, 483]" in text
+    # The made pictures are tiny.
+    assert "# pitch and yaw not estimated: camera.center_px = (970.5, 483): outside the im" in text
     for section in ("mobileye", "regions", "ranges", "detectors.yolox-nano", "cues", "cars"):
         assert f"# [{section}]" in text
     # Every commented line is one of a vehicle file, once a person takes the sign away.
