@@ -453,7 +453,7 @@ def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Refere
 
 
 def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
-    """Build the filter that continues across approaches; None if the vehicle file has no such.
+    """Build the filter that continues across approaches; None without ``temporal``.
 
     Raises:
         ValueError: ``temporal`` has no fitted parameters; a vehicle file cannot have this state.

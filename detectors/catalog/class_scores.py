@@ -22,7 +22,7 @@ ORDER: Final = 1e-6
 
 
 class Platt(Settings):
-    """Platt scaling: logit of the correct fraction = ``slope * logit(score) + offset`` (1999)."""
+    """Platt scaling (1999): the correct fraction's logit is ``slope * logit(score) + offset``."""
 
     kind: Literal["platt"]
     slope: Annotated[float, Field(gt=0.0, le=100.0)]
@@ -43,11 +43,11 @@ class Isotonic(Settings):
     fractions: tuple[Proportion, ...]
 
     @model_validator(mode="after")
-    def _rising(self) -> Self:
+    def _increasing(self) -> Self:
         if len(self.fractions) != len(self.scores):
             raise ValueError(f"fractions: expected {len(self.scores)}, as many as scores")
         if (np.diff(self.scores) <= 0.0).any() or (np.diff(self.fractions) < 0.0).any():
-            raise ValueError("scores and fractions: expected rising numbers")
+            raise ValueError("scores and fractions: expected increasing numbers")
         return self
 
     def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -60,7 +60,6 @@ class ClassScores(Settings):
     """Threshold and calibration of one class."""
 
     threshold: Proportion | None = None
-    """Score after calibration above which a detection is a cue; the vehicle file can override it.
-    """
+    """Calibrated score above which a detection is a cue; the vehicle file can override it."""
     calibration: Annotated[Platt | Isotonic, Field(discriminator="kind")] | None = None
     """Maps the network's score to the fraction of such detections that are correct."""

@@ -32,7 +32,7 @@ from .card import MAX_BYTES, Input
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
 _MAX_BRACKETS: Final = 200
-"""In metadata; parsing more of them is slow."""
+"""Maximum number of brackets in metadata; parsing more is slow."""
 DEFAULT_SIDE_PX: Final = 640
 """Default side of a network's input, where the file declares no size."""
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
@@ -145,7 +145,7 @@ def _yaml_metadata(path: Path) -> dict[str, str]:
     try:
         content = read_at_most(path, _MAX_NAMES_CHARACTERS)
         if content is None or content.count(b"[") + content.count(b"{") > _MAX_BRACKETS:
-            raise ValueError("larger or deeper than any real one")
+            raise ValueError("too large or too deeply nested")
         found = YAML(typ="safe", pure=True).load(content.decode("utf-8"))
     except (YAMLError, ValueError, RecursionError) as error:
         why = one_line(error, 160)

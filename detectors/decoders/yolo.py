@@ -167,7 +167,7 @@ class PrototypeMasks:
 
 
 def prototype_output(model: Interface) -> tuple[str, int] | None:
-    """Name of the output with prototype masks, and their number; None if it is missing."""
+    """Name of the output with prototype masks, and their number; None without such an output."""
     for out in model.outputs:
         count = static(out.shape, 1)
         if len(out.shape) == 4 and count == _COEFFICIENTS:

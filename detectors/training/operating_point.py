@@ -97,7 +97,7 @@ def rates_at(judged: Judged, score: float) -> Rates:
 
 
 def threshold_for(judged: Judged, precision: float) -> float | None:
-    """Lowest score at which, and above which, the precision is reached; None if there is no such.
+    """Lowest score at which, and above which, the precision is reached; None if none exists.
 
     The condition on all higher scores excludes chance fluctuations.
     """

@@ -43,7 +43,7 @@ def load_coco(name: str) -> Checkpoint:
     place = Path(torch.hub.get_dir()) / "checkpoints" / weights.url.rsplit("/", 1)[-1]
     try:
         if place.exists():
-            _check_whole(place)
+            _verify_hash(place)
         tensors = weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
     except (URLError, TimeoutError, ConnectionError) as error:
         raise VehicleError(
@@ -58,7 +58,7 @@ def load_coco(name: str) -> Checkpoint:
     return coco_checkpoint(name, weights, tensors)
 
 
-def _check_whole(path: Path) -> None:
+def _verify_hash(path: Path) -> None:
     """Verify a file's hash; torchvision does so only for a file that it has just fetched.
 
     Raises:

@@ -201,7 +201,7 @@ class MaskRcnnDetector:
         """
         found: list[Found] = []
         while len(found) < len(frames):
-            part = _alike(frames[len(found) : len(found) + self._batch.size])
+            part = _of_one_size(frames[len(found) : len(found) + self._batch.size])
             try:
                 found += self._detect(part)
             except (torch.OutOfMemoryError, MemoryError):
@@ -266,7 +266,7 @@ class MaskRcnnDetector:
         )
 
 
-def _alike(frames: Sequence[Frame]) -> Sequence[Frame]:
+def _of_one_size(frames: Sequence[Frame]) -> Sequence[Frame]:
     """Leading frames that have the size of the first."""
     shape = frames[0].pixels.shape
     count = next((i for i, f in enumerate(frames) if f.pixels.shape != shape), len(frames))
@@ -302,13 +302,13 @@ def place(pixels: Bytes, plan: Plan) -> Placed:
     if size != (width, last - first):
         scaled = np.asarray(cv2.resize(scaled, size, interpolation=cv2.INTER_LINEAR), np.uint8)
     scale = (size[0] / width, size[1] / (last - first))
-    padded = np.empty((_whole(size[1]), _whole(size[0]), 3), np.uint8)
+    padded = np.empty((_padded(size[1]), _padded(size[0]), 3), np.uint8)
     padded[: size[1], : size[0]] = scaled
     padded[size[1] :] = padded[: size[1], size[0] :] = _PAD
     return Placed(padded, scale, (0, round(first * scale[1])))
 
 
-def _whole(side: int) -> int:
+def _padded(side: int) -> int:
     return -(-side // STRIDE) * STRIDE
 
 

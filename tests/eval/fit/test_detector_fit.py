@@ -102,7 +102,7 @@ def test_platt_without_slope_and_offset_changes_nothing() -> None:
 
 
 def test_points_that_fall_are_refused() -> None:
-    with pytest.raises(ValueError, match="rising numbers"):
+    with pytest.raises(ValueError, match="increasing numbers"):
         Isotonic(kind="isotonic", scores=(0.2, 0.4), fractions=(0.6, 0.5))
 
 
