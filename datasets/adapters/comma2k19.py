@@ -307,7 +307,7 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
     block = Block(name, source.t_ns[part], source.rows(part))
     wanted = block.log_ns != NO_TIME
     timeless = int(count - wanted.sum())
-    ledger.spoil(name, "a row without a possible time", timeless)
+    ledger.spoil(name, "a row without a valid time", timeless)
     if selection.start_ns is not None:
         wanted &= block.log_ns >= selection.start_ns
     if selection.end_ns is not None:

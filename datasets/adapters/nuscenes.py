@@ -46,7 +46,7 @@ radius in meters"). An unloaded 195/55 R16 tyre has 0.3105 m, 2 % more than this
 earlier edition has 0.328, which is 8 % faster; ``crosscue fit odometry`` fits the scale of a
 drive."""
 RPM_TO_MPS: Final = WHEEL_RADIUS_M * 2.0 * math.pi / 60.0
-DAMAGED_ROW: Final = "a row that is not understood"
+DAMAGED_ROW: Final = "a damaged row"
 FRONT: Final = "CAM_FRONT"
 
 

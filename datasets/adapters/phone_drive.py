@@ -39,7 +39,7 @@ MILE_H_MPS: Final = 0.44704
 MICROTESLA: Final = 1e-6
 QUARTER_HOUR_S: Final = 900.0
 """Quarter of an hour; time zones differ from UTC by multiples of it."""
-DAMAGED: Final = "a line that cannot be understood"
+DAMAGED: Final = "a line that cannot be parsed"
 GRAVITY: Final = tuple(f"motionGravity{axis}(G)" for axis in "XYZ")
 GYRO: Final = tuple(f"gyroRotation{axis}(rad/s)" for axis in "XYZ")
 FIELD: Final = tuple(f"locationHeading{axis}(µT)" for axis in "XYZ")

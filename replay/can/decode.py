@@ -39,7 +39,7 @@ REMOTE_FRAME: Final = "remote frame"
 ERROR_FRAME: Final = "error frame"
 TOO_SHORT: Final = "frame shorter than its message"
 TOO_LONG: Final = "frame longer than its message"
-WRONG_FORMAT: Final = "CAN FD frame, but the database says classic"
+WRONG_FORMAT: Final = "CAN FD frame of a classic message"
 NO_BRANCH: Final = "multiplexer value without a branch"
 RARE_REASONS: Final = (
     ERROR_FRAME,

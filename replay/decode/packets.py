@@ -23,7 +23,7 @@ MAX_PIXELS: Final = 64_000_000
 AT_ONCE: Final = 8
 """Number of pictures in a block; at 1280 by 720 these are 22 MB."""
 NOT_DECODED: Final = "video packet not decoded"
-NO_PICTURE: Final = "video packet that became no picture"
+NO_PICTURE: Final = "video packet without picture"
 
 
 def is_stream(images: Images) -> bool:

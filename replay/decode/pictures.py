@@ -99,7 +99,7 @@ def _judge(row: PictureRow | str, picture: Picture) -> tuple[ImageCoding | None,
         return coding_of(row.magic, row.label), IMAGE_CODING, row.label[:40]
     sides = (row.width_px, row.height_px)
     if min(sides) < 1 or max(sides) > MAX_SIDE_PX:
-        return None, "picture size not plausible", f"{row.width_px} x {row.height_px}"
+        return None, "implausible picture size", f"{row.width_px} x {row.height_px}"
     if row.step_bytes < row.width_px or row.stop - row.start < row.step_bytes * row.height_px:
         return None, "picture has fewer bytes than its size needs", ""
     return "raw", "", ""

@@ -9,8 +9,8 @@ from crosscue.replay.base import Block, Ledger
 MISFIT: Final = "does not fit its schema"
 WRONG_CODING: Final = "CDR representation not supported"
 EMPTY_PICTURE: Final = "empty picture"
-IMAGE_CODING: Final = "image coding not known"
-VIDEO_CODING: Final = "video coding not known"
+IMAGE_CODING: Final = "unknown image coding"
+VIDEO_CODING: Final = "unknown video coding"
 BIG_ENDIAN: Final = "big-endian pixels not supported"
 LONG_LENS: Final = "over 14 lens coefficients"
 

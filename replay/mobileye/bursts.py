@@ -21,9 +21,9 @@ Int64s: TypeAlias = NDArray[np.int64]
 NO_STATUS: Final = "obstacle before the first status frame"
 LATE: Final = "too long after its status frame"
 REPEATED: Final = "repeated frame"
-NEXT_BURST: Final = "slot sent twice: the status frame between is missing"
+NEXT_BURST: Final = "slot sent twice: the status frame in between is missing"
 BEYOND_COUNT: Final = "slot beyond the count of its status frame"
-CUT: Final = "obstacle cut: A, B or C is missing"
+CUT: Final = "incomplete obstacle: A, B or C is missing"
 LANE_A_ALONE: Final = "lane A without its B"
 LANE_B_ALONE: Final = "lane B without its A"
 

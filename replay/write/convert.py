@@ -36,7 +36,7 @@ from crosscue.replay.vehicle.roles import OF_TABLES
 
 from .mcap import Compression, McapWriter, Stretch
 
-NO_TYPE: Final = "type not known, so ROS 2 cannot hold it"
+NO_TYPE: Final = "unknown type, which ROS 2 cannot store"
 BAD_SCHEMA: Final = "its definition is damaged"
 TOO_EARLY: Final = "time before 1970"
 

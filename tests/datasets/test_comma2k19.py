@@ -148,7 +148,7 @@ def test_a_time_that_damage_made_impossible_or_far_costs_its_row_alone(
     is_time = abs(damaged) < 1e9
     assert rows == ledger.accounts["imu/gyro"].used == (50 if is_time else 49)
     dropped = ledger.accounts["imu/gyro"].dropped
-    assert dropped == ({} if is_time else {"a row without a possible time": 1})
+    assert dropped == ({} if is_time else {"a row without a valid time": 1})
 
 
 OTHERS: dict[str, NDArray[np.generic]] = {

@@ -220,7 +220,7 @@ def _raw_doubts(fields: Fields) -> Iterator[Doubt]:
     size = fields.items("data")[1]
     yield size == 0, EMPTY_PICTURE
     small, large = np.minimum(width, height), np.maximum(width, height)
-    yield (small < 1) | (large > MAX_SIDE_PX), "picture size not plausible"
+    yield (small < 1) | (large > MAX_SIDE_PX), "implausible picture size"
     yield (step < width) | (size < step * height), "picture has fewer bytes than its size needs"
     big = fields.number("is_bigendian").astype(np.bool_)
     deep = np.array(["16" in each or "32" in each for each in fields.texts("encoding")], np.bool_)

@@ -46,8 +46,8 @@ from crosscue.replay.mobileye.wire import columns_of, values_of
 from .admit import Admission, Admitted
 from .family import FamilyEvidence
 
-CUT_AT_END: Final = "obstacle cut by the end of the log"
-NOT_COME: Final = "obstacle frames announced by a status frame that did not come"
+CUT_AT_END: Final = "incomplete obstacle at the end of the log"
+NOT_COME: Final = "obstacle frames announced by a status frame but missing"
 _EVENTS_TOLD: Final = 50
 _OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
 _LANE_PARTS: Final = {

@@ -13,7 +13,7 @@ from crosscue.replay.mobileye.bursts import NO_BURST
 from crosscue.replay.mobileye.layout import Columns
 from crosscue.replay.mobileye.settings import MobileyeSettings
 
-NOT_COME: Final = "obstacle messages announced by a status message that did not come"
+NOT_COME: Final = "obstacle messages announced by a status message but missing"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

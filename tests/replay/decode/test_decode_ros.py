@@ -343,7 +343,7 @@ def test_pictures_come_as_ranges_of_the_log_itself() -> None:
     assert images.coding == ("jpeg", "png")
     assert [images.bytes_.payload(i).tobytes() for i in range(2)] == pictures[:2]
     assert np.shares_memory(images.bytes_.buffer, block.rows.buffer)  # type: ignore[union-attr]
-    assert ledger.topic("/cam").skipped == {"image coding not known": 1, "empty picture": 1}
+    assert ledger.topic("/cam").skipped == {"unknown image coding": 1, "empty picture": 1}
 
 
 @pytest.mark.parametrize("is_cdr", [True, False])

@@ -88,7 +88,7 @@ def test_parts_of_different_slots_are_never_one_obstacle() -> None:
     tables, ledger = decode(frames(sent, [0, MS, 2 * MS, 3 * MS, 66 * MS]))
 
     assert "obstacles" not in tables
-    assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 3
+    assert skipped(ledger)["incomplete obstacle: A, B or C is missing"] == 3
     assert ledger.topic("can1").dropped.total() == 3
 
 
@@ -98,7 +98,7 @@ def test_a_triple_across_two_status_frames_is_not_joined() -> None:
     tables, ledger = decode(frames(sent, [0, MS, 66 * MS, 67 * MS, 68 * MS, 132 * MS]))
 
     assert "obstacles" not in tables
-    assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 3
+    assert skipped(ledger)["incomplete obstacle: A, B or C is missing"] == 3
     assert [d.t_ns for d in ledger.details if not d.is_dropped] == [MS, 67 * MS]
     assert ledger.topic("can1").dropped.total() == 3
 
@@ -109,7 +109,7 @@ def test_a_cut_burst_keeps_its_whole_obstacles_and_reports_the_rest() -> None:
     tables, ledger = decode(frames(sent, times))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
-    assert skipped(ledger)["obstacle cut: A, B or C is missing"] == 2
+    assert skipped(ledger)["incomplete obstacle: A, B or C is missing"] == 2
     lost = list(ledger.drops())
     assert [(d.count, d.t_ns, d.detail) for d in lost] == [(4, 0, "burst 0")]
 
@@ -118,7 +118,7 @@ def test_a_log_that_ends_within_a_burst_is_not_called_damaged() -> None:
     tables, ledger = decode(frames([status(2, 0), *triple(0, 7), triple(1, 9)[0]]))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
-    assert skipped(ledger)["obstacle cut by the end of the log"] == 1
+    assert skipped(ledger)["incomplete obstacle at the end of the log"] == 1
     assert ledger.is_whole
     assert any("ends within an image's burst" in n for n in ledger.notices)
 
@@ -129,7 +129,7 @@ def test_a_lost_status_frame_does_not_mix_two_images() -> None:
     tables, ledger = decode(frames(sent, [*range(0, 10 * MS, MS), 99 * MS]))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
-    assert skipped(ledger)["slot sent twice: the status frame between is missing"] == 6
+    assert skipped(ledger)["slot sent twice: the status frame in between is missing"] == 6
 
 
 def test_frames_long_after_their_status_frame_belong_to_another_image() -> None:
