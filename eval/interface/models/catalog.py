@@ -51,6 +51,7 @@ class Model:
         card, given = self.card, self.card.input
         resizable = ", resizable" if given.is_resizable else ""
         network = "" if card.network is None else f"{card.network.architecture}, "
+        decoded = given.decode if card.network is None else "full"
         cues = ", ".join(self.cue_labels) or "no default cue uses any of its classes"
         lines = [
             f"{self.name}: {card.about or 'no description'}",
@@ -58,7 +59,7 @@ class Model:
             f"source     {card.source or 'not named'}",
             f"weights    {card.weights}, SHA-256 {card.sha256}",
             f"input      {given.width_px} x {given.height_px}{resizable}, {given.colour}, "
-            f"{given.fit}",
+            f"{given.fit}, JPEGs decoded {decoded}",
             f"output     {network}{card.output.kind}, {len(card.output.classes)} classes",
             f"cues       {cues}",
         ]
