@@ -7,15 +7,15 @@ Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is looked up
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.datasets.truth.truth import Truth, load
 from crosscue.detectors.cues.cars import (
@@ -29,40 +29,7 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.scoring.truth import cue_at
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-MIN_NEAR = 0.5
-"""A true car counts where its middle is so near, in lengths of its box."""
-KINDS = {
-    "cross": "car on the crossroad that moves",
-    "parked_cross": "car parked on the crossroad",
-    "other": "car in a lot or driveway, or parked at the own road",
-    "oncoming": "oncoming car",
-    "outgoing": "car ahead",
-    "parked_past": "car parked past the intersection",
-}
-
-
-def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
-    """From a frame's time to its cars."""
-    content = json.loads((drive / "objects.json").read_text())
-    times = {one["id"]: one["t_ns"] for one in content["images"]}
-    car = next(one["id"] for one in content["categories"] if one["name"] == "car")
-    cars: dict[int, list[dict[str, Any]]] = {t_ns: [] for t_ns in times.values()}
-    for one in content["annotations"]:
-        if one["category_id"] == car:
-            cars[times[one["image_id"]]].append(one)
-    return cars
-
-
-def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
-    """What the nearest true car does, or that none exists."""
-    best, nearest = "no car", MIN_NEAR
-    for one in cars:
-        x0, y0, width, height = one["bbox"]
-        away = float(np.hypot(x - x0 - width / 2, y - y0 - height / 2)) / max(width, height)
-        if away < nearest:
-            best, nearest = KINDS[one["role"]], away
-    return best
+from support.perfect_boxes import true_cars, what_is_at
 
 
 def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, float]]:

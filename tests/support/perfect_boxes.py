@@ -13,6 +13,40 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.detectors.base import Detections
 from crosscue.eval.scoring.truth import cue_at
 
+MIN_NEAR = 0.5
+"""A true car counts where its middle is so near, in lengths of its box."""
+KINDS = {
+    "cross": "car on the crossroad that moves",
+    "parked_cross": "car parked on the crossroad",
+    "other": "car in a lot or driveway, or parked at the own road",
+    "oncoming": "oncoming car",
+    "outgoing": "car ahead",
+    "parked_past": "car parked past the intersection",
+}
+
+
+def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
+    """From a frame's time to its cars."""
+    content = json.loads((drive / "objects.json").read_text())
+    times = {one["id"]: one["t_ns"] for one in content["images"]}
+    car = next(one["id"] for one in content["categories"] if one["name"] == "car")
+    cars: dict[int, list[dict[str, Any]]] = {t_ns: [] for t_ns in times.values()}
+    for one in content["annotations"]:
+        if one["category_id"] == car:
+            cars[times[one["image_id"]]].append(one)
+    return cars
+
+
+def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
+    """What the nearest true car does, or that none exists."""
+    best, nearest = "no car", MIN_NEAR
+    for one in cars:
+        x0, y0, width, height = one["bbox"]
+        away = float(np.hypot(x - x0 - width / 2, y - y0 - height / 2)) / max(width, height)
+        if away < nearest:
+            best, nearest = KINDS[one["role"]], away
+    return best
+
 
 def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
     """The drive's objects as a perfect detector would find them, picture by picture."""
