@@ -103,7 +103,7 @@ def tables_of(scores: LayoutScores) -> list[Table]:
     if scores.rules:
         found.append(
             Table(
-                "Rules for real roads, each left out, one drive of each layout",
+                "Rules for real roads, each left out",
                 ("left out", "Brier", "log score", "false a drive", "full", "full, m"),
                 tuple(_score_row(rule or "none", one) for rule, one in scores.rules.items()),
             )

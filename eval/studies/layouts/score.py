@@ -88,8 +88,7 @@ class LayoutScores:
         less: The belief over time less each other, by what they are called.
         cues: From cues left out to the belief over time in every picture without them, less that
             with all.
-        rules: From what is left out (empty for nothing) to the score with the other rules, over
-            one drive of each layout.
+        rules: From what is left out (empty for nothing) to the score with the other rules.
         rules_less: From the rule to the belief without it less that with all.
         drives: How many.
         layouts: How many.

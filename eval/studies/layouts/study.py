@@ -91,11 +91,9 @@ def score_study(
 def _by_rule(
     drives: Sequence[StudyDrive], learned: Mapping[int, Learned], on_step: OnStep
 ) -> dict[str, list[DriveBelief]]:
-    # Regions on the ground take ten times as long as all else, so one drive of each layout.
-    first = list({one.layout: one for one in reversed(drives)}.values())[::-1]
     return {
         rule: _all(
-            first,
+            drives,
             lambda one, rule=rule: believed(  # type: ignore[misc]
                 one, with_rules(one, rule or None), learned[one.fold].base_rates
             ),
