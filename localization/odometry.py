@@ -38,6 +38,8 @@ _POSITIVE: Final = (
     "wheelbase_m",
     "wheel_scale",
     "right_wheel_scale",
+    "front_left_scale",
+    "front_right_scale",
     "max_gap_s",
 )
 
@@ -52,6 +54,9 @@ class OdometrySettings:
         wheel_scale: True speed per reported speed.
         right_wheel_scale: Additional scale of the right-hand wheels. A tyre that is 0.1 % larger
             than the other turns the wheels' heading by half a radian per kilometre.
+        front_left_scale: Additional scale of the front left wheel; None takes that of the rear
+            wheel on its side.
+        front_right_scale: Additional scale of the front right wheel.
         use_front_wheels: True to average all four wheels, where available; else the rear two.
         wheel_step_mps: Resolution of the reported wheel speed; errors are up to half of it.
         slip_per_sqrt_m: S.d. of the distance after one metre.
@@ -76,6 +81,8 @@ class OdometrySettings:
     wheelbase_m: float | None = None
     wheel_scale: float = 1.0
     right_wheel_scale: float = 1.0
+    front_left_scale: float | None = None
+    front_right_scale: float | None = None
     use_front_wheels: bool = False
     wheel_step_mps: float = 0.0
     slip_per_sqrt_m: float = 0.02
@@ -114,6 +121,14 @@ class OdometrySettings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected >= 0, got {value}")
+
+    @property
+    def wheel_scales(self) -> Floats:
+        """Scales of front left, front right, rear left and rear right wheel, shape (4,)."""
+        rear = (1.0, self.right_wheel_scale)
+        front = (self.front_left_scale, self.front_right_scale)
+        of_front = [own or side for own, side in zip(front, rear, strict=True)]
+        return self.wheel_scale * np.array([*of_front, *rear])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -349,8 +364,7 @@ def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None
 
 def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floats, Floats]:
     """Speed of the rear axle's centre, and yaw rate by the difference of left and right wheels."""
-    sides = np.tile([1.0, settings.right_wheel_scale], wheels.wheels_mps.shape[1] // 2)
-    speeds = wheels.signed_mps() * settings.wheel_scale * sides
+    speeds = wheels.signed_mps() * settings.wheel_scales[-wheels.wheels_mps.shape[1] :]
     left, right = speeds[:, -2], speeds[:, -1]
     if settings.use_front_wheels and speeds.shape[1] == 4 and settings.wheelbase_m is not None:
         front_sideways_mps = (right - left) / settings.track_width_m * settings.wheelbase_m

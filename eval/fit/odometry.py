@@ -27,7 +27,14 @@ from .log_signals import plan_of, read_signals
 from .reference import Reference, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 
-SHARED: Final = ("wheel_scale", "slip_per_sqrt_m", "turn_delay_s", "turn_rad_per_sqrt_rad")
+SHARED: Final = (
+    "wheel_scale",
+    "front_left_scale",
+    "front_right_scale",
+    "slip_per_sqrt_m",
+    "turn_delay_s",
+    "turn_rad_per_sqrt_rad",
+)
 OF_ONE_TURN: Final = {
     "yaw rate": ("yaw_rate_scale", "gyro_bias_radps", "gyro_noise_rad_per_sqrt_s"),
     "steering": (

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.localization.fixes import Fixes
-from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds, integrate
+from crosscue.localization.odometry import (
+    Increments,
+    OdometrySettings,
+    TurnSignal,
+    WheelSpeeds,
+    integrate,
+)
 from crosscue.localization.pose_filter import State, at_point, predict, update_position
 from crosscue.localization.start_pose import start_pose
 from crosscue.replay.compiled import kept
@@ -128,9 +134,13 @@ class KnownDrive:
             between(made.turn_var_rad2),
         )
 
+    def increments(self, settings: OdometrySettings) -> Increments:
+        """Return the odometry of the complete log, positions or not."""
+        return integrate(self.wheels, settings, self.turn).increments
+
     def start(self, settings: OdometrySettings) -> State:
         """Estimate the pose at the first position, as an initial value."""
-        made = integrate(self.wheels, settings, self.turn).increments
+        made = self.increments(settings)
         return start_pose(made, self.fixes, self.lever_m)
 
     def follow(self, start: State, steps: Steps, cov_m2: Floats | None = None) -> Predicted:

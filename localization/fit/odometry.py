@@ -25,6 +25,7 @@ import numpy as np
 
 from crosscue.localization.angles import wrap
 from crosscue.localization.fit.compass import NotObservable, persistence
+from crosscue.localization.fit.front_wheels import front_wheels
 from crosscue.localization.fit.known_drive import GATE_NIS, KnownDrive, Steps, whitened
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.localization.pose_filter import State
@@ -57,6 +58,7 @@ _MIN_SD: Final = 1e-6
 START: Final = ("start_x_m", "start_y_m", "start_heading_rad")
 FIX_DELAY: Final = "fix_delay_s"
 DRIFT: Final = "gyro_drift_radps2"
+FRONT: Final = ("front_left_scale", "front_right_scale")
 
 
 class _Kind(NamedTuple):
@@ -370,6 +372,8 @@ class _Fit:
 
 
 def _given(settings: OdometrySettings, name: str) -> float:
+    if name in FRONT:
+        return float(settings.wheel_scales[FRONT.index(name)]) / settings.wheel_scale
     return float(getattr(settings, name, 0.0))
 
 
@@ -403,15 +407,22 @@ def _result(
     settings = fit.settings(values)
     steps = drive.steps(settings, 0.0, values.get(FIX_DELAY, 0.0))
     factor = 1.0 if whole_s is None else max(whole_s / float(drive.seconds[-1]), 1.0)
+    settings = _with_doubt(settings, steps, sd, float(drive.seconds[-1]) * factor, factor)
+    span_ns = int(drive.fixes.t_ns[0]), int(drive.fixes.t_ns[-1])
+    front = front_wheels(drive.wheels, drive.increments(settings), settings, span_ns)
     return OdometryFit(
         source=drive.source,
-        settings=_with_doubt(settings, steps, sd, float(drive.seconds[-1]) * factor, factor),
-        fitted=tuple(
-            Fitted(name, _given(given, name), values[name], sd[name]) for name in _own(fit.names)
+        settings=_changed(settings, {one.setting: one.scale for one in front}),
+        fitted=(
+            *(
+                Fitted(name, _given(given, name), values[name], sd[name])
+                for name in _own(fit.names)
+            ),
+            *(Fitted(one.setting, _given(given, one.setting), one.scale, one.sd) for one in front),
         ),
         not_observable=missing,
         start=State(x, y, wrap(heading), 0.0, xx, xy, xh, 0.0, yy, yh, 0.0, hh, 0.0, 0.0),
-        start_ns=int(drive.fixes.t_ns[0]),
+        start_ns=span_ns[0],
         fix_sd_m=fit.fix_scale * drive.fix_sd_m,
         residual_rms=float(np.sqrt(np.mean(white**2))),
         fixes=len(drive.fixes),

@@ -53,6 +53,10 @@ class Odometry(Section):
     wheelbase_m: Positive = 2.7
     wheel_scale: Positive = 1.0
     right_wheel_scale: Positive = 1.0
+    front_left_scale: Positive | None = None
+    """Further scale of the front left wheel; by default that of the rear wheel on its side. Only
+    ``use_front_wheels`` uses the front wheels."""
+    front_right_scale: Positive | None = None
     use_front_wheels: bool = False
     wheel_step_mps: NotNegative = 0.0028
     slip_per_sqrt_m: NotNegative = 0.3

@@ -1,0 +1,62 @@
+"""Each front wheel's scale is found from how the rear axle moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crosscue.localization.fit.front_wheels import front_wheels
+from crosscue.localization.odometry import OdometrySettings, WheelSpeeds, integrate
+from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
+
+REAR = {"wheel_scale": 1.02, "right_wheel_scale": 0.995}
+FRONT = {"front_left_scale": 1.008, "front_right_scale": 0.991}
+CAR = OdometrySettings(
+    track_width_m=TRACK_M, wheelbase_m=BASE_M, slip_per_sqrt_m=0.005, gyro_noise_rad_per_sqrt_s=1e-3
+)
+
+
+def four_wheels(truth: Truth, rng: np.random.Generator) -> WheelSpeeds:
+    """Speeds that wheels of these four scales report."""
+    rear = wheels(truth, CAR, rng).wheels_mps
+    across = BASE_M * truth.yaw_radps[:, None]
+    front = np.sign(rear) * np.hypot(rear, across)
+    scales = replace(CAR, **REAR, **FRONT).wheel_scales
+    return WheelSpeeds(truth.t_ns, np.hstack([front, rear]) / scales)
+
+
+def test_distinct_scales_of_four_wheels_are_recovered() -> None:
+    rng = np.random.default_rng(seed=3)
+    truth = drive(rng, seconds=300.0)
+    car, settings = four_wheels(truth, rng), replace(CAR, **REAR)
+    made = integrate(car, settings, gyro(truth, CAR, rng)).increments
+
+    found = front_wheels(car, made, settings, (int(truth.t_ns[0]), int(truth.t_ns[-1])))
+
+    assert [one.setting for one in found] == [*FRONT]
+    for one in found:
+        off = one.scale - FRONT[one.setting]
+        assert abs(off) < 4.0 * one.sd
+        assert one.sd < 0.5 * abs(FRONT[one.setting] - 1.0)
+
+
+def test_four_scaled_wheels_agree_on_the_way() -> None:
+    truth = drive(np.random.default_rng(seed=5))
+    exact = replace(CAR, slip_per_sqrt_m=0.0)
+    car = four_wheels(truth, np.random.default_rng(seed=6))
+    ways = [
+        float(np.abs(integrate(car, replace(exact, **REAR, **FRONT, use_front_wheels=front))
+        .increments.distance_m).sum())
+        for front in (False, True)
+    ]  # fmt: skip
+
+    assert ways[1] == pytest.approx(ways[0], rel=2e-3)
+
+
+def test_wheels_that_share_one_speed_have_no_scale_of_their_own() -> None:
+    truth = drive(np.random.default_rng(seed=7))
+    rear = wheels(truth, CAR).wheels_mps
+    car = WheelSpeeds(truth.t_ns, np.hstack([rear, rear]))
+    made = integrate(car, CAR).increments
+
+    assert front_wheels(car, made, CAR, (int(truth.t_ns[0]), int(truth.t_ns[-1]))) == ()
