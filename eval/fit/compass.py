@@ -24,6 +24,9 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
         EmptyResultError: The logs have no magnetometer.
         VehicleError: Too few readings have a reference.
     """
+    if vehicle.compass.use is None:
+        section = vehicle.compass.model_copy(update={"use": True})
+        vehicle = vehicle.model_copy(update={"compass": section})
     planned = plan_of(logs, vehicle)
     magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
     if magnetometer is None:

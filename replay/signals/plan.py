@@ -126,7 +126,7 @@ def _plan_imu(planner: _Planner) -> None:
 
 def _plan_heading(planner: _Planner) -> None:
     names, compass = planner.vehicle.topics, planner.vehicle.compass
-    if not compass.use:
+    if compass.use is False:
         planner.missing[Signal.MAGNETIC_FIELD] = "compass.use is false in the vehicle file"
         planner.missing[Signal.HEADING] = planner.missing[Signal.MAGNETIC_FIELD]
     elif names.heading is not None:
@@ -135,8 +135,13 @@ def _plan_heading(planner: _Planner) -> None:
             planner.choose(place, Signal.HEADING)
     else:
         place = planner.only(Role.MAGNETOMETER, names.magnetometer, "topics.magnetometer")
-        if place is not None:
+        if place is not None and compass.uses_magnetometer:
             planner.choose(place, Signal.MAGNETIC_FIELD)
+        elif place is not None:
+            planner.missing[Signal.MAGNETIC_FIELD] = (
+                f"{place[1].name} is not calibrated: run crosscue fit compass, or set compass.use "
+                "= true in the vehicle file to use it as it is"
+            )
     place = planner.only(Role.GNSS, names.gnss, "topics.gnss")
     if place is not None:
         planner.choose(place, Signal.COURSE)

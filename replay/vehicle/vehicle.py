@@ -112,7 +112,9 @@ class Mobileye(Section):
 class Compass(Section):
     """Conversion of magnetometer readings to a heading; written by ``crosscue fit compass``."""
 
-    use: bool = True
+    use: bool | None = None
+    """By default, a magnetometer is used only if this section sets anything. Without calibration,
+    its heading can be wrong by any angle."""
     mounting_rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     """Rotation from the sensor's axes to forward, left, up."""
     mounting_yaw_rad: Finite = 0.0
@@ -127,6 +129,11 @@ class Compass(Section):
     """Minimum time between two readings that are used: twice the correlation time of the error."""
     gate_nis: Positive | None = 10.8
     """Readings with a larger normalised innovation squared are rejected."""
+
+    @property
+    def uses_magnetometer(self) -> bool:
+        """True if readings of the magnetic field become headings."""
+        return self != Compass() if self.use is None else self.use
 
 
 class Regions(Section):

@@ -111,7 +111,9 @@ class ScoredRuns:
 def _lines_of_one(found: ScoredRuns) -> list[str]:
     (run,) = found.runs
     one = run.scored.one
-    lines = [f"run        {visible(str(one.run.path))}", *_account(found), ""]
+    lines = [f"run        {visible(str(one.run.path))}", *_account(found)]
+    lines += [reported_line("note", visible(text)) for text in one.run.drive_manifest().notices]
+    lines.append("")
     lines += _scores(found, one.why_no_pose)
     if one.pose is not None:
         lines += ["", pose_summary(one.pose)]

@@ -190,7 +190,5 @@ def test_the_smoother_weighs_in_what_the_filter_was_given(tmp_path: Path) -> Non
 
 
 def test_positions_cannot_be_weighed_into_a_map_that_lies_nowhere() -> None:
-    with pytest.raises(
-        VehicleError, match=r"where the map's zero lies is not known; expected GNSS"
-    ):
+    with pytest.raises(VehicleError, match=r"the map's origin is unknown; expected GNSS"):
         with_start([driven(0.0)], Vehicle(version=1), EVERYTHING, gnss="fuse")

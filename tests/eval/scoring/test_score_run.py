@@ -75,6 +75,16 @@ def test_a_run_finds_the_truth_beside_its_log_and_leaves_its_scores(
     assert frames.filter(frames["cue"].to_numpy(zero_copy_only=False) == "road_left").num_rows == 50
 
 
+def test_a_score_repeats_what_the_run_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth_folder(tmp_path)
+    run_folder(tmp_path / "run", notices=("284 of 411 compass readings were rejected",))
+
+    assert cli.run(["score", str(tmp_path / "run"), "--without-figures"]) == 0
+    assert "\nnote       284 of 411 compass readings" in capsys.readouterr().out
+
+
 def test_the_summary_reports_coverage_first_and_fits_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
