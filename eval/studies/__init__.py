@@ -1,1 +1,1 @@
-"""The Monte Carlo studies of chapter 2: settings, the work on many cores, results and pictures."""
+"""Simulated studies: navigation in towns (chapter 2), intersections (chapter 3), and layouts."""

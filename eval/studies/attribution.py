@@ -1,6 +1,6 @@
-"""What each cue was worth: every measure again with the cue left out, as if nobody had looked.
+"""Ablation of cues: every measure with one cue left out, as if it had not been searched.
 
-Nothing is detected again; who calls supplies the estimates. Distances and log scores are compared
+Detectors do not run again; the caller supplies the estimates. Distances and log scores are compared
 approach by approach, so their intervals are those of paired differences.
 """
 
@@ -37,15 +37,15 @@ PASSED_OVER: Final = frozenset(
 
 
 class EstimateWithout(Protocol):
-    """Estimates a drive again as if some cues had not been looked for."""
+    """Function that estimates a drive again as if some cues had not been searched."""
 
     def __call__(self, cues: frozenset[str], /) -> RunTables:
-        """The run's tables without these cues."""
+        """Return the run's tables without these cues."""
         ...
 
 
 class Drive(NamedTuple):
-    """A judged drive, its truth, and how to estimate it again."""
+    """A judged drive, its truth, and the function that estimates it again."""
 
     judged: DriveJudged
     truth: DriveTruth
@@ -54,7 +54,7 @@ class Drive(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """A measure with all cues and without one; NaN where it could not be scored."""
+    """A measure with all cues and without one; NaN if it could not be scored."""
 
     with_all: float
     without: float
@@ -62,20 +62,20 @@ class Worth:
 
 @dataclass(frozen=True, slots=True)
 class Attribution:
-    """What one cue (or one with both its sides) was worth.
+    """Effect of one cue, or of both sides of a cue, on the scores.
 
     Attributes:
-        cues: Left out together.
+        cues: Cues that are left out together.
         scores: All scores without them.
-        measures: Every measure that changed, by path.
-        detected_m: How much further away intersections were detected thanks to the cue, over the
-            approaches detected with and without it.
-        full_m: The same for the full intersection.
-        detected_only_with: Approaches detected only thanks to the cue.
-        detected_only_without: Approaches that it kept from being detected.
-        full_only_with: The same for the full intersection.
-        full_only_without: The same.
-        belief: Without minus with all, by feature: positive where the cue helped.
+        measures: Measures that changed, by path.
+        detected_m: Gain in the distance at detection due to the cue, over the approaches detected
+            with and without it.
+        full_m: Gain in the distance at full detection due to the cue.
+        detected_only_with: Number of approaches detected only with the cue.
+        detected_only_without: Number of approaches detected only without the cue.
+        full_only_with: Number of approaches fully detected only with the cue.
+        full_only_without: Number of approaches fully detected only without the cue.
+        belief: Scores without the cue minus with it, by feature; positive if the cue helps.
     """
 
     cues: tuple[str, ...]
@@ -98,9 +98,9 @@ def attribute(
     """Leave out each group of cues in turn, in all drives.
 
     Args:
-        drives: Judged with the same settings.
-        groups: From name to the cues that are left out together; the rows of Table 5 if None.
-        settings: Of the scores.
+        drives: Drives, judged with the same settings.
+        groups: Cues to leave out together, by name; None for the rows of Table 5.
+        settings: Settings of the scores.
     """
     if groups is None:
         groups = {name: [cue.name for cue in some] for name, some in cue_table.groups().items()}
@@ -166,7 +166,7 @@ def _changed(whole: Scores, without: Scores) -> dict[str, Worth]:
 
 
 def attribution_tree(found: Mapping[str, Attribution]) -> dict[str, Any]:
-    """As plain values for ``metrics.json``, without the whole scores again."""
+    """Return the effects as plain values for ``metrics.json``, without the scores."""
     return {
         name: {key: value for key, value in asdict(one).items() if key != "scores"}
         for name, one in found.items()
@@ -174,7 +174,7 @@ def attribution_tree(found: Mapping[str, Attribution]) -> dict[str, Any]:
 
 
 def attribution_lines(found: Mapping[str, Attribution]) -> list[str]:
-    """A table for a person: what each cue was worth, within 80 columns."""
+    """Return a text table of the effect of each cue, within 80 columns."""
     lines = ["left out        full m   only with  only w/o  log score: left   right  straight"]
     for name, one in found.items():
         scores = [
@@ -185,7 +185,7 @@ def attribution_lines(found: Mapping[str, Attribution]) -> list[str]:
             f"{name:14} {_signed(one.full_m.value, 1):>7} {one.full_only_with:>11} "
             f"{one.full_only_without:>9} {scores[0]:>16} {scores[1]:>7} {scores[2]:>9}"
         )
-    lines.append("full m: how much further away thanks to the cue; log score: loss without it")
+    lines.append("full m: gain in distance due to the cue; log score: loss without the cue")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""A run's tables estimated again, with other settings or without a cue, ready to be scored."""
+"""Estimate a run's tables again, with other settings or without a cue, for scoring."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 
 def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWithout:
-    """Estimates from a run's own detections and pose; no picture is opened.
+    """Return a function that estimates from a run's detections and pose, without pictures.
 
     Args:
-        run: With a finished detect stage.
-        vehicle: Other settings; the run's, if left out.
+        run: Run with a finished detect stage.
+        vehicle: Other settings; default: those of the run.
 
     Raises (when called):
-        RunError: No detector has examined the run's camera.
+        RunError: No detector ran on the run's camera.
     """
 
     def estimate(cues: frozenset[str], /) -> RunTables:

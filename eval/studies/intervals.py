@@ -1,8 +1,9 @@
 """Numbers with their 95 % intervals: means, fractions, ratios, and the range at a success rate.
 
-Means and ratios: Student's t, a ratio's variance by linearisation (Cochran, *Sampling Techniques*,
-section 6.4). Everything else by the bootstrap, its percentiles widened for few drives (Hesterberg,
-*What Teachers Should Know About the Bootstrap*, The American Statistician 69, 2015, section 4.3).
+Means and ratios use Student's t; the variance of a ratio is linearised (Cochran, *Sampling
+Techniques*, section 6.4). All others use the bootstrap, with percentiles widened for few drives
+(Hesterberg, *What Teachers Should Know About the Bootstrap*, The American Statistician 69, 2015,
+section 4.3).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ STEEPEST: Final = 40.0
 
 
 class Measured(NamedTuple):
-    """A value and its 95 % interval; infinite beyond what was driven, NaN for too few drives."""
+    """A value and its 95 % interval; infinite beyond the longest drive, NaN for too few drives."""
 
     value: float
     low: float
@@ -34,38 +35,38 @@ class Measured(NamedTuple):
 
 
 def mean_of(values: Floats) -> Measured:
-    """Mean, with the interval of Student's t; NaN without values."""
+    """Return the mean, with the interval of Student's t; NaN without values."""
     return ratio_of(values, np.ones(len(values)))
 
 
 def fraction_of(right: int, of: int) -> Measured:
-    """A fraction with Wilson's interval (1927)."""
+    """Return a fraction with Wilson's interval (1927)."""
     if not of:
         return Measured(math.nan, 0.0, 1.0)
     return Measured(right / of, *wilson(right, of))
 
 
 def weights_of(n: int, replicates: int = REPLICATES, seed: int = 0) -> Floats:
-    """Shape (1 + replicates, n): ones, then how often each bootstrap replicate drew each drive."""
+    """Return weights of drives, shape (1 + replicates, n): ones, then bootstrap counts."""
     rng = np.random.default_rng(seed)
     drawn: Floats = rng.multinomial(n, np.full(n, 1.0 / n), replicates).astype(np.float64)
     return np.vstack([np.ones((1, n)), drawn])
 
 
 def measured(values: Floats, drives: int) -> Measured:
-    """The first value, with percentiles of the bootstrap's replicates that follow it."""
+    """Return the first value, with percentiles of the bootstrap replicates that follow it."""
     from scipy.special import ndtr, stdtrit
 
     if drives < MIN_CLUSTERS:
         return Measured(float(values[0]), math.nan, math.nan)
     tail = float(ndtr(math.sqrt(drives / (drives - 1)) * stdtrit(drives - 1, 0.025)))
-    # Infinite replicates are legitimate: percentiles by rank, without interpolation.
+    # Replicates can be infinite, so percentiles are by rank, without interpolation.
     low, high = np.quantile(values[1:], [tail, 1.0 - tail], method="nearest")
     return Measured(float(values[0]), float(low), float(high))
 
 
 def ratio_of(top: Floats, bottom: Floats) -> Measured:
-    """Ratio of two sums over the same drives; NaN without any."""
+    """Return the ratio of two sums over the same drives; NaN without drives."""
     if not bottom.any():
         return Measured(math.nan, math.nan, math.nan)
     ratio = float(top.sum() / bottom.sum())
@@ -73,7 +74,7 @@ def ratio_of(top: Floats, bottom: Floats) -> Measured:
 
 
 def _with_t(value: float, influence: Floats) -> Measured:
-    """A value and how much each drive moves it."""
+    """Return a value with Student's interval, from the influence of each drive on it."""
     from scipy.special import stdtrit
 
     n = len(influence)
@@ -84,9 +85,9 @@ def _with_t(value: float, influence: Floats) -> Measured:
 
 
 def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Floats) -> Measured:
-    """Ratio of two means, each over the drives that its 0 or 1 chooses; drives are paired.
+    """Return the ratio of two means over paired drives, each over the drives of weight 1.
 
-    NaN where none is chosen.
+    NaN if all weights of a mean are 0.
     """
     if not (of_top.any() and of_bottom.any()):
         return Measured(math.nan, math.nan, math.nan)
@@ -100,16 +101,16 @@ def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Float
 
 
 def range_at(distances_m: Floats, is_success: Floats, fraction: float) -> Measured:
-    """The distance at which success has fallen to ``fraction``, from a logistic curve.
+    """Return the distance at which success falls to ``fraction``, from a logistic curve.
 
     Args:
-        distances_m: Shape (N,): from start to goal.
+        distances_m: Shape (N,): distance from start to goal.
         is_success: Shape (N,): 1 or 0.
         fraction: Between 0 and 1.
 
     Returns:
-        Infinite where the curve stays above ``fraction`` up to the farthest goal driven to; zero
-        where it begins below.
+        Infinite if the curve stays above ``fraction`` up to the farthest goal; zero if it starts
+        below.
     """
     weights = weights_of(len(distances_m))
     a, b = logistic(distances_m, is_success, weights)
@@ -123,15 +124,15 @@ def range_at(distances_m: Floats, is_success: Floats, fraction: float) -> Measur
 
 
 def logistic(x: Floats, is_success: Floats, weights: Floats) -> tuple[Floats, Floats]:
-    """Intercepts and slopes of weighted logistic regressions, by Newton's method.
+    """Return intercepts and slopes of weighted logistic regressions, by Newton's method.
 
     Args:
         x: Shape (N,).
         is_success: Shape (N,): 1 or 0.
-        weights: Shape (R, N): one regression for each row.
+        weights: Shape (R, N): one regression per row.
 
     Returns:
-        Shapes (R,) and (R,). A trace of ridge keeps the slope finite where the data separate.
+        Shapes (R,) and (R,). A small ridge penalty keeps the slope finite for separable data.
     """
     scale = float(np.abs(x).max()) or 1.0
     u = x / scale

@@ -1,4 +1,4 @@
-"""A study's results on one page that needs no network and runs no script."""
+"""Write a study's results to a page that needs no network and runs no script."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ p.note{color:var(--soft)}"""
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of text under a heading.
+    """A table of text.
 
     Attributes:
-        heading: Above it.
+        heading: Heading above the table.
         head: Column names.
-        rows: As many entries each.
+        rows: Rows with one entry per column.
     """
 
     heading: str
@@ -45,7 +45,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
     def as_text(self) -> str:
-        """For a terminal, columns aligned."""
+        """Return the table as text with aligned columns."""
         widths = [max(map(len, column)) for column in zip(self.head, *self.rows, strict=True)]
         lines = [self._line(self.head, widths), *(self._line(row, widths) for row in self.rows)]
         return "\n".join([self.heading, *lines])
@@ -64,7 +64,7 @@ def write_page(
     """Write the page.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The page cannot be written.
     """
     parts = [f"<h1>{html.escape(title)}</h1>"]
     parts += [f'<p class="note">{html.escape(note)}</p>' for note in notes]

@@ -1,4 +1,4 @@
-"""How a study's figures are drawn and saved: PNG and SVG, the same bytes for the same rows."""
+"""Draw and save a study's figures as PNG and SVG; the same rows yield the same bytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLOURS: Final = ("#2ca02c", "#1f77b4", "#d62728", "#7f7f7f", "#9467bd", "#8c564
 
 
 def figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with axes side by side."""
+    """Return a figure with axes side by side."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -31,15 +31,15 @@ def figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes
 
 
 def save(made: Figure, folder: Path, name: str) -> Path:
-    """Write ``NAME.png`` and ``NAME.svg``; the PNG's path comes back.
+    """Write ``NAME.png`` and ``NAME.svg``; return the path of the PNG.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: A file cannot be written.
     """
     from matplotlib import rc_context
 
     formats: dict[str, dict[str, Any]] = {
-        # The library's own stamps would make the same rows give other bytes.
+        # The library's time stamps would make the bytes differ.
         "png": {"dpi": DPI, "metadata": {"Software": ""}},
         "svg": {"metadata": {"Date": None, "Creator": None}},
     }

@@ -1,7 +1,8 @@
-"""Drives of a study, each from its seed to a finished run.
+"""Simulate and replay the drives of a study.
 
-Drives are done in the order of runs (A-01 to H-01, then A-02 ...), so that a study that is cut
-short has each layout about as often; a second start goes on with what is missing.
+Drives are processed in the order of runs (A-01 to H-01, then A-02, ...), so that an interrupted
+study has about the same number of drives of each layout. A second start continues with the missing
+drives.
 """
 
 from __future__ import annotations
@@ -34,23 +35,23 @@ from crosscue.replay.vehicle.vehicle import load
 LOG: Final = "drive.mcap"
 VEHICLE: Final = "vehicle.toml"
 SPARSE_AND_EMBEDDED: Final = (SPARSE_PHOTOGRAPHS, EMBEDDED)
-"""What records and sees the drives of a study of many layouts."""
+"""Camera and detectors of a study of many layouts."""
 MADE_BY: Final = "made_by.txt"
-"""In a simulated drive's folder, once it is whole: the key of its settings and of the code."""
+"""File in a complete simulated drive's folder, with the key of its settings and of the code."""
 
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What is done for one drive, here or in another process.
+    """Simulation and replay of one drive, in any process.
 
     Attributes:
         drives: Folder of the simulated drives.
-        scenes: By name.
-        vehicle: A vehicle file to replay with, or None.
-        detectors: Comma-separated.
-        cache: Where detectors' results are kept.
-        made_by: By name, the key of the settings and code that simulate the drive.
-        imager: What cameras record.
+        scenes: Settings by name of the drive.
+        vehicle: Vehicle file to replay with; None for that of each drive.
+        detectors: Comma-separated names.
+        cache: Folder of the detection caches.
+        made_by: Key of the settings and code that simulate the drive, by name.
+        imager: Camera that records the pictures.
     """
 
     drives: Path
@@ -62,11 +63,11 @@ class Work:
     imager: Imager = PHOTOGRAPHS
 
     def __call__(self, job: Job) -> Outcome:
-        """Simulate the drive unless it is there, then replay it."""
+        """Simulate the drive unless it exists, then replay it."""
         folder = self.simulated(job.name)
         vehicle = load(self.vehicle or folder / VEHICLE)
         choices = chosen(self.detectors, choices_of(vehicle))
-        # One cache a drive: workers never wait for one another.
+        # One cache per drive, so that workers do not wait for each other.
         detecting = Detecting(choices, self.cache / f"{job.name}.sqlite")
         run = create(job.run, overwrite=True)
         with open_log(folder / LOG) as log:
@@ -74,7 +75,7 @@ class Work:
         return replace(outcome, ledgers=(), detected=None)
 
     def simulated(self, name: str) -> Path:
-        """The drive's folder, written unless it is there whole, by the same settings and code."""
+        """Return the drive's folder; simulate it unless it is complete and up to date."""
         folder, key = self.drives / name, self.made_by[name]
         made_by = folder / MADE_BY
         if not made_by.exists() or made_by.read_text(encoding="utf-8") != key:
@@ -87,7 +88,7 @@ class Work:
 
 
 def code_of(folder: str) -> str:
-    """A hash of a folder's code: what it made is stale when the code changes, not its comments."""
+    """Return a hash of a folder's code, which does not depend on comments and docstrings."""
     digest = hashlib.sha256()
     for source in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
         digest.update(meaning_of(source.read_text(encoding="utf-8")).encode())
@@ -95,7 +96,7 @@ def code_of(folder: str) -> str:
 
 
 def meaning_of(source: str) -> str:
-    """A module's syntax tree without docstrings and comments."""
+    """Return a module's syntax tree without docstrings and comments."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -122,16 +123,16 @@ def run_drives(
     vehicle: Path | None = None,
     imager: Imager = PHOTOGRAPHS,
 ) -> tuple[Done[Outcome], ...]:
-    """Simulate and replay all drives that are not there yet, below ``out``.
+    """Simulate and replay all missing drives below ``out``.
 
     Args:
         out: Folder of the study.
-        scenes: Drives, in the order in which they are done.
-        detectors: Comma-separated, as ``replay`` takes them.
-        engine: Where to work.
+        scenes: Settings of the drives, in the order of processing.
+        detectors: Comma-separated names, as for ``crosscue replay``.
+        engine: Engine that runs the work.
         on_progress: Called about once a second.
-        vehicle: A vehicle file to replay with; each drive's own, if left out.
-        imager: What cameras record.
+        vehicle: Vehicle file to replay with; default: that of each drive.
+        imager: Camera that records the pictures.
 
     Raises:
         VehicleError: The vehicle file cannot be read.

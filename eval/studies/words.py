@@ -1,4 +1,4 @@
-"""Measured numbers in words."""
+"""Format measured numbers as text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .intervals import TOO_FEW, Measured
 
 
 def km(value: Measured, digits: int = 2) -> str:
-    """Kilometres with their interval."""
+    """Return a distance in kilometres with its interval."""
     if math.isinf(value.value):
         return "beyond"
     if math.isnan(value.low):
@@ -18,7 +18,7 @@ def km(value: Measured, digits: int = 2) -> str:
 
 
 def percent(value: Measured) -> str:
-    """A fraction with its interval."""
+    """Return a fraction in per cent with its interval."""
     if math.isnan(value.low):
         return f"{100 * value.value:.1f} % ({TOO_FEW})"
     return f"{100 * value.value:.1f} % ({100 * value.low:.1f}..{100 * value.high:.1f})"

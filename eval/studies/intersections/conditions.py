@@ -1,4 +1,4 @@
-"""What a condition cost, against runs at the same intersections in good conditions."""
+"""Effect of bad conditions, compared with good conditions at the same intersections."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from crosscue.eval.scoring.scene.approaches import ApproachResult
 
 @dataclass(frozen=True, slots=True)
 class ConditionCost:
-    """What a condition cost, against runs at the same intersections in good conditions.
+    """Effect of a condition, compared with good conditions at the same intersections.
 
     Attributes:
-        condition: Tag.
-        approaches: With it, at intersections that were also approached in good conditions.
-        detected_m: How much further away it was detected; negative is later.
-        full_m: The same for the full intersection.
-        undetected: Approaches with the tag that were never detected, though good ones were.
-        not_full: The same for the full intersection.
+        condition: Tag of the condition.
+        approaches: Number of approaches with it, at intersections with approaches in good
+            conditions.
+        detected_m: Difference in the distance at detection; negative is later.
+        full_m: Difference in the distance at full detection; negative is later.
+        undetected: Number of those approaches that were never detected, unlike good ones.
+        not_full: Number of those approaches that were never fully detected, unlike good ones.
     """
 
     condition: str
@@ -35,10 +36,10 @@ class ConditionCost:
 
 
 def condition_costs(results: Sequence[ApproachResult]) -> tuple[ConditionCost, ...]:
-    """Every bad condition against good ones at the same intersection.
+    """Compare every bad condition with good conditions at the same intersection.
 
-    What always holds at an intersection (its vegetation) has nothing to be compared with and is
-    left out of the tags that separate good from bad.
+    Conditions that always apply at an intersection (its vegetation) have no comparison and are
+    ignored.
     """
     always = _always(results)
     tags = sorted({tag for one in results for tag in one.conditions} - GOOD)

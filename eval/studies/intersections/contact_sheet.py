@@ -1,4 +1,4 @@
-"""One picture of a whole study: a frame of every drive with what was found, for people to judge."""
+"""Contact sheet of a study: one frame of every drive with its detections."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.base import Bytes, Int64s, write_bytes
 
 AWAY_M: Final = 18.0
-"""True distance to the intersection at which the frame is taken."""
+"""True distance to the intersection of the frame."""
 TILE_PX: Final = (480, 270)
 ENLARGE: Final = 2.0
-"""Text and lines, before a frame is shrunk to its tile."""
+"""Magnification of text and lines before a frame is reduced to its tile."""
 QUALITY: Final = 80
 
 
 def write_sheet(
     drives: Sequence[RunScored], path: Path, columns: int = 8, quality: int = QUALITY
 ) -> None:
-    """Write a JPEG with a tile a drive.
+    """Write a JPEG with one tile per drive.
 
     Args:
-        drives: Runs with a finished detect stage; one without its log has a black tile.
-        path: Of the JPEG.
-        columns: Most tiles beside one another.
-        quality: Of the JPEG, 1 to 100.
+        drives: Runs with a finished detect stage; a run without its log has a black tile.
+        path: JPEG file to write.
+        columns: Max number of tiles per row.
+        quality: Quality of the JPEG, 1 to 100.
 
     Raises:
         RunError: A table is damaged.
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     import cv2
 
@@ -67,7 +67,7 @@ def _tile(one: RunScored) -> Bytes:
 
 
 def _frame_near(one: RunScored) -> StoredFrame | None:
-    """The frame that was taken nearest to ``AWAY_M`` before the first intersection."""
+    """Return the frame nearest to ``AWAY_M`` before the first intersection."""
     times: Int64s = one.run.table("frames", ["t_ns"])["t_ns"].to_numpy()
     inside = times[one.truth.approach_at(times) >= 0]
     if not len(inside):

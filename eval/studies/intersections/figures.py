@@ -1,4 +1,4 @@
-"""Pictures of the intersections study: distances as in Fig. 29, beliefs as in Fig. 31."""
+"""Figures of the intersections study: distances as in Fig. 29, beliefs as in Fig. 31."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ FAR_M: Final = 120.0
 
 
 def draw_distances(results: Sequence[ApproachResult], path: Path) -> None:
-    """Distance at detection and at full detection, a point an approach; failures at the bottom."""
+    """Draw distances at detection and at full detection, one point per approach.
+
+    Approaches that were never detected are at the bottom.
+    """
     names = sorted({one.intersection for one in results})
 
     def draw(axes: Axes) -> None:
@@ -67,7 +70,7 @@ def draw_distances(results: Sequence[ApproachResult], path: Path) -> None:
 
 
 def draw_beliefs(curves: Sequence[Curve], path: Path) -> None:
-    """Probability of each feature against distance, one panel an intersection, a line a drive."""
+    """Draw probabilities over distance, with a panel per intersection and a line per drive."""
     from matplotlib.figure import Figure
 
     names = sorted({one.intersection for one in curves})
@@ -100,7 +103,7 @@ def draw_beliefs(curves: Sequence[Curve], path: Path) -> None:
 def draw_reliability(
     source: Mapping[str, BeliefScore], calibrated: Mapping[str, BeliefScore] | None, path: Path
 ) -> None:
-    """How often a feature is there against how probable it was held, for one or both fusions."""
+    """Draw the frequency of features over their probability, for one or both fusions."""
     from matplotlib.figure import Figure
 
     names = [name for name in COLOURS if name in source]
@@ -138,7 +141,7 @@ def _write(path: Path, size: tuple[float, float], draw: object) -> None:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    # Neither time nor version goes into the file, so that the same study gives the same bytes.
+    # Without time and version in the file, the same study yields the same bytes.
     write_whole(
         path,
         lambda partial: figure.savefig(partial, format="png", dpi=130, metadata={"Software": None}),

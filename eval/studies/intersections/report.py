@@ -1,4 +1,4 @@
-"""The study's files: metrics as JSON, figures, and one page with the tables side by side."""
+"""Write the study's files: metrics as JSON, figures, and a page with the tables."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SHEET: Final = "detections.jpg"
 
 @dataclass(frozen=True, slots=True)
 class StudyFiles:
-    """What was written."""
+    """The written files."""
 
     page: Path
     tables: Path
@@ -52,10 +52,10 @@ class StudyFiles:
 def write_study(
     out: Path, settings: IntersectionStudy, done: Sequence[Done[Outcome]], scored: StudyScores
 ) -> StudyFiles:
-    """Write metrics, tables, figures and page into ``out``.
+    """Write metrics, tables, figures and page to ``out``.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: A file cannot be written.
     """
     approaches = scored.scores.approaches
     assert approaches is not None
@@ -148,7 +148,7 @@ def _signed(value: float | None, digits: int = 0) -> str:
 
 
 def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFiles) -> str:
-    """The study in a terminal of 80 columns."""
+    """Return a text summary of the study, within 80 columns."""
     approaches = scored.scores.approaches
     assert approaches is not None
     failed = [one for one in done if one.error is not None]
@@ -185,13 +185,13 @@ def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFi
         "",
         f"page       {written.page}",
         f"tables     {written.tables}",
-        f"pictures   {written.sheet}: a frame of each drive, with what was found",
+        f"pictures   {written.sheet}: a frame of each drive, with detections",
     ]
     return "\n".join(lines)
 
 
 def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
-    """A difference as of ``asdict``, with its interval."""
+    """Return a difference with its interval as text, from the result of ``asdict``."""
     value, low, high = mean["value"], mean["low"], mean["high"]
     if math.isnan(value):
         return "-"
@@ -205,7 +205,7 @@ def _of(some: int, of: int) -> str:
 
 
 def _findings(scored: Sequence[RunScored]) -> tuple[Finding, ...]:
-    """All late, missing and invented features, drive by drive."""
+    """Return all late, missing and false features, drive by drive."""
     return tuple(
         found
         for one in scored

@@ -1,4 +1,4 @@
-"""What the study of intersections simulates, and how it replays that."""
+"""Settings of the study of intersections."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from crosscue.replay.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class IntersectionStudy:
-    """What to simulate and how to replay it.
+    """Settings of the study of intersections.
 
     Attributes:
-        layouts: Intersections.
-        runs: Of each, from 1.
-        seed: Of everything that differs from run to run.
-        width_px: Of the pictures, 9/16 high.
-        vehicle: A vehicle file to replay with; each drive's own, if left out.
-        detectors: Comma-separated, as ``replay`` takes them.
+        layouts: Names of the layouts.
+        runs: Number of drives per layout.
+        seed: Seed of everything that differs between runs.
+        width_px: Width of the pictures; the height is 9/16 of it.
+        vehicle: Vehicle file to replay with; default: that of each drive.
+        detectors: Comma-separated names, as for ``crosscue replay``.
     """
 
     layouts: tuple[str, ...] = tuple(SCORED)
@@ -33,13 +33,13 @@ class IntersectionStudy:
     detectors: str = EMBEDDED
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Check the values.
 
         Raises:
-            UsageError: Naming what was wanted.
+            UsageError: A value is out of range.
         """
         if self.runs < 1 or self.seed < 0:
-            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 or more, 0 or more")
+            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 and 0 or more")
         if not 64 <= self.width_px <= 3840 or self.width_px % 16:
             raise UsageError(f"width {self.width_px}: expected a multiple of 16 from 64 to 3840")
         unknown = [name for name in self.layouts if name not in SCORED]
@@ -49,7 +49,7 @@ class IntersectionStudy:
             )
 
     def scenes(self) -> tuple[SceneSettings, ...]:
-        """Every drive, in the order in which they are done."""
+        """Return all drives, in the order of processing."""
         camera = Camera(width_px=self.width_px, height_px=self.width_px * 9 // 16)
         return tuple(
             SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)

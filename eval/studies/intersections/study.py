@@ -1,4 +1,4 @@
-"""The published experiment on simulated drives, scored: eight intersections, ten drives each."""
+"""Score the published experiment on simulated drives: eight intersections, ten drives each."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .tables import StudyScores
 
 AS_PUBLISHED: Final = ScoreSettings(detection="published")
-"""What the published distances are compared with counts as the source counts it."""
+"""Settings of scores that are compared with the published distances."""
 MIN_PLACES: Final = 3
-"""Intersections, so that messages for one can be learned at two others or more."""
+"""Min number of intersections, so that messages are learned at two others or more."""
 
 
 def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) -> StudyScores:
-    """Score the drives of a study that are done.
+    """Score the finished drives of a study.
 
     Raises:
-        RunError: None is done, or one is damaged.
+        RunError: No drive is finished, or one is damaged.
     """
     scored = tuple(
         judge_run(open_run(out / "runs" / name), out / "drives" / name / FILE, AS_PUBLISHED)
         for name in names
     )
     if not scored:
-        raise RunError(f"{out}: not one drive is done, so there is nothing to score")
+        raise RunError(f"{out}: no drive is finished, so there is nothing to score")
     worth = {}
     if attribution:
         drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
@@ -65,10 +65,9 @@ def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) ->
 
 
 def calibrated_vehicles(scored: Sequence[RunScored]) -> list[Vehicle] | None:
-    """For each drive the settings with messages learned elsewhere: from all other intersections.
+    """Return, for each drive, settings with messages learned at the other intersections.
 
-    No drive is judged by messages that its own intersection had a part in. None where there are
-    too few intersections to learn from the others, or nothing could be learned.
+    None if there are too few intersections, or if nothing could be learned.
     """
     places = [_place(one) for one in scored]
     if len(set(places)) < MIN_PLACES or any(not place for place in places):

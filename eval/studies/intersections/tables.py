@@ -1,4 +1,4 @@
-"""The published numbers of chapter 3, and a study's beside them."""
+"""Tables of a study's results with the published numbers of chapter 3."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from crosscue.replay.vehicle.cue_table import groups
 
 @dataclass(frozen=True, slots=True)
 class StudyScores:
-    """The scored study.
+    """Scores of the study.
 
     Attributes:
-        scored: Every drive beside its truth.
-        scores: All together.
-        worth: What each of the nine cues was worth; empty where that was not asked.
-        calibrated: All again, each intersection with messages learned at the others; None where
-            there are too few.
-        difference: Calibrated less source, by feature.
+        scored: Every drive, compared with its truth.
+        scores: Scores of all drives together.
+        worth: Effect of each of the nine cues; empty if not requested.
+        calibrated: Scores with messages learned at the other intersections; None if there are too
+            few intersections.
+        difference: Belief of the calibrated minus the published messages, by feature.
     """
 
     scored: tuple[RunScored, ...]
@@ -41,16 +41,16 @@ PUBLISHED_RUNS: Final[Mapping[str, tuple[float, float]]] = {
     "E-01": (38.6, 19.8), "F-05": (41.2, 29.4), "A-07": (75.2, 30.1), "B-10": (47.7, 17.6),
     "G-03": (43.5, 9.8), "E-07": (8.2, 7.6), "D-10": (30.1, 11.8),
 }  # fmt: skip
-"""Single runs quoted in the text: metres at detection and at full detection."""
+"""Single runs in the dissertation's text: metres at detection and at full detection."""
 
 Row = dict[str, Any]
 
 
 def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
-    """One row a cue of Table 5, pooled over its columns.
+    """Return one row per cue of Table 5, pooled over its columns.
 
-    ``precision`` asks whether the thing itself is there (lane lines and vehicles past: whether the
-    road goes on); ``feature_precision`` whether what the cue says of the intersection is so.
+    ``precision`` compares with objects (lane lines and vehicles past the intersection: with the
+    continuation of the road), and ``feature_precision`` with the cue's feature of the intersection.
     """
     rows: list[Row] = []
     for group in groups().values():
@@ -58,7 +58,7 @@ def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
         some = [cues[cue.name] for cue in group if cue.name in cues]
         right = sum(one.precision.right for one in some)
         of = sum(one.precision.of for one in some)
-        # Clusters are counted column by column, so a pooled interval over them is the widest.
+        # Clusters are known only per column, so the widest interval over clusters is used.
         low, high = wilson(right, of)
         lows = [one.precision.clusters_low for one in some if one.precision.of]
         highs = [one.precision.clusters_high for one in some if one.precision.of]
@@ -89,7 +89,7 @@ def _pooled(fractions: Sequence[Proportion]) -> float:
 
 
 def intersection_rows(results: Sequence[ApproachResult]) -> list[Row]:
-    """One row an intersection: how often and from where it was detected, and why not."""
+    """Return one row per intersection: frequency and distance of detection, and failures."""
     rows: list[Row] = []
     for name in sorted({one.intersection for one in results}):
         mine = [one for one in results if one.intersection == name]
@@ -120,9 +120,9 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def quoted_rows(scored: StudyScores) -> list[Row]:
-    """The published single runs beside the simulated ones of the same name.
+    """Return the published single runs and the simulated runs of the same name.
 
-    Conditions of one name are not the same drive: it is a comparison of size, not of runs.
+    Runs of the same name have the same conditions, but are not the same drive.
     """
     found = {one.judged.coverage.drive.rpartition("/")[2]: one.judged for one in scored.scored}
     rows: list[Row] = []
@@ -145,7 +145,7 @@ def quoted_rows(scored: StudyScores) -> list[Row]:
 
 
 def attribution_rows(scored: StudyScores) -> list[Row]:
-    """What each cue was worth; distances and log scores are compared approach by approach."""
+    """Return the effect of each cue; distances and log scores are compared by approach."""
     whole = scored.scores
     rows: list[Row] = []
     for group, one in scored.worth.items():
@@ -169,7 +169,7 @@ def attribution_rows(scored: StudyScores) -> list[Row]:
 
 
 def mean_text(mean: Mean) -> str:
-    """A mean with its interval."""
+    """Return a mean with its interval as text."""
     if math.isnan(mean.value):
         return "none"
     if math.isnan(mean.low):

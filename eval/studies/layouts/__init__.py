@@ -1,1 +1,1 @@
-"""The study of random layouts, negatives among them: fitted on some, tested on the others."""
+"""The study of random layouts, with and without intersections: fitted on some, tested on others."""

@@ -1,4 +1,4 @@
-"""Beliefs of each kind about drives that had no part in what they were fitted on."""
+"""Compute beliefs of each kind about drives that they were not fitted to."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from .drives import StudyDrive
 from .score import FEATURES, THRESHOLD, DriveBelief
 
 KINDS: Final = ("source", "persistent", "calibrated", "calibrated, base rates", "temporal")
-"""Beliefs that are compared; the fourth is the third with the training layouts' frequencies for
-priors, since ``temporal`` learns those too."""
+"""Kinds of beliefs that are compared.
+
+The fourth is the third with the training layouts' frequencies as priors, which ``temporal`` also
+learns.
+"""
 EVERYWHERE: Final = "temporal, every picture"
-"""The same belief outside approaches as well, where the others say nothing."""
+"""The belief over time, also outside approaches, where the other kinds have no belief."""
 REAL_ROADS: Final[Mapping[str, Mapping[str, str]]] = {
     "regions": {"kind": "ground"},
     "cars": {"kind": "tracks"},
@@ -32,7 +35,7 @@ RULES: Final[Mapping[str, tuple[str, str]]] = {
     "motion-compensated trackers": ("cars", "pairs"),
     "persistence": ("fusion", "source"),
 }
-"""From each rule to its section, and what stands there where it is left out."""
+"""Section of each rule, and its values without the rule."""
 
 
 def believed(
@@ -40,12 +43,12 @@ def believed(
     vehicle: Vehicle,
     base_rates: Mapping[str, float],
 ) -> DriveBelief:
-    """What is believed in each picture; where no approach is open, the base rates.
+    """Return the belief in each picture; outside approaches, the base rates.
 
     Args:
-        drive: Of which detections are stored.
+        drive: Drive with stored detections.
         vehicle: Settings.
-        base_rates: By feature.
+        base_rates: Base rates by feature.
     """
     t_ns = np.asarray(drive.run.table("frames", ["t_ns"])["t_ns"], np.int64)
     table = scene_tables(drive.run, vehicle)["belief"]
@@ -77,14 +80,14 @@ def believed_everywhere(
     learned: TemporalFit,
     without: frozenset[str] = frozenset(),
 ) -> DriveBelief:
-    """What the belief over time says in each picture, approach or not.
+    """Return the belief over time in each picture, inside and outside approaches.
 
     Args:
-        drive: Which.
+        drive: The drive.
         parts: Its annotated parts.
-        learned: Elsewhere.
-        without: Cues that nothing looked for; ranges by signs stay, so that what a cue says of
-            the intersection is apart from what it says of the distance.
+        learned: Parameters fitted to other drives.
+        without: Cues to leave out. Ranges from signs are kept, to separate a cue's evidence on the
+            intersection from that on the distance.
     """
     part = next(
         one for one in parts if one.features["intersection"] == drive.features["intersection"]
@@ -98,14 +101,14 @@ def believed_everywhere(
 
 
 def with_fusion(drive: StudyDrive, changes: Mapping[str, Any]) -> Vehicle:
-    """The run's settings with another belief."""
+    """Return the run's settings with another belief."""
     vehicle = drive.run.drive_manifest().settings
     fusion = vehicle.fusion.model_copy(update=dict(changes))
     return vehicle.model_copy(update={"fusion": fusion})
 
 
 def with_rules(drive: StudyDrive, without: str | None = None) -> Vehicle:
-    """The run's settings with the rules for real roads, all or all but one."""
+    """Return the run's settings with all rules for real roads, or all but one."""
     vehicle = drive.run.drive_manifest().settings
     rules = {name: dict(changes) for name, changes in REAL_ROADS.items()}
     if without is not None:

@@ -1,4 +1,4 @@
-"""Finished drives of the study of layouts."""
+"""Open the finished drives of the study of layouts."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ class StudyDrive:
     """A drive of the study with its truth.
 
     Attributes:
-        name: Layout and run.
-        layout: Its name.
-        fold: It is tested in.
-        features: What is true of the layout, as far as that can be said.
-        run: Finished.
-        truth: Of the drive.
+        name: Name of the drive, from layout and run.
+        layout: Name of the layout.
+        fold: Fold that it is tested in.
+        features: True features of the layout, where known.
+        run: The finished run.
+        truth: Truth of the drive.
     """
 
     name: str
@@ -34,11 +34,11 @@ class StudyDrive:
 def open_drive(
     out: Path, name: str, layout: str, fold: int, features: Mapping[str, bool]
 ) -> StudyDrive:
-    """A drive whose run is finished.
+    """Open a drive whose run is finished.
 
     Raises:
-        RunError: It is not there, or damaged.
-        AnnotationError: Its truth does not fit.
+        RunError: The run is missing or damaged.
+        AnnotationError: The truth does not fit.
     """
     truth = load(out / "drives" / name, name)
     return StudyDrive(name, layout, fold, features, open_run(out / "runs" / name), truth)

@@ -1,4 +1,4 @@
-"""What some drives of the study of layouts teach, for each kind of belief."""
+"""Fit each kind of belief to some drives of the study of layouts."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_te
 from .drives import StudyDrive
 
 Annotations = Mapping[str, Sequence[Any]]
-"""From a drive to its annotated approaches."""
+"""Annotated approaches by drive."""
 
 
 class Learned(NamedTuple):
-    """What one fold's drives are judged by.
+    """Fits for the drives of one fold.
 
     Attributes:
-        fusions: From each kind to what it changes in ``Fusion``.
-        base_rates: How often each feature is there in the training layouts.
+        fusions: Changes to ``Fusion`` by kind of belief.
+        base_rates: Frequency of each feature in the training layouts.
         temporal: The belief over time.
     """
 
@@ -40,14 +40,14 @@ class Learned(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lessons:
-    """What every drive has to teach, read once for all folds."""
+    """Training data of all drives, read once for all folds."""
 
     approaches: Annotations
     drives: Mapping[str, Sequence[AnnotatedDrive]]
 
 
 def lessons_of(drives: Sequence[StudyDrive]) -> Lessons:
-    """Annotated approaches and drives, by drive; a layout is one place, however often driven."""
+    """Read annotated approaches and drives, by drive; all drives of a layout are one place."""
     approaches, parts = {}, {}
     for drive in drives:
         vehicle = drive.run.drive_manifest().settings
@@ -62,7 +62,7 @@ def lessons_of(drives: Sequence[StudyDrive]) -> Lessons:
 
 
 def learn(drives: Sequence[StudyDrive], lessons: Lessons) -> Learned:
-    """All kinds, from these drives alone."""
+    """Fit all kinds of beliefs to these drives."""
     graph, vehicle = graph_of_runs([one.run for one in drives])
     calibrated = fit_messages(
         [part for one in drives for part in lessons.approaches[one.name]], graph

@@ -1,4 +1,4 @@
-"""The results of the study of layouts as tables: one page, one JSON file, one text."""
+"""Write the results of the study of layouts as a page, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ NOTES: Final[dict[Perception, str]] = {
     "pixels": "Everything here is simulated. The embedded networks saw rendered photographs; they "
     "were trained on other layouts of the same renderer. Intervals are 95 %, over layouts.",
     "faults": "Everything here is simulated. No network saw a picture: masks are the renderer's, "
-    "with misses, false finds and errors of height drawn from settings that were measured nowhere. "
+    "with misses, false detections and errors of height drawn from settings that are not measured. "
     "Intervals are 95 %, over layouts.",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutFiles:
-    """What was written."""
+    """The written files."""
 
     page: Path
     tables: Path
@@ -39,10 +39,10 @@ class LayoutFiles:
 def write_layout_study(
     out: Path, settings: LayoutStudy, scores: LayoutScores, failures: Mapping[str, str]
 ) -> LayoutFiles:
-    """Write page and tables into ``out``.
+    """Write page and tables to ``out``.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: A file cannot be written.
     """
     flags = (
         f"--perception {settings.perception} --blocks {settings.blocks} --runs {settings.runs} "
@@ -63,7 +63,7 @@ def write_layout_study(
 
 
 def tables_of(scores: LayoutScores) -> list[Table]:
-    """All tables, for the page and for a terminal."""
+    """Return all tables, for the page and for a terminal."""
     found = [
         Table(
             "Beliefs",
@@ -134,12 +134,12 @@ def _difference_row(name: str, one: LayoutDifference) -> tuple[str, ...]:
 
 
 def verdict(less: Mean) -> str:
-    """What a difference of scores shows: undecided where its interval holds zero or is missing."""
+    """Return the verdict of a difference: undecided if its interval contains zero or is missing."""
     return "better" if less.high < 0.0 else "worse" if less.low > 0.0 else "undecided"
 
 
 def text(value: Mean, digits: int = 3, *, signed: bool = False) -> str:
-    """A mean with its interval."""
+    """Return a mean with its interval as text."""
     if math.isnan(value.value):
         return "-"
     sign = "+" if signed else ""

@@ -1,6 +1,6 @@
-"""Beliefs of the study of layouts against the truth, with intervals over layouts.
+"""Score the beliefs of the study of layouts, with intervals over layouts.
 
-Every picture counts, so that all beliefs are judged on the same ones.
+Every picture counts, so that all beliefs are scored on the same pictures.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveBelief:
-    """What was believed in N pictures of a drive.
+    """Belief in N pictures of a drive.
 
     Attributes:
-        drive: Name.
-        layout: Name; drives of one are a cluster.
-        features: What is true, as far as that can be said.
-        start_m: Shape (N,): to the intersection, NaN where none is ahead.
+        drive: Name of the drive.
+        layout: Name of the layout, whose drives are a cluster.
+        features: True features, where known.
+        start_m: Shape (N,): range to the intersection ahead; NaN without one.
         probabilities: Shape (N, features), in the order of ``FEATURES``.
-        established: Shape (N,): presence was.
-        is_silent: Shape (N,): no approach was open, so the base rates stand.
+        established: Shape (N,): True where the intersection's presence is established.
+        is_silent: Shape (N,): True outside approaches, where the base rates apply.
     """
 
     drive: str
@@ -47,17 +47,18 @@ class DriveBelief:
 
 @dataclass(frozen=True, slots=True)
 class LayoutScore:
-    """One kind of belief over all drives, its intervals over layouts.
+    """Scores of one kind of belief over all drives, with intervals over layouts.
 
     Attributes:
         brier: Mean squared error over pictures and features.
-        log_score: Mean of -ln(probability of what is so).
-        brier_by_feature: By feature.
-        false_features: Features that are not there and were above 0.9, mean of a drive.
+        log_score: Mean of -ln(probability of the true state).
+        brier_by_feature: Mean squared error by feature.
+        false_features: Mean number of absent features above 0.9 per drive.
         full: Fraction of the drives to an intersection with full detection.
-        full_m: True distance there.
-        full_before_detected: Pictures in which a way was above 0.9 and the intersection was not.
-        silent: Fraction of pictures without an approach.
+        full_m: True distance at full detection.
+        full_before_detected: Fraction of pictures in which a direction is above 0.9 but the
+            intersection is not.
+        silent: Fraction of pictures outside approaches.
     """
 
     brier: Mean
@@ -72,7 +73,7 @@ class LayoutScore:
 
 @dataclass(frozen=True, slots=True)
 class LayoutDifference:
-    """One kind less another over the same pictures; negative is an improvement."""
+    """Scores of one kind minus those of another over the same pictures; negative is better."""
 
     brier: Mean
     log_score: Mean
@@ -84,14 +85,13 @@ class LayoutScores:
     """All results.
 
     Attributes:
-        kinds: From each kind of belief to its score.
-        less: The belief over time less each other, by what they are called.
-        cues: From cues left out to the belief over time in every picture without them, less that
-            with all.
-        rules: From what is left out (empty for nothing) to the score with the other rules.
-        rules_less: From the rule to the belief without it less that with all.
-        drives: How many.
-        layouts: How many.
+        kinds: Score by kind of belief.
+        less: Differences of the belief over time from each other kind, by their names.
+        cues: Differences of the belief over time without cues from that with all, by cues left out.
+        rules: Score without a rule, by rule (empty for all rules).
+        rules_less: Differences of the belief without a rule from that with all, by rule.
+        drives: Number of drives.
+        layouts: Number of layouts.
         exponents: Exponent and lapse of the belief over time, by fold.
     """
 
@@ -128,13 +128,13 @@ def score_layouts(beliefs: Sequence[DriveBelief]) -> LayoutScore:
 
 
 def difference(first: Sequence[DriveBelief], second: Sequence[DriveBelief]) -> LayoutDifference:
-    """The second less the first, picture by picture; both of the same drives in the same order.
+    """Return the scores of the second minus the first belief, over the same pictures.
 
     Raises:
-        ValueError: They are not.
+        ValueError: The beliefs are not about the same drives in the same order.
     """
     if [one.drive for one in first] != [one.drive for one in second]:
-        raise ValueError("difference: expected beliefs about the same drives, in one order")
+        raise ValueError("difference: expected beliefs about the same drives, in the same order")
     before, after = _Rows.of(first), _Rows.of(second)
     return LayoutDifference(
         mean(after.brier - before.brier, before.cluster),
@@ -148,7 +148,7 @@ def difference(first: Sequence[DriveBelief], second: Sequence[DriveBelief]) -> L
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """One row a picture and known feature."""
+    """Columns with one row per picture and known feature."""
 
     brier: Floats
     log_score: Floats
@@ -191,12 +191,12 @@ def _false_features(beliefs: Sequence[DriveBelief]) -> Floats:
 
 
 def _full_m(one: DriveBelief) -> float | None:
-    """Where all features that are there were believed and stayed so for some pictures."""
+    """Return the distance where all present features are believed for several pictures."""
     is_full = ~one.is_silent
     for i, name in enumerate(FEATURES):
         if one.features.get(name):
             above = one.probabilities[:, i] > THRESHOLD
-            # Nothing speaks of the presence of an intersection without sign or light.
+            # Without a sign or a light, no cue supports the presence of an intersection.
             is_full &= (above | one.established) if name == "intersection" else above
     places = np.flatnonzero(held(is_full & np.isfinite(one.start_m), CONFIRM_FRAMES))
     return float(one.start_m[places[0]]) if len(places) else None
@@ -217,6 +217,6 @@ def _of_pictures(beliefs: Sequence[DriveBelief], flags_of: Callable[[DriveBelief
 
 
 def _fraction(flags: Flags, clusters: Int64s) -> Mean:
-    """As ``mean``, its interval within 0 and 1."""
+    """Return ``mean`` with its interval limited to 0 to 1."""
     found = fraction(flags, clusters)
     return Mean(found.value, found.clusters_low, found.clusters_high, found.of, found.clusters)

@@ -1,4 +1,4 @@
-"""What the study of layouts simulates, and which layouts are tested together."""
+"""Settings of the study of layouts, and its folds."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ PERCEPTIONS: Final[tuple[Perception, ...]] = get_args(Perception)
 
 @dataclass(frozen=True, slots=True)
 class LayoutStudy:
-    """What to simulate, and what sees it.
+    """Settings of the study of layouts.
 
-    Layouts are ``M`` and a seed. Thirteen in a row hold every kind once, so they stay together:
-    each fold is whole blocks of thirteen.
+    Layouts are named ``M`` and a seed. A block of thirteen consecutive layouts contains every kind
+    once, so a fold consists of complete blocks.
 
     Attributes:
-        perception: ``pixels``: the embedded networks see photographs. ``faults``: no network sees
-            anything, and the renderer's masks have faults made up by ``faulty_labels``.
-        blocks: Of thirteen layouts.
-        runs: Drives of each layout, under different conditions.
-        folds: Parts of the blocks; each is tested by what was fitted on the others.
-        seed: Of everything that differs from run to run.
-        width_px: Of the pictures, 9/16 high.
+        perception: ``pixels``: the embedded networks process rendered photographs. ``faults``: no
+            network runs, and ``faulty_labels`` adds faults to the renderer's masks.
+        blocks: Number of blocks of thirteen layouts.
+        runs: Number of drives per layout, under different conditions.
+        folds: Number of folds; each is tested with fits to the others.
+        seed: Seed of everything that differs between runs.
+        width_px: Width of the pictures; the height is 9/16 of it.
     """
 
     perception: Perception = "pixels"
@@ -39,10 +39,10 @@ class LayoutStudy:
     width_px: int = 960
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be.
+        """Check the values.
 
         Raises:
-            UsageError: Naming what was wanted.
+            UsageError: A value is out of range.
         """
         if self.perception not in PERCEPTIONS:
             raise UsageError(
@@ -51,10 +51,10 @@ class LayoutStudy:
         if not MIN_FOLDS <= self.folds <= self.blocks:
             raise UsageError(
                 f"folds {self.folds}, blocks {self.blocks}: expected {MIN_FOLDS} folds or more, "
-                "and a block for each"
+                "and at least as many blocks"
             )
         if self.runs < 1 or self.seed < 0:
-            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 or more, 0 or more")
+            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 and 0 or more")
         camera_of_width(self.width_px)
 
     @property
@@ -63,15 +63,15 @@ class LayoutStudy:
         return tuple(f"M{number}" for number in range(self.blocks * len(KINDS)))
 
     def fold_of(self, layout: str) -> int:
-        """Which fold a layout is tested in."""
+        """Return the fold that a layout is tested in."""
         return int(layout[1:]) // len(KINDS) % self.folds
 
     def features_of(self, layout: str) -> dict[str, bool]:
-        """What is true of it, as far as that can be said."""
+        """Return the true features of a layout, where known."""
         return mixed_layout(int(layout[1:])).features
 
     def scenes(self) -> tuple[SceneSettings, ...]:
-        """Every drive, in the order in which they are done: one of each layout, then the next."""
+        """Return all drives in the order of processing: one of each layout, then the next."""
         camera = camera_of_width(self.width_px)
         return tuple(
             SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)

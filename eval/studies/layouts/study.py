@@ -1,4 +1,4 @@
-"""The study of layouts: every drive judged by what other layouts taught, then rule by rule."""
+"""Cross-validate beliefs over layouts, with ablations of cues and rules."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def score_study(
     ablation: bool = True,
     on_step: OnStep = lambda what, done, of: None,
 ) -> LayoutScores:
-    """Fit on all folds but one, judge that one, for each; then leave out cues and rules.
+    """Score the drives of each fold with beliefs fitted to the other folds, then run ablations.
 
     Args:
-        drives: Finished.
-        ablation: Leave out cues and rules.
-        on_step: Called with what is being done, how much of it is, and of how much.
+        drives: Finished drives.
+        ablation: True to also leave out each cue and each rule.
+        on_step: Called with the name of the current step, the amount done, and the total.
     """
     lessons = lessons_of(drives)
     folds = sorted({one.fold for one in drives})

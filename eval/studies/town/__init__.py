@@ -1,1 +1,1 @@
-"""The Monte Carlo studies of chapter 2."""
+"""Monte Carlo studies of navigation in towns (chapter 2)."""

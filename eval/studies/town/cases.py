@@ -1,4 +1,4 @@
-"""The table of a study's drives, case by case."""
+"""Divide the table of a study's drives by case."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def split(table: pa.Table) -> Iterator[dict[str, NDArray[np.float64]]]:
-    """The columns of each case in turn, by name."""
+    """Yield the columns of each case, by name."""
     cases = table["case"].to_numpy()
     columns = {name: table[name].to_numpy() for name in table.column_names if name != "case"}
     for case in range(int(cases[-1]) + 1):

@@ -1,4 +1,4 @@
-"""Is a simulated drive's filter as wrong as it says? A measure for errors that are on an arc."""
+"""NEES of a simulated drive's filter for errors along an arc."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from crosscue.localization.angles import wrap
 
 
 def nees_along_the_arc(row: NDArray[np.float64]) -> float:
-    """NEES of the turn and shift that carry the estimate to the truth: errors on an arc.
+    """Return the NEES of the rigid motion from the estimate to the truth.
 
-    Long, Wolfe, Mashner, Chirikjian, *The banana distribution is Gaussian*, RSS 2012.
+    It is consistent for errors along an arc (Long, Wolfe, Mashner, Chirikjian, *The banana
+    distribution is Gaussian*, RSS 2012).
 
     Args:
-        row: Shape (16,): one of ``Traced.steps``.
+        row: Shape (16,): one row of ``Traced.steps``.
     """
     x, y, heading = row[:3]
     at_x, at_y, at_heading = row[7:10]
@@ -26,6 +27,6 @@ def nees_along_the_arc(row: NDArray[np.float64]) -> float:
     half = 0.5 * turn
     along = half / math.tan(half) if half else 1.0
     dx, dy = x - at_x, y - at_y
-    # With the estimate as origin, turn and shift have the covariance of the pose.
+    # In the frame of the estimate, the motion has the covariance of the pose.
     error = np.array([along * dx + half * dy, along * dy - half * dx, turn])
     return float(error @ np.linalg.solve(cov, error))

@@ -1,4 +1,4 @@
-"""One simulated drive as a picture: streets, paths, ellipses, landmarks, goals."""
+"""Draw one simulated drive: streets, paths, ellipses, landmarks, goals."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ ENDS: Final = {
 
 
 def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
-    """Write ``drive_plan.png`` and ``drive_plan.svg``; the PNG's path comes back.
+    """Write ``drive_plan.png`` and ``drive_plan.svg``; return the path of the PNG.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: A file cannot be written.
     """
     made, (axes,) = figure(1, 9.0, 8.2)
     axes.grid(visible=False)
@@ -91,7 +91,7 @@ def _places(
 
 
 def _draw_streets(axes: Axes, streets: Streets) -> None:
-    """Two-way streets grey, one-way streets lighter."""
+    """Draw two-way streets in grey, and one-way streets lighter."""
     from matplotlib.collections import LineCollection
 
     both: list[list[tuple[float, float]]] = []

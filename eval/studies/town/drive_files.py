@@ -1,8 +1,8 @@
-"""A simulated drive of the studies as files that ``crosscue replay`` reads as it reads a real one.
+"""Write a simulated drive of the studies as files that ``crosscue replay`` reads like a real drive.
 
-CAN with the rear wheels' speeds, a magnetometer, and, where there are landmarks, a camera that sees
-a made-up wall at each landmark passed, with a landmark database beside. A landmark passed unnoticed
-shows a wall that the database does not hold. Truth is in ``truth.json``.
+The log has CAN frames with the speeds of the rear wheels, and a magnetometer. With landmarks, it
+also has a camera, which sees a generated wall at each passed landmark, and there is a landmark
+database. At an unnoticed landmark, the wall is not in the database. Truth is in ``truth.json``.
 """
 
 from __future__ import annotations
@@ -115,13 +115,13 @@ heading_sd_rad = {heading_sd_rad}
 
 @dataclass(frozen=True, slots=True)
 class StudyDriveFiles:
-    """What was written.
+    """The written files.
 
     Attributes:
         log: ``drive.mcap``.
         vehicle: ``vehicle.toml``.
         truth: ``truth.json``.
-        landmarks: ``landmarks.db``, or None where no landmark was passed.
+        landmarks: ``landmarks.db``; None if no landmark was passed.
     """
 
     log: Path
@@ -136,14 +136,14 @@ def write_drive_files(
     """Write log, vehicle file, DBC file, truth and landmark database of one drive.
 
     Args:
-        folder: Where to.
-        settings: As driven.
+        folder: Output folder.
+        settings: Settings of the drive.
         traced: The drive.
-        seed: Of the drive; walls come from it.
-        overwrite: Replace files that are there.
+        seed: Seed of the drive and of the walls.
+        overwrite: Replace existing files.
 
     Raises:
-        OutputError: A file is there already, or cannot be written.
+        OutputError: A file already exists, or cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "drive.mcap"
@@ -170,7 +170,7 @@ def write_drive_files(
 
 
 def vehicle_text(settings: Drive, traced: Traced) -> str:
-    """The vehicle file that fits the simulated car and its start."""
+    """Return the vehicle file of the simulated car and its start."""
     car, sensors = settings.car, settings.sensors
     compass = sensors.compass_2sigma_deg
     x, y, heading = traced.first_belief
@@ -193,7 +193,7 @@ def vehicle_text(settings: Drive, traced: Traced) -> str:
 
 
 def _times(settings: Drive, steps: int) -> Int64s:
-    """Log time at the end of each step."""
+    """Return the log time at the end of each step."""
     return START_NS + np.round(np.arange(1, steps + 1) * settings.car.step_s * 1e9).astype(np.int64)
 
 
@@ -213,7 +213,7 @@ def _batches(block: Block) -> Iterator[Block]:
 
 
 def _can_block(settings: Drive, traced: Traced, t_ns: Int64s, folder: Path) -> Block:
-    """Wheel speeds over each step, stamped at its middle."""
+    """Return the wheel speeds of each step, with the time of its middle."""
     database = CanDatabase.load([folder / "study_car.dbc"])
     kmh = np.round(traced.steps[:, 4:6] / settings.car.step_s * 3.6, 2)
     payload = np.zeros((len(t_ns), 8), np.uint8)
@@ -232,7 +232,7 @@ def _can_block(settings: Drive, traced: Traced, t_ns: Int64s, folder: Path) -> B
 
 
 def _compass_block(traced: Traced, t_ns: Int64s) -> Block:
-    """The field at every step; its error stays the same from one reading to the next."""
+    """Return the magnetic field at every step, whose error is constant between readings."""
     heading, read = traced.steps[:, 2], traced.steps[:, 6]
     rows = np.flatnonzero(~np.isnan(read))
     if not len(rows):
@@ -253,7 +253,7 @@ def _compass_block(traced: Traced, t_ns: Int64s) -> Block:
 
 
 def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
-    """The wall as the car passes it, and what comes after: the replay weighs what it has passed."""
+    """Return frames of the wall at a landmark, and after it, when the replay uses the match."""
     import cv2
 
     first = int(row[0]) - 1
@@ -273,7 +273,7 @@ def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
 
 
 def _wall(seed: int, number: int) -> Bytes:
-    """A made-up wall with enough corners; negative numbers are walls without a landmark."""
+    """Generate a wall with enough corners; negative numbers are walls without a landmark."""
     import cv2
 
     rng = np.random.default_rng(key_of(seed, number & 0xFFFF_FFFF, int(number < 0)))
@@ -286,7 +286,7 @@ def _wall(seed: int, number: int) -> Bytes:
 
 
 def _seen(wall: Bytes, seed: int) -> Bytes:
-    """The wall from a little elsewhere, darker, with noise."""
+    """Return the wall from a slightly different position, darker and with noise."""
     import cv2
 
     rng = np.random.default_rng(key_of(seed))
@@ -299,7 +299,7 @@ def _seen(wall: Bytes, seed: int) -> Bytes:
 
 
 def _write_landmarks(path: Path, passed: Floats, sd_m: float, seed: int) -> None:
-    """One entry for each recognition: where its noise put the landmark, as the drive had it."""
+    """Write one entry per recognition, at the noisy position that the drive used."""
     from crosscue.localization.landmarks.database import LandmarkWriter, Place
     from crosscue.localization.landmarks.features import make_matcher
 

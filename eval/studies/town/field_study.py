@@ -1,9 +1,8 @@
-"""The field protocol: successive random goals in a small town, recorded, replayed, scored.
+"""The field protocol: drives to successive random goals in a small town, as logs.
 
-Range runs have no landmark, landmark runs at most one at a time. Each run becomes a log, a vehicle
-file and a truth file; what is reported comes from the replay of the log and its score, as it would
-for recorded runs. Goals reached are kept in the drive itself, because a log does not hold them: the
-navigator on board knew them.
+Range runs have no landmarks, landmark runs at most one at a time. Each run is a log, a vehicle file
+and a truth file, and the results come from the replay of the log and its score, as for recorded
+runs. The goals reached are those of the simulated navigator, because a log does not contain them.
 """
 
 from __future__ import annotations
@@ -36,40 +35,40 @@ SUMMARY: Final = "summary.json"
 PAGE: Final = "study.html"
 PUBLISHED_GOAL_M: Final = 6900.0
 NOTES: Final = (
-    "Simulated runs that went through log files and crosscue replay; recorded runs go the same way "
-    "with crosscue replay and crosscue score.",
-    "In a town of 1 km2 no goal is 6.9 km from the start; the source's Euclidean distance can only "
-    "be a sum over successive goals, which is what stands here as the way from goal to goal.",
-    "The published field runs lie between the published curves of 20 and 30 degrees; at 25 degrees "
+    "Simulated runs, written as log files and processed by crosscue replay; recorded runs can be "
+    "processed in the same way with crosscue replay and crosscue score.",
+    "In a town of 1 km2, no goal is 6.9 km from the start. The dissertation's Euclidean distance "
+    "can only be a sum over successive goals, reported here as the distance from goal to goal.",
+    "The published field runs are between the published curves of 20 and 30 degrees; at 25 degrees "
     f"those curves imply {implied_m(20.0, 25.0) / 1e3:.1f} km, not 'nearly 10 km'.",
-    "Range runs last longer than both: in a small town blocks are short "
-    "and turns many, so that a heading's error, which persists for a while, is spread over both "
-    "axes and partly undone. Towns of 25 km2, or wheels that forget a heading sooner, give 13 to "
-    "14 km (docs/studies.md). Streets in which the compass is worse, the source's explanation, "
-    "shorten a run only where the filter models them: the ellipse does not see true errors.",
+    "Range runs last longer than both: a small town has short blocks and many turns, so that a "
+    "heading error, which persists for a while, is spread over both axes and partly cancelled. "
+    "Towns of 25 km2, or wheels with a shorter heading memory, yield 13 to 14 km "
+    "(docs/studies.md). Streets with a worse compass, the dissertation's explanation, shorten a "
+    "run only if the filter models them, because the ellipse does not depend on true errors.",
 )
 
 
 @dataclass(frozen=True, slots=True)
 class FieldRun:
-    """One run, as its replay states it unless configured.
+    """Results of one run, from its replay unless noted.
 
     Attributes:
-        name: Of its folder.
-        seed: Of the drive.
-        has_landmarks: Kind of run.
-        travelled_m: True way.
-        minutes: Driven.
-        goals: Reached, by the navigator on board.
-        goal_to_goal_m: Sum of straight distances from start to goal to goal, goals reached only.
-        landmarks_weighed: In the replay.
-        landmarks_refused: By the replay's gate.
-        major_axis_m: At the end.
-        lost_at_m: Distance at which the replay's ellipse exceeded the limit; None: never.
-        ape_rmse_m: Error of position, not aligned.
-        nees_mean: Of x, y, heading over the run.
-        longest_gap_m: Longest way between landmarks weighed in on board.
-        is_whole: Nothing of the log was lost.
+        name: Name of its folder.
+        seed: Seed of the drive.
+        has_landmarks: True for landmark runs.
+        travelled_m: True distance travelled.
+        minutes: Duration.
+        goals: Number of goals that the simulated navigator reached.
+        goal_to_goal_m: Sum of straight distances from start to goal to goal, over reached goals.
+        landmarks_weighed: Number of landmark updates.
+        landmarks_refused: Number of landmarks rejected by the gate.
+        major_axis_m: Major axis of the ellipse at the end.
+        lost_at_m: Distance at which the ellipse exceeded the limit; None if never.
+        ape_rmse_m: Position error, not aligned.
+        nees_mean: Mean NEES of x, y, heading over the run.
+        longest_gap_m: Longest distance between landmark updates of the simulated navigator.
+        is_whole: True if nothing of the log was dropped.
     """
 
     name: str
@@ -90,34 +89,34 @@ class FieldRun:
 
 
 class Replayed(Protocol):
-    """One drive and what became of it; see ``replayed.Replayed``."""
+    """One drive and its replay; see ``replayed.Replayed``."""
 
     @property
     def traced(self) -> Traced:
-        """As simulated."""
+        """The simulated drive."""
         ...
 
     @property
     def score(self) -> PoseScore:
-        """The replay against truth."""
+        """Score of the replay."""
         ...
 
     @property
     def is_whole(self) -> bool:
-        """The replay lost nothing of the log."""
+        """True if the replay dropped nothing of the log."""
         ...
 
     @property
     def landmark_counts(self) -> dict[str, int]:
-        """What became of camera frames."""
+        """Numbers of camera frames by result of the landmark match."""
         ...
 
 
 class ThroughLog(Protocol):
-    """Drives, writes the log, replays and scores it."""
+    """Function that simulates a drive, writes its log, replays and scores it."""
 
     def __call__(self, folder: Path, settings: Drive, seed: int, *, overwrite: bool) -> Replayed:
-        """One drive, in its folder."""
+        """Simulate, replay and score one drive, in its folder."""
         ...
 
 
@@ -138,20 +137,20 @@ def drive_field(
     *,
     overwrite: bool = False,
 ) -> Iterator[tuple[float, FieldRun]]:
-    """Drive, record, replay and score every run; fraction done and run, in order.
+    """Simulate, replay and score every run; yield the fraction done and the run, in order.
 
-    A run that is there already, of the same study, is not driven again.
+    Existing runs of the same study are kept.
 
     Args:
-        study: What to drive.
-        folder: Where to.
-        workers: Processes.
-        through_log: Drives once and replays that; ``replayed.through_log``.
+        study: Settings of the study.
+        folder: Output folder.
+        workers: Number of processes.
+        through_log: Simulates and replays one drive; ``replayed.through_log``.
         overwrite: Replace another study's results.
 
     Raises:
-        RunError: The folder holds another study.
-        CrosscueError: As drive, replay and score.
+        RunError: The folder contains another study.
+        CrosscueError: A run cannot be simulated, replayed or scored.
     """
     _claim(study, folder, overwrite=overwrite)
     jobs = [
@@ -174,7 +173,7 @@ def _claim(study: FieldStudy, folder: Path, *, overwrite: bool) -> None:
             before = None
         if before != wanted:
             raise RunError(
-                f"{folder}: holds a study with other settings; give another folder or --overwrite"
+                f"{folder}: contains a study with other settings; use another folder or --overwrite"
             )
     folder.mkdir(parents=True, exist_ok=True)
     if overwrite:
@@ -217,7 +216,7 @@ def _run(through_log: ThroughLog, job: _Job) -> FieldRun:
 
 
 def finish_field(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> tuple[Table, ...]:
-    """Summary, picture and page; the tables come back."""
+    """Write summary, picture and page; return the tables."""
     made = _tables(runs)
     picture = _draw(study, runs, folder)
     content = {
@@ -292,7 +291,7 @@ def _draw(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> Path:
     interval_m = study.drive.sensors.compass_interval_m
     for degrees, style in ((20.0, "--"), (30.0, ":")):
         variance = math.radians(degrees / 2.0) ** 2
-        # Half of the straight law's variance on either axis: a car that turns all the time.
+        # Half of the straight law's variance on each axis, as for a car that turns all the time.
         both = 4.0 * np.sqrt(variance * interval_m * distance_m / 2.0)
         axes.plot(
             distance_m / 1e3, both, style, color="0.4", lw=1.0, label=f"r ds D / 2 at ±{degrees:g}°"

@@ -1,4 +1,4 @@
-"""The landmark study as pictures: range by rate and density, and success against distance."""
+"""Figures of the landmark study: range by rate and density, and success over distance."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def draw(
     rows: Sequence[dict[str, NDArray[np.float64]]],
     folder: Path,
 ) -> list[Path]:
-    """Write ``landmarks_range`` and ``landmarks_success`` as PNG and SVG; the PNGs' paths."""
+    """Write ``landmarks_range`` and ``landmarks_success`` as PNG and SVG; return the PNGs."""
     farthest_m = max(float(part["straight_m"].max()) for part in rows)
     rates = sorted(study.detection_rates, key=lambda rate: abs(rate - SHOWN_RATE))
     return [
@@ -129,7 +129,7 @@ def _successes(
         axes.axhline(0.8, color="0.3", ls="--", lw=1.0)
         axes.set_title(strategy, fontsize=10)
         axes.set_ylim(0.0, 1.03)
-        axes.set_xlabel("start to goal, as the crow flies (km)")
+        axes.set_xlabel("straight distance from start to goal (km)")
     panels[0].set_ylabel("fraction of drives that reach the goal")
     panels[0].legend(frameon=False, fontsize=8, title="landmarks per km²", title_fontsize=8)
     made.suptitle(

@@ -1,7 +1,7 @@
-"""Who reaches the goal: success against distance, range at 80 % success, extra distance driven.
+"""Results of the landmark study: success over distance, range at 80 % success, extra distance.
 
-Strategies of the same density and rate share cities, starts, goals and sensor errors too, so that
-their differences are the strategies'.
+Strategies with the same density and rate have the same cities, starts, goals and sensor errors, so
+that differences are due to the strategies.
 """
 
 from __future__ import annotations
@@ -41,41 +41,41 @@ PUBLISHED_POINT: Final = (0.55, 0.6, 6900.0)
 """Landmarks per km2, detection rate, and the distance that 8 of 10 field tests reached."""
 CITY_BORDERS_KM2: Final = (0.0, 25.0, 50.0, 75.0, 401.0)
 DENSE_PER_KM2: Final = 10.0
-"""From here on the source makes no claim about strategies."""
+"""Density from which on the dissertation makes no claim about strategies."""
 NOTES: Final = (
-    "Range: the distance from start to goal, as the crow flies, at which a logistic curve through "
-    "all drives of a cell has fallen to 80 % success; 'beyond': not within the farthest goal that "
-    "cities of at most 100 km2 gave. Intervals: 95 %, bootstrap over drives.",
-    "Extra distance: ratio of the mean distances of all drives that reached the goal, each "
-    "strategy's own, as the source compares averages over all drives of a strategy. It counts that "
-    "a strategy reaches farther goals as well. The column below 10 landmarks per km2 has the cells "
-    "of the source's sentence on range; this subset was chosen after seeing the results. Ours in "
-    "addition: 'paired', the same seeds where both reached the goal, and 'all drives', lost ones "
-    "as far as they came.",
-    "The extra distance depends on the size of cities: the source has 1 to 100 km2 and does not "
-    "state how they are distributed (here: uniformly).",
+    "Range: the straight distance from start to goal at which a logistic curve through all drives "
+    "of a cell falls to 80 % success; 'beyond': not within the farthest goal in cities of at most "
+    "100 km2. Intervals: 95 %, bootstrap over drives.",
+    "Extra distance: ratio of the mean distances of all drives that reached the goal, as the "
+    "dissertation compares averages over all drives of a strategy. It includes the effect that a "
+    "strategy reaches farther goals. The column below 10 landmarks per km2 has the cells of the "
+    "dissertation's statement on range; this subset was chosen after the results were known. Two "
+    "columns are added: 'paired', the same seeds if both reached the goal, and 'all drives', with "
+    "lost drives up to their loss.",
+    "The extra distance depends on the size of cities: the dissertation has 1 to 100 km2 and does "
+    "not state their distribution (here: uniform).",
     "Gains are reported only for cells where both ranges are within the "
-    "farthest goal, which leaves out those in which looking for landmarks helps most.",
-    "The source says nothing of the landmarks' own uncertainty, nor where in a city they stand "
-    "(here: at intersections, 5 m s.d.), nor when a landmark is given up as a target.",
+    "farthest goal, which leaves out those in which landmarks help most.",
+    "The dissertation specifies neither the landmarks' uncertainty, nor their places in a city "
+    "(here: at intersections, 5 m s.d.), nor when a landmark is abandoned as a target.",
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One strategy, density and rate.
+    """Results of one strategy, density and rate.
 
     Attributes:
-        strategy: By name.
-        landmarks_per_km2: Density.
-        detection_rate: Of landmarks passed.
-        drives: How many.
-        lost: Of them.
-        given_up: Neither lost nor there after the longest distance.
-        success: Share that reached the goal.
-        range_m: At 80 % success; infinite beyond the farthest goal.
-        travelled_m: Mean way.
-        updates: Mean number of landmarks weighed in.
+        strategy: Name of the strategy.
+        landmarks_per_km2: Density of landmarks.
+        detection_rate: Detection rate of passed landmarks.
+        drives: Number of drives.
+        lost: Number of lost drives.
+        given_up: Number of drives that neither were lost nor arrived within the longest distance.
+        success: Fraction that reached the goal.
+        range_m: Range at 80 % success; infinite beyond the farthest goal.
+        travelled_m: Mean distance travelled.
+        updates: Mean number of landmark updates.
     """
 
     strategy: str
@@ -91,7 +91,7 @@ class Cell:
 
 
 class CityExtra(NamedTuple):
-    """How much farther a strategy drove in cities from ``min_km2`` to below ``max_km2``."""
+    """Extra distance of a strategy in cities from ``min_km2`` to below ``max_km2``."""
 
     min_km2: float
     max_km2: float
@@ -100,22 +100,22 @@ class CityExtra(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A strategy against driving straight to the goal.
+    """Comparison of a strategy with driving straight to the goal.
 
     Attributes:
-        strategy: By name.
-        pairs: Drives of the same seeds in which both reached the goal.
-        extra_reached: How much farther this one drove: 0.31 is 31 %. Means of all drives that
-            reached the goal, each strategy's own; this one reaches farther goals too.
-        extra_sparse: The same over cells below 10 per km2.
-        by_city: The same as ``extra_reached`` by size of city.
-        extra: Of pairs alone.
-        extra_all: Means of all drives, lost ones as far as they came.
-        published_extra: NaN where none exists.
-        gains_m: Range less that of straight to goal, of cells below 10 per km2 where both are
+        strategy: Name of the strategy.
+        pairs: Number of pairs of drives with the same seed in which both reached the goal.
+        extra_reached: Extra distance driven; 0.31 is 31 %. It is the ratio of means over all drives
+            that reached the goal, and this strategy also reaches farther goals.
+        extra_sparse: Extra distance over cells below 10 per km2.
+        by_city: Extra distance by size of city.
+        extra: Extra distance over pairs only.
+        extra_all: Extra distance over all drives, with lost drives up to their loss.
+        published_extra: Published extra distance; NaN if not published.
+        gains_m: Range minus that of straight to goal, for cells below 10 per km2 where both are
             known.
-        gain_m: Their mean.
-        beyond: Cells below 10 per km2 where this strategy's range is beyond the farthest goal.
+        gain_m: Mean gain.
+        beyond: Number of cells below 10 per km2 with a range beyond the farthest goal.
         more_success: Difference in the fraction that reached the goal, over all pairs of drives.
     """
 
@@ -135,11 +135,11 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class LandmarkResult:
-    """The whole study.
+    """Results of the study.
 
     Attributes:
-        cells: In the order of the study's cases.
-        comparisons: Of strategies other than straight to goal.
+        cells: Results in the order of the study's cases.
+        comparisons: Comparisons of the strategies other than straight to goal.
     """
 
     cells: tuple[Cell, ...]
@@ -147,7 +147,7 @@ class LandmarkResult:
 
 
 def summarise(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
-    """Results from ``drives.parquet``."""
+    """Return the results from ``drives.parquet``."""
     cases = study.cases()
     rows = list(split(table))
     cells = tuple(_cell(case.settings, part) for case, part in zip(cases, rows, strict=True))
@@ -175,11 +175,11 @@ def _cell(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> Cell:
 def comparisons_of(
     study: LandmarkStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
 ) -> list[Comparison]:
-    """Strategies against straight to goal.
+    """Compare strategies with straight to goal.
 
     Args:
-        study: Its grid only is compared.
-        rows: The columns of ``Result`` for each of the study's cases.
+        study: The study, of which only the grid is compared.
+        rows: Columns of ``Result`` for each of the study's cases.
     """
     grid = len(study.cases()) - len(study.points)
     cells = [_cell(case.settings, part) for case, part in zip(study.cases(), rows, strict=True)]
@@ -254,7 +254,7 @@ def _comparison(
 
 
 def _extra(driven: NDArray[np.float64], there: NDArray[np.float64]) -> Measured:
-    """Both of shape (2, N): this strategy above, straight to goal below."""
+    """Return the extra distance; arrays have shape (2, N): this strategy, straight to goal."""
     return _less_one(ratio_of_means(driven[0], there[0], driven[1], there[1]))
 
 
@@ -263,7 +263,7 @@ def _less_one(ratio: Measured) -> Measured:
 
 
 def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
-    """Results in words, beside the published ones."""
+    """Return the results as tables, with the published ones."""
     grid = result.cells[: len(result.cells) - len(study.points)]
     by_strategy = [
         Table(

@@ -1,4 +1,4 @@
-"""The range study as a picture: growth of the ellipse, and how many are not lost yet."""
+"""Figures of the range study: growth of the ellipse, and fraction of drives not lost yet."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def draw(
     growth.set_xlabel("distance driven along streets (km)")
     growth.set_ylabel("2-sigma ellipse, full major axis (m)")
     growth.set_title(
-        "One point a drive: at its first goal, or where it was lost before", fontsize=9
+        "One point per drive: at its first goal, or where it was lost before", fontsize=9
     )
     growth.legend(frameon=False, fontsize=8, loc="upper right", markerscale=4)
     survival.set_xlim(0.0, 60.0)
@@ -55,7 +55,7 @@ def draw(
 
 
 def name_of(result: CompassResult) -> str:
-    """The compass in words."""
+    """Return the compass as text."""
     degrees = result.compass_2sigma_deg
     return "no compass" if degrees is None else f"compass ±{degrees:g}° (2 sigma)"
 

@@ -1,8 +1,8 @@
-"""How far without landmarks: the major axis against distance, and the distance at loss.
+"""Results of the range study: major axis over distance, and distance at loss.
 
 Each drive goes from goal to goal until its 2-sigma ellipse is longer than 100 m, or it is given up.
-The published figure shows one goal a drive; its point here is where the same drive reached its
-first goal, or was lost before.
+The published figure shows one goal per drive. Here, its point is where the drive reached its first
+goal, or was lost before.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 PUBLISHED_M: Final = {10.0: math.inf, 20.0: 20_800.0, 30.0: 9_300.0, None: 300.0}
-"""Mean distance at loss by compass 2-sigma in degrees; infinite: never lost."""
+"""Mean distance at loss by compass 2-sigma in degrees; infinite if never lost."""
 CALIBRATED_DEG: Final = 30.0
 SLIPS: Final = (0.5, 1.0, 2.0, 3.0)
-"""Times the study's own."""
+"""Factors of the study's slip."""
 INTERVALS: Final = (0.6, 0.8, 0.95, 1.0, 1.25, 1.6)
-"""Times the study's own."""
+"""Factors of the study's compass interval."""
 PREDICTED: Final = (20.0, None)
-"""Compasses whose published figure was not calibrated to; infinite ones need no curve."""
+"""Compasses whose published range was not used for calibration and is finite."""
 FRACTION: Final = 10
-"""Of the study's drives, one in so many for each choice."""
+"""Number of the study's drives per drive of each choice."""
 BLOCK: Final = 1000
-"""Of seeds, which no case of the study uses."""
+"""Block of seeds that no case of the study uses."""
 CALIBRATION_SEED: Final = 424_242
 CALIBRATION_DRIVES: Final = 2_000
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """``axis^2 = start + linear D + square D^2``: the start's, the compass's, the heading's share.
+    """Growth of the ellipse: ``axis^2 = start + linear D + square D^2``.
 
     Attributes:
-        start_m2: At distance zero.
-        linear_m: Growth as of a random walk.
-        square: Growth as of a constant heading error.
-        crossing_m: Where the curve reaches the limit.
+        start_m2: Value at distance zero.
+        linear_m: Coefficient of a random walk, from compass errors.
+        square: Coefficient of a constant heading error.
+        crossing_m: Distance at which the curve reaches the limit.
     """
 
     start_m2: float
@@ -61,7 +61,7 @@ class Growth:
     crossing_m: Measured
 
     def axis_m(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The curve."""
+        """Return the major axis at given distances."""
         axis: NDArray[np.float64] = np.sqrt(
             self.start_m2 + self.linear_m * distance_m + self.square * distance_m**2
         )
@@ -70,24 +70,24 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class CompassResult:
-    """One compass.
+    """Results with one compass.
 
     Attributes:
-        compass_2sigma_deg: None: without.
-        drives: How many.
-        lost: Of them.
-        given_up: Not lost within the longest distance.
-        reached_first_goal: Reached at least one goal before.
-        lost_after_m: Mean distance at loss of those lost.
-        shortest_m: The soonest loss; NaN without.
-        longest_m: The latest.
-        fraction_lost: Of all drives.
-        law_m: Straight driving: 25^2 / (r ds); NaN without compass.
-        growth: Curve through the points of the published kind of figure.
-        nees_mean: Of x, y, heading at the end; 3 where the filter is honest.
-        nees_band: Where 95 % of such means lie.
-        published_m: Infinite: never lost; NaN: not published.
-        is_calibrated: The one figure that a parameter was calibrated to.
+        compass_2sigma_deg: 2-sigma error of the compass; None without a compass.
+        drives: Number of drives.
+        lost: Number of lost drives.
+        given_up: Number of drives not lost within the longest distance.
+        reached_first_goal: Number of drives that reached at least one goal before.
+        lost_after_m: Mean distance at loss, of the lost drives.
+        shortest_m: Shortest distance at loss; NaN without losses.
+        longest_m: Longest distance at loss; NaN without losses.
+        fraction_lost: Fraction of drives that were lost.
+        law_m: Distance at loss when driving straight: 25^2 / (r ds); NaN without a compass.
+        growth: Curve through the points of the published figure.
+        nees_mean: Mean NEES of x, y, heading at the end; 3 for a consistent filter.
+        nees_band: 95 % interval of such means.
+        published_m: Published distance; infinite if never lost, NaN if not published.
+        is_calibrated: True for the published number that a parameter was calibrated to.
     """
 
     compass_2sigma_deg: float | None
@@ -108,7 +108,7 @@ class CompassResult:
 
 
 def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
-    """Results by compass, in the order of the study's cases."""
+    """Return the results by compass, in the order of the study's cases."""
     return [
         _of_case(case.settings, rows)
         for case, rows in zip(study.cases(), split(table), strict=True)
@@ -116,7 +116,7 @@ def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
 
 
 def points(rows: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance and major axis of each drive at its first goal, or where it was lost before."""
+    """Return distance and major axis of each drive at its first goal, or at an earlier loss."""
     reached = ~np.isnan(rows["first_goal_m"])
     distance = np.where(reached, rows["first_goal_m"], rows["travelled_m"])
     axis = np.where(reached, rows["first_goal_axis_m"], rows["major_axis_m"])
@@ -125,7 +125,7 @@ def points(rows: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], N
 
 
 def law_m(settings: Drive) -> float:
-    """Where a car that drives straight is lost, by the law r ds D; NaN without a compass."""
+    """Return the distance at loss when driving straight, by r ds D; NaN without a compass."""
     compass = settings.sensors.compass_2sigma_deg
     if compass is None:
         return math.nan
@@ -135,19 +135,19 @@ def law_m(settings: Drive) -> float:
 
 
 def implied_m(published_deg: float, compass_deg: float) -> float:
-    """The mean distance at loss that a published one implies for another compass, by r ds D."""
+    """Return the mean distance at loss that a published one implies for another compass."""
     return PUBLISHED_M[published_deg] * (published_deg / compass_deg) ** 2
 
 
 def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
-    """The compass interval with which cars at 30 degrees are lost after the published mean.
+    """Find the compass interval for which the mean range at 30 degrees is the published one.
 
-    On seeds of its own, which no study reports. The same seeds at each step, so that it converges.
+    Uses separate seeds, which no study reports, and the same seeds at each step for convergence.
 
     Args:
-        drive: Everything else; its compass is replaced.
-        workers: Threads.
-        tolerance: Relative, of the mean distance.
+        drive: Settings of the drives; the compass is replaced.
+        workers: Number of threads.
+        tolerance: Relative tolerance of the mean distance.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -202,13 +202,13 @@ def _of_case(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> CompassRe
 def fit_growth(
     distance_m: NDArray[np.float64], axis_m: NDArray[np.float64], start_m: float, limit_m: float
 ) -> Growth:
-    """Least squares on relative errors of axis^2, coefficients not negative.
+    """Fit the growth by least squares of relative errors of axis^2, with coefficients >= 0.
 
     Args:
         distance_m: Shape (N,).
         axis_m: Shape (N,).
-        start_m: The axis at distance zero, which is known.
-        limit_m: Of the axis, for the crossing.
+        start_m: Known axis at distance zero.
+        limit_m: Limit of the axis, for the crossing.
     """
     from scipy.optimize import nnls
 
@@ -225,7 +225,7 @@ def fit_growth(
 
 
 def _crossing(start: float, linear: float, square: float, limit_m: float) -> float:
-    """Where start + linear x + square x^2 is the limit squared."""
+    """Return the distance x at which start + linear x + square x^2 is the squared limit."""
     short = limit_m**2 - start
     if short <= 0.0:
         return 0.0
@@ -236,14 +236,14 @@ def _crossing(start: float, linear: float, square: float, limit_m: float) -> flo
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The distance at loss with one slip and one compass interval.
+    """Distance at loss with one slip and one compass interval.
 
     Attributes:
         slip_per_sqrt_m: S.d. of a wheel's path after one metre.
-        compass_interval_m: Distance between readings with errors of their own.
-        is_studied: The choice of the study itself.
-        drives: With each compass.
-        lost_after_m: Mean by compass 2-sigma in degrees; None without a compass.
+        compass_interval_m: Distance between readings with independent errors.
+        is_studied: True for the choice of the study.
+        drives: Number of drives with each compass.
+        lost_after_m: Mean distance by compass 2-sigma in degrees; None is without a compass.
     """
 
     slip_per_sqrt_m: float
@@ -254,7 +254,7 @@ class Choice:
 
 
 def drive_choices(study: RangeStudy, workers: int = 2) -> tuple[Choice, ...]:
-    """Drive every pair of slip and interval; seconds for a full study."""
+    """Simulate every pair of slip and interval, which takes seconds for a full study."""
     from concurrent.futures import ThreadPoolExecutor
 
     sensors, count = study.drive.sensors, max(study.drives // FRACTION, 1)
@@ -296,7 +296,7 @@ def _lost_after(
 
 
 def choice_tree(choice: Choice) -> dict[str, object]:
-    """As in ``summary.json``; the compass is named in degrees, or ``none``."""
+    """Return a choice as in ``summary.json``, with the compass in degrees, or ``none``."""
     return {
         **asdict(choice),
         "lost_after_m": {

@@ -1,4 +1,4 @@
-"""A simulated drive through its log: written, replayed, scored as a real one would be."""
+"""Simulate a drive, write its log, and replay and score it like a real drive."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from .drive_files import StudyDriveFiles, write_drive_files
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replayed:
-    """One drive and what became of it.
+    """One simulated drive and its replay.
 
     Attributes:
-        traced: As simulated, with the filter that navigated.
+        traced: The simulated drive, with the navigator's filter.
         files: Its log and truth.
-        run: The replay's folder.
-        score: The replay against truth.
-        is_whole: The replay lost nothing of the log.
-        landmark_counts: What became of camera frames.
+        run: Folder of the replay.
+        score: Score of the replay.
+        is_whole: True if the replay dropped nothing of the log.
+        landmark_counts: Numbers of camera frames by result of the landmark match.
     """
 
     traced: Traced
@@ -43,11 +43,11 @@ class Replayed:
 
 
 def through_log(folder: Path, settings: Drive, seed: int, *, overwrite: bool = False) -> Replayed:
-    """Drive, write the log, replay it into ``folder/run``, score that.
+    """Simulate a drive, write its log, replay it into ``folder/run``, and score the run.
 
     Raises:
-        OutputError: Files are there already, or cannot be written.
-        RunError: The run folder holds something else.
+        OutputError: Files already exist, or cannot be written.
+        RunError: The run folder has other contents.
     """
     traced = drive_traced(settings, seed)
     files = write_drive_files(folder, settings, traced, seed, overwrite=overwrite)
@@ -64,7 +64,7 @@ def through_log(folder: Path, settings: Drive, seed: int, *, overwrite: bool = F
 
 
 def score_pose(run: RunFolder, truth_path: Path) -> PoseScore:
-    """Score a run's pose alone; metrics, tracks and figures go into its ``score`` folder.
+    """Score only a run's pose; write metrics, tracks and figures to its ``score`` folder.
 
     Raises:
         RunError: The run's tables are missing or damaged.

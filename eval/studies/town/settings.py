@@ -1,6 +1,6 @@
-"""What a study varies, how often it drives, and with which car: checked, from TOML or by default.
+"""Settings of a study, by default or from a TOML file.
 
-A study file names its ``kind`` and whatever differs from the published study of that kind:
+A study file has its ``kind`` and the settings that differ from the published study of that kind:
 
     version = 1
     kind = "range"
@@ -26,7 +26,7 @@ from crosscue.replay.vehicle.validation_errors import explain
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000
-VARIED: Final = "this study varies or fixes it itself, a file leaves it out"
+VARIED: Final = "set by the study; remove it from the file"
 LARGEST_FILE: Final = 1 << 20
 
 StrategyName = Literal["straight to goal", "landmark to landmark", "hybrid"]
@@ -40,8 +40,8 @@ class Case(NamedTuple):
     """One combination of conditions.
 
     Attributes:
-        block: Cases of one block drive the same cities, starts, goals and sensor errors.
-        settings: Of each of its drives.
+        block: Number of the block; its cases have the same cities, starts, goals and sensor errors.
+        settings: Settings of each drive.
     """
 
     block: int
@@ -54,7 +54,7 @@ class _Study(Section):
     drive: Drive = Drive()
 
     varied: ClassVar[tuple[str, ...]] = ()
-    """Settings of the drive that belong to the study itself."""
+    """Settings of the drive that the study sets."""
 
     @model_validator(mode="after")
     def _leaves_the_varied_alone(self) -> Self:
@@ -69,11 +69,11 @@ class _Study(Section):
 
 
 class RangeStudy(_Study):
-    """How far without landmarks: drives from goal to goal until lost."""
+    """Range without landmarks: drives from goal to goal until lost."""
 
     kind: Literal["range"] = "range"
     drives: Drives = 1000
-    """With each compass."""
+    """Number of drives with each compass."""
     compass_2sigma_deg: tuple[Degrees, ...] = (10.0, 20.0, 30.0)
     without_compass: bool = True
 
@@ -82,11 +82,11 @@ class RangeStudy(_Study):
     @model_validator(mode="after")
     def _has_a_compass_or_none(self) -> Self:
         if not self.compass_2sigma_deg and not self.without_compass:
-            raise _misfit("no compass and none without: nothing to drive", False, "without_compass")
+            raise _misfit("expected a compass, or drives without one", False, "without_compass")
         return self
 
     def cases(self) -> tuple[Case, ...]:
-        """One for each compass."""
+        """Return one case per compass."""
         compasses = (*self.compass_2sigma_deg, *((None,) if self.without_compass else ()))
         return tuple(
             Case(block, changed(self.drive, compass_2sigma_deg=compass, goals=UNTIL_LOST))
@@ -95,11 +95,11 @@ class RangeStudy(_Study):
 
 
 class LandmarkStudy(_Study):
-    """Who reaches the goal: strategy by density by detection rate, one goal a drive."""
+    """Success by strategy, density of landmarks and detection rate, with one goal per drive."""
 
     kind: Literal["landmarks"] = "landmarks"
     drives: Drives = 700
-    """With each combination."""
+    """Number of drives with each combination."""
     strategies: Annotated[tuple[StrategyName, ...], Field(min_length=1)] = (
         "straight to goal",
         "landmark to landmark",
@@ -120,7 +120,7 @@ class LandmarkStudy(_Study):
         1.0,
     )
     points: tuple[tuple[Density, Proportion], ...] = ((0.55, 0.6),)
-    """More pairs of density and rate, driven landmark to landmark only."""
+    """Further pairs of density and rate, only for landmark to landmark."""
 
     varied: ClassVar[tuple[str, ...]] = (
         "navigation.strategy",
@@ -130,7 +130,10 @@ class LandmarkStudy(_Study):
     )
 
     def cases(self) -> tuple[Case, ...]:
-        """Strategies outermost; strategies of one density and rate share their cities."""
+        """Return all cases, strategies outermost.
+
+        Strategies of the same density and rate have the same cities.
+        """
         grid = tuple(product(self.densities_per_km2, self.detection_rates))
         cases = [
             Case(block, _landmarks(self.drive, strategy, *pair))
@@ -145,7 +148,7 @@ class LandmarkStudy(_Study):
 
 
 class FieldStudy(_Study):
-    """The field protocol: drives from goal to goal in a small town, through logs and the replay."""
+    """The field protocol: drives from goal to goal in a small town, with logs and replays."""
 
     kind: Literal["field"] = "field"
     range_runs: Annotated[int, Field(ge=0, le=10_000)] = 33
@@ -169,7 +172,7 @@ class FieldStudy(_Study):
     )
 
     def settings(self, *, has_landmarks: bool) -> Drive:
-        """Of one kind of run."""
+        """Return the settings of one kind of run."""
         town = self.drive.city.model_dump(exclude={"smallest_km2", "largest_km2"})
         base = self.drive.model_copy(
             update={
@@ -194,7 +197,7 @@ _Sensors = ("compass_2sigma_deg", "detection_rate")
 
 
 def changed(drive: Drive, **values: object) -> Drive:
-    """A drive's settings with some of them replaced, named without their sections."""
+    """Return a drive's settings with some replaced, by their names without sections."""
     sensors = {name: values.pop(name) for name in _Sensors if name in values}
     navigation = {"strategy": values.pop("strategy")} if "strategy" in values else {}
     return drive.model_copy(
@@ -210,19 +213,19 @@ def load_study(path: Path, kind: type[Study]) -> Study:
     """Read and check a study file.
 
     Raises:
-        StudyFileError: Not there, not TOML, of another kind, or a key or value that does not fit;
-            with the line.
+        StudyFileError: The file is missing, not TOML or of another kind, or a key or value is not
+            valid; the message names the line.
     """
     try:
         content = read_at_most(path, LARGEST_FILE)
         if content is None:
-            raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; give a study file")
+            raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; expected a study file")
         text = content.decode("utf-8")
         tree = toml_tree(text)
     except OSError as error:
         raise StudyFileError(f"{path}: {error.strerror}; check the path") from None
     except UnicodeDecodeError:
-        raise StudyFileError(f"{path}: not UTF-8 text; give a study file") from None
+        raise StudyFileError(f"{path}: not UTF-8 text; expected a study file") from None
     except ValueError as error:
         raise StudyFileError(f"{path}: not TOML: {error}; correct that line") from None
     wanted = kind.model_fields["kind"].default
@@ -237,7 +240,7 @@ def load_study(path: Path, kind: type[Study]) -> Study:
 
 
 def _misfit(why: str, given: object, *keys: str) -> ValidationError:
-    """An error that names its key, which a model's validator cannot do by a ValueError."""
+    """Return an error with its key, which a ValueError in a model's validator cannot have."""
     kind = PydanticCustomError("misfit", "{why}", {"why": why})
     return ValidationError.from_exception_data(
         why, [InitErrorDetails(type=kind, loc=keys, input=given)]

@@ -1,4 +1,4 @@
-"""A study from settings to its folder: drives, summary, pictures, page."""
+"""Run a study from its settings: drives, summary, pictures, page."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from .work import DRIVES, assemble, chunks_of, run
 SUMMARY: Final = "summary.json"
 PAGE: Final = "study.html"
 OURS: Final = (
-    "Everything here is simulated. The source fixes the sizes of cities, the compasses and the "
-    "limits of 50 and 100 m; every other number is ours and stands in summary.json. One of them, "
-    "the distance between compass readings with errors of their own, was calibrated to the "
-    "published 9.3 km at 30 degrees, on seeds that are not reported; all else are predictions."
+    "Everything here is simulated. The dissertation specifies the sizes of cities, the compasses "
+    "and the limits of 50 and 100 m; every other number is our choice and is in summary.json. One "
+    "of them, the distance between compass readings with independent errors, was calibrated to "
+    "the published 9.3 km at 30 degrees, on seeds that are not reported; the rest are predictions."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What a study left behind.
+    """Results of a finished study.
 
     Attributes:
         folder: Its folder.
-        tables: Results in words.
-        notes: What to know when reading them.
+        tables: Results as text.
+        notes: Notes on the results.
     """
 
     folder: Path
@@ -52,12 +52,12 @@ def drive_study(
     *,
     overwrite: bool = False,
 ) -> Iterator[float]:
-    """Drive all drives of a study into ``folder``; the fraction done comes as it grows.
+    """Simulate all drives of a study, and yield the fraction done.
 
     Raises:
-        RunError: The folder holds another study's results, and ``overwrite`` is not given; or
-            another process works in it.
-        WorkerError: As ``work.run``.
+        RunError: The folder contains another study's results and ``overwrite`` is not set, or
+            another process is writing to it.
+        WorkerError: As in ``work.run``.
     """
     _refuse_another(study, folder, overwrite=overwrite)
     folder.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def drive_study(
 
 
 def finish_range(study: RangeStudy, folder: Path) -> Made:
-    """Summary, picture and page from ``drives.parquet``."""
+    """Write summary, picture and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     results = range_study.summarise(study, table)
     picture = range_figure.draw(
@@ -89,7 +89,7 @@ def finish_range(study: RangeStudy, folder: Path) -> Made:
 
 
 def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
-    """Summary, pictures and page from ``drives.parquet``."""
+    """Write summary, pictures and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     result = landmark_study.summarise(study, table)
     pictures = landmark_figure.draw(study, result, list(split(table)), folder)
@@ -106,30 +106,30 @@ def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
 
 
 RANGE_NOTES: Final = (
-    f"How the calibrated number was chosen: study range --calibrate drives "
-    f"{range_study.CALIBRATION_DRIVES:,} drives at 30 degrees on seeds of their own and scales the "
-    "compass interval by their mean distance at loss over 9.3 km until both agree within 0.2 %. "
-    "The slip of the wheels is ours and was fitted to nothing; several pairs of slip and interval "
-    "reproduce the published 9.3 km, as the table of other choices shows.",
+    f"Choice of the calibrated number: study range --calibrate simulates "
+    f"{range_study.CALIBRATION_DRIVES:,} drives at 30 degrees on separate seeds, and scales the "
+    "compass interval by the ratio of their mean distance at loss to 9.3 km until both agree "
+    "within 0.2 %. The slip of the wheels is our choice and was not fitted; several pairs of slip "
+    "and interval reproduce the published 9.3 km, as the table of other choices shows.",
     f"The published means follow the law of 1 / r: at 25 degrees they imply "
     f"{range_study.implied_m(20.0, 25.0) / 1e3:.1f} km (from 20 degrees) or "
-    f"{range_study.implied_m(30.0, 25.0) / 1e3:.1f} km (from 30), where the field runs are said to "
-    "have reached nearly 10 km.",
-    "Drives go on from goal to goal until lost or 60 km; the source drove to one goal each and "
-    "says neither how it averaged nor how it came to 20.8 km, farther than nearly all of its goals "
-    "can have been.",
-    "r ds D: the distance at which a car driving straight on would be lost; turns spread the "
+    f"{range_study.implied_m(30.0, 25.0) / 1e3:.1f} km (from 30), while the field runs are "
+    "reported to have reached nearly 10 km.",
+    "Drives continue from goal to goal until lost or 60 km. In the dissertation, each drive had "
+    "one goal; neither the averaging nor the origin of 20.8 km, farther than nearly all of its "
+    "goals can have been, is described.",
+    "r ds D: the distance at which a car that drives straight is lost; turns spread the "
     "variance over two axes and lengthen it.",
-    "NEES: squared error of x, y, heading in units of the covariance claimed, 3 where honest. "
-    "Without a compass the filter is too sure: after a heading error of 5 degrees the true "
-    "positions lie on an arc, its ellipse is straight. With one it is too sure by a few per cent, "
-    "at 10 degrees because it does not know of the steps of the wheels' encoders "
+    "NEES: squared error of x, y, heading, normalised by the covariance; 3 if consistent. Without "
+    "a compass the filter is overconfident: after a heading error of 5 degrees, the true positions "
+    "are on an arc, but its ellipse is straight. With a compass it is overconfident by a few per "
+    "cent, at 10 degrees because it does not model the steps of the wheels' encoders "
     "(docs/studies.md).",
 )
 
 
 def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, ...]:
-    """Results by compass, beside the published ones."""
+    """Return the results by compass, with the published ones."""
     return (
         Table(
             "Distance at loss (95 % intervals)",
@@ -163,7 +163,7 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
 
 
 def choices_table(choices: Sequence[range_study.Choice]) -> Table:
-    """Every choice beside the published figures."""
+    """Return every choice, with the published numbers."""
     published = [
         f"{range_study.PUBLISHED_M[c] / 1e3:.1f} published"
         for c in (range_study.CALIBRATED_DEG, *range_study.PREDICTED)
@@ -230,5 +230,5 @@ def _refuse_another(study: RangeStudy | LandmarkStudy, folder: Path, *, overwrit
         before = None
     if before != study.model_dump(mode="json"):
         raise RunError(
-            f"{folder}: holds a study with other settings; give another folder or --overwrite"
+            f"{folder}: contains a study with other settings; use another folder or --overwrite"
         )

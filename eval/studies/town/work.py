@@ -1,9 +1,9 @@
-"""Thousands of drives on many cores: in chunks that are kept, so that nothing is driven twice.
+"""Simulate thousands of drives on many cores, in chunks that are kept for later studies.
 
-A chunk is named after everything that its rows depend on: the compiled code, the settings and the
-seeds. It is written whole or not at all. What an interrupted study leaves behind, the next one
-finds; so does a larger study of the same conditions. Chunks are put together in order, whoever
-finished first: the result is the same, byte for byte, on any number of workers.
+The name of a chunk is a hash of everything that its rows depend on: the compiled code, the settings
+and the seeds. A chunk is written completely or not at all. The chunks of an interrupted study are
+used by the next start, and by a larger study of the same conditions. Chunks are joined in order, so
+the result has the same bytes on any number of workers.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ class Chunk:
     """Some drives of one case.
 
     Attributes:
-        case: Its place in the list.
-        settings: Of each drive.
-        block: Of the case.
+        case: Index of the case.
+        settings: Settings of each drive.
+        block: Block of the case.
         first: Number of the first drive.
-        count: How many.
-        study_seed: Everything random comes from it.
+        count: Number of drives.
+        study_seed: Seed of the study.
     """
 
     case: int
@@ -69,13 +69,13 @@ class Chunk:
     study_seed: int
 
     def seeds(self) -> Keys:
-        """Shape (count,): a drive's seed depends on study, block and number alone."""
+        """Seeds, shape (count,), which depend only on study seed, block and number of the drive."""
         numbers = range(self.first, self.first + self.count)
         return np.array([key_of(self.study_seed, self.block, i) for i in numbers], np.uint64)
 
     @property
     def name(self) -> str:
-        """Of its file: a hash of all that its rows depend on."""
+        """Name of its file: a hash of everything that its rows depend on."""
         parts = hashlib.sha256(_code())
         parts.update(self.settings.model_dump_json().encode())
         parts.update(self.seeds().tobytes())
@@ -83,7 +83,7 @@ class Chunk:
 
 
 def chunks_of(cases: Sequence[Case], drives: int, study_seed: int) -> list[Chunk]:
-    """All the work, in the order of the result."""
+    """Return all chunks, in the order of the result."""
     return [
         Chunk(i, case.settings, case.block, first, min(CHUNK_DRIVES, drives - first), study_seed)
         for i, case in enumerate(cases)
@@ -92,7 +92,7 @@ def chunks_of(cases: Sequence[Case], drives: int, study_seed: int) -> list[Chunk
 
 
 def default_workers() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
@@ -103,18 +103,18 @@ def run(
     ray_address: str | None = None,
     drive: DriveMany = drive_many,
 ) -> Iterator[int]:
-    """Drive whatever is not there yet; the number of finished chunks comes as it grows.
+    """Simulate the missing chunks, and yield the number of finished chunks.
 
     Args:
-        chunks: From ``chunks_of``.
-        folder: Of the study; finished chunks are in its folder ``chunks``.
-        workers: Threads on this machine, or cores of a local Ray cluster.
-        ray_address: Of a Ray cluster that drives instead; ``local`` starts one here.
-        drive: What drives.
+        chunks: Chunks from ``chunks_of``.
+        folder: Folder of the study; finished chunks are in its folder ``chunks``.
+        workers: Number of threads on this machine, or of cores of a local Ray cluster.
+        ray_address: Address of a Ray cluster to run on; ``local`` starts one on this machine.
+        drive: Function that simulates drives.
 
     Raises:
         WorkerError: A worker died; finished chunks are kept.
-        UsageError: Ray is wanted and not installed.
+        UsageError: Ray is requested but not installed.
         CrosscueError: The cluster cannot be reached or started.
         OutputError: The disk is full.
     """
@@ -138,7 +138,7 @@ def run(
 
 
 def assemble(chunks: Sequence[Chunk], folder: Path) -> None:
-    """Write ``drives.parquet``: every drive with its conditions, in order.
+    """Write ``drives.parquet`` with all drives and their conditions, in order.
 
     Raises:
         RunError: A chunk is missing or damaged.
@@ -155,7 +155,7 @@ def assemble(chunks: Sequence[Chunk], folder: Path) -> None:
 
 
 def drives_schema() -> pa.Schema:
-    """Columns of ``drives.parquet``."""
+    """Return the columns of ``drives.parquet``."""
     import pyarrow as pa
 
     return pa.schema(
@@ -199,7 +199,7 @@ def _code() -> bytes:
 
 
 def _read(kept: RunFolder, chunk: Chunk) -> dict[str, Floats] | None:
-    """A finished chunk, or None: not there, or damaged, which is as good as not there."""
+    """Read a finished chunk; None if it is missing or damaged."""
     if not kept.file(f"{chunk.name}.parquet").exists():
         return None
     try:
@@ -223,7 +223,7 @@ def _on_threads(
                 chunk = waiting.popleft()
                 running[pool.submit(drive, chunk.settings, chunk.seeds())] = chunk
             done = wait(running, return_when=FIRST_COMPLETED).done
-            # Failures last: what has been finished beside them is kept.
+            # Failures are raised last, so that chunks finished at the same time are kept.
             for future in sorted(done, key=lambda one: one.exception() is not None):
                 yield running.pop(future), _result(future.result)
     finally:

@@ -191,7 +191,7 @@ def test_the_like_for_like_figure_comes_first_and_says_how_the_subset_was_chosen
 
     names = compared.head
     assert names.index("drives farther by") < names.index("published") < names.index("paired")
-    assert any("chosen after seeing" in note for note in made.notes)
+    assert any("chosen after the results were known" in note for note in made.notes)
     cities = next(table for table in made.tables if "by size of city" in table.heading)
     assert [row[0] for row in cities.rows] == ["landmark to landmark", "hybrid"]
 
@@ -255,11 +255,11 @@ def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
         ('version = 1\nkind = "range"\ncompass_2sigma_deg = [500.0]\n', ":3: compass_2sigma_deg"),
         (
             'version = 1\nkind = "range"\n[drive]\ngoals = 3\n',
-            r":4: drive\.goals: this study varies or fixes it itself",
+            r":4: drive\.goals: set by the study",
         ),
         (
             'version = 1\nkind = "range"\ncompass_2sigma_deg = []\nwithout_compass = false\n',
-            ":4: without_compass: .*nothing to drive",
+            ":4: without_compass: .*expected a compass",
         ),
         ("version = 1\nkind = \n", "not TOML"),
     ],
