@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from crosscue.fusion.approaches import Approaches
-from crosscue.fusion.belief import begin, multiply, probabilities, source_speaker
+from crosscue.fusion.belief import begin, multiply, probabilities, published_message_model
 from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
@@ -73,9 +73,9 @@ def loop(evidence: list[FrameEvidence], fusion: Fusion) -> int:
 
 def our_belief(evidence: list[FrameEvidence]) -> int:
     graph = graph_of(Fusion())
-    speaker, belief = source_speaker(graph, 0.49), begin(graph)
+    model, belief = published_message_model(graph, 0.49), begin(graph)
     for one in evidence:
-        belief = multiply(belief, speaker(Situation(one.counts, True)))
+        belief = multiply(belief, model(Situation(one.counts, True)))
         probabilities(belief, graph)
     return len(evidence)
 

@@ -30,18 +30,18 @@ from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 
 from .belief import (
     Belief,
-    Speaker,
+    MessageModel,
     begin,
     establish,
     multiply,
     probabilities,
-    source_speaker,
+    published_message_model,
 )
-from .calibrated import CalibratedMessageModel, voices_of
+from .calibrated import CalibratedMessageModel, cue_messages_of
 from .evidence import FrameEvidence, PastCues, RangePosterior, SignRange
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
-from .persistence import Confirmed, Persistence, PersistentSpeaker
+from .persistence import Confirmed, Persistence, PersistentMessageModel
 from .range_track import (
     NOTHING,
     RangeTrack,
@@ -51,7 +51,13 @@ from .range_track import (
     measure,
     predict_without_odometry,
 )
-from .temporal import TemporalFilter, TemporalSpeaker, hear, ranges_to_start, temporal_model
+from .temporal import (
+    TemporalFilter,
+    TemporalMessageModel,
+    ranges_to_start,
+    temporal_model,
+    update_with,
+)
 
 TURN_FADES_M: Final = 25.0
 """Distance over which an accumulated turn decays, so that bends of a road do not add up to one."""
@@ -114,7 +120,7 @@ class _Open:
 
     number: int
     belief: Belief
-    speaker: Speaker
+    model: MessageModel
     start: RangeTrack = NOTHING
     end: RangeTrack = NOTHING
     way_m: float = 0.0
@@ -136,7 +142,7 @@ class Approaches:
         self._graph = graph
         self._fusion = fusion
         self._filter = range_filter
-        self._new_speaker = speakers_of(graph, fusion)
+        self._new_model = message_models_of(graph, fusion)
         self._over_drive = _over_drive(graph, fusion)
         self._first = tuple(cue.name for cue in graph.cues if cue.speaks_first)
         self._persistence = Persistence(graph) if fusion.kind == "persistent" else None
@@ -151,25 +157,25 @@ class Approaches:
         if moved is None:
             return Step(evidence.t_ns, None, {})
         if self._open is not None:
-            self._go_on(self._open, evidence, moved.way_m)
+            self._advance(self._open, evidence, moved.way_m)
         self._rest_m = max(0.0, self._rest_m - moved.way_m)
         self._since_range_m += moved.way_m
-        signs = self._sane(evidence.signs)
+        signs = self._plausible(evidence.signs)
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
-        heard = self._heard(evidence.counts, evidence.is_new_picture)
-        speaks = any(heard.counts.get(cue, 0) > 0 for cue in self._first)
+        confirmed = self._confirmed(evidence.counts, evidence.is_new_picture)
+        speaks = any(confirmed.counts.get(cue, 0) > 0 for cue in self._first)
         if self._open is not None and _is_about_another(self._open, ranged, self._fusion.longest_m):
             self._close("another ahead")
         if self._open is None and (ranged or (speaks and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
-            self._count_silent(heard.silent)
+            self._count_silent(confirmed.silent)
             if self._over_drive is not None:
-                hear(self._over_drive, self._situation(evidence, heard.counts, moved))
-            return Step(evidence.t_ns, None, evidence.counts, not_believed=heard.silent)
+                update_with(self._over_drive, self._situation(evidence, confirmed.counts, moved))
+            return Step(evidence.t_ns, None, evidence.counts, not_believed=confirmed.silent)
         if ranged or speaks:
             self._open.since_evidence_m = 0.0
-        return self._step(self._open, evidence, heard, signs, past, moved)
+        return self._step(self._open, evidence, confirmed, signs, past, moved)
 
     def restart(self) -> None:
         """Restart after a gap in time, because the belief is about another place."""
@@ -187,7 +193,7 @@ class Approaches:
         if self._open is not None:
             self._close("the drive ended")
 
-    def _heard(self, counts: Mapping[str, int], is_new_picture: bool) -> Confirmed:
+    def _confirmed(self, counts: Mapping[str, int], is_new_picture: bool) -> Confirmed:
         """Counts that can be used: all, or the confirmed ones with persistence."""
         if self._persistence is None:
             return Confirmed(counts, {})
@@ -216,53 +222,53 @@ class Approaches:
         # The distance is unknown: its mean is half of the estimate, with that half as s.d.
         return _Moved(way_m, passed_s, 0.5 * way_m, 0.25 * way_m * way_m)
 
-    def _go_on(self, at_hand: _Open, evidence: FrameEvidence, moved_m: float) -> None:
+    def _advance(self, current: _Open, evidence: FrameEvidence, moved_m: float) -> None:
         """Predict the approach over the distance since the last evidence; close it if over."""
-        had = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
-        at_hand.start = self._carried(at_hand.start, evidence, moved_m)
-        at_hand.end = self._carried(at_hand.end, evidence, moved_m)
-        has = (at_hand.start.belief is not None) + (at_hand.end.belief is not None)
+        had = (current.start.belief is not None) + (current.end.belief is not None)
+        current.start = self._predicted(current.start, evidence, moved_m)
+        current.end = self._predicted(current.end, evidence, moved_m)
+        has = (current.start.belief is not None) + (current.end.belief is not None)
         if has < had:
             self.counts["ranges dropped: too uncertain"] += had - has
-        at_hand.way_m += moved_m
-        at_hand.since_evidence_m += max(moved_m - evidence.assumed_m, 0.0)
-        at_hand.since_dissent_m += moved_m
+        current.way_m += moved_m
+        current.since_evidence_m += max(moved_m - evidence.assumed_m, 0.0)
+        current.since_dissent_m += moved_m
         if evidence.turned_rad is not None and math.isfinite(evidence.turned_rad):
-            kept = at_hand.turned_rad * math.exp(-moved_m / TURN_FADES_M)
-            at_hand.turned_rad = kept + evidence.turned_rad
-        why = self._over(at_hand)
+            kept = current.turned_rad * math.exp(-moved_m / TURN_FADES_M)
+            current.turned_rad = kept + evidence.turned_rad
+        why = self._over(current)
         if why is not None:
             self._close(why)
 
-    def _carried(self, track: RangeTrack, evidence: FrameEvidence, moved_m: float) -> RangeTrack:
+    def _predicted(self, track: RangeTrack, evidence: FrameEvidence, moved_m: float) -> RangeTrack:
         if evidence.travelled_m is None or not _has_way(evidence):
             return predict_without_odometry(track, moved_m, self._filter)
         return advance(track, evidence.travelled_m, evidence.travelled_var_m2, self._filter)
 
-    def _over(self, at_hand: _Open) -> str | None:
+    def _over(self, current: _Open) -> str | None:
         """Reason why the approach is over; None if it is not."""
-        fusion, end_m = self._fusion, _end_m(at_hand, self._fusion.length_m)
+        fusion, end_m = self._fusion, _end_m(current, self._fusion.length_m)
         if end_m is not None and end_m < -fusion.closes_behind_m:
             return "passed"
         if end_m is not None and end_m > self._filter.max_m + fusion.length_m:
             return "out of reach"
         is_at_it = end_m is None or end_m <= fusion.length_m
-        if is_at_it and abs(at_hand.turned_rad) >= fusion.turned_rad:
+        if is_at_it and abs(current.turned_rad) >= fusion.turned_rad:
             return "turned"
-        if end_m is None and at_hand.way_m > fusion.longest_m:
+        if end_m is None and current.way_m > fusion.longest_m:
             return "too long"
         limit_m = fusion.stale_unranged_m if end_m is None else fusion.stale_after_m
-        return "stale" if at_hand.since_evidence_m > limit_m else None
+        return "stale" if current.since_evidence_m > limit_m else None
 
     def _begin(self) -> None:
         self.counts["approaches opened"] += 1
         number = self.counts["approaches opened"]
-        speaker = (
-            self._new_speaker()
+        model = (
+            self._new_model()
             if self._over_drive is None
-            else TemporalSpeaker(self._graph, self._over_drive)
+            else TemporalMessageModel(self._graph, self._over_drive)
         )
-        self._open = _Open(number, begin(self._graph), speaker)
+        self._open = _Open(number, begin(self._graph), model)
 
     def _close(self, why: str) -> None:
         is_real = self._open is not None and self._open.belief.is_established
@@ -270,7 +276,7 @@ class Approaches:
         self._rest_m = self._fusion.rest_m if why in ("passed", "turned") else 0.0
         self._open = None
 
-    def _sane(self, signs: Sequence[SignRange]) -> dict[Reference, tuple[float, float]]:
+    def _plausible(self, signs: Sequence[SignRange]) -> dict[Reference, tuple[float, float]]:
         """Mean range and variance of each reference's signs; implausible ranges are rejected.
 
         The variance of the mean is that of one sign, because all share the curve's error.
@@ -293,50 +299,52 @@ class Approaches:
 
     def _step(
         self,
-        at_hand: _Open,
+        current: _Open,
         evidence: FrameEvidence,
-        heard: Confirmed,
+        confirmed: Confirmed,
         signs: Mapping[Reference, tuple[float, float]],
         past: PastCues,
         moved: _Moved,
     ) -> Step:
-        ranges = self._measured(at_hand, signs, evidence.posteriors, moved.way_m)
-        best, reference = _best(at_hand, Reference(self._fusion.reference))
+        ranges = self._measured(current, signs, evidence.posteriors, moved.way_m)
+        best, reference = _best(current, Reference(self._fusion.reference))
         more = past(best, reference)
         counts = {**evidence.counts, **more} if more else evidence.counts
         if more:
-            also = self._heard(more, evidence.is_new_picture)
-            heard = Confirmed({**heard.counts, **also.counts}, {**heard.silent, **also.silent})
+            also = self._confirmed(more, evidence.is_new_picture)
+            confirmed = Confirmed(
+                {**confirmed.counts, **also.counts}, {**confirmed.silent, **also.silent}
+            )
         is_near = best is not None and best.mean_m <= self._fusion.dissent_within_m
-        may_dissent = is_near and at_hand.since_dissent_m >= self._fusion.dissent_every_m
+        may_dissent = is_near and current.since_dissent_m >= self._fusion.dissent_every_m
         if may_dissent:
-            at_hand.since_dissent_m = 0.0
+            current.since_dissent_m = 0.0
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
         taken = {row.reference for row in ranges if row.measured_m is not None}
         ranged = {reference: one for reference, one in ranged.items() if reference in taken}
-        messages = at_hand.speaker(
+        messages = current.model(
             replace(
-                self._situation(evidence, heard.counts, moved, self._to_start(ranged)),
-                is_established=at_hand.belief.is_established,
+                self._situation(evidence, confirmed.counts, moved, self._to_start(ranged)),
+                is_established=current.belief.is_established,
                 is_near=is_near,
                 may_dissent=may_dissent,
                 range_m=None if best is None else best.mean_m,
             )
         )
-        silent = heard.silent
-        if isinstance(at_hand.speaker, PersistentSpeaker):
-            silent = {**silent, **at_hand.speaker.silent}
+        silent = confirmed.silent
+        if isinstance(current.model, PersistentMessageModel):
+            silent = {**silent, **current.model.silent}
         self._count_silent(silent)
-        was_established = at_hand.belief.is_established
-        belief = multiply(at_hand.belief, messages)
+        was_established = current.belief.is_established
+        belief = multiply(current.belief, messages)
         withdrawn = None if self._over_drive is None else self._fusion.withdrawn
         belief = establish(belief, self._graph, self._fusion.established, withdrawn)
-        at_hand.belief = belief
+        current.belief = belief
         if belief.is_established and not was_established:
             self.counts["approaches established"] += 1
         now = probabilities(belief, self._graph)
         return Step(
-            evidence.t_ns, at_hand.number, counts, ranges, now, belief.is_established, silent
+            evidence.t_ns, current.number, counts, ranges, now, belief.is_established, silent
         )
 
     def _situation(
@@ -370,7 +378,7 @@ class Approaches:
 
     def _measured(
         self,
-        at_hand: _Open,
+        current: _Open,
         signs: Mapping[Reference, tuple[float, float]],
         posteriors: Sequence[RangePosterior],
         way_m: float,
@@ -378,17 +386,17 @@ class Approaches:
         """Update with the signs and follow the posteriors; return the rows to write."""
         start_m = end_m = None
         if Reference.START in signs:
-            at_hand.start, start_m = self._weigh(at_hand.start, *signs[Reference.START])
+            current.start, start_m = self._weigh(current.start, *signs[Reference.START])
         if Reference.END in signs:
-            at_hand.end, end_m = self._weigh(at_hand.end, *signs[Reference.END])
+            current.end, end_m = self._weigh(current.end, *signs[Reference.END])
         for one in posteriors:
             if one.reference is Reference.START:
-                at_hand.start, start_m = self._follow(at_hand.start, one, way_m), one.measured_m
+                current.start, start_m = self._follow(current.start, one, way_m), one.measured_m
             else:
-                at_hand.end, end_m = self._follow(at_hand.end, one, way_m), one.measured_m
+                current.end, end_m = self._follow(current.end, one, way_m), one.measured_m
         rows = (
-            (Reference.START, at_hand.start.belief, start_m),
-            (Reference.END, at_hand.end.belief, end_m),
+            (Reference.START, current.start.belief, start_m),
+            (Reference.END, current.end.belief, end_m),
         )
         return tuple(
             RangeRow(reference, belief.mean_m, belief.var_m2, measured_m)
@@ -423,28 +431,28 @@ def _has_way(evidence: FrameEvidence) -> bool:
     return way_m is not None and math.isfinite(way_m) and 0.0 <= var_m2 < math.inf
 
 
-def _end_m(at_hand: _Open, length_m: float) -> float | None:
+def _end_m(current: _Open, length_m: float) -> float | None:
     """Distance to the intersection's end; None where unknown."""
-    if at_hand.end.belief is not None:
-        return at_hand.end.belief.mean_m
-    start = at_hand.start.belief
+    if current.end.belief is not None:
+        return current.end.belief.mean_m
+    start = current.start.belief
     return None if start is None else start.mean_m + length_m
 
 
 def _is_about_another(
-    at_hand: _Open, signs: Mapping[Reference, tuple[float, float]], longest_m: float
+    current: _Open, signs: Mapping[Reference, tuple[float, float]], longest_m: float
 ) -> bool:
     """Whether the first range shows that the approach opened too far away."""
-    is_ranged = at_hand.start.belief is not None or at_hand.end.belief is not None
-    if is_ranged or not signs or at_hand.way_m == 0.0:
+    is_ranged = current.start.belief is not None or current.end.belief is not None
+    if is_ranged or not signs or current.way_m == 0.0:
         return False
     nearest_m = min(range_m for range_m, _ in signs.values())
-    return at_hand.way_m + nearest_m > longest_m
+    return current.way_m + nearest_m > longest_m
 
 
-def _best(at_hand: _Open, wanted: Reference) -> tuple[RangeBelief | None, Reference | None]:
+def _best(current: _Open, wanted: Reference) -> tuple[RangeBelief | None, Reference | None]:
     """Range to the preferred reference, otherwise to the other one, unchanged."""
-    known = {Reference.START: at_hand.start.belief, Reference.END: at_hand.end.belief}
+    known = {Reference.START: current.start.belief, Reference.END: current.end.belief}
     other = Reference.END if wanted is Reference.START else Reference.START
     for reference in (wanted, other):
         if known[reference] is not None:
@@ -465,18 +473,18 @@ def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
     return TemporalFilter(temporal_model(graph, fusion.temporal))
 
 
-def speakers_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Speaker]:
+def message_models_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], MessageModel]:
     """Return a factory of the message model of each approach.
 
     Raises:
         ValueError: ``calibrated`` has no fitted parameters; a vehicle file cannot have this state.
     """
     if fusion.kind == "persistent":
-        return lambda: PersistentSpeaker(graph, fusion.dissent)
+        return lambda: PersistentMessageModel(graph, fusion.dissent)
     if fusion.kind in ("source", "temporal", None):
-        speaker = source_speaker(graph, fusion.dissent)
-        return lambda: speaker
+        model = published_message_model(graph, fusion.dissent)
+        return lambda: model
     if fusion.calibrated is None:
         raise ValueError("fusion.calibrated: expected what crosscue fit messages wrote, got None")
-    voices, size = voices_of(graph, fusion.calibrated), len(graph.features)
-    return lambda: CalibratedMessageModel(size, voices)
+    cues, size = cue_messages_of(graph, fusion.calibrated), len(graph.features)
+    return lambda: CalibratedMessageModel(size, cues)

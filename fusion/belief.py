@@ -64,7 +64,7 @@ def probabilities(belief: Belief, graph: FactorGraph) -> dict[str, float]:
     }
 
 
-Speaker = Callable[[Situation], Sequence[float]]
+MessageModel = Callable[[Situation], Sequence[float]]
 """Message model: maps a frame's situation to the sum of messages into each feature, in log odds.
 
 It can depend on earlier messages of the same approach; each approach has a new instance.
@@ -82,7 +82,7 @@ class _Line(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class SourceSpeaker:
+class PublishedMessageModel:
     """The published messages: precision along direct edges, its complement along exclusive ones.
 
     Until earlier frames have established presence, only cues with ``speaks_first`` send messages.
@@ -109,7 +109,7 @@ class SourceSpeaker:
         return out
 
 
-def source_speaker(graph: FactorGraph, dissent: float) -> SourceSpeaker:
+def published_message_model(graph: FactorGraph, dissent: float) -> PublishedMessageModel:
     """Precompute the graph's messages; ``dissent`` is the message of an absent cue when near."""
     place = {name: i for i, name in enumerate(graph.feature_names)}
     against = log_odds(dissent)
@@ -120,4 +120,4 @@ def source_speaker(graph: FactorGraph, dissent: float) -> SourceSpeaker:
         detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
         absent = tuple((place[e.feature], against) for e in edges if cue.dissents and e.is_direct)
         lines.append(_Line(cue.name, cue.speaks_first, cue.counted, detected, absent))
-    return SourceSpeaker(len(place), tuple(lines))
+    return PublishedMessageModel(len(place), tuple(lines))

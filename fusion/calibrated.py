@@ -43,7 +43,7 @@ class Learned(NamedTuple):
     if_not: float
     scale: float
 
-    def says(
+    def message(
         self, is_positive: bool, was_positive: bool | None, rho: float, fraction: float
     ) -> float:
         """Message of one observation, in log odds.
@@ -67,11 +67,11 @@ class Published(NamedTuple):
     """One edge without fitted rates: the published message of a detection, times the exponent."""
 
     feature: int
-    says: float
+    log_odds: float
 
 
 @dataclass(frozen=True, slots=True)
-class Voice:
+class CueMessages:
     """One cue with its edges, precomputed.
 
     Attributes:
@@ -94,10 +94,10 @@ class Voice:
 
 
 @dataclass(slots=True)
-class _Heard:
+class _History:
     """History of one cue in this approach; positions are in units of the cue's fade."""
 
-    looked_at: float = -math.inf
+    observed_at: float = -math.inf
     was_positive: bool | None = None
     changed_at: dict[bool, float] = field(default_factory=dict)
     sent_at: float = -math.inf
@@ -108,9 +108,9 @@ class _Heard:
 class CalibratedMessageModel:
     """Message model of one approach, with fitted rates."""
 
-    def __init__(self, size: int, voices: Iterable[Voice]) -> None:
+    def __init__(self, size: int, cues: Iterable[CueMessages]) -> None:
         self._size = size
-        self._voices = [(voice, _Heard()) for voice in voices]
+        self._cues = [(messages, _History()) for messages in cues]
         self._way_m = 0.0
         self._time_s = 0.0
 
@@ -121,55 +121,60 @@ class CalibratedMessageModel:
         self._time_s += situation.passed_s
         if not situation.is_new_picture:
             return out
-        for voice, heard in self._voices:
-            count = situation.counts.get(voice.cue)
-            if count is None or not (voice.speaks_first or situation.is_established):
+        for messages, history in self._cues:
+            count = situation.counts.get(messages.cue)
+            if count is None or not (messages.speaks_first or situation.is_established):
                 continue
-            self._speak(voice, heard, count, situation, out)
+            self._add_messages(messages, history, count, situation, out)
         return out
 
-    def _speak(
-        self, voice: Voice, heard: _Heard, count: int, situation: Situation, out: list[float]
+    def _add_messages(
+        self,
+        messages: CueMessages,
+        history: _History,
+        count: int,
+        situation: Situation,
+        out: list[float],
     ) -> None:
-        fade = voice.fade
+        fade = messages.fade
         at = self._time_s / fade.time_s if fade.time_s else self._way_m / (fade.way_m or math.inf)
         is_positive = count > 0
-        is_fresh = is_positive and _is_fresh(heard, count, situation.objects.get(voice.cue))
-        before = False if is_fresh and heard.was_positive else heard.was_positive
-        rho = math.exp(heard.looked_at - at)
+        is_fresh = is_positive and _is_fresh(history, count, situation.objects.get(messages.cue))
+        before = False if is_fresh and history.was_positive else history.was_positive
+        rho = math.exp(history.observed_at - at)
         fraction = 1.0
         if before is not is_positive:
-            last_at = heard.changed_at.get(is_positive, -math.inf)
+            last_at = history.changed_at.get(is_positive, -math.inf)
             fraction = 1.0 if is_fresh else effective_sample_fraction(at - last_at)
-            heard.changed_at[is_positive] = at
-        for edge in voice.near if situation.is_near else voice.far:
-            out[edge.feature] += edge.says(is_positive, before, rho, fraction)
+            history.changed_at[is_positive] = at
+        for edge in messages.near if situation.is_near else messages.far:
+            out[edge.feature] += edge.message(is_positive, before, rho, fraction)
         if is_positive:
-            again = 1.0 if is_fresh else effective_sample_fraction(at - heard.sent_at)
-            for other in voice.published_near if situation.is_near else voice.published_far:
-                out[other.feature] += again * other.says
-            heard.sent_at = at
-        heard.looked_at = at
-        heard.was_positive = is_positive
+            again = 1.0 if is_fresh else effective_sample_fraction(at - history.sent_at)
+            for other in messages.published_near if situation.is_near else messages.published_far:
+                out[other.feature] += again * other.log_odds
+            history.sent_at = at
+        history.observed_at = at
+        history.was_positive = is_positive
 
 
-def _is_fresh(heard: _Heard, count: int, objects: tuple[int, ...] | None) -> bool:
+def _is_fresh(history: _History, count: int, objects: tuple[int, ...] | None) -> bool:
     """Whether an object is new in this approach; the current objects are remembered."""
     if objects is None:
-        is_fresh = count > heard.max_count
-        heard.max_count = max(heard.max_count, count)
+        is_fresh = count > history.max_count
+        history.max_count = max(history.max_count, count)
         return is_fresh
-    is_fresh = not heard.known.issuperset(objects)
-    heard.known.update(objects)
+    is_fresh = not history.known.issuperset(objects)
+    history.known.update(objects)
     return is_fresh
 
 
-def voices_of(graph: FactorGraph, learned: Calibrated) -> tuple[Voice, ...]:
+def cue_messages_of(graph: FactorGraph, learned: Calibrated) -> tuple[CueMessages, ...]:
     """Combine the graph with fitted parameters."""
     rates = {(one.cue, one.feature, one.near): one for one in learned.rates}
     scales = {name: learned.exponents.get(name, 1.0) for name in graph.feature_names}
     return tuple(
-        Voice(
+        CueMessages(
             cue.name,
             cue.speaks_first,
             learned.fades.get(cue.name, USUAL_FADE),
@@ -198,11 +203,11 @@ def _learned(
 def _published(
     graph: FactorGraph, cue: CueNode, near: bool, rates: _Table, scales: Mapping[str, float]
 ) -> tuple[Published, ...]:
-    says = log_odds(cue.precision)
+    message = log_odds(cue.precision)
     return tuple(
         Published(
             graph.feature_names.index(edge.feature),
-            scales[edge.feature] * (says if edge.is_direct else -says),
+            scales[edge.feature] * (message if edge.is_direct else -message),
         )
         for edge in graph.edges
         if edge.cue == cue.name and (cue.name, edge.feature, near) not in rates

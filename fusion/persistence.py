@@ -88,7 +88,7 @@ class _Line:
     sent: _Sent = field(default_factory=_Sent)
 
 
-class PersistentSpeaker:
+class PersistentMessageModel:
     """Message model of one approach, with persistence.
 
     Attributes:
@@ -119,10 +119,12 @@ class PersistentSpeaker:
                 if count > 0:
                     self.silent[line.cue.name] = why
                 continue
-            self._speak(line, count > 0, situation.may_dissent, out)
+            self._add_messages(line, count > 0, situation.may_dissent, out)
         return out
 
-    def _speak(self, line: _Line, is_positive: bool, may_dissent: bool, out: list[float]) -> None:
+    def _add_messages(
+        self, line: _Line, is_positive: bool, may_dissent: bool, out: list[float]
+    ) -> None:
         fade = line.cue.fade
         at = self._time_s / fade.time_s if fade.time_s else self._way_m / (fade.way_m or math.inf)
         if is_positive:

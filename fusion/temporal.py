@@ -221,7 +221,7 @@ class TemporalFilter:
         mass = self.ahead.sum(axis=1)
         return float(mass @ self.centers_m() / max(float(mass.sum()), FLOOR))
 
-    def hear(
+    def update(
         self,
         counts: Mapping[str, int],
         ranges: Sequence[MeasuredRange] = (),
@@ -344,7 +344,7 @@ def _blurred(mass: NDArray[np.float64], side: float) -> NDArray[np.float64]:
     return np.asarray(blurred)
 
 
-class TemporalSpeaker:
+class TemporalMessageModel:
     """Message model of one approach: the filter's changes of the log odds."""
 
     def __init__(self, graph: FactorGraph, over_drive: TemporalFilter) -> None:
@@ -354,16 +354,16 @@ class TemporalSpeaker:
 
     def __call__(self, situation: Situation) -> list[float]:
         """Process a frame; return the change of the log odds."""
-        hear(self._filter, situation)
+        update_with(self._filter, situation)
         odds = [log_odds(p) for p in self._filter.probabilities().tolist()]
         out = [now - before for now, before in zip(odds, self._odds, strict=True)]
         self._odds = odds
         return out
 
 
-def hear(over_drive: TemporalFilter, situation: Situation) -> None:
+def update_with(over_drive: TemporalFilter, situation: Situation) -> None:
     """Process a frame's situation with the filter."""
-    over_drive.hear(
+    over_drive.update(
         situation.counts,
         [MeasuredRange(range_m, var_m2) for range_m, var_m2 in situation.ranges],
         situation.advanced_m,

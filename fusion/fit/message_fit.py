@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.fusion.calibrated import CalibratedMessageModel, voices_of
+from crosscue.fusion.calibrated import CalibratedMessageModel, cue_messages_of
 from crosscue.fusion.factor_graph import CueNode, FactorGraph, log_odds
 from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
 from crosscue.fusion.fit.fade_fit import FadeFit, fit_fade
@@ -179,8 +179,8 @@ def log_odds_of(
     approach: AnnotatedApproach, graph: FactorGraph, learned: Calibrated
 ) -> NDArray[np.float64]:
     """Sum of messages after each frame, without the prior, shape (N, features)."""
-    speaker = CalibratedMessageModel(len(graph.features), voices_of(graph, learned))
-    messages = [speaker(situation) for situation in _situations(approach)]
+    model = CalibratedMessageModel(len(graph.features), cue_messages_of(graph, learned))
+    messages = [model(situation) for situation in _situations(approach)]
     return np.cumsum(np.array(messages).reshape(-1, len(graph.features)), axis=0)
 
 

@@ -162,7 +162,7 @@ def filtered(drive: AnnotatedDrive, model: TemporalModel) -> NDArray[np.float64]
     belief = TemporalFilter(model)
     out = []
     for i, counts in enumerate(_frames(drive)):
-        belief.hear(
+        belief.update(
             counts,
             drive.ranges[i],
             float(drive.advanced_m[i]),

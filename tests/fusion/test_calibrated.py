@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches
-from crosscue.fusion.belief import source_speaker
-from crosscue.fusion.calibrated import CalibratedMessageModel, voices_of
+from crosscue.fusion.belief import published_message_model
+from crosscue.fusion.calibrated import CalibratedMessageModel, cue_messages_of
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.fit.message_fit import fit_messages, log_odds_of
 from crosscue.fusion.independence import effective_sample_fraction
@@ -36,8 +36,8 @@ LEARNED = Calibrated(
 
 def said(*looks: Situation, learned: Calibrated = LEARNED) -> list[float]:
     """Change of the log odds of left by each observation."""
-    speaker = CalibratedMessageModel(len(GRAPH.features), voices_of(GRAPH, learned))
-    return [speaker(look)[LEFT] for look in looks]
+    model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, learned))
+    return [model(look)[LEFT] for look in looks]
 
 
 def road(count: int, moved_m: float = 1.0) -> Situation:
@@ -114,11 +114,11 @@ def test_what_moves_by_itself_is_heard_again_after_a_time_though_the_car_stands(
 
 
 def test_an_edge_of_which_nothing_was_learned_sends_the_published_message_discounted() -> None:
-    speaker = CalibratedMessageModel(len(GRAPH.features), voices_of(GRAPH, LEARNED))
+    model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, LEARNED))
     sign = situation({"stop_sign": 1}, moved_m=2.0)
     published = math.log(0.97 / 0.03)
 
-    first, second = (speaker(sign)[0] for _ in range(2))
+    first, second = (model(sign)[0] for _ in range(2))
 
     assert first == pytest.approx(published)
     assert second == pytest.approx(published * effective_sample_fraction(2.0 / 10.0))
@@ -216,11 +216,11 @@ def test_on_simulated_approaches_not_learned_from_it_scores_better_than_the_sour
         is_left = one.features["left"]
         odds = log_odds_of(one, GRAPH, learned)[:, LEFT]
         ours += float(np.logaddexp(0.0, -odds if is_left else odds).mean())
-        speaker = source_speaker(GRAPH, 0.49)
+        model = published_message_model(GRAPH, 0.49)
         frames = range(len(one.way_m))
         looks = ({cue: int(n[i]) for cue, n in one.counts.items()} for i in frames)
         messages = [
-            speaker(situation(look, near=bool(one.is_near[i]))) for i, look in enumerate(looks)
+            model(situation(look, near=bool(one.is_near[i]))) for i, look in enumerate(looks)
         ]
         source = np.cumsum(np.array(messages), axis=0)[:, LEFT]
         theirs += float(np.logaddexp(0.0, -source if is_left else source).mean())

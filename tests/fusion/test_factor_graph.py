@@ -11,7 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.fusion.belief import Belief, begin, establish, multiply, probabilities, source_speaker
+from crosscue.fusion.belief import (
+    Belief,
+    begin,
+    establish,
+    multiply,
+    probabilities,
+    published_message_model,
+)
 from crosscue.fusion.factor_graph import (
     CueNode,
     Edge,
@@ -34,10 +41,10 @@ def heard(
     graph: FactorGraph, frames: Iterable[Mapping[str, int]], *, near: bool = False
 ) -> dict[str, float]:
     """Probabilities of an established approach after the frames."""
-    speaker = source_speaker(graph, DISSENT)
+    model = published_message_model(graph, DISSENT)
     belief = begin(graph)
     for counts in frames:
-        belief = multiply(belief, speaker(situation(counts, near=near)))
+        belief = multiply(belief, model(situation(counts, near=near)))
     return probabilities(belief, graph)
 
 
@@ -218,9 +225,9 @@ def test_near_by_absent_direct_cues_of_directions_dissent_and_signs_do_not() -> 
 
 
 def test_before_presence_is_established_only_four_cues_speak() -> None:
-    speaker = source_speaker(USUAL, DISSENT)
+    model = published_message_model(USUAL, DISSENT)
 
-    speaking = {cue for cue in CUES if any(speaker(situation({cue: 1}, established=False)))}
+    speaking = {cue for cue in CUES if any(model(situation({cue: 1}, established=False)))}
 
     assert speaking == {"traffic_light", "stop_sign", "road_left", "road_right"}
 

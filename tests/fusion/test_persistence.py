@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.fusion.approaches import Approaches, Step, speakers_of
+from crosscue.fusion.approaches import Approaches, Step, message_models_of
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.factor_graph import graph_of, log_odds
 from crosscue.fusion.intersection_range import Reference
-from crosscue.fusion.persistence import Persistence, PersistentSpeaker
+from crosscue.fusion.persistence import Persistence, PersistentMessageModel
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
 from support.fusion import NONE_SEEN, SECOND_NS, situation
@@ -79,7 +79,7 @@ def test_nothing_is_said_before_enough_of_the_last_frames_agree(positive: list[i
 def test_copies_of_a_frame_are_no_more_evidence_than_the_frame(
     copies: int, seconds: float, cue: str
 ) -> None:
-    once, again = (PersistentSpeaker(GRAPH, FUSION.dissent) for _ in range(2))
+    once, again = (PersistentMessageModel(GRAPH, FUSION.dissent) for _ in range(2))
     first = situation({cue: 3}, passed_s=seconds)
     copy = situation({cue: 3}, new_picture=False, passed_s=seconds)
 
@@ -104,13 +104,12 @@ def test_copies_of_a_frame_do_not_confirm_it(copies: int) -> None:
 
 @given(frames=st.integers(2, 400), way_m=st.floats(0.0, 80.0))
 def test_more_frames_over_the_same_way_are_hardly_more_evidence(frames: int, way_m: float) -> None:
-    speaker = PersistentSpeaker(GRAPH, FUSION.dissent)
+    model = PersistentMessageModel(GRAPH, FUSION.dissent)
     place = GRAPH.feature_names.index("intersection")
     message = log_odds(FUSION.cues["traffic_light"].precision)
 
     total = sum(
-        speaker(situation({"traffic_light": 1}, moved_m=way_m / frames))[place]
-        for _ in range(frames)
+        model(situation({"traffic_light": 1}, moved_m=way_m / frames))[place] for _ in range(frames)
     )
 
     # Continuous observation counts as half as many independent ones as there are fading lengths.
@@ -119,7 +118,7 @@ def test_more_frames_over_the_same_way_are_hardly_more_evidence(frames: int, way
 
 @given(many=st.integers(1, 20), cue=st.sampled_from(CUES))
 def test_many_things_in_a_frame_say_no_more_than_one(many: int, cue: str) -> None:
-    one, all_of_them = (PersistentSpeaker(GRAPH, FUSION.dissent) for _ in range(2))
+    one, all_of_them = (PersistentMessageModel(GRAPH, FUSION.dissent) for _ in range(2))
 
     assert one(situation({cue: 1})) == all_of_them(situation({cue: many}))
 
@@ -128,13 +127,13 @@ def test_many_things_in_a_frame_say_no_more_than_one(many: int, cue: str) -> Non
 def test_a_cue_says_nothing_of_an_intersection_beyond_where_it_was_validated(
     over_m: float, cue: str
 ) -> None:
-    speaker = PersistentSpeaker(GRAPH, FUSION.dissent)
+    model = PersistentMessageModel(GRAPH, FUSION.dissent)
     limit_m = FUSION.cues[cue].within_m
 
     far = replace(situation({cue: 1}), range_m=limit_m + over_m)
-    assert speaker(far) == [0.0] * len(GRAPH.features)
-    assert speaker.silent == {cue: f"intersection further than {limit_m:g} m"}
-    assert any(speaker(replace(far, range_m=limit_m)))
+    assert model(far) == [0.0] * len(GRAPH.features)
+    assert model.silent == {cue: f"intersection further than {limit_m:g} m"}
+    assert any(model(replace(far, range_m=limit_m)))
 
 
 def test_an_unbroken_cue_far_away_says_why_it_is_not_believed() -> None:
@@ -165,10 +164,10 @@ def test_the_default_is_the_source_only_for_simulated_cars(
 
 
 def test_source_multiplies_every_frame_in_as_published() -> None:
-    speaker = speakers_of(GRAPH, Fusion(kind="source"))()
+    model = message_models_of(GRAPH, Fusion(kind="source"))()
     place = GRAPH.feature_names.index("left")
     counts = {"cross_traffic_left": 2}
 
-    total = sum(speaker(situation(counts, new_picture=False, moved_m=0.0))[place] for _ in range(7))
+    total = sum(model(situation(counts, new_picture=False, moved_m=0.0))[place] for _ in range(7))
 
     assert total == pytest.approx(7 * 2 * log_odds(0.86))

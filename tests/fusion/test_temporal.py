@@ -155,7 +155,7 @@ def test_the_filter_equals_a_sum_over_all_paths(exponent: float) -> None:
     belief = TemporalFilter(temporal_model(GRAPH, about))
 
     for counts, moved_m, ranges in frames:
-        belief.hear(counts, ranges, moved_m, 0.0, 0.1)
+        belief.update(counts, ranges, moved_m, 0.0, 0.1)
 
     np.testing.assert_allclose(belief.probabilities(), enumerated(about, frames), rtol=1e-10)
 
@@ -179,7 +179,7 @@ def test_no_way_is_believed_more_than_the_intersection_and_mass_is_kept(
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
 
     for counts, moved_m, var_m2, ranges in steps:
-        belief.hear(counts, [MeasuredRange(*one) for one in ranges], moved_m, var_m2, 0.1)
+        belief.update(counts, [MeasuredRange(*one) for one in ranges], moved_m, var_m2, 0.1)
         intersection, left = belief.probabilities()
         assert left <= intersection
         assert belief.nowhere.sum() + belief.ahead.sum() == pytest.approx(1.0)
@@ -192,7 +192,7 @@ def test_ranges_that_agree_say_where_and_not_whether() -> None:
     before = belief.probabilities()[0]
 
     for _ in range(3):
-        belief.hear({}, [MeasuredRange(5.0, 1.0)])
+        belief.update({}, [MeasuredRange(5.0, 1.0)])
 
     assert belief.probabilities()[0] == pytest.approx(before)
     assert belief.distance_m() == pytest.approx(5.0, abs=0.5)
@@ -204,7 +204,7 @@ def test_a_lapse_keeps_a_belief_from_certainty_and_the_law() -> None:
     )
     for belief in (sure, careful):
         for _ in range(3):
-            belief.hear({"sign": 1, "road": 1}, moved_m=2.0)
+            belief.update({"sign": 1, "road": 1}, moved_m=2.0)
 
     usual = careful.model.usual
     np.testing.assert_allclose(
@@ -215,23 +215,23 @@ def test_a_lapse_keeps_a_belief_from_certainty_and_the_law() -> None:
 
 def test_a_car_that_stands_before_the_same_pictures_learns_little_more() -> None:
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
-    belief.hear({"sign": 1}, moved_m=2.0, passed_s=0.1)
+    belief.update({"sign": 1}, moved_m=2.0, passed_s=0.1)
     before = belief.probabilities()[0]
 
     for _ in range(100):
-        belief.hear({"sign": 1}, passed_s=0.1, is_new_picture=False)
+        belief.update({"sign": 1}, passed_s=0.1, is_new_picture=False)
 
     assert belief.probabilities()[0] == pytest.approx(before)
 
 
 def test_a_cue_that_stays_says_less_than_one_that_appears() -> None:
     once, again = (TemporalFilter(temporal_model(GRAPH, learned())) for _ in range(2))
-    once.hear({"sign": 0}, moved_m=0.0)
-    again.hear({"sign": 1}, moved_m=0.0)
+    once.update({"sign": 0}, moved_m=0.0)
+    again.update({"sign": 1}, moved_m=0.0)
     odds = [math.log(p / (1 - p)) for p in (once.probabilities()[0], again.probabilities()[0])]
 
     for belief in (once, again):
-        belief.hear({"sign": 1}, moved_m=1.6)
+        belief.update({"sign": 1}, moved_m=1.6)
     after = [math.log(p / (1 - p)) for p in (once.probabilities()[0], again.probabilities()[0])]
 
     assert after[0] - odds[0] > after[1] - odds[1]
@@ -243,9 +243,9 @@ def test_frames_between_two_steps_change_nothing() -> None:
     counts = {"sign": 1, "road": 0}
 
     for belief, frames in ((coarse, 1), (fine, 4)):
-        belief.hear(counts)
+        belief.update(counts)
         for _ in range(3 * frames):
-            belief.hear(counts, moved_m=2.0 / frames, passed_s=0.2 / frames)
+            belief.update(counts, moved_m=2.0 / frames, passed_s=0.2 / frames)
 
     np.testing.assert_allclose(fine.probabilities(), coarse.probabilities(), rtol=1e-12)
 
@@ -362,7 +362,7 @@ def test_a_vehicle_file_that_cannot_be_is_refused(
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"edges_m": (0.0, 8.0, 4.0)}, "rising"),
+        ({"edges_m": (0.0, 8.0, 4.0)}, "ascending"),
         ({"edges_m": (0.0, 4.0)}, "expected 1 entries, got 2"),
         ({"ways": {}}, "at least one"),
     ],
