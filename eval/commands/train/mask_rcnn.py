@@ -27,6 +27,39 @@ from crosscue.eval.commands.shared.terminal import print_result, progress_line
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options to the parser."""
+    _add_file_arguments(parser)
+    _add_network_arguments(parser)
+    _add_schedule_arguments(parser)
+    _add_sampling_arguments(parser)
+    parser.add_argument(
+        "--check-every",
+        type=int,
+        default=500,
+        metavar="N",
+        help="steps between validations (default: 500)",
+    )
+    parser.add_argument(
+        "--check-images",
+        type=int,
+        default=60,
+        metavar="N",
+        help="images per validation during training (default: 60)",
+    )
+    parser.add_argument(
+        "--device",
+        default="auto",
+        choices=("auto", "cpu", "cuda", "mps"),
+        help="device to train on (default: auto)",
+    )
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="CPU threads (default: 1)"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted training")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing results")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def _add_file_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", type=Path, required=True, metavar="COCO", help="annotations to train on"
     )
@@ -43,6 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, metavar="OUT.safetensors", help="checkpoint to write"
     )
+
+
+def _add_network_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--measure",
         metavar="NETWORK",
@@ -71,6 +107,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("torch", "openvino"),
         help="inference engine to measure with (default: torch)",
     )
+
+
+def _add_schedule_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--classes",
         nargs="+",
@@ -92,6 +131,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="max learning rate (default: 0.001)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="random seed (default: 0)")
+
+
+def _add_sampling_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--width",
         type=int,
@@ -128,32 +170,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FRACTION",
         help="0 samples every object equally often, 1 every class (default: 1)",
     )
-    parser.add_argument(
-        "--check-every",
-        type=int,
-        default=500,
-        metavar="N",
-        help="steps between validations (default: 500)",
-    )
-    parser.add_argument(
-        "--check-images",
-        type=int,
-        default=60,
-        metavar="N",
-        help="images per validation during training (default: 60)",
-    )
-    parser.add_argument(
-        "--device",
-        default="auto",
-        choices=("auto", "cpu", "cuda", "mps"),
-        help="device to train on (default: auto)",
-    )
-    parser.add_argument(
-        "--threads", type=int, default=1, metavar="N", help="CPU threads (default: 1)"
-    )
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted training")
-    parser.add_argument("--overwrite", action="store_true", help="replace existing results")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
