@@ -218,37 +218,34 @@ def fit_detector(
         labelled_run(folder, one, detector, meanings)
         for folder, one in zip(folders, read, strict=True)
     ]
-    parts, others = whole[: len(given)], whole[len(given) :]
-    row = _one_detector([*parts, *others])
+    row = _one_detector(whole)
     source = _card_of(row, card, is_needed=output is not None)
     if output is not None and source is not None:
         check_place(read_card(source), source, Path(output), overwrite=overwrite)
-    first = [_ends_at(part, 0.0 if others else hold_out) for part in parts]
-    rest = [~one for one in first] if not others else [_everything(one) for one in others]
+    fitted, held = _split(whole[: len(given)], whole[len(given) :], hold_out)
     fits = tuple(
         fit_class(
             name,
-            parts[0].members[name],
-            _judged(parts, first, name, overlap),
-            _judged(others or parts, rest, name, overlap),
+            whole[0].members[name],
+            fitted.judged(name, overlap),
+            held.judged(name, overlap),
             precision,
             CONFIDENCE,
             calibration,
         )
-        for name in _common(parts, others)
+        for name in _common(whole)
     )
-    left_out = sum((Counter(part.left_out) for part in whole), Counter[str]())
-    fitted_to, held = (sum(int(one.sum()) for one in which) for which in (first, rest))
     written = None
     if output is not None and source is not None and any(one.scores for one in fits):
         written = Path(output)
-        counts = f"{fitted_to} images fitted to, {held} held out"
-        pictures = f"{counts}, of {_log_names(whole)}{_date_of(parts)}"
+        counts = f"{len(fitted)} images fitted to, {len(held)} held out"
+        pictures = f"{counts}, of {_log_names(whole)}{_date_of(fitted.runs)}"
         aim = f"precision {precision:g} with {CONFIDENCE:.0%} confidence"
         text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, date, aim)
         write_text(written, text)
+    left_out = sum((Counter(part.left_out) for part in whole), Counter[str]())
     is_whole = all(part.is_whole for part in whole)
-    return FittedDetector(row, fits, precision, fitted_to, held, left_out, written, is_whole)
+    return FittedDetector(row, fits, precision, len(fitted), len(held), left_out, written, is_whole)
 
 
 def _check(precision: float, calibration: str, hold_out: float, overlap: float) -> None:
@@ -291,36 +288,52 @@ def _card_of(row: DetectorRow, card: Path | str | None, *, is_needed: bool) -> P
     return None
 
 
-def _common(parts: Sequence[LabelledRun], others: Sequence[LabelledRun]) -> list[str]:
-    found = {name for part in parts for name in part.classes}
-    return sorted(found.intersection(*(part.classes for part in (*parts, *others))))
+def _common(parts: Sequence[LabelledRun]) -> list[str]:
+    return sorted(set(parts[0].classes).intersection(*(part.classes for part in parts)))
 
 
-def _ends_at(part: LabelledRun, hold_out: float) -> np.typing.NDArray[np.bool_]:
-    """Return a mask of the pictures that are not held out, the first in time, shape (P,)."""
-    n = len(part.names)
-    return np.arange(n) < n - round(hold_out * n)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pictures:
+    """Chosen pictures of labelled runs.
+
+    Attributes:
+        runs: The runs.
+        chosen: Mask of the pictures of each run, shape (P,).
+    """
+
+    runs: Sequence[LabelledRun]
+    chosen: Sequence[np.typing.NDArray[np.bool_]]
+
+    def __len__(self) -> int:
+        return sum(int(one.sum()) for one in self.chosen)
+
+    def judged(self, name: str, overlap: float) -> Judged:
+        """Match the detections of one class to labels."""
+        scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
+        for run, chosen in zip(self.runs, self.chosen, strict=True):
+            matched = match(
+                *run.part(chosen), run.classes.index(name), overlaps=np.array([overlap])
+            )
+            judged = ~matched.is_out[0]
+            scores.append(matched.scores[judged])
+            right.append(matched.is_right[0][judged])
+            labels += len(matched.labels)
+        return Judged(np.concatenate(scores), np.concatenate(right), labels)
 
 
-def _everything(part: LabelledRun) -> np.typing.NDArray[np.bool_]:
-    return np.ones(len(part.names), np.bool_)
-
-
-def _judged(
-    parts: Sequence[LabelledRun],
-    which: Sequence[np.typing.NDArray[np.bool_]],
-    name: str,
-    overlap: float,
-) -> Judged:
-    """Match detections of one class to labels, in the chosen pictures of each run."""
-    scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
-    for part, chosen in zip(parts, which, strict=True):
-        matched = match(*part.part(chosen), part.classes.index(name), overlaps=np.array([overlap]))
-        judged = ~matched.is_out[0]
-        scores.append(matched.scores[judged])
-        right.append(matched.is_right[0][judged])
-        labels += len(matched.labels)
-    return Judged(np.concatenate(scores), np.concatenate(right), labels)
+def _split(
+    parts: Sequence[LabelledRun], others: Sequence[LabelledRun], hold_out: float
+) -> tuple[_Pictures, _Pictures]:
+    """Return the pictures to fit to, and the held-out ones: ``others``, or the last of each run."""
+    if others:
+        fitted, held = (
+            _Pictures(runs, [np.ones(len(run.names), np.bool_) for run in runs])
+            for runs in (parts, others)
+        )
+        return fitted, held
+    counts = [len(part.names) for part in parts]
+    first = [np.arange(n) < n - round(hold_out * n) for n in counts]
+    return _Pictures(parts, first), _Pictures(parts, [~one for one in first])
 
 
 def _log_names(parts: Sequence[LabelledRun]) -> str:
