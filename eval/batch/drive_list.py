@@ -247,7 +247,7 @@ def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
     elif _format(folder) and not (each and is_split):
         yield _Found((str(folder),), folder.parent)
     else:
-        found = list(_walk(folder, 1))
+        found = list(_drives_below(folder, 1))
         if not found:
             raise UnknownFormatError(
                 f"{folder}: no drive found; expected recordings or folders of recordings"
@@ -255,7 +255,7 @@ def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
         yield from found
 
 
-def _walk(folder: Path, depth: int) -> Iterator[_Found]:
+def _drives_below(folder: Path, depth: int) -> Iterator[_Found]:
     """Yield the drives in a folder of drives."""
     recordings = _recordings(folder)
     formats = {_format(one) for one in recordings if one.is_file()}
@@ -273,7 +273,7 @@ def _walk(folder: Path, depth: int) -> Iterator[_Found]:
             elif _format(entry):
                 yield _Found((str(entry),), entry.parent)
             elif depth < DEPTH and not entry.is_symlink():
-                yield from _walk(entry, depth + 1)
+                yield from _drives_below(entry, depth + 1)
 
 
 def _drive_folder(folder: Path) -> _Found:

@@ -74,7 +74,7 @@ class OnRay:
                 ready, _ = ray.wait(list(running), num_returns=1, timeout=TICK_S)
                 for reference in ready:
                     job, number = running.pop(reference)
-                    done = _taken(ray, reference, job)
+                    done = _result_of(ray, reference, job)
                     if isinstance(done, Done):
                         yield replace(done, attempts=number)
                     elif number < self.attempts:
@@ -95,7 +95,7 @@ class OnRay:
         return found | ({"PYTHONPATH": os.pathsep.join(sys.path)} if self.address == LOCAL else {})
 
 
-def _taken(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
+def _result_of(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
     """Return the outcome of a task, or how its worker died."""
     try:
         done: Done[Any] = ray.get(reference)

@@ -31,7 +31,7 @@ BY: Final[Mapping[str, str]] = {"commit": "crosscue_commit", "version": "crosscu
 """Column of ``runs`` by the value of ``--by``; any other value is the name of a tag."""
 
 
-class Asked(Protocol):
+class Queryable(Protocol):
     """A catalog of runs."""
 
     def query(self, sql: str) -> pa.Table:
@@ -125,7 +125,7 @@ def _lines(found: History) -> Iterator[str]:
     )
 
 
-def history_of(catalog: Asked, by: str, patterns: Sequence[str] = ()) -> History:
+def history_of(catalog: Queryable, by: str, patterns: Sequence[str] = ()) -> History:
     """Return the history of every judged metric.
 
     Args:
@@ -175,7 +175,7 @@ def limits() -> dict[str, object]:
     }
 
 
-def _runs(catalog: Asked, by: str) -> list[dict[str, Any]]:
+def _runs(catalog: Queryable, by: str) -> list[dict[str, Any]]:
     column = BY.get(by, "tags['{}']".format(by.replace("'", "''")))
     # The name is quoted, and a query can only read the catalog's tables.
     sql = (
@@ -187,7 +187,7 @@ def _runs(catalog: Asked, by: str) -> list[dict[str, Any]]:
 
 
 def _parts(
-    catalog: Asked, place: Mapping[str, int], patterns: Sequence[str]
+    catalog: Queryable, place: Mapping[str, int], patterns: Sequence[str]
 ) -> dict[str, list[tuple[int, DriveMetric]]]:
     """Return each drive's contribution with the index of its version, by metric."""
     found: dict[str, list[tuple[int, DriveMetric]]] = {}

@@ -19,7 +19,7 @@ Scored: TypeAlias = tuple[list[DriveMetric] | None, bool]
 """Each drive's contribution to the metrics (None if not scored); True if no rows were dropped."""
 
 
-class Asked(Protocol):
+class Queryable(Protocol):
     """A catalog of runs."""
 
     def query(self, sql: str) -> pa.Table:
@@ -56,7 +56,7 @@ def read_scored(path: Path | str) -> Scored:
     return parts_of(run), is_whole_run(run)
 
 
-def scores_of(catalog: Asked) -> Callable[[Path | str], Scored]:
+def scores_of(catalog: Queryable) -> Callable[[Path | str], Scored]:
     """Return a function from a run's name in a catalog, local or on a store, to its score."""
     outcomes = catalog.query("select run, outcome from runs").to_pydict()
     is_whole = {run: outcome == "whole" for run, outcome in zip(*outcomes.values(), strict=True)}

@@ -130,7 +130,7 @@ def _count(rows: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(rows))
 
 
-def _speaking(
+def _relevant(
     feature: str, is_there: bool, cues: Mapping[str, CueEvidence]
 ) -> tuple[CueEvidence, ...]:
     return tuple(
@@ -143,13 +143,13 @@ def _speaking(
 def _absent(
     result: ApproachResult, feature: str, at_m: float | None, cues: Mapping[str, CueEvidence]
 ) -> Finding:
-    for_it, against = _speaking(feature, True, cues), _speaking(feature, False, cues)
+    for_it, against = _relevant(feature, True, cues), _relevant(feature, False, cues)
     cause, reported = _cause(result, feature, for_it, against)
     return Finding(
         drive=result.drive,
         approach=result.approach,
         intersection=result.intersection,
-        conditions=_bad(result),
+        conditions=_adverse(result),
         feature=feature,
         failing="missing" if at_m is None else "late",
         at_m=at_m,
@@ -185,14 +185,14 @@ def _cause(
 
 
 def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEvidence]) -> Finding:
-    for_it = sorted(_speaking(feature, True, cues), key=lambda one: -one.found)
+    for_it = sorted(_relevant(feature, True, cues), key=lambda one: -one.found)
     loud = [one for one in for_it if one.found]
     reported = ", ".join(f"{_name(one.cue)} in {one.found} of {one.frames}" for one in loud)
     return Finding(
         drive=result.drive,
         approach=result.approach,
         intersection=result.intersection,
-        conditions=_bad(result),
+        conditions=_adverse(result),
         feature=feature,
         failing="invented",
         at_m=loud[0].first_m if loud else None,
@@ -202,7 +202,7 @@ def _invented(result: ApproachResult, feature: str, cues: Mapping[str, CueEviden
     )
 
 
-def _bad(result: ApproachResult) -> tuple[str, ...]:
+def _adverse(result: ApproachResult) -> tuple[str, ...]:
     return tuple(tag for tag in result.conditions if tag not in GOOD)
 
 

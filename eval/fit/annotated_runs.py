@@ -113,7 +113,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
     counts = _counts_at(run.table("cues", ["t_ns", "cue", "count"]), t_ns)
     for one in np.unique(number).tolist():
         rows = np.flatnonzero(number == one)
-        kept, features, place, what = _meant(t_ns[rows], truth)
+        kept, features, place, what = _annotation_of(t_ns[rows], truth)
         into.used[what] += 1
         if features is None or not kept.any():
             continue
@@ -132,7 +132,7 @@ def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) ->
         )
 
 
-def _meant(
+def _annotation_of(
     t_ns: Int64s, truth: Truth
 ) -> tuple[NDArray[np.bool_], dict[str, bool] | None, str, str]:
     """Return the frames to use, the true features, the intersection, and the approach's kind."""

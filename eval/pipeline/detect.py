@@ -489,7 +489,7 @@ class _Tables:
                 for named, found in zip(self.detectors, result.found, strict=True)
                 if isinstance(found, Detections)
             )
-        once, again = self._once(result.found)
+        once, again = self._without_duplicates(result.found)
         sorted_by_role = seen(result.t_ns, once, self.is_for_signs, self._labels)
         cues = self.cues(sorted_by_role)
         self._held["frames"].append(
@@ -543,7 +543,7 @@ class _Tables:
             self._held["cues"].append(row)
             self.cue_frames[cue] = self.cue_frames.get(cue, 0) + (count > 0)
 
-    def _once(self, found: Sequence[Found]) -> tuple[list[Found], dict[int, Int64s]]:
+    def _without_duplicates(self, found: Sequence[Found]) -> tuple[list[Found], dict[int, Int64s]]:
         """Return results without duplicates, and by detector who keeps each of its detections.
 
         The latter is the index of the other detector, or ``KEPT`` for a detector's own.

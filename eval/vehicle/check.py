@@ -186,10 +186,10 @@ def _judged(
     if steering is not None:
         rates = [] if yaw is None else [of_rate(yaw, 1, grid)]
         verdicts[Signal.STEERING] = judge_steering(
-            _as_usual(steering, vehicle), [*references, *rates], speed, grid
+            _normalized(steering, vehicle), [*references, *rates], speed, grid
         )
         if speed is not None:
-            references.append(of_steering(_as_usual(steering, vehicle), 1, speed, grid))
+            references.append(of_steering(_normalized(steering, vehicle), 1, speed, grid))
     if yaw is not None:
         found = judge_yaw_rate(yaw, references, speed, grid)
         if not confirmed and not found.wrong:
@@ -267,7 +267,7 @@ def _series(samples: Mapping[Signal, Samples], planned: Plan, signal: Signal) ->
     return series if len(series) > 1 else None
 
 
-def _as_usual(steering: Series, vehicle: Vehicle) -> Series:
+def _normalized(steering: Series, vehicle: Vehicle) -> Series:
     """Return the steering angle converted to a typical steering ratio and without its offset."""
     odometry = vehicle.odometry
     scale = 15.0 / odometry.steering_ratio

@@ -135,7 +135,7 @@ def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of:
         else:
             rows += [] if read is None else [read]
     stale = gone | {one.run for one in changed}
-    tables = {name: _brought_up(earlier.tables.get(name), name, stale, rows) for name in KEPT}
+    tables = {name: _updated(earlier.tables.get(name), name, stale, rows) for name in KEPT}
     entries = _entries(complete, unreadable)
     return _index(tables, {**unreadable, **half}, _save(path, {ENTRIES: entries, **tables}))
 
@@ -194,7 +194,7 @@ def _why(error: Exception) -> str:
     return str(error.strerror or error) if isinstance(error, OSError) else str(error)
 
 
-def _brought_up(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -> pa.Table:
+def _updated(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -> pa.Table:
     """Return a table without the rows of stale runs and with the new rows."""
     import pyarrow as pa
     import pyarrow.compute as pc

@@ -58,7 +58,7 @@ class RemoteRuns:
         """
         # Some stores' libraries cache the listing of an earlier catalog.
         self._system.invalidate_cache()
-        listed = self._asked(lambda: self._system.find(self._root, detail=True))
+        listed = self._with_errors(lambda: self._system.find(self._root, detail=True))
         self._objects = _by_folder(self._root, listed)
         found: list[str] = []
         for folder in sorted(self._objects, key=lambda name: [*name.split("/")]):
@@ -134,7 +134,7 @@ class RemoteRuns:
         size = int(own[head].get("size") or 0)
         return (_digest({head: own[head]}), size, _digest(others), _digest(scored))
 
-    def _asked(self, ask: Callable[[], T]) -> T:
+    def _with_errors(self, ask: Callable[[], T]) -> T:
         """Return a store's answer; translate the errors of the store's library."""
         try:
             return ask()

@@ -167,8 +167,8 @@ class _Chain:
             choice.go_on(motion)
         if self.cue != TRAFFIC_LIGHT.name:
             return self._posteriors({Reference.START: self.choices[Reference.START](tracks)})
-        end = self.choices[Reference.END](_may_end(tracks))
-        start = self.choices[Reference.START](_may_start(tracks, end))
+        end = self.choices[Reference.END](_end_candidates(tracks))
+        start = self.choices[Reference.START](_start_candidates(tracks, end))
         is_seen = any(one.is_seen for one in tracks)
         self.counts[ONE_GROUP] += is_seen and end is not None and start is None
         self.counts[ONLY_AWAY] += is_seen and end is None and start is not None
@@ -216,13 +216,13 @@ class _Chain:
         return found
 
 
-def _may_end(tracks: Sequence[Track]) -> list[Track]:
+def _end_candidates(tracks: Sequence[Track]) -> list[Track]:
     """Return the lights facing the vehicle, or, if none does, those of unknown facing."""
     facing = [one for one in tracks if one.facing is Facing.EGO]
     return facing or [one for one in tracks if one.facing is Facing.UNKNOWN]
 
 
-def _may_start(tracks: Sequence[Track], end: Track | None) -> list[Track]:
+def _start_candidates(tracks: Sequence[Track], end: Track | None) -> list[Track]:
     """Return the lights that may mark the start.
 
     These are lights facing away or, if the end is known, of known facing and clearly nearer.
@@ -279,22 +279,24 @@ class _Choice:
         return best
 
     def _best(self, tracks: Sequence[Track]) -> Track | None:
-        able = [one for one in tracks if self._is_able(one)]
-        if not able:
+        eligible = [one for one in tracks if self._is_eligible(one)]
+        if not eligible:
             return None
-        nearest_m = min(one.range_m for one in able)
-        enough = min(PERSISTS, 0.5 * max(one.seen for one in able))
-        able = [one for one in able if one.range_m <= nearest_m + WIDEST_M and one.seen >= enough]
+        nearest_m = min(one.range_m for one in eligible)
+        enough = min(PERSISTS, 0.5 * max(one.seen for one in eligible))
+        eligible = [
+            one for one in eligible if one.range_m <= nearest_m + WIDEST_M and one.seen >= enough
+        ]
         sign = 1.0 if self.reference is Reference.END else -1.0
-        extreme = max(able, key=lambda one: sign * one.range_m)
-        group = [one for one in able if not _is_apart(one, extreme)]
+        extreme = max(eligible, key=lambda one: sign * one.range_m)
+        group = [one for one in eligible if not _is_apart(one, extreme)]
         kept = [one for one in group if one.number == self.chosen]
         if kept:
             return kept[0]
         often = 0.5 * max(one.seen for one in group)
         return max((one for one in group if one.seen >= often), key=lambda one: sign * one.range_m)
 
-    def _is_able(self, one: Track) -> bool:
+    def _is_eligible(self, one: Track) -> bool:
         settings = self.vehicle.range_filter
         sd_m = math.sqrt(one.var_m2)
         if one.seen < settings.begin_after or sd_m > settings.max_sd_m:

@@ -225,7 +225,7 @@ class _Scene:
         step = (
             self.approaches(evidence)
             if past is None
-            else self.approaches(evidence, _leaving_out(past, without))
+            else self.approaches(evidence, _without(past, without))
         )
         self.frames += 1
         self.looked.update(step.counts)
@@ -316,7 +316,7 @@ def _is_repeated(before: Seen, now: Seen) -> bool:
 _MEASURES: Final = {reference: cue.name for cue, reference in MEASURED}
 
 
-def _leaving_out(past: PastCues, without: frozenset[str]) -> PastCues:
+def _without(past: PastCues, without: frozenset[str]) -> PastCues:
     if not without:
         return past
     return lambda belief, reference: {
