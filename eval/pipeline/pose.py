@@ -35,7 +35,7 @@ from crosscue.localization.pose_track import (
     TrackSettings,
     TrackState,
 )
-from crosscue.localization.position_looks import PositionLooks
+from crosscue.localization.position_updates import PositionLooks
 from crosscue.replay.base import Floats, Int64s, VehicleError
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.windows import Window

@@ -10,7 +10,7 @@ import pytest
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.landmarks.update import update_camera_position
 from crosscue.localization.pose_track import BothLooks, start_belief
-from crosscue.localization.position_looks import PositionLooks
+from crosscue.localization.position_updates import PositionLooks
 
 SECOND = 1_000_000_000
 LEVER_M = (1.3, -0.4)
