@@ -15,8 +15,8 @@ since the last used one. This is the dissertation's compass of variance r every 
 
 Long drives are processed in windows: pass each call's ``TrackState`` to the next. It stores
 headings and requested rows that are later than the odometry so far, and the track is identical, bit
-for bit, to that of a single window. ``Looks`` add measurements at times of their own, such as
-landmarks at a camera's frames.
+for bit, to that of a single window. A ``MeasurementSource`` adds measurements at other times, such
+as landmarks at a camera's frames.
 """
 
 from __future__ import annotations
@@ -214,36 +214,36 @@ class HeadingColumns:
         return len(self.t_ns)
 
 
-class Looks(Protocol):
+class MeasurementSource(Protocol):
     """Source of additional measurements at times of its own, such as a camera's landmarks."""
 
     def times_ns(self) -> Sequence[int]:
         """Times of measurements, in order; times after the odometry are not used in this call."""
         ...
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Return the posterior at the belief's time, or None without a measurement."""
         ...
 
 
-class NoLooks:
-    """``Looks`` without measurements."""
+class NoMeasurements:
+    """A ``MeasurementSource`` without measurements."""
 
     def times_ns(self) -> Sequence[int]:
         """Return no times."""
         return ()
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Return None."""
         return None
 
 
 @dataclass(slots=True)
-class BothLooks:
-    """Two ``Looks`` combined, each used at its own times."""
+class BothSources:
+    """Two sources combined, each used at its own times."""
 
-    first: Looks
-    second: Looks
+    first: MeasurementSource
+    second: MeasurementSource
     _due: list[tuple[int, bool]] = field(default_factory=list)
 
     def times_ns(self) -> Sequence[int]:
@@ -252,13 +252,13 @@ class BothLooks:
         self._due = sorted(of_first + [(t_ns, True) for t_ns in self.second.times_ns()])
         return [t_ns for t_ns, _ in self._due]
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Update with the measurement of the one whose time it is."""
         while self._due[0][0] < belief.t_ns:
             self._due.pop(0)
         _, is_second = self._due.pop(0)
         whose = self.second if is_second else self.first
-        return whose.weigh(belief, travelled_m)
+        return whose.update(belief, travelled_m)
 
 
 class Advance(NamedTuple):
@@ -270,7 +270,7 @@ class Advance(NamedTuple):
     counts: TrackCounts
 
 
-NO_LOOKS: Final = NoLooks()
+NO_MEASUREMENTS: Final = NoMeasurements()
 
 
 def start_belief(
@@ -295,7 +295,7 @@ def advance(
     settings: TrackSettings,
     headings: Headings = NO_HEADINGS,
     rows_ns: Int64s | None = None,
-    looks: Looks = NO_LOOKS,
+    measurements: MeasurementSource = NO_MEASUREMENTS,
 ) -> Advance:
     """Predict along the increments, and update with headings in order of time.
 
@@ -306,8 +306,8 @@ def advance(
         headings: The window's compass readings in any order; later ones wait for odometry.
         rows_ns: Shape (M,): times of requested rows; None for a row after every interval. The
             choice must be the same in every window.
-        looks: Additional measurements, used after headings of the same time. If rows are after
-            every interval, there is also a row after each measurement.
+        measurements: Additional measurements, used after headings of the same time. With a row
+            after every interval, there is also a row after each measurement.
 
     Returns:
         The state for the next window, the rows, the outcome of each heading that reached the
@@ -317,7 +317,7 @@ def advance(
     wanted = None
     if rows_ns is not None:
         wanted = np.sort(np.concatenate([state.waiting_rows_ns, rows_ns]))
-    run = _Run(state, settings, headings, wanted, looks)
+    run = _Run(state, settings, headings, wanted, measurements)
     for start, stop, *interval in zip(
         increments.start_ns.tolist(),
         increments.stop_ns.tolist(),
@@ -345,7 +345,7 @@ class _Run:
         settings: TrackSettings,
         headings: Headings,
         rows: Int64s | None,
-        looks: Looks,
+        measurements: MeasurementSource,
     ) -> None:
         self.settings = settings
         self.t_ns = state.belief.t_ns
@@ -368,9 +368,9 @@ class _Run:
         self.every_interval = rows is None
         self.rows = NO_TIMES if rows is None else rows[rows >= self.t_ns]
         self.row_times = self.rows.tolist()
-        self.looks = looks
-        self.look_times = [t for t in looks.times_ns() if t >= self.t_ns]
-        self.next_look = 0
+        self.measurements = measurements
+        self.measurement_times = [t for t in measurements.times_ns() if t >= self.t_ns]
+        self.next_measurement = 0
         self.next_heading = 0
         self.next_row = 0
         self.event_ns = 0
@@ -452,17 +452,18 @@ class _Run:
             self._weigh_heading(*rows[self.next_heading][1:])
             self.next_heading += 1
         while (
-            self.next_look < len(self.look_times) and self.look_times[self.next_look] == self.t_ns
+            self.next_measurement < len(self.measurement_times)
+            and self.measurement_times[self.next_measurement] == self.t_ns
         ):
-            self._look()
-            self.next_look += 1
+            self._measure()
+            self.next_measurement += 1
         while self.next_row < len(self.row_times) and self.row_times[self.next_row] == self.t_ns:
             self._keep_row()
             self.next_row += 1
         self._find_event()
 
-    def _look(self) -> None:
-        found = self.looks.weigh(unpacked(self.t_ns, self.state), self.travelled_m)
+    def _measure(self) -> None:
+        found = self.measurements.update(unpacked(self.t_ns, self.state), self.travelled_m)
         if found is None:
             return
         self.state = packed(found)
@@ -470,14 +471,14 @@ class _Run:
             self._keep_row()
 
     def _find_event(self) -> None:
-        heading_ns, row_ns, look_ns = _NEVER, _NEVER, _NEVER
+        heading_ns, row_ns, measured_ns = _NEVER, _NEVER, _NEVER
         if self.next_heading < len(self.heading_rows):
             heading_ns = self.heading_rows[self.next_heading][0]
         if self.next_row < len(self.row_times):
             row_ns = self.row_times[self.next_row]
-        if self.next_look < len(self.look_times):
-            look_ns = self.look_times[self.next_look]
-        self.event_ns = min(heading_ns, row_ns, look_ns)
+        if self.next_measurement < len(self.measurement_times):
+            measured_ns = self.measurement_times[self.next_measurement]
+        self.event_ns = min(heading_ns, row_ns, measured_ns)
 
     def _weigh_heading(self, heading_rad: float, var_rad2: float) -> None:
         self.tally["headings"] += 1

@@ -38,8 +38,8 @@ class PositionCounts:
 
 
 @dataclass(slots=True)
-class PositionLooks:
-    """``Looks`` of a pose track: positions of the antenna in the map frame.
+class PositionUpdates:
+    """``MeasurementSource`` of a pose track: positions of the antenna in the map frame.
 
     Attributes:
         lever_m: Position of the antenna, ahead of and to the left of the rear axle.
@@ -74,7 +74,7 @@ class PositionLooks:
         times: list[int] = self._waiting.t_ns.tolist()
         return times
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Update with the position of the belief's time."""
         self.let_go(belief.t_ns)
         fix, self._waiting = self._waiting.take(slice(0, 1)), self._waiting.take(slice(1, None))

@@ -24,7 +24,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
-from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
+from crosscue.fusion.fit.annotated_approach import NOT_EVALUATED, AnnotatedApproach
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.temporal import MeasuredRange, ranges_to_start
@@ -314,12 +314,12 @@ def _var_m2(reference: Reference, range_m: float, believed_m2: float, vehicle: V
 
 
 def _counts_at(table: pa.Table, t_ns: Int64s) -> dict[str, Int64s]:
-    """Return the counts of each cue at sorted times, ``NOT_LOOKED`` where it was not evaluated."""
+    """Return the counts of each cue at sorted times, or ``NOT_EVALUATED``."""
     at, count = np.asarray(table["t_ns"], np.int64), np.asarray(table["count"], np.int64)
     cue = np.array(table["cue"].to_pylist(), np.str_)
     out: dict[str, Int64s] = {}
     for name in np.unique(cue).tolist():
-        column = np.full(len(t_ns), NOT_LOOKED, np.int64)
+        column = np.full(len(t_ns), NOT_EVALUATED, np.int64)
         where, found = _indices_of(t_ns, at[cue == name])
         column[where] = count[cue == name][found]
         out[name] = column

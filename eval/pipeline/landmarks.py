@@ -73,7 +73,7 @@ class _Frame:
 
 @dataclass(slots=True)
 class LandmarkStage:
-    """``Looks`` of a pose track that matches camera frames with a landmark database.
+    """``MeasurementSource`` of a pose track that matches camera frames with a landmark database.
 
     Attributes:
         search: Search with database, matcher and counts.
@@ -105,11 +105,11 @@ class LandmarkStage:
         """Times of the waiting frames."""
         return [frame.t_ns for frame in self._frames]
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Match the frame at the belief's time; return the corrected belief, or None."""
         self.let_go(belief.t_ns)
         frame = self._frames.pop(0)
-        found = self.search.look(belief, travelled_m, partial(self._describe, frame))
+        found = self.search.process(belief, travelled_m, partial(self._describe, frame))
         for sighting in self.search.sightings:
             if sighting.outcome == ACCEPTED:
                 self.names[sighting.t_ns] = sighting.name

@@ -26,16 +26,16 @@ from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
-    BothLooks,
+    BothSources,
     Headings,
-    Looks,
-    NoLooks,
+    MeasurementSource,
+    NoMeasurements,
     PoseColumns,
     TrackCounts,
     TrackSettings,
     TrackState,
 )
-from crosscue.localization.position_updates import PositionLooks
+from crosscue.localization.position_updates import PositionUpdates
 from crosscue.replay.base import Floats, Int64s, VehicleError
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.windows import Window
@@ -83,7 +83,7 @@ def gap_settings(vehicle: Vehicle) -> GapSettings:
     return GapSettings(**fields)
 
 
-def fused_positions(vehicle: Vehicle) -> PositionLooks | None:
+def fused_positions(vehicle: Vehicle) -> PositionUpdates | None:
     """Return the updater for GNSS positions, or None if the vehicle file does not request it.
 
     Raises:
@@ -97,10 +97,10 @@ def fused_positions(vehicle: Vehicle) -> PositionLooks | None:
             "gnss.use = 'fuse': the map's origin is unknown; expected GNSS in the first "
             "seconds, with the vehicle moving, or start.map_origin in the vehicle file"
         )
-    return PositionLooks((gnss.x_m, gnss.y_m), gnss.interval_s, gnss.gate_nis, gnss.delay_s)
+    return PositionUpdates((gnss.x_m, gnss.y_m), gnss.interval_s, gnss.gate_nis, gnss.delay_s)
 
 
-class LandmarkLooks(Looks, Protocol):
+class LandmarkSource(MeasurementSource, Protocol):
     """Search for landmarks along the pose track, such as ``landmarks.LandmarkStage``."""
 
     def take_sightings(self) -> list[Sighting]:
@@ -124,7 +124,7 @@ class LandmarkLooks(Looks, Protocol):
         ...
 
 
-class NoLandmarks(NoLooks):
+class NoLandmarks(NoMeasurements):
     """A replay without a landmark database."""
 
     def take_sightings(self) -> list[Sighting]:
@@ -166,8 +166,8 @@ class PoseStage:
 
     vehicle: Vehicle
     turn: Signal | None
-    landmarks: LandmarkLooks = field(default_factory=NoLandmarks)
-    positions: PositionLooks | None = None
+    landmarks: LandmarkSource = field(default_factory=NoLandmarks)
+    positions: PositionUpdates | None = None
     notices: list[str] = field(default_factory=list)
     odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
     track_counts: TrackCounts = field(default_factory=TrackCounts)
@@ -310,9 +310,9 @@ class PoseStage:
             step.increments,
             track_settings(self.vehicle),
             headings,
-            looks=self.landmarks
+            measurements=self.landmarks
             if self.positions is None
-            else BothLooks(self.landmarks, self.positions),
+            else BothSources(self.landmarks, self.positions),
         )
         self._state = made.state
         self._measured += [

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crosscue.fusion.factor_graph import CueNode
 
-NOT_LOOKED: Final = -1
+NOT_EVALUATED: Final = -1
 """Count of a cue that was not evaluated."""
 
 Bools = NDArray[np.bool_]
@@ -26,7 +26,7 @@ class AnnotatedApproach:
         time_s: Shape (N,): time since the first frame, non-decreasing.
         is_near: Shape (N,): True if the intersection was known to be near.
         is_established: Shape (N,): True if earlier frames had established presence.
-        counts: Counts of each cue, shape (N,), or ``NOT_LOOKED``.
+        counts: Counts of each cue, shape (N,), or ``NOT_EVALUATED``.
         features: True or False for each known feature; a missing one is unknown.
         place: Name of the intersection; drives to the same one are not independent evidence.
     """
@@ -39,10 +39,10 @@ class AnnotatedApproach:
     features: Mapping[str, bool]
     place: str
 
-    def looks(self, cue: CueNode) -> NDArray[np.int64]:
+    def observed(self, cue: CueNode) -> NDArray[np.int64]:
         """Indices of frames in which the cue was evaluated and would send a message."""
         count = self.counts.get(cue.name)
         if count is None:
             return np.empty(0, np.int64)
-        speaks = (count != NOT_LOOKED) & (self.is_established | cue.speaks_first)
+        speaks = (count != NOT_EVALUATED) & (self.is_established | cue.speaks_first)
         return np.flatnonzero(speaks).astype(np.int64)

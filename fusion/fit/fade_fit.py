@@ -34,7 +34,7 @@ class FadeFit(NamedTuple):
     cue: str
     fade: Fade
     positives: int
-    looks: int
+    observations: int
     is_learned: bool
 
 
@@ -55,14 +55,14 @@ class Binned(NamedTuple):
 def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: CueNode) -> FadeFit:
     """Fit a cue's fade; with too few positive observations, the default is returned."""
     residuals = _residuals(approaches, graph, cue)
-    looks, positives, squares = 0, 0, 0.0
+    observations, positives, squares = 0, 0, 0.0
     ways, times, products = [np.empty(0)], [np.empty(0)], [np.empty(0)]
     spans: list[tuple[float, float]] = []
     for approach, (rows, residual) in zip(approaches, residuals, strict=True):
         if not len(rows):
             continue
         way_m, time_s = approach.way_m[rows], approach.time_s[rows]
-        looks += len(rows)
+        observations += len(rows)
         positives += int((approach.counts[cue.name][rows] > 0).sum())
         squares += float((residual**2).sum())
         spans.append((float(way_m[-1] - way_m[0]), float(time_s[-1] - time_s[0])))
@@ -72,13 +72,13 @@ def fit_fade(approaches: Sequence[AnnotatedApproach], graph: FactorGraph, cue: C
             products.append(residual[lag:] * residual[:-lag])
     correlation = np.concatenate(products)
     if positives < MIN_POSITIVES or squares == 0.0 or not len(correlation):
-        return FadeFit(cue.name, USUAL_FADE, positives, looks, False)
-    correlation *= looks / squares
+        return FadeFit(cue.name, USUAL_FADE, positives, observations, False)
+    correlation *= observations / squares
     length_m, length_s = np.mean(spans, axis=0).tolist()
     way, way_misfit = _integral(_binned(np.concatenate(ways), correlation), WAYS_M, length_m)
     time, time_misfit = _integral(_binned(np.concatenate(times), correlation), TIMES_S, length_s)
     fade = Fade(way_m=way) if way_misfit <= time_misfit else Fade(time_s=time)
-    return FadeFit(cue.name, fade, positives, looks, True)
+    return FadeFit(cue.name, fade, positives, observations, True)
 
 
 def _residuals(
@@ -86,7 +86,7 @@ def _residuals(
 ) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Rows of each approach's observations, and residuals from the rate in similar situations."""
     ends = [edge.feature for edge in graph.edges if edge.cue == cue.name]
-    rows = [approach.looks(cue) for approach in approaches]
+    rows = [approach.observed(cue) for approach in approaches]
     groups: dict[tuple[object, ...], list[tuple[int, Bools]]] = {}
     positive = [
         (approach.counts[cue.name][at] > 0).astype(np.float64) if len(at) else np.empty(0)

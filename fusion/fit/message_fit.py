@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from crosscue.fusion.calibrated import CalibratedMessageModel, cue_messages_of
 from crosscue.fusion.factor_graph import CueNode, FactorGraph, log_odds
-from crosscue.fusion.fit.annotated_approach import NOT_LOOKED, AnnotatedApproach
+from crosscue.fusion.fit.annotated_approach import NOT_EVALUATED, AnnotatedApproach
 from crosscue.fusion.fit.fade_fit import FadeFit, fit_fade
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
@@ -44,13 +44,13 @@ class Side(NamedTuple):
     Attributes:
         rates: Fraction of positive frames at each place with observations.
         frames: Number of frames.
-        looks: Number of independent observations to which the frames are equivalent.
+        observations: Number of independent observations to which the frames are equivalent.
         hits: Number of independent observations to which the positive frames are equivalent.
     """
 
     rates: tuple[float, ...]
     frames: int
-    looks: float
+    observations: float
     hits: float
 
     @property
@@ -130,7 +130,7 @@ def _side(approaches: Sequence[AnnotatedApproach], cue: CueNode, near: bool, fad
     totals: dict[str, tuple[float, float]] = {}
     frames = 0
     for approach in approaches:
-        rows = approach.looks(cue)
+        rows = approach.observed(cue)
         alike = approach.is_near[rows] == near
         if not alike.any():
             continue
@@ -141,14 +141,17 @@ def _side(approaches: Sequence[AnnotatedApproach], cue: CueNode, near: bool, fad
         )
         worth = np.concatenate([[1.0], np.tanh(0.5 * np.diff(at))])[alike]
         is_positive = approach.counts[cue.name][rows][alike] > 0
-        looks, hits = totals.get(approach.place, (0.0, 0.0))
-        totals[approach.place] = looks + float(worth.sum()), hits + float(worth[is_positive].sum())
+        observations, hits = totals.get(approach.place, (0.0, 0.0))
+        totals[approach.place] = (
+            observations + float(worth.sum()),
+            hits + float(worth[is_positive].sum()),
+        )
         frames += len(worth)
-    kept = [(looks, hits) for looks, hits in totals.values() if looks > 0.0]
+    kept = [(observations, hits) for observations, hits in totals.values() if observations > 0.0]
     return Side(
-        tuple(hits / looks for looks, hits in kept),
+        tuple(hits / observations for observations, hits in kept),
         frames,
-        sum(looks for looks, _ in kept),
+        sum(observations for observations, _ in kept),
         sum(hits for _, hits in kept),
     )
 
@@ -190,5 +193,5 @@ def _situations(approach: AnnotatedApproach) -> Iterator[Situation]:
     passed = np.diff(approach.time_s, prepend=approach.time_s[:1]).tolist()
     near, established = approach.is_near.tolist(), approach.is_established.tolist()
     for i in range(len(moved)):
-        counts = {name: column[i] for name, column in columns.items() if column[i] != NOT_LOOKED}
+        counts = {name: column[i] for name, column in columns.items() if column[i] != NOT_EVALUATED}
         yield Situation(counts, established[i], near[i], moved_m=moved[i], passed_s=passed[i])

@@ -34,7 +34,7 @@ from crosscue.fusion.temporal import (
 )
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
-from .annotated_approach import NOT_LOOKED
+from .annotated_approach import NOT_EVALUATED
 
 EDGES_M: Final = (0.0, 10.0, 20.0, 35.0, 50.0, 80.0)
 PULL_STEPS: Final = 20.0
@@ -55,7 +55,7 @@ class AnnotatedDrive:
         advanced_var_m2: Shape (N,): variance of the distance.
         passed_s: Shape (N,): time since the previous frame.
         start_m: Shape (N,): true distance to the intersection ahead, NaN without one.
-        counts: Counts of each cue, shape (N,), or ``NOT_LOOKED``.
+        counts: Counts of each cue, shape (N,), or ``NOT_EVALUATED``.
         ranges: Measured ranges to the start in each of the N frames.
         features: True features of the intersection, or of a road without one.
         place: Name of the layout or intersection.
@@ -176,7 +176,7 @@ def filtered(drive: AnnotatedDrive, model: TemporalModel) -> NDArray[np.float64]
 def _frames(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
     columns = {name: column.tolist() for name, column in drive.counts.items()}
     for i in range(len(drive.start_m)):
-        yield {name: column[i] for name, column in columns.items() if column[i] != NOT_LOOKED}
+        yield {name: column[i] for name, column in columns.items() if column[i] != NOT_EVALUATED}
 
 
 def _steps(drive: AnnotatedDrive, about: Temporal) -> np.typing.NDArray[np.bool_]:
@@ -255,7 +255,7 @@ def _tally(
         before: bool | None = None
         for i in np.flatnonzero(is_step).tolist():
             now = int(count[i])
-            if now == NOT_LOOKED:
+            if now == NOT_EVALUATED:
                 before = None
                 continue
             state = _state(drive, features, at[i]) if is_ahead[i] else NOWHERE

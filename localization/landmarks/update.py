@@ -211,7 +211,7 @@ class LandmarkSearch:
     _peak: _Peak | None = None
     _counted_m: dict[str, float] = field(default_factory=dict)
 
-    def look(
+    def process(
         self, belief: PoseBelief, travelled_m: float, describe: Callable[[], Features | None]
     ) -> PoseBelief | None:
         """Process one frame.

@@ -34,10 +34,10 @@ LEARNED = Calibrated(
 )
 
 
-def said(*looks: Situation, learned: Calibrated = LEARNED) -> list[float]:
+def said(*observations: Situation, learned: Calibrated = LEARNED) -> list[float]:
     """Change of the log odds of left by each observation."""
     model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, learned))
-    return [model(look)[LEFT] for look in looks]
+    return [model(look)[LEFT] for look in observations]
 
 
 def road(count: int, moved_m: float = 1.0) -> Situation:
@@ -126,9 +126,11 @@ def test_an_edge_of_which_nothing_was_learned_sends_the_published_message_discou
 
 def test_a_features_exponent_scales_all_it_hears() -> None:
     half = LEARNED.model_copy(update={"exponents": {"left": 0.5}})
-    looks = (road(1), road(1), situation({"one_way_right": 1}))
+    observations = (road(1), road(1), situation({"one_way_right": 1}))
 
-    assert said(*looks, learned=half) == pytest.approx([0.5 * x for x in said(*looks)])
+    assert said(*observations, learned=half) == pytest.approx(
+        [0.5 * x for x in said(*observations)]
+    )
 
 
 def test_the_gate_holds_for_learned_messages_too() -> None:
@@ -171,7 +173,7 @@ def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
             wanted = RATES[one.cue]
             found = (one.rates.if_there, one.rates.if_not)
             for rate, side, fraction in zip(wanted, (one.there, one.missing), found, strict=True):
-                four_sd = 4 * math.sqrt(rate * (1 - rate) / side.looks)
+                four_sd = 4 * math.sqrt(rate * (1 - rate) / side.observations)
                 assert fraction == pytest.approx(rate, abs=four_sd)
     learned = {(one.cue, one.feature) for one in fit.calibrated.rates}
     assert learned == {
@@ -218,9 +220,9 @@ def test_on_simulated_approaches_not_learned_from_it_scores_better_than_the_sour
         ours += float(np.logaddexp(0.0, -odds if is_left else odds).mean())
         model = published_message_model(GRAPH, 0.49)
         frames = range(len(one.way_m))
-        looks = ({cue: int(n[i]) for cue, n in one.counts.items()} for i in frames)
+        observations = ({cue: int(n[i]) for cue, n in one.counts.items()} for i in frames)
         messages = [
-            model(situation(look, near=bool(one.is_near[i]))) for i, look in enumerate(looks)
+            model(situation(look, near=bool(one.is_near[i]))) for i, look in enumerate(observations)
         ]
         source = np.cumsum(np.array(messages), axis=0)[:, LEFT]
         theirs += float(np.logaddexp(0.0, -source if is_left else source).mean())

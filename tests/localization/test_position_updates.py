@@ -9,8 +9,8 @@ import pytest
 
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.landmarks.update import update_camera_position
-from crosscue.localization.pose_track import BothLooks, start_belief
-from crosscue.localization.position_updates import PositionLooks
+from crosscue.localization.pose_track import BothSources, start_belief
+from crosscue.localization.position_updates import PositionUpdates
 
 SECOND = 1_000_000_000
 LEVER_M = (1.3, -0.4)
@@ -27,9 +27,9 @@ def fixes(*rows: tuple[int, float, float]) -> Fixes:
 
 def test_a_position_is_weighed_in_as_the_antennas() -> None:
     belief = start_belief(SECOND, 4.0, 5.0, 0.7, 8.0, 1.5, 0.02, 0.5)
-    looks = PositionLooks(LEVER_M)
-    looks.add(fixes((SECOND, 5.5, 5.2)))
-    found = looks.weigh(belief, 0.0)
+    measurements = PositionUpdates(LEVER_M)
+    measurements.add(fixes((SECOND, 5.5, 5.2)))
+    found = measurements.update(belief, 0.0)
     wanted = update_camera_position(belief, np.array([5.5, 5.2]), COV, LEVER_M, None).belief
 
     assert found is not None
@@ -40,9 +40,9 @@ def test_a_position_is_weighed_in_as_the_antennas() -> None:
 
 def test_a_position_stamped_late_is_carried_ahead() -> None:
     belief = start_belief(SECOND, 0.0, 0.0, math.pi / 2, 10.0, 1.0, 1e-6, 1e-6)
-    looks = PositionLooks(delay_s=0.2)
-    looks.add(fixes((SECOND, 0.0, -2.0)))
-    found = looks.weigh(belief, 0.0)
+    measurements = PositionUpdates(delay_s=0.2)
+    measurements.add(fixes((SECOND, 0.0, -2.0)))
+    found = measurements.update(belief, 0.0)
 
     assert found is not None
     np.testing.assert_allclose(found.mean[:2], 0.0, atol=1e-9)
@@ -50,25 +50,31 @@ def test_a_position_stamped_late_is_carried_ahead() -> None:
 
 def test_positions_too_soon_or_too_far_off_do_not_count() -> None:
     belief = start_belief(SECOND, 0.0, 0.0, 0.0, 0.0, 1.0)
-    looks = PositionLooks(interval_s=1.0)
-    looks.add(
+    measurements = PositionUpdates(interval_s=1.0)
+    measurements.add(
         fixes((SECOND // 2, 0.0, 0.0), (SECOND, 100.0, 0.0), (SECOND, 0.1, 0.0), (SECOND, 0.1, 0.0))
     )
 
-    assert looks.weigh(belief, 0.0) is None
-    assert looks.weigh(belief, 0.0) is not None
-    assert looks.weigh(belief, 0.0) is None
-    assert looks.as_dict() == {"received": 4, "accepted": 1, "thinned": 1, "rejected": 1, "late": 1}
+    assert measurements.update(belief, 0.0) is None
+    assert measurements.update(belief, 0.0) is not None
+    assert measurements.update(belief, 0.0) is None
+    assert measurements.as_dict() == {
+        "received": 4,
+        "accepted": 1,
+        "thinned": 1,
+        "rejected": 1,
+        "late": 1,
+    }
 
 
 @pytest.mark.parametrize("is_second", [False, True])
 def test_each_is_asked_at_its_own_times(is_second: bool) -> None:
     belief = start_belief(2 * SECOND, 0.0, 0.0, 0.0, 0.0, 1.0)
-    early, due = PositionLooks(), PositionLooks()
+    early, due = PositionUpdates(), PositionUpdates()
     early.add(fixes((SECOND, 0.0, 0.0)))
     due.add(fixes((2 * SECOND, 0.1, 0.0)))
-    both = BothLooks(early, due) if is_second else BothLooks(due, early)
+    both = BothSources(early, due) if is_second else BothSources(due, early)
 
     assert both.times_ns() == [SECOND, 2 * SECOND]
-    assert both.weigh(belief, 0.0) is not None
+    assert both.update(belief, 0.0) is not None
     assert (early.counts.accepted, due.counts.accepted) == (0, 1)

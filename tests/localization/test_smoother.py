@@ -103,7 +103,7 @@ def one(seed: int) -> tuple[Truth, PoseBelief, Increments, Headings, Fixes]:
     return truth, first, made, headings, Fixes(truth.t_ns[rows], truth.xyh[rows, :2] + noise, cov)
 
 
-class FixLooks:
+class FixMeasurements:
     """Provides the fixes as measurements of the filter."""
 
     def __init__(self, fixes: Fixes) -> None:
@@ -113,7 +113,7 @@ class FixLooks:
         """Times of the fixes."""
         return [int(t) for t in self.fixes.t_ns]
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Update with one fix."""
         i = int(np.searchsorted(self.fixes.t_ns, belief.t_ns))
         return update_camera_position(belief, self.fixes.xy_m[i], self.fixes.cov_m2[i]).belief
@@ -132,8 +132,8 @@ def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> Non
     for seed in range(30):
         truth, first, made, headings, fixes = one(seed)
         at = truth.t_ns[20::20]
-        looks = FixLooks(fixes)
-        track = advance(TrackState(first), made, EVERY_READING, headings, at, looks).poses
+        measurements = FixMeasurements(fixes)
+        track = advance(TrackState(first), made, EVERY_READING, headings, at, measurements).poses
         found = smooth(first, made, headings, fixes, at)
         error = errors(truth, found.t_ns, found.xyh)
         nees.append(float(error[15] @ np.linalg.solve(found.cov[15], error[15])))

@@ -71,8 +71,8 @@ def landmarks_along(
 
 
 @dataclass(slots=True)
-class PlaceLooks:
-    """``Looks`` whose frames show where the car truly is."""
+class PlaceMeasurements:
+    """A ``MeasurementSource`` whose frames show the true position of the car."""
 
     search: LandmarkSearch
     truth: Truth
@@ -85,11 +85,11 @@ class PlaceLooks:
         times: list[int] = self.truth.t_ns[:: self.every].tolist()
         return times
 
-    def weigh(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
+    def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Look at the true place."""
         row = int(np.searchsorted(self.truth.t_ns, belief.t_ns))
         camera_m = camera_path(self.truth, self.lever_m)[row]
-        found = self.search.look(belief, travelled_m, lambda: there(camera_m))
+        found = self.search.process(belief, travelled_m, lambda: there(camera_m))
         if found is not None:
             self.times.append(belief.t_ns)
         return found

@@ -63,7 +63,7 @@ class FittedMessages:
                 {
                     "cue": one.cue,
                     "positives": one.positives,
-                    "frames": one.looks,
+                    "frames": one.observations,
                     "learned": one.is_learned,
                     **one.fade.model_dump(),
                 }
@@ -120,7 +120,8 @@ def _side_text(side: Side) -> str:
     by_place = TOO_FEW if math.isnan(low) else f"{low:.2f} to {high:.2f}"
     return (
         f"{reported.rate:.2f} ({reported.wilson.low:.2f} to {reported.wilson.high:.2f} by "
-        f"{side.looks:.0f} independent frames of {side.frames}; {by_place} by {side.places} places)"
+        f"{side.observations:.0f} independent frames of {side.frames}; {by_place} by {side.places} "
+        "places)"
     )
 
 
@@ -128,7 +129,7 @@ def _fade_text(one: FadeFit) -> str:
     fade = one.fade
     scale = f"{fade.way_m:.1f} m" if fade.way_m is not None else f"{fade.time_s:.2f} s"
     why = "" if one.is_learned else ", not learned: too few positive frames, or all positive"
-    return f"  {one.cue:20} {scale:>8}  {one.positives} positive of {one.looks} frames{why}"
+    return f"  {one.cue:20} {scale:>8}  {one.positives} positive of {one.observations} frames{why}"
 
 
 def _side_json(side: Side) -> dict[str, object]:
@@ -157,11 +158,11 @@ class _SideRate(NamedTuple):
 
 def _rates_of(side: Side) -> _SideRate:
     """Return a side's rate with both intervals."""
-    looks = round(side.looks)
+    observations = round(side.observations)
     rates = np.array(side.rates)
     return _SideRate(
         float(rates.mean()) if len(rates) else math.nan,
-        wilson(min(round(side.hits), looks), looks),
+        wilson(min(round(side.hits), observations), observations),
         mean_by_cluster(rates, np.arange(len(rates))),
     )
 
@@ -179,7 +180,7 @@ def _section_of(fit: MessageFit) -> str:
             name, number = key if key[1] is not None else value
             lines.append(
                 f"{one.cue} = {{ {name} = {number:.3g} }}  "
-                f"# {one.positives} positive of {one.looks} frames"
+                f"# {one.positives} positive of {one.observations} frames"
             )
     return "\n".join(lines) + "\n"
 

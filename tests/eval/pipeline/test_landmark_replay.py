@@ -334,8 +334,8 @@ def test_a_picture_that_does_not_decode_is_dropped_in_the_account(tmp_path: Path
     stage.see(block([b"no picture at all", encoded(wall(1))]))
 
     assert list(stage.times_ns()) == [0, 500_000_000]
-    assert stage.weigh(belief_at(0), 0.0) is None
-    assert stage.weigh(belief_at(500_000_000), 5.0) is None
+    assert stage.update(belief_at(0), 0.0) is None
+    assert stage.update(belief_at(500_000_000), 5.0) is None
     assert ledger.accounts["cam"].dropped == {"picture does not decode": 1}
     assert ledger.accounts["cam"].used == 1
     assert stage.counts()["undecodable"] == 1

@@ -28,7 +28,7 @@ from crosscue.localization.pose_track import (
     start_belief,
 )
 from crosscue.replay.base import Floats
-from support.landmark_drive import PlaceLooks, landmarks_along, search_in, there
+from support.landmark_drive import PlaceMeasurements, landmarks_along, search_in, there
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 
 ODOMETRY = OdometrySettings(
@@ -130,7 +130,7 @@ def test_settings_that_mean_nothing_are_refused() -> None:
 
 def run(
     folder: Path, seed: int, lever_m: tuple[float, float] = (0.0, 0.0)
-) -> tuple[Advance, Truth, PlaceLooks]:
+) -> tuple[Advance, Truth, PlaceMeasurements]:
     rng = np.random.default_rng(seed)
     truth = drive(rng, seconds=40.0)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng))
@@ -150,9 +150,11 @@ def run(
             revisit_m=1e6,
             lever_m=lever_m,
         )
-        looks = PlaceLooks(search_in(database, options), truth, lever_m=lever_m)
-        done = advance(TrackState(first), made.increments, EVERY_READING, headings, looks=looks)
-    return done, truth, looks
+        measurements = PlaceMeasurements(search_in(database, options), truth, lever_m=lever_m)
+        done = advance(
+            TrackState(first), made.increments, EVERY_READING, headings, measurements=measurements
+        )
+    return done, truth, measurements
 
 
 def nees(done: Advance, truth: Truth) -> float:
@@ -175,7 +177,7 @@ def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
 
     low, high = mean_band(3, SEEDS)
     assert low < np.mean([nees(done, truth) for done, truth, _ in runs]) < high
-    nis = np.array([s.nis for _, _, looks in runs for s in looks.search.sightings])
+    nis = np.array([s.nis for _, _, measurements in runs for s in measurements.search.sightings])
     low, high = mean_band(2, len(nis))
     assert len(nis) > 3 * SEEDS
     assert low < nis.mean() < high
@@ -186,19 +188,19 @@ def test_a_camera_ahead_of_the_axle_is_no_bias(tmp_path: Path) -> None:
     """Heading errors rotate the camera's position, and its covariance includes this."""
     runs = [run(tmp_path, seed, (5.0, 1.0)) for seed in range(SEEDS)]
 
-    nis = np.array([s.nis for _, _, looks in runs for s in looks.search.sightings])
+    nis = np.array([s.nis for _, _, measurements in runs for s in measurements.search.sightings])
     assert mean_band(2, len(nis))[0] < nis.mean() < mean_band(2, len(nis))[1]
 
 
 def test_every_frame_is_accounted_for_and_every_row_named(tmp_path: Path) -> None:
-    done, _, looks = run(tmp_path, 3)
-    counts = looks.search.counts
+    done, _, measurements = run(tmp_path, 3)
+    counts = measurements.search.counts
 
-    assert counts.frames == len(looks.times_ns())
-    assert counts.accepted == len(looks.times) == len(looks.search.sightings)
+    assert counts.frames == len(measurements.times_ns())
+    assert counts.accepted == len(measurements.times) == len(measurements.search.sightings)
     assert counts.accepted <= counts.matched <= counts.frames - counts.thinned
     assert counts.candidates >= counts.matched
-    assert set(looks.times) <= set(done.poses.t_ns.tolist())
+    assert set(measurements.times) <= set(done.poses.t_ns.tolist())
     assert len(np.unique(done.poses.t_ns)) == len(done.poses)
 
 
@@ -211,7 +213,7 @@ def straight(length_m: float = 400.0, speed_mps: float = 10.0) -> Truth:
 
 def follow(
     path: Path, truth: Truth, marks: dict[str, Floats], options: LandmarkSettings, **start: float
-) -> tuple[Advance, PlaceLooks]:
+) -> tuple[Advance, PlaceMeasurements]:
     """Simulate a drive without noise past landmarks at their true positions."""
     if not path.exists():
         with LandmarkWriter(path, "nearness") as writer:
@@ -230,34 +232,36 @@ def follow(
         0.1,
     )
     with LandmarkDatabase(path) as database:
-        looks = PlaceLooks(search_in(database, options), truth)
-        return advance(TrackState(first), made, TrackSettings(), looks=looks), looks
+        measurements = PlaceMeasurements(search_in(database, options), truth)
+        return advance(
+            TrackState(first), made, TrackSettings(), measurements=measurements
+        ), measurements
 
 
 def test_a_landmark_counts_once_at_its_best(tmp_path: Path) -> None:
     """Odometry starts 8 m off; the measurement is the position at the peak, moved ahead."""
-    done, looks = follow(
+    done, measurements = follow(
         tmp_path / "lm.sqlite", straight(), {"gate": np.array([100.0, 0.0])}, SETTINGS, x_m=8.0
     )
 
-    (sighting,) = looks.search.sightings
+    (sighting,) = measurements.search.sightings
     true_x = 10.0 * sighting.t_ns * 1e-9
     assert sighting.xy_m[0] == pytest.approx(true_x, abs=0.3)
     assert sighting.score == pytest.approx(100.0, abs=0.3)
     row = int(np.searchsorted(done.poses.t_ns, sighting.t_ns))
     assert abs(done.poses.x_m[row - 1] - true_x) > 7.0
     assert abs(done.poses.x_m[row] - true_x) < 0.5
-    assert looks.search.counts.matched > 10
+    assert measurements.search.counts.matched > 10
 
 
 def test_backing_past_a_landmark_carries_its_place_backwards(tmp_path: Path) -> None:
     ahead = straight()
     truth = Truth(ahead.t_ns, ahead.xyh * [-1.0, 1.0, 1.0], -ahead.speed_mps, ahead.yaw_radps)
-    _, looks = follow(
+    _, measurements = follow(
         tmp_path / "lm.sqlite", truth, {"gate": np.array([-100.0, 0.0])}, SETTINGS, x_m=5.0
     )
 
-    (sighting,) = looks.search.sightings
+    (sighting,) = measurements.search.sightings
     assert sighting.xy_m[0] == pytest.approx(-10.0 * sighting.t_ns * 1e-9, abs=0.3)
 
 
@@ -265,10 +269,12 @@ def test_a_standing_car_does_not_count_a_landmark_again_and_again(tmp_path: Path
     moving = straight()
     still = np.tile(moving.xyh[200], (len(moving.xyh), 1))
     truth = Truth(moving.t_ns, still, np.zeros(len(still)), moving.yaw_radps)
-    _, looks = follow(tmp_path / "lm.sqlite", truth, {"gate": still[0, :2]}, SETTINGS, x_m=100.0)
+    _, measurements = follow(
+        tmp_path / "lm.sqlite", truth, {"gate": still[0, :2]}, SETTINGS, x_m=100.0
+    )
 
-    assert looks.search.sightings == []
-    assert looks.search.counts.thinned == len(truth.t_ns) - 1
+    assert measurements.search.sightings == []
+    assert measurements.search.counts.thinned == len(truth.t_ns) - 1
 
 
 def test_a_second_visit_counts_only_after_a_while(tmp_path: Path) -> None:
@@ -279,10 +285,10 @@ def test_a_second_visit_counts_only_after_a_while(tmp_path: Path) -> None:
     speed = np.where(np.arange(n) < n // 2, 10.0, -10.0)
     truth = Truth(there_and_back.t_ns, xyh, speed, there_and_back.yaw_radps)
     marks = {"near": np.array([120.0, 0.0]), "far": np.array([20.0, 0.0])}
-    _, looks = follow(tmp_path / "lm.sqlite", truth, marks, SETTINGS)
+    _, measurements = follow(tmp_path / "lm.sqlite", truth, marks, SETTINGS)
 
-    assert [s.name for s in looks.search.sightings] == ["far", "near", "far"]
-    assert looks.search.counts.repeated == 1
+    assert [s.name for s in measurements.search.sightings] == ["far", "near", "far"]
+    assert measurements.search.counts.repeated == 1
 
 
 def test_only_landmarks_inside_the_ellipse_are_compared(tmp_path: Path) -> None:
@@ -297,27 +303,27 @@ def test_only_landmarks_inside_the_ellipse_are_compared(tmp_path: Path) -> None:
         )
 
     narrow = LandmarkSettings(min_score=70.0, interval_m=0.2)
-    _, looks = follow(path, straight(), {}, narrow, sd_m=5.0)
-    assert [s.name for s in looks.search.sightings] == ["right"]
-    assert looks.search.counts.candidates < 100
+    _, measurements = follow(path, straight(), {}, narrow, sd_m=5.0)
+    assert [s.name for s in measurements.search.sightings] == ["right"]
+    assert measurements.search.counts.candidates < 100
     _, wide = follow(path, straight(), {}, narrow, sd_m=200.0)
-    assert wide.search.counts.candidates > 4 * looks.search.counts.candidates
+    assert wide.search.counts.candidates > 4 * measurements.search.counts.candidates
 
 
 def test_no_landmarks_at_all_leave_the_track_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "none.sqlite"
     with LandmarkWriter(path, "nearness"):
         pass
-    done, looks = follow(path, straight(), {}, SETTINGS)
+    done, measurements = follow(path, straight(), {}, SETTINGS)
 
-    assert looks.search.counts.without_candidate == looks.search.counts.frames > 0
-    assert looks.search.counts.candidates == 0
+    assert measurements.search.counts.without_candidate == measurements.search.counts.frames > 0
+    assert measurements.search.counts.candidates == 0
     assert done.poses.x_m[-1] == pytest.approx(400.0)
 
 
 def test_a_lost_car_is_found_again_by_a_landmark(tmp_path: Path) -> None:
     """A start with an error of tens of metres, lost above 100 m of major axis, and one landmark."""
-    done, looks = follow(
+    done, measurements = follow(
         tmp_path / "lm.sqlite",
         straight(),
         {"gate": np.array([100.0, 0.0])},
@@ -327,7 +333,7 @@ def test_a_lost_car_is_found_again_by_a_landmark(tmp_path: Path) -> None:
     )
 
     assert done.poses.major_axis_m[0] > 100.0
-    assert len(looks.search.sightings) == 1
+    assert len(measurements.search.sightings) == 1
     assert done.poses.major_axis_m[-1] < 100.0
     assert not is_lost(done.state.belief)
     assert major_axis_m(done.state.belief) == pytest.approx(done.poses.major_axis_m[-1])
