@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="source",
         type=Path,
         metavar="FOLDER",
-        help="take the real drive and the weights from this folder; no network is used",
+        help="folder with the real drive and the weights, to use instead of downloading them",
     )
     parser.add_argument("--layout", choices=SCORED, help="layout of the intersection (default: C)")
     parser.add_argument(

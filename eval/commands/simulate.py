@@ -121,11 +121,11 @@ def _wanted(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
     """Return the requested layouts, and the runs of each."""
     if args.all == bool(args.layouts):
         raise crosscue.UsageError(
-            "simulate: give layouts (A to H, L0, L1, ..., M0, M1, ...), or --all"
+            "simulate: expected layouts (A to H, L0, L1, ..., M0, M1, ...), or --all"
         )
     if (args.output is None) == (args.sheet is None):
         raise crosscue.UsageError(
-            "simulate: give -o DIR for drives, or --sheet JPEG for pictures of them"
+            "simulate: expected -o DIR for drives, or --sheet JPEG for pictures of them"
         )
     if args.run is not None and (args.runs is not None or args.all):
         raise crosscue.UsageError("--run: cannot be combined with --runs or --all; use one of them")

@@ -135,9 +135,7 @@ def _whole(table: pa.Table, name: str, where: str) -> Int64s:
 
     column = _column(table, name, where)
     if column.null_count or not pa.types.is_integer(column.type):
-        raise UnreadableRunError(
-            f"{where}: {name}: expected whole numbers in every row; replay again"
-        )
+        raise UnreadableRunError(f"{where}: {name}: expected integers in every row; replay again")
     return np.asarray(column.cast(pa.int64()).to_numpy(), np.int64)
 
 
@@ -147,9 +145,7 @@ def _approach(table: pa.Table, where: str) -> Int64s:
 
     column = _column(table, "approach", where)
     if not (pa.types.is_integer(column.type) or pa.types.is_null(column.type)):
-        raise UnreadableRunError(
-            f"{where}: approach: expected whole numbers or nulls; replay again"
-        )
+        raise UnreadableRunError(f"{where}: approach: expected integers or nulls; replay again")
     filled = pc.fill_null(column.cast(pa.int64()), NONE)
     return np.asarray(filled.to_numpy(), np.int64)
 

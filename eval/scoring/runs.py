@@ -89,7 +89,7 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
     """
     if given is not None:
         return given
-    looked: list[str] = []
+    folders: list[str] = []
     for log in run.drive_manifest().logs:
         if is_remote(log.path):
             continue
@@ -97,9 +97,9 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
         for folder in (path, path.parent):
             if (folder / FILE).is_file():
                 return folder / FILE
-            looked.append(str(folder))
+            folders.append(str(folder))
     raise UsageError(
-        f"{run.path}: no {FILE} next to its logs ({', '.join(looked)}); name it with --truth"
+        f"{run.path}: no {FILE} next to its logs ({', '.join(folders)}); name it with --truth"
     )
 
 
@@ -210,7 +210,7 @@ def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) ->
     for one in truth.approaches:
         if one.start_ns > span[1] + SLACK_NS or one.enter_ns < span[0] - SLACK_NS:
             raise SchemaError(
-                f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns lies outside "
+                f"{path}: approach {one.id} from {one.start_ns} to {one.enter_ns} ns is outside "
                 f"the log, of which {run.path} has {span[0]} to {span[1]} ns; correct the truth"
             )
 

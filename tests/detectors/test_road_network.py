@@ -227,7 +227,7 @@ def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Pat
         (["--layouts", "L1", "--seed", "-1"], "expected 0 or more"),
         (["--layouts", "L1", "--threads", "-1"], "expected 0 or more"),
         (["--measure", "embedded", "--test-layouts", "A"], "cannot be combined with -o"),
-        ([], "give --layouts"),
+        ([], "expected --layouts"),
     ],
 )
 def test_wrong_usage_is_reported(
@@ -246,7 +246,7 @@ def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[st
     assert reported["measured_pictures"] == 2
     assert reported["measured_iou"] > 0.95
     assert run(measure) == 2
-    assert "give --test-layouts with layouts" in capsys.readouterr().err
+    assert "expected --test-layouts with layouts" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

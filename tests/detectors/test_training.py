@@ -389,7 +389,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
         (["--classes", ""], "empty or repeated"),
         (["--width", "10"], "width_px: input should be greater than or equal to 64"),
         (["--measure", "embedded"], "cannot be combined with -o"),
-        (["--val-data", "x.json"], "give both or neither"),
+        (["--val-data", "x.json"], "expected both or neither"),
         (["--crop-top", "0.6", "--crop-bottom", "0.6"], "less than a tenth"),
     ],
 )

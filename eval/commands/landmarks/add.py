@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         )
     else:
         raise crosscue.UsageError(
-            "landmarks add: give LOG... with --poses, or --images with --coordinates"
+            "landmarks add: expected LOG... with --poses, or --images with --coordinates"
         )
     print_result(found, args)
     return 0 if found.is_whole else 3

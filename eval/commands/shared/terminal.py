@@ -93,7 +93,7 @@ def add_truth_of_runs(parser: argparse.ArgumentParser) -> None:
         "--truth",
         type=Path,
         metavar="T.json",
-        help="truth of all runs (default: truth.json beside each run's log)",
+        help="truth of all runs (default: truth.json next to each run's log)",
     )
     parser.add_argument(
         "--any-log",

@@ -177,7 +177,7 @@ def run(args: argparse.Namespace) -> int:
     if args.measure is not None:
         return _measure(args)
     if args.output is None:
-        raise crosscue.UsageError("train mask-rcnn: give -o OUT.safetensors, or --measure")
+        raise crosscue.UsageError("train mask-rcnn: expected -o OUT.safetensors, or --measure")
     # With --json, stdout contains nothing but the result.
     show = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
     found = crosscue.train_mask_rcnn(

@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
                 on_runs=rendered,
             )
         elif args.output is None:
-            raise crosscue.UsageError("train road: give -o OUT.safetensors, or --measure")
+            raise crosscue.UsageError("train road: expected -o OUT.safetensors, or --measure")
         else:
             found = crosscue.train_road(
                 _settings(args),

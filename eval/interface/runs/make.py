@@ -185,7 +185,7 @@ def _settings_again(
         return with_start_of(manifest.settings, vehicle or manifest.settings)
     vehicle = vehicle or without_found_start(manifest.settings)
     with ExitStack() as stack:
-        logs = [stack.enter_context(reopened(folder, said)) for said in manifest.logs]
+        logs = [stack.enter_context(reopened(folder, row)) for row in manifest.logs]
         return with_start(logs, vehicle, manifest.selection.selection, gnss, start)
 
 

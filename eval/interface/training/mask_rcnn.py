@@ -264,7 +264,7 @@ def _check(settings: MaskRcnnTrainingSettings, output: Path) -> None:
     if not all(settings.classes) or len(set(settings.classes)) != len(settings.classes):
         raise UsageError("--classes: a name is empty or repeated; name each class once")
     if (settings.val_data is None) != (settings.val_images is None):
-        raise UsageError("--val-data, --val-images: give both or neither")
+        raise UsageError("--val-data, --val-images: expected both or neither")
 
 
 def _slice(text: str | None) -> slice:

@@ -137,7 +137,7 @@ def train_road(
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists; give another name or --overwrite")
     if (settings.data is None) == (not settings.layouts):
-        raise UsageError("train road: give --layouts to simulate, or --data with pictures")
+        raise UsageError("train road: expected --layouts to simulate, or --data with pictures")
     import torch
 
     from crosscue.detectors.networks.devices import chosen_device
@@ -216,7 +216,7 @@ def measure_road(
     )
     _check(settings)
     if (data is None) == (not test_layouts):
-        raise UsageError("--measure: give --test-layouts with layouts, or --data with pictures")
+        raise UsageError("--measure: expected --test-layouts with layouts, or --data with pictures")
     from crosscue.datasets.adapters.road_folder import load_folder
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road

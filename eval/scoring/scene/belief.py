@@ -213,8 +213,8 @@ def log_score(
     probability: NDArray[np.float64], is_there: NDArray[np.bool_], clip: float = CLIP
 ) -> NDArray[np.float64]:
     """Return minus the logarithm of the clipped probability of the true state, shape (N,)."""
-    said = np.where(is_there, probability, 1.0 - probability)
-    return np.asarray(-np.log(np.clip(said, clip, 1.0 - clip)))
+    likelihood = np.where(is_there, probability, 1.0 - probability)
+    return np.asarray(-np.log(np.clip(likelihood, clip, 1.0 - clip)))
 
 
 def reliability(

@@ -53,14 +53,14 @@ def believed(
     t_ns = np.asarray(drive.run.table("frames", ["t_ns"])["t_ns"], np.int64)
     table = scene_tables(drive.run, vehicle)["belief"]
     at = np.searchsorted(t_ns, np.asarray(table["t_ns"], np.int64))
-    said = np.full((len(t_ns), len(FEATURES)), np.nan)
+    probabilities = np.full((len(t_ns), len(FEATURES)), np.nan)
     for column, name in enumerate(FEATURES):
-        said[at, column] = np.asarray(table[name], np.float64)
+        probabilities[at, column] = np.asarray(table[name], np.float64)
     established: NDArray[np.bool_] = np.zeros(len(t_ns), np.bool_)
     established[at] = np.asarray(table["established"], np.bool_)
     rates = np.array([base_rates[name] for name in FEATURES])
-    is_silent = np.isnan(said[:, 0])
-    said[is_silent] = rates
+    is_silent = np.isnan(probabilities[:, 0])
+    probabilities[is_silent] = rates
     start_m = drive.truth.start_m(t_ns)
     kept = np.isfinite(start_m) | (not drive.features["intersection"])
     return DriveBelief(
@@ -68,7 +68,7 @@ def believed(
         drive.layout,
         drive.features,
         start_m[kept],
-        said[kept],
+        probabilities[kept],
         established[kept],
         is_silent[kept],
     )
@@ -93,10 +93,16 @@ def believed_everywhere(
         one for one in parts if one.features["intersection"] == drive.features["intersection"]
     )
     left = {cue: count for cue, count in part.counts.items() if cue not in without}
-    said = filtered(replace(part, counts=left), learned.model)
-    silent = np.zeros(len(said), np.bool_)
+    probabilities = filtered(replace(part, counts=left), learned.model)
+    silent = np.zeros(len(probabilities), np.bool_)
     return DriveBelief(
-        drive.name, drive.layout, drive.features, part.start_m, said, said[:, 0] > THRESHOLD, silent
+        drive.name,
+        drive.layout,
+        drive.features,
+        part.start_m,
+        probabilities,
+        probabilities[:, 0] > THRESHOLD,
+        silent,
     )
 
 

@@ -158,16 +158,16 @@ class _Rows:
     @classmethod
     def of(cls, beliefs: Sequence[DriveBelief]) -> _Rows:
         clusters = _clusters([one.layout for one in beliefs])
-        said, is_there, feature, cluster = [], [], [], []
+        probabilities, is_there, feature, cluster = [], [], [], []
         for one, number in zip(beliefs, clusters.tolist(), strict=True):
             for i, name in enumerate(FEATURES):
                 if name in one.features:
                     n = len(one.probabilities)
-                    said.append(one.probabilities[:, i])
+                    probabilities.append(one.probabilities[:, i])
                     is_there.append(np.full(n, one.features[name]))
                     feature.append(np.full(n, i))
                     cluster.append(np.full(n, number))
-        p, so = np.concatenate(said), np.concatenate(is_there)
+        p, so = np.concatenate(probabilities), np.concatenate(is_there)
         return cls(brier(p, so), log_score(p, so), np.concatenate(feature), np.concatenate(cluster))
 
 

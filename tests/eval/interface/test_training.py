@@ -87,6 +87,6 @@ def test_a_training_is_refused_before_anything_is_written(tmp_path: Path) -> Non
         crosscue.train_road(road, tmp_path / "a.safetensors")
     with pytest.raises(crosscue.UsageError, match="multiples of 32"):
         crosscue.train_mask_rcnn(masks, tmp_path / "a.safetensors")
-    with pytest.raises(crosscue.UsageError, match="give --test-layouts"):
+    with pytest.raises(crosscue.UsageError, match="expected --test-layouts"):
         crosscue.measure_road("embedded")
     assert not [*tmp_path.iterdir()]

@@ -307,7 +307,7 @@ def test_add_wants_a_log_with_poses_or_pictures_with_coordinates(
 ) -> None:
     for more in ([], ["--images", "x"], ["log"], ["log", "--poses", "p", "--images", "x"]):
         status, text = refused(capsys, "landmarks", "add", str(tmp_path / "lm.sqlite"), *more)
-        assert (status, "give LOG... with --poses" in text) == (2, True)
+        assert (status, "expected LOG... with --poses" in text) == (2, True)
 
 
 def block(payloads: list[bytes], first_ns: int = 0, step_ns: int = 500_000_000) -> Block:

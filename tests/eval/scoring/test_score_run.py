@@ -354,7 +354,7 @@ def test_tables_of_another_version_are_refused_by_column(
         "no column count": {"cues": cue_table(CUES).drop_columns(["count"])},
         "outside 0 to 1": {"belief": belief_table({"left": {3: 1.5}})},
         "expected start or end": {"range": range_table(3, 9, reference="middle")},
-        "expected whole numbers": {"belief": belief.set_column(0, "t_ns", belief["intersection"])},
+        "expected integers": {"belief": belief.set_column(0, "t_ns", belief["intersection"])},
         "count -1": {"cues": cue_table({"stop_sign": {3: -1}})},
     }
     for i, (said, tables) in enumerate(broken.items()):
