@@ -54,9 +54,10 @@ class OdometrySettings:
         wheel_scale: True speed per reported speed.
         right_wheel_scale: Additional scale of the right-hand wheels. A tyre that is 0.1 % larger
             than the other turns the wheels' heading by half a radian per kilometre.
-        front_left_scale: Additional scale of the front left wheel; None takes that of the rear
+        front_left_scale: Additional scale of the front left wheel; None for that of the rear wheel
+            on its side.
+        front_right_scale: Additional scale of the front right wheel; None for that of the rear
             wheel on its side.
-        front_right_scale: Additional scale of the front right wheel.
         use_front_wheels: True to average all four wheels, where available; else the rear two.
         wheel_step_mps: Resolution of the reported wheel speed; errors are up to half of it.
         slip_per_sqrt_m: S.d. of the distance after one metre.

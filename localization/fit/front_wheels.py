@@ -1,9 +1,9 @@
-"""Scales of the front wheels, from the motion of the rear axle.
+"""Fit the scales of the front wheels to the motion of the rear axle.
 
-A wheel of a rigid body rolls a known way: along the body, the rear axle's distance less or plus
-half the track width times the turn, and across it, the wheelbase times the turn. The ratio of that
-way to the one that the wheel reports is the wheel's scale. Pieces of the drive are compared with
-each other, so that errors that persist are counted in the standard deviation.
+The distance that a wheel of a rigid body rolls is known. Its component along the body is the rear
+axle's distance minus or plus half the track width times the turn; its component across the body is
+the wheelbase times the turn. The ratio of this distance to the reported one is the wheel's scale.
+The standard deviation is that between pieces of the drive, so that it includes persistent errors.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from crosscue.replay.base import Floats, Int64s
 PIECES: Final = 10
 MIN_ROWS: Final = 10 * PIECES
 LENGTH_DOUBT: Final = 0.1
-"""Standard deviation of track width and wheelbase as given, as fractions."""
+"""Relative standard deviation of the given track width and wheelbase."""
 
 
 class FrontWheel(NamedTuple):
-    """Scale of one front wheel, with ``wheel_scale`` taken off, and its standard deviation."""
+    """Scale of one front wheel relative to ``wheel_scale``, and its standard deviation."""
 
     setting: str
     scale: float
@@ -33,11 +33,11 @@ class FrontWheel(NamedTuple):
 def front_wheels(
     wheels: WheelSpeeds, made: Increments, settings: OdometrySettings, span_ns: tuple[int, int]
 ) -> tuple[FrontWheel, ...]:
-    """Return the scales of the front wheels that turned and have a speed of their own.
+    """Return the scales of the front wheels that move and have independent speed readings.
 
     Args:
         wheels: Wheel speeds of the drive.
-        made: Odometry of the same drive with ``settings``.
+        made: Odometry of the same drive by ``settings``.
         settings: Fitted settings.
         span_ns: First and last time of the part that is fitted.
     """
@@ -76,7 +76,7 @@ def _seconds(t_ns: Int64s, since_ns: int) -> Floats:
 
 
 def _rolled(speed_mps: Floats, t_s: Floats, starts_s: Floats, stops_s: Floats) -> Floats:
-    """Way that a wheel reports for each interval."""
+    """Distance that a wheel reports for each interval."""
     steps_m = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s)
     way_m = np.append(0.0, np.cumsum(steps_m))
     return np.asarray(np.interp(stops_s, t_s, way_m) - np.interp(starts_s, t_s, way_m))

@@ -135,7 +135,7 @@ class KnownDrive:
         )
 
     def increments(self, settings: OdometrySettings) -> Increments:
-        """Return the odometry of the complete log, positions or not."""
+        """Return the odometry of the complete log, also outside the positions."""
         return integrate(self.wheels, settings, self.turn).increments
 
     def start(self, settings: OdometrySettings) -> State:
