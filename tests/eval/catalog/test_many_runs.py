@@ -79,7 +79,7 @@ def test_runs_on_a_store_are_compared_as_in_a_folder(
     assert there.drives == here.drives == (8, 0, 0)
     with pytest.raises(crosscue.UsageError, match="memory://compared: runs on a store; copy them"):
         crosscue.failures("memory://compared")
-    with pytest.raises(crosscue.UsageError, match="give --runs and --against, or copy it"):
+    with pytest.raises(crosscue.UsageError, match="use --runs and --against, or copy it"):
         crosscue.compare_runs("memory://compared/before", "memory://compared/after")
 
 
