@@ -1,4 +1,4 @@
-"""Bad input from the command line: what can be read is read, the rest is reported in a line."""
+"""Bad input on the command line: readable parts are read, and the rest is reported in one line."""
 
 import json
 import os
@@ -43,7 +43,7 @@ def _noise(path: Path) -> None:
 
 
 def _declares_gigabytes(path: Path) -> None:
-    # A chunk record that says 2**40 bytes in a file of a hundred.
+    # A chunk record that declares 2**40 bytes in a file of 100 bytes.
     path.write_bytes(MAGIC + struct.pack("<BQ", 0x06, 1 << 40) + bytes(80))
 
 
@@ -62,7 +62,7 @@ def test_a_file_without_a_log_in_it(
 
     status, _, err = _info(path, capsys)
 
-    # Text formats cannot tell an empty or foreign file from a log that lost everything: 3.
+    # In text formats, an empty or unsupported file looks like a log without readable rows.
     assert status in (3, 4)
     assert status == 3 or (_one_line(err) and path.name in err)
 

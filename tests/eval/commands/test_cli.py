@@ -1,4 +1,4 @@
-"""One boundary for errors: one line, the right exit status, no traceback without -v."""
+"""Errors of commands: one line, the documented exit status, no traceback without -v."""
 
 import argparse
 import subprocess

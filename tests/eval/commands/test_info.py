@@ -1,4 +1,4 @@
-"""``crosscue info``: what it prints is what the log holds, on any terminal, and as strict JSON."""
+"""``crosscue info`` prints the contents of a log on any terminal, and as strict JSON."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NASTY = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
 
 @dataclass(slots=True)
 class MadeLog:
-    """A log made of blocks, with losses as reported."""
+    """A log in memory, with given blocks and losses."""
 
     blocks: tuple[Block, ...]
     topics: tuple[Topic, ...]
@@ -50,7 +50,7 @@ class MadeLog:
     format: str = "made"
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """The blocks, accounted for."""
+        """Yield the blocks and account for them."""
         for block in self.blocks:
             ledger.find(block.topic, len(block))
             yield block

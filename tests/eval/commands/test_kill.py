@@ -1,4 +1,4 @@
-"""Killed, starved and disturbed at any place: a run folder is whole, or says that it is not."""
+"""Killed or disturbed at any time, a run folder is complete or marked as incomplete."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Drive:
         assert {"manifest.json", "pose.parquet", "belief.parquet"} <= set(self.whole)
 
     def replay(self, run: Path, *more: str) -> list[str]:
-        """The command line: two seconds of the drive."""
+        """Return the command line that replays two seconds of the drive."""
         return [
             "replay",
             str(self.folder / "drive.mcap"),
@@ -76,7 +76,7 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive() -> Iterator[Drive]:
-    # Not below pytest's own folder, which only its owner may look into.
+    # Not below pytest's folder, which only its owner may read.
     folder = Path(tempfile.mkdtemp(prefix="crosscue-kill-"))
     folder.chmod(0o755)
     try:
@@ -86,7 +86,7 @@ def drive() -> Iterator[Drive]:
 
 
 def _some(count: int, of: int, seed: int) -> list[int]:
-    """The first, the last, and others by chance."""
+    """Return the first, the last, and some random points."""
     between = random.Random(seed).sample(range(1, of - 1), min(count, of - 2))
     return [0, *sorted(between), of - 1]
 
@@ -99,7 +99,7 @@ def _is_text(ended: faults.Ended) -> None:
 
 
 def _is_whole_or_says_so(run: Path, *wholes: dict[str, str]) -> None:
-    """Either the run's manifest is missing or one of the detect stage, or every byte is right."""
+    """Check that the run is incomplete by its manifest, or that all bytes are right."""
     try:
         manifest = open_run(run).manifest()
     except RunError:
@@ -192,7 +192,7 @@ def test_a_disk_that_fails_to_flush_is_reported(drive: Drive, tmp_path: Path) ->
 
 
 def test_a_file_that_cannot_grow_is_reported(drive: Drive, tmp_path: Path) -> None:
-    # The manifest's timings make it a few bytes longer or shorter from run to run.
+    # The manifest's length varies by a few bytes because of its timings.
     sizes = sorted(p.stat().st_size for p in (drive.folder / "whole").glob("*.parquet"))
 
     for size in (0, 100, sizes[len(sizes) // 2], sizes[-1] - 1):
@@ -243,7 +243,7 @@ def test_of_many_that_find_a_dead_lock_one_at_a_time_gets_it(tmp_path: Path) -> 
 
 
 def _takes_turns(path: Path, rounds: int) -> int:
-    """0 if nobody else was ever inside, or 1; every third time it leaves without a word."""
+    """Return 0 if the lock was exclusive, else 1; imitate a killed process every third time."""
     run, inside = create(path, overwrite=True), path.parent / "inside"
     for number in range(rounds):
         try:
@@ -255,7 +255,7 @@ def _takes_turns(path: Path, rounds: int) -> int:
                 time.sleep(0.0005)
                 inside.unlink()
                 if number % 3 == 0:
-                    # As a killed process would leave it: the file stays, naming one long dead.
+                    # As after a killed process: the file remains, with the id of an ended process.
                     dead = path / ".lock.dead"
                     dead.write_text("4194305 elsewhere gone")
                     dead.unlink()

@@ -1,4 +1,4 @@
-"""``crosscue model init`` from files of each layout, made here, to a card that runs."""
+"""``crosscue model init`` writes a card that runs, for generated files of each layout."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _file(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
 
 
 def test_a_rt_detr_of_selected_boxes_is_known_by_its_head(tmp_path: Path) -> None:
-    """Ultralytics 8.4 writes rows as of an end-to-end export, and means fractions."""
+    """Ultralytics 8.4 writes rows as in an end-to-end export, but in fractions."""
     metadata = {**ULTRALYTICS, "head": "RTDETRDecoder", "task": "detect"}
 
     assert run(["model", "init", str(_file(tmp_path, "end-to-end", metadata))]) == 0
@@ -107,7 +107,7 @@ METADATA = "task: detect\nimgsz:\n- 64\n- 128\nnames:\n  0: person\n  1: car\n  
 
 
 def _openvino_file(folder: Path, labels: list[str] | None = None) -> Path:
-    """A YOLOv8 network as an OpenVINO file, with its labels where Ultralytics writes them."""
+    """A YOLOv8 network as an OpenVINO file, with labels in the place that Ultralytics uses."""
     if find_spec("openvino") is None:
         pytest.skip("the extra openvino is not installed")
     ov = import_openvino()
@@ -167,7 +167,7 @@ def test_damaged_metadata_beside_an_openvino_file_is_one_line(
 
 
 def test_torchvision_is_known_without_names_of_its_outputs(tmp_path: Path) -> None:
-    """torch.onnx numbers the outputs that a user does not name."""
+    """torch.onnx numbers unnamed outputs."""
     outputs = {"1042": _rows(2, 4), "1043": np.ones(2, np.int64), "1044": _rows(2)}
     path = tmp_path / "my.onnx"
     path.write_bytes(constant_model((3, 64, 128), outputs))
@@ -223,7 +223,7 @@ def test_members_of_the_detr_family_are_told_apart(
 
 
 def test_a_yolox_with_decoded_boxes_keeps_its_colours(tmp_path: Path) -> None:
-    """One row a cell, as of YOLOX; the networks with three anchors a cell take other pictures."""
+    """One row per cell, as in YOLOX; networks with three anchors per cell have other inputs."""
     for rows, colour, scale in ((168, "bgr", 1.0), (504, "rgb", 1 / 255)):
         path = tmp_path / "my.onnx"
         path.write_bytes(constant_model((1, 3, 64, 128), {"output": _rows(1, rows, 85)}))
@@ -238,7 +238,7 @@ def test_a_yolox_with_decoded_boxes_keeps_its_colours(tmp_path: Path) -> None:
 def test_coco_s_classes_are_numbered_as_the_layout_s_networks_do(
     tmp_path: Path, kind: str, number: int
 ) -> None:
-    """Those of YOLO count 80 without gaps; torchvision's and TensorFlow's keep COCO's numbers."""
+    """YOLO numbers 80 classes without gaps; torchvision and TensorFlow keep COCO's numbers."""
     crosscue.draft_card(_file(tmp_path, kind, {}), kind=kind)
 
     assert read_card(tmp_path / "my.toml").output.classes.index("stop sign") == number
@@ -295,7 +295,7 @@ def test_a_network_for_another_task_is_said_to_be_one(tmp_path: Path) -> None:
 def test_a_folder_of_images_gets_no_drawing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is a log, and every image in it a frame."""
+    """The folder is a log, and every image in it is a frame."""
     log, home = tmp_path / "log", tmp_path / "home"
     for folder in (log, home):
         folder.mkdir()
@@ -369,7 +369,7 @@ def test_sizes_that_a_file_leaves_open_are_found_by_running_it(
 
 
 def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One row a cell, and boxes that are wrong by either layout."""
+    """One row per cell, and boxes that are wrong in both layouts."""
     model = constant_model((1, 3, 64, 128), {"output": np.full((1, 168, 85), 20.0, np.float32)})
     path = tmp_path / "my.onnx"
     path.write_bytes(model)

@@ -1,4 +1,4 @@
-"""The line that long commands keep on a terminal: what is done, how fast, time left."""
+"""The progress line of long commands: amount done, rate and time left."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ COMMAND: Final = (
 
 
 class Terminal(io.StringIO):
-    """Takes what is written, and says that it is a terminal."""
+    """Stream that records what is written, and reports to be a terminal."""
 
     def isatty(self) -> bool:
-        """It is one."""
+        """Return True."""
         return True
 
 
 def stderr_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    """In place of stderr; called in the test, since pytest puts its own there before."""
+    """Replace stderr; called inside the test, because pytest replaces stderr before it."""
     made = Terminal()
     monkeypatch.setattr(sys, "stderr", made)
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
@@ -42,7 +42,7 @@ def stderr_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 
 def shown(line: ProgressLine, terminal: Terminal) -> str:
-    """What the terminal shows now."""
+    """Return the text that the terminal shows."""
     assert line._bar is not None
     terminal.truncate(0)
     line._bar.refresh()

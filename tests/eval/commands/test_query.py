@@ -1,4 +1,4 @@
-"""``crosscue query``: what it prints and writes, and that it can only read."""
+"""``crosscue query`` prints and writes rows, and is read-only."""
 
 import csv
 import json

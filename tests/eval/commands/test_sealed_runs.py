@@ -1,4 +1,4 @@
-"""Runs whose sealed log got damaged afterwards, same size: whoever reads it again says so."""
+"""Damage to a sealed log after a run is reported by every command that reads the log again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from support.scoring import approach, good_truth, span, truth, truth_folder
 
 def _run_with_sealed_log(folder: Path) -> tuple[Path, Path]:
     run = pictured.scene_run(folder).path
-    # A car that is said to cross and does not: the page shows the picture of it.
+    # A false crossing car in the truth, so that the page shows its picture.
     wrong = span("cross_traffic_right", 0, 40, present=False, count=0)
     reported = truth([*good_truth().truth.cues, wrong], approaches=[approach(intersection="A")])
     truth_folder(folder, reported)
@@ -24,7 +24,7 @@ def _run_with_sealed_log(folder: Path) -> tuple[Path, Path]:
 
 
 def _flip(log: Path) -> None:
-    """Bytes in the middle; head, tail and index, by which a large log is known, stay."""
+    """Damage bytes in the middle, not in head, tail and index, which identify a large log."""
     raw = bytearray(log.read_bytes())
     assert len(raw) > 5 * MIB
     for at in range(MIB + MIB // 2, len(raw) - MIB, MIB // 2):

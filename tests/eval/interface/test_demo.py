@@ -1,4 +1,4 @@
-"""The real demonstration: fetched once and checked, replayed, scored, shown."""
+"""The real demonstration is downloaded once, verified, replayed, scored and shown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The public interface: what is listed exists, is documented, and costs nothing to import."""
+"""Public names exist, are documented, and are imported lazily."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_the_reference_pages_list_the_public_names_and_no_others() -> None:
 
 
 def test_every_error_is_public() -> None:
-    """So the page of errors, whose names the test above compares, lists all of them."""
+    """All errors are exported, so the page of errors lists all of them."""
     raised = {
         name
         for name, one in vars(errors).items()

@@ -1,4 +1,4 @@
-"""What commands do, done from Python: each function returns a record that prints as its table."""
+"""The commands' functions in Python: each returns a record whose repr is a table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.pandaset_drive import pandaset_drive
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drive of four seconds; ``car.toml`` and ``truth.json`` beside it."""
+    """A drive of four seconds, with ``car.toml`` and ``truth.json`` next to it."""
     return write_drive(tmp_path_factory.mktemp("drive"), Clock(), seconds=4)
 
 
@@ -98,11 +98,11 @@ def test_a_draft_has_the_published_intrinsics_and_what_no_log_shows_as_comments(
     text = crosscue.draft_vehicle(pandaset_drive(tmp_path / "002", 4)).text
 
     assert "focal_px = 1970  # published with the data set\ncenter_px = [970.5, 483]" in text
-    # The made pictures are tiny.
+    # The generated pictures are tiny.
     assert "# pitch and yaw not estimated: camera.center_px = (970.5, 483): outside the im" in text
     for section in ("mobileye", "regions", "ranges", "detectors.yolox-nano", "cues", "cars"):
         assert f"# [{section}]" in text
-    # Every commented line is one of a vehicle file, once a person takes the sign away.
+    # Every commented line is valid in a vehicle file when uncommented.
     lines = [line.removeprefix("# ") for line in text.splitlines()]
     kept = [line for line in lines if re.match(r"\[[\w.-]+\]( +#|$)|\w+ = ", line)]
     parse("\n".join(line for line in kept if 'kind = "curve"' not in line), "uncommented")
@@ -192,7 +192,7 @@ def test_a_mounting_that_is_given_is_written(tmp_path: Path) -> None:
     assert camera.yaw_rad == pytest.approx(-0.01745, abs=1e-4)
     with pytest.raises(crosscue.UsageError, match="camera_height_m: expected"):
         crosscue.draft_vehicle(log, camera_height_m=-1.0)
-    # Four tiny pictures show no vanishing point: a comment says so, and the default stays.
+    # Four tiny pictures have no vanishing point: a comment reports it, and the default is kept.
     text = crosscue.draft_vehicle(log).text
     assert "# pitch and yaw not estimated" in text
     assert "# pitch_rad = 0.0" in text

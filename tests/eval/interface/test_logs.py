@@ -1,4 +1,4 @@
-"""A recorded drive through ``crosscue.open``: tables, frames, signals, and what was lost."""
+"""Drives opened with ``crosscue.open``: tables, frames, signals and losses."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_table_equals_what_decode_writes(drive: DriveFiles, tmp_path: Path) ->
     manifest = decoded.manifest()
     assert isinstance(manifest, DecodeManifest)
     written = decoded.table(manifest.tables[name].removesuffix(".parquet"))
-    # decode has the drive's time and segment in front.
+    # Tables of decode begin with the drive's time and segment.
     written = written.drop_columns(["t_ns", "segment"])
     assert table.replace_schema_metadata() == written.replace_schema_metadata()
 

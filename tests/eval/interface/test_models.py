@@ -1,4 +1,4 @@
-"""Networks by the public interface: the catalog, a card of one's own, and its check."""
+"""Networks in the public interface: the catalog, a user's card, and its check."""
 
 from __future__ import annotations
 

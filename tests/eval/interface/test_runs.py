@@ -1,4 +1,4 @@
-"""A run through the public interface: made, printed, estimated again, scored, compared."""
+"""Runs in the public interface: make, print, estimate again, score, compare."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
 
 @pytest.fixture(scope="module")
 def run(drive: DriveFiles, tmp_path_factory: pytest.TempPathFactory) -> crosscue.Run:
-    """Its replay; the vehicle file is the one beside the log."""
+    """A replay with the vehicle file next to the log."""
     return crosscue.replay_drive(drive.log, tmp_path_factory.mktemp("runs") / "run")
 
 

@@ -1,4 +1,4 @@
-"""Pictures to train on by the public interface, as the command makes them."""
+"""Training pictures from the public interface equal those of the command."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_study_of_intersections_refuses_layouts_that_are_not_scored() -> None:
 
 
 def _defaults(command: str) -> dict[str, object]:
-    """What the command takes for the flags that are not given."""
+    """Return the command's defaults of optional arguments."""
     parser = argparse.ArgumentParser()
     import_module(f"crosscue.eval.commands.train.{command}").add_arguments(parser)
     return {

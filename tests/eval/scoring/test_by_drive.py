@@ -1,4 +1,4 @@
-"""What is called better or worse is better or worse; how much was scored is neither."""
+"""Directions of metrics are right; the amount scored has none."""
 
 import json
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ DRIVES: Final = 8
 
 @pytest.fixture(scope="module")
 def scores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Of a made-up drive with a sign, a belief and ranges."""
+    """Scores of a generated drive with a sign, a belief and ranges."""
     folder = tmp_path_factory.mktemp("drive")
     truth_folder(folder)
     tables = {
@@ -44,7 +44,7 @@ def fleet(tree: Mapping[str, Any]) -> list[DriveMetric]:
 
 
 def of_twice_as_many(tree: Any, name: str = "") -> Any:
-    """The same rates over twice as many rows: every count is doubled, and nothing else."""
+    """The same rates over twice as many rows: only counts are doubled."""
     if isinstance(tree, Mapping):
         return {key: of_twice_as_many(value, key) for key, value in tree.items()}
     is_count = isinstance(tree, int) and not isinstance(tree, bool)
@@ -96,7 +96,7 @@ def test_what_is_not_scored_at_all_any_more_is_reported(scores: dict[str, Any]) 
 
 
 def test_what_only_a_drive_of_one_side_has_is_not_lost() -> None:
-    """A fleet with one drive more has conditions that the other one never saw."""
+    """A fleet with one more drive has conditions that the other lacks."""
 
     def of(log: str, metric: str) -> DriveMetric:
         return DriveMetric(log, metric, "mean", 1.0, 1)

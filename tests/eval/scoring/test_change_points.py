@@ -1,4 +1,4 @@
-"""Change points of a history: found where they are, and as rarely false as stated."""
+"""Change points are found at the right versions, with the stated rate of false ones."""
 
 import math
 
@@ -15,7 +15,7 @@ DRIVES, VERSIONS = 8, 6
 def history(
     chance: np.random.Generator, steps: dict[int, float], drives: int = DRIVES
 ) -> NDArray[np.float64]:
-    """Values of drives that differ much, with noise, and steps from some versions on."""
+    """Values of very different drives, with noise, and steps at some versions."""
     level = chance.normal(0.0, 1.0, (drives, 1))
     values = level + chance.normal(0.0, 0.1, (drives, VERSIONS))
     for at, step in steps.items():

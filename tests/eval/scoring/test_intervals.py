@@ -1,4 +1,4 @@
-"""Intervals over whole clusters: coverage by simulation, and what they become in the limit."""
+"""Intervals over clusters: coverage in simulations, and limits."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from crosscue.replay.columns import Int64s
 
 TIMES = 800
 SLACK = 0.023
-"""Three standard deviations of a coverage of 95 % counted so often."""
+"""Three standard deviations of a coverage of 95 % in this number of trials."""
 
 
 def sizes(chance: np.random.Generator, clusters: int, *, equal: bool) -> Int64s:

@@ -1,4 +1,4 @@
-"""Pose metrics: laws of their own, and evo beside them."""
+"""Pose metrics satisfy laws, and equal those of evo."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def walk(seed: int, n: int = 60, flat: bool = False) -> Trajectory:
 
 
 def near(truth: Trajectory, seed: int, sd_m: float = 0.5, sd_rad: float = 0.1) -> Trajectory:
-    """The same poses, each off a little, and all moved as a whole."""
+    """The same poses with small errors, moved together."""
     rng = np.random.default_rng(seed)
     n = len(truth)
     half = rng.normal(0.0, sd_rad / 2, (n, 3))

@@ -42,7 +42,7 @@ def test_distances_are_those_at_the_first_step_above_the_threshold() -> None:
     assert judged is not None
     (one,) = judged.results
 
-    # p(intersection) 0.95 from frame 10 on (30 m), ranges from frame 8 on; right last, at 15 m.
+    # p(intersection) is 0.95 from frame 10 on (30 m), ranges are from frame 8 on; right is at 15 m.
     assert one.detected_m == pytest.approx(30.0)
     assert one.full_m == pytest.approx(15.0)
     assert one.features_m["left"] == pytest.approx(20.0)
@@ -91,7 +91,7 @@ def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None
         assert judged is not None
         assert judged.results[0].detected_m == distance_m
         assert judged.results[0].why_not_detected == why
-        # The full detection needs no range, as in the source's intersection H.
+        # Full detection needs no range, as for the dissertation's intersection H.
         assert judged.results[0].full_m == 15.0
 
 

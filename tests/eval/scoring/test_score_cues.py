@@ -61,7 +61,7 @@ def test_a_hand_counted_drive() -> None:
     score = score_cues(match_cues(good_tables(), good_truth()))["stop_sign"]
     objects = score.readings["object"]
 
-    # The sign is there in frames 5 to 39, found in 10 to 39; frames 40 to 49 are past it.
+    # The sign is present in frames 5 to 39, found in 10 to 39; frames 40 to 49 are past it.
     assert (objects.frames, objects.scored, objects.with_truth) == (50, 40, 40)
     assert objects.left_out == {"in the intersection": 10}
     assert (score.precision.right, score.precision.of) == (30, 30)
@@ -84,7 +84,7 @@ def test_frames_sum_up_to_scored_and_reasons_in_every_reading() -> None:
         for reading in score.readings.values():
             assert reading.scored + sum(reading.left_out.values()) == reading.frames == 51
     assert scores["road_left"].readings["object"].left_out["not looked for"] == 40
-    # Frame 80 lies behind the end of the truth.
+    # Frame 80 is after the end of the truth.
     assert scores["stop_sign"].readings["object"].left_out["outside the truth's time"] == 1
 
 
@@ -98,7 +98,7 @@ def test_the_two_readings_differ_where_a_way_is_there_but_closed() -> None:
     road, sign = scores["road_left"].readings, scores["one_way_right"].readings
     assert road["object"].precision.value == 1.0
     assert road["feature"].precision.value == 0.0
-    # No such sign hangs there, yet what it says is so.
+    # There is no such sign, but its feature is true.
     assert sign["object"].precision.value == 0.0
     assert sign["feature"].precision.value == 1.0
 
@@ -108,7 +108,7 @@ def test_a_cue_of_an_intersection_where_none_is_ahead_is_wrong() -> None:
     judged = match_cues(tables({"traffic_light": {5: 1, 25: 1}}), truth([], [far]))
     score = score_cues(judged)["traffic_light"]
 
-    # Without truth of lights themselves, the other reading leads and the score says so.
+    # Without truth of lights, the other criterion leads, and the score reports it.
     assert score.reading == "feature"
     assert not score.is_sources_reading
     assert (score.precision.right, score.precision.of) == (1, 2)

@@ -1,4 +1,4 @@
-"""A run's pose against truth: what a perfect run scores, and what is refused."""
+"""Scores of a run's pose: a perfect run, and refused truth."""
 
 import json
 import warnings
@@ -85,10 +85,10 @@ def test_a_perfect_run_has_no_error_and_says_what_was_left_out(tmp_path: Path) -
 
     assert result.ape["none"].translation_m.max < 1e-2
     assert result.rpe["100 m"].translation_m.max < 1e-2
-    # Chi-square scores of no error at all are below their band: claims were too modest.
+    # NEES without any error is below its band: the filter is underconfident.
     assert result.nees_xyh.mean < 0.01
     covered = result.coverage
-    # The first row stands at the end of the first interval, 0.1 s in.
+    # The first row is at the end of the first interval, at 0.1 s.
     assert covered.before_estimate == 22
     assert covered.scored + covered.before_estimate + covered.after_estimate == covered.truth_poses
 
@@ -113,7 +113,7 @@ def test_truth_of_the_camera_is_compared_at_the_camera(tmp_path: Path) -> None:
 
 
 def _turned(track: Trajectory, yaw_rad: float) -> Trajectory:
-    """The same track of a body that is mounted turned to the left."""
+    """The same track, of a body that is mounted rotated to the left."""
     heading = heading_rad(track) + yaw_rad
     return planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading)
 
@@ -299,7 +299,7 @@ def test_no_nees_where_the_runs_frame_is_its_own(tmp_path: Path) -> None:
     text = pose_summary(result)
     assert "NEES not computed: the run's frame is its own" in text
     assert "NEES of" not in text
-    # What does not need a common frame is still measured.
+    # Errors that need no common frame are still measured.
     assert result.ape["yaw"].translation_m.max < 1e-2
 
 

@@ -1,4 +1,4 @@
-"""``crosscue score`` on run folders: files, gates, exit status, and what is refused."""
+"""``crosscue score`` on run folders: files, gates, exit status, and refused input."""
 
 import errno
 import json
@@ -41,14 +41,14 @@ from support.scoring import (
 
 
 def _one(tmp_path: Path, name: str = "one") -> Path:
-    """A run whose truth is beside its log."""
+    """A run whose truth is next to its log."""
     truth_folder(tmp_path / name)
     run_folder(tmp_path / name / "run")
     return tmp_path / name / "run"
 
 
 def _fails(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
-    """The one line that a command fails with."""
+    """Return the one line that a command fails with."""
     capsys.readouterr()
     assert cli.run([str(one) for one in argv]) in (1, 2, 4)
     line = capsys.readouterr().err

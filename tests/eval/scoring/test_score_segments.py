@@ -1,4 +1,4 @@
-"""What cannot be scored as its log time comes twice has a line of its own everywhere."""
+"""Rows that are not scored because their log time occurs twice are counted separately."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _replayed(folder: Path, clock: Clock) -> RunFolder:
 
 
 def _ambiguous_rows(run: RunFolder, name: str) -> int:
-    """By hand: rows whose stamp is in the other segment's time."""
+    """Return the rows whose stamp is also in the other segment's time."""
     timeline = run.drive_manifest().timeline
     table = run.table(name)
     log_ns, numbers = table["log_t_ns"].to_numpy(), table["segment"].to_numpy().astype(np.int64)

@@ -1,4 +1,4 @@
-"""Noise derived from the simulator's own settings makes the pose as wrong as it says."""
+"""With the simulator's noise settings, the pose's errors are consistent."""
 
 from pathlib import Path
 

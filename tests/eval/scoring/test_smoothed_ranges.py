@@ -1,4 +1,4 @@
-"""The range smoother beside the range filter, on made-up approaches."""
+"""The range smoother and the range filter on generated approaches."""
 
 from __future__ import annotations
 

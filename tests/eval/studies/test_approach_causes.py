@@ -1,4 +1,4 @@
-"""Why an approach failed is read off its frames; what a condition costs, off the same place's."""
+"""Causes of failed approaches from their frames, and effects of conditions at the same place."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _result(**changes: object) -> ApproachResult:
 def _cue(
     cue: str, *, found: int = 0, there: int = 0, visible: float = 1.0, approach: int = 0
 ) -> CueFrames:
-    """Things there, and positives, in the first so many frames."""
+    """Objects, and positives, in the first frames."""
     first = np.arange(FRAMES)
     return CueFrames(
         drive="runs/X-01",

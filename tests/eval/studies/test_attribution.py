@@ -1,4 +1,4 @@
-"""What a cue was worth: nothing where it said nothing, everything where all came from it."""
+"""Effect of a cue: none if it has no evidence, everything if all evidence is its own."""
 
 import math
 from collections.abc import Mapping

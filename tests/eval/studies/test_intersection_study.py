@@ -38,7 +38,7 @@ def _with_oracle(path: Path) -> Vehicle:
 
 
 def _stay_here(patch: pytest.MonkeyPatch) -> None:
-    """No process of its own for a drive: it would not know of the patched detectors."""
+    """Run drives in this process, because another would not have the patched detectors."""
     patch.setattr(simulated_drives, "load", _with_oracle)
     patch.setattr(study_intersections, "engine_of", lambda *_args: in_turn)
 

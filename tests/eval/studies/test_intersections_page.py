@@ -1,4 +1,4 @@
-"""The page of the intersections study asks its records for nothing that they lack."""
+"""The page of the intersections study uses only existing fields of its records."""
 
 from __future__ import annotations
 

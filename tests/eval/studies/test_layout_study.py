@@ -1,4 +1,4 @@
-"""The study of layouts: what every fold holds, and what its scores say of beliefs made up here."""
+"""The study of layouts: contents of folds, and scores of generated beliefs."""
 
 from __future__ import annotations
 

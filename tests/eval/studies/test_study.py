@@ -1,4 +1,4 @@
-"""Studies: the same bytes however they are driven, nothing driven twice, bad input named."""
+"""Studies yield the same bytes on any workers, simulate nothing twice, and name bad input."""
 
 import json
 import math
@@ -70,7 +70,7 @@ def whole(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
 
 
 def driven(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
-    """Drives only: summaries and figures take longer than these drives."""
+    """Run only the drives, because summaries and figures take longer."""
     assert list(drive_study(study, folder, workers))[-1] == 1.0
     return folder
 
@@ -176,7 +176,7 @@ def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() ->
     assert found.extra.value == pytest.approx(0.1)
     assert found.extra_reached.value == pytest.approx((15_300.0 / 3.0) / (3000.0 / 2.0) - 1.0)
     assert found.extra_all.value == pytest.approx(15_300.0 / 12_000.0 - 1.0)
-    # Below 10 landmarks per km2 lies the only cell; all cities are of 1 km2.
+    # The only cell is below 10 landmarks per km2, and all cities have 1 km2.
     assert found.extra_sparse.value == found.extra_reached.value
     assert found.by_city[0].extra.value == found.extra_reached.value
     assert all(math.isnan(one.extra.value) for one in found.by_city[1:])
@@ -207,7 +207,7 @@ def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
     assert [key for key, one in found.items() if one.is_studied] == [(0.003, 1.876)]
     for slip in (0.0015, 0.003, 0.006, 0.009):
         means = [one.lost_after_m[30.0].value for key, one in found.items() if key[0] == slip]
-        # The longer a compass error lasts, the sooner the car is lost: about as 1 / interval.
+        # The longer a compass error lasts, the sooner the car is lost: about 1 / interval.
         assert means == sorted(means, reverse=True)
         assert 1.5 < means[0] / means[-1] < 4.0
     for one in found.values():
@@ -372,7 +372,7 @@ def test_the_default_compass_interval_is_the_calibrated_one() -> None:
 
 @pytest.mark.slow
 def test_twenty_degrees_is_predicted_from_thirty(tmp_path: Path) -> None:
-    """The law r ds D: distances at loss are as the inverse squares of the compass's errors."""
+    """Distances at loss are inversely proportional to the squared compass error (r ds D)."""
     study = RangeStudy(drives=120, compass_2sigma_deg=(20.0, 30.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(work, "CHUNK_DRIVES", 60)
