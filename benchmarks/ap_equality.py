@@ -67,7 +67,7 @@ ROUNDS = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What a pipeline found in one picture: boxes (N, 4), scores (N,), COCO class numbers (N,)."""
+    """Detections in one picture: boxes (N, 4), scores (N,), COCO class numbers (N,)."""
 
     boxes: Floats
     scores: Floats
@@ -89,7 +89,7 @@ class Labelled:
     visible: Floats
 
     def is_counted(self, reach_m: float) -> NDArray[np.bool_]:
-        """Which vehicles are to be found; the others are ignored."""
+        """Mask of the vehicles to be found; others are ignored."""
         return (self.range_m <= reach_m) & (self.visible >= MIN_VISIBLE)
 
 
@@ -121,7 +121,7 @@ def pandaset(folder: Path) -> list[Labelled]:
 
 
 def _labelled(path: Path, nearest_first: list[tuple[float, Floats, bool]], size: Size) -> Labelled:
-    """What of each box is visible: inside the picture, and not behind a nearer box."""
+    """Visible part of each box: inside the picture, and not behind a nearer box."""
     is_hidden = np.zeros((size[1] // 2, size[0] // 2), bool)
     kept = []
     for distance, whole, is_vehicle in nearest_first:
@@ -172,7 +172,7 @@ class Bare:
         self.network_s = 0.0
 
     def __call__(self, path: Path, view: View | None = None) -> tuple[Found, float]:
-        """What it finds, and CPU seconds from the decoded picture on.
+        """Return the detections, and the CPU seconds after the picture is decoded.
 
         Args:
             path: The picture.
@@ -242,7 +242,7 @@ class Ours:
         self.numbers = {name: i for i, name in enumerate(entry(model).output.classes)}
 
     def __call__(self, path: Path) -> tuple[Found, float]:
-        """What it finds, and CPU seconds from the decoded picture on."""
+        """Return the detections, and the CPU seconds after the picture is decoded."""
         pixels, size = decode(read_file(path), self.detector.view)
         began = time.process_time()
         (found,) = self.detector([Frame(0, "", pixels, size)])
@@ -327,7 +327,7 @@ def _xywh(box: Floats) -> list[float]:
 
 
 def recall(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, int]:
-    """How many counted vehicles have a box over them by half, score at least 0.3; of how many."""
+    """Number of vehicles with a box of IoU 0.5 and score 0.3 or more, and of all vehicles."""
     hits = total = 0
     for picture, one in zip(pictures, found, strict=True):
         boxes = one.boxes[one.scores >= RECALL_SCORE]
@@ -340,7 +340,7 @@ def recall(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, i
 
 
 def on_nothing(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, int]:
-    """How many boxes above 0.5 are on no vehicle's projected box at all; of how many."""
+    """Number of boxes above 0.5 that overlap no vehicle's projected box, and of all boxes."""
     alone = total = 0
     for picture, one in zip(pictures, found, strict=True):
         for box in one.boxes[one.scores > FALSE_SCORE]:

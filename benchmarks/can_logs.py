@@ -65,7 +65,7 @@ def originals(folder: Path, data: Path, repeat: int) -> list[Path]:
 
 
 def seconds(read: Callable[[Path], int], path: Path) -> tuple[float, int]:
-    """How long one pass takes, and what it counts."""
+    """Duration of one pass, and its counts."""
     began = time.perf_counter()
     count = read(path)
     return time.perf_counter() - began, count

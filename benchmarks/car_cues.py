@@ -1,4 +1,4 @@
-"""What the wrong car cues of a simulated study were: each positive car beside the true one.
+"""False car cues of a simulated study: each positive car beside the true one.
 
 Run it as ``python benchmarks/car_cues.py STUDY`` on the folder of ``crosscue study intersections``.
 Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is looked up in the drive's
@@ -56,7 +56,7 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
 
 
 def is_true(truth: Truth, cue: str, t_ns: int) -> bool | None:
-    """Whether the thing is there in the frame, whichever car was meant; None unknown."""
+    """Truth of the cue in the frame, whichever car was meant; None if unknown."""
     at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
     return None if at.present[0] < 0 else bool(at.present[0])
 

@@ -1,4 +1,4 @@
-"""How many frames a second fusion takes, and its belief beside GTSAM.
+"""Frames per second of the fusion, and its belief beside GTSAM's.
 
 A made-up drive of ten minutes at ten frames a second passes an intersection every 130 m. The whole
 loop has no peer (its range filter is filterpy's); its belief is measured beside GTSAM's discrete

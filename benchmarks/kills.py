@@ -85,7 +85,7 @@ def ended(child: int) -> int:
 def kill_and_resume(
     argv: list[str], run: Path, after_s: float, right: dict[str, str]
 ) -> tuple[list[str], float]:
-    """What became of one replay, of what it left, and of the resumed one; how long that took."""
+    """Outcome of a killed replay, of its remains and of the resumed replay, with durations."""
     child = started(argv)
     time.sleep(after_s)
     os.kill(child, signal.SIGKILL)
@@ -146,7 +146,7 @@ def main() -> None:
 
 
 def after_kill(run: Path, right: dict[str, str]) -> str:
-    """What a killed run passes for: it may be unfinished, but never wrong."""
+    """State of a killed run: it may be unfinished, but never wrong."""
     try:
         manifest = open_run(run).manifest()
     except RunError:

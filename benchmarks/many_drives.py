@@ -52,7 +52,7 @@ kind = "estimate:build"
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What the engine asks for, and no more."""
+    """Minimal work that the engine requires."""
 
     exit_status: int = 0
 

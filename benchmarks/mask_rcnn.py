@@ -103,7 +103,7 @@ class PlainLoop:
     plan: Plan
 
     def __call__(self, frame: Frame) -> dict[str, Tensor]:
-        """What it finds, masks pasted."""
+        """Return the detections with pasted masks."""
         placed = place(frame.pixels, self.plan).pixels
         height, width = placed.shape[:2]
         # A size equal to the picture's: torchvision's transform then scales nothing.
@@ -260,7 +260,7 @@ def above(found: Detections, min_score: Least) -> list[int]:
 
 
 def matches(theirs: Detections, ours: Detections, min_score: Least) -> Counter[str]:
-    """How many are the same in both, and how many are in one alone."""
+    """Number of detections in both, and in only one of them."""
     free, counts = set(above(ours, min_score)), Counter[str]()
     for i in above(theirs, min_score):
         apart_px = {
@@ -279,7 +279,7 @@ def matches(theirs: Detections, ours: Detections, min_score: Least) -> Counter[s
 
 
 def judged(found: Detections, scene: Scene, min_score: Least) -> Counter[str]:
-    """How many are right, how many find an object again, how many are false."""
+    """Numbers of correct, duplicate and false detections."""
     counts, met = Counter[str](), set[int]()
     for i in above(found, min_score):
         fractions = [

@@ -71,7 +71,7 @@ def print_heights(labelled: LabelledSet, found: Sequence[Detections], name: str)
 
 
 def print_noses(labelled: LabelledSet, found: Sequence[Detections]) -> None:
-    """How often the nose is at the same end as in the true mask."""
+    """Fraction of masks whose nose is at the same end as in the true mask."""
     agree: list[bool] = []
     for found_px, box, own, true, picture in pairs(labelled, found, "car", 0.95):
         is_whole = box[0] > 1.0 and box[2] < picture.size_px[0] - 1.0

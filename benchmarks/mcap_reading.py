@@ -240,7 +240,7 @@ AGAINST = (
     ("rosbags, deserialised", 1, True),
     ("bare decompression", 2, False),
 )
-"""What ratios are taken to, digits printed, and whether more is better."""
+"""Reference of the ratios, printed digits, and True if more is better."""
 
 
 def speed(rounds: int) -> None:

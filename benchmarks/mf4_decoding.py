@@ -65,7 +65,7 @@ def our_database(dbc: Path) -> Any:
 
 
 def theirs(log: Path, database: Any) -> Any:
-    """What asammdf extracts, as an MDF object in memory."""
+    """Signals extracted by asammdf, as an MDF object in memory."""
     import asammdf
 
     with asammdf.MDF(log) as mdf:

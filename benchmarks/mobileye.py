@@ -1,4 +1,4 @@
-"""How fast a Mobileye's frames are decoded, beside cantools frame by frame.
+"""Speed of decoding a Mobileye's frames, beside cantools frame by frame.
 
 Both get the same simulated frames and the same layout: an in-memory cantools database is made from
 our table (classic revision, family extended). cantools gives a dictionary a frame; ours gives

@@ -96,7 +96,7 @@ def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion,
 
 
 def true_kinds(drives: list[Path], min_visible: float) -> dict[str, Counter[str]]:
-    """What the cars that each rule counts are in truth, by cue."""
+    """True state of the cars that each rule counts, by cue."""
     kinds: dict[str, Counter[str]] = {cue: Counter() for cue in RULES}
     for drive in drives:
         rules, cars = load_vehicle(drive / "vehicle.toml").cars, true_cars(drive)

@@ -90,7 +90,7 @@ class WindowSearch:
         return [(best[1], best[2])] if best[1] else []
 
     def seconds(self, grey: Bytes, first: int) -> float:
-        """What a search takes, from every ``ONE_IN``-th window after ``first`` of each level."""
+        """Seconds of a search, from every ``ONE_IN``-th window after ``first`` of each level."""
         taken, looked, there = 0.0, 0, 0
         for size, of_size in self._by_size.items():
             for number, window in enumerate(self._windows(grey, size)):

@@ -1,4 +1,4 @@
-"""How fast simulated drives are made: pictures a second, stage by stage, on one core.
+"""Speed of simulating drives: pictures per second, stage by stage, on one core.
 
 There is no peer that draws these scenes without a GPU; each stage stands as a fraction of the
 whole, and OpenCV's encoding of the same picture as JPEG serves as the unit to compare machines by.

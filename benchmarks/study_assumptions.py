@@ -1,4 +1,4 @@
-"""How far the studies' results hang on what the source does not report: one assumption at a time.
+"""Sensitivity of the studies to what the source does not state: one assumption at a time.
 
     python benchmarks/study_assumptions.py [--only field|nees|landmarks] [--drives 200]
         [--field-drives 400] [--nees-drives 20000] [--seed 77]

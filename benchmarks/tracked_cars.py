@@ -39,7 +39,7 @@ PLACE_SD_M = 2.0
 
 
 class Totals(NamedTuple):
-    """What is counted over all drives: (cue, counted, truly there), and gates by cue."""
+    """Counts over all drives: (cue, counted, truly there), and gates by cue."""
 
     rows: Counter[tuple[str, bool, bool]]
     gates: Counter[str]

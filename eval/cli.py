@@ -128,7 +128,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class Command(Protocol):
-    """What a module in ``commands`` offers."""
+    """Interface of a module in ``commands``."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Declare flags."""

@@ -80,7 +80,7 @@ class Names(SphinxDirective):
 
 
 def first_line(documented: object) -> str:
-    """What a public name is, without the marks of its docstring."""
+    """Summary line of a public name, without markup."""
     text = (inspect.getdoc(documented) or "").partition("\n\n")[0]
     return " ".join(text.replace("``", "").split())
 

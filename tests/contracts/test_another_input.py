@@ -1,4 +1,4 @@
-"""What goes on with a result, or replaces it, refuses one that is made of something else."""
+"""Commands that continue or replace a result refuse one that was made from other inputs."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ BAD = {
     "other-camera": "outside the images of 24 x 16 pixels",
     "not-counted": "net: no cue counts any of its 2 labels (cat, dog); state what its classes mean",
 }
-"""What is bad of a network for three pictures, and a part of the line that says so."""
+"""Defects of a network for three pictures, and a part of the error line."""
 
 
 def card(folder: Path, model: bytes, classes: list[str], width_px: int = 64) -> str:

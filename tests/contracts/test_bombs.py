@@ -215,7 +215,7 @@ READS_CAMERA: dict[str, str] = {
     "fit landmarks": "{log} --database {db} --poses {truth}",
     "fit signs": "{drive} --label stop_sign",
 }
-"""What decodes a camera's pictures, at least their headers."""
+"""Commands that decode a camera's pictures, or at least their headers."""
 
 
 @pytest.mark.parametrize("holder", HOLDERS)
@@ -263,7 +263,7 @@ READS_FILES: dict[str, str] = {
     "train mask-rcnn": "--data {folder}/coco.json --images {folder}/images -o {out}.safetensors "
     "--steps 1 --batch 1 --check-every 1 --device cpu",
 }
-"""What decodes picture files."""
+"""Commands that decode picture files."""
 
 
 @pytest.mark.parametrize("coded", CODED)

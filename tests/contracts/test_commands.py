@@ -1,4 +1,4 @@
-"""What holds for every command of the table: help, wrong usage, missing input, pipes, JSON."""
+"""Laws of every command of the table: help, wrong usage, missing input, pipes, JSON."""
 
 import argparse
 import os

@@ -164,7 +164,7 @@ def test_a_dummy_cue_goes_from_pixels_to_tables_scores_report_and_recording(
 
 
 def _static(recording: Path, entity: str, component: str) -> list[object]:
-    """What a recording says of an entity for all times."""
+    """Static components of an entity in a recording."""
     batches = [
         chunk.to_record_batch()
         for chunk in RrdReader(recording).stream()

@@ -42,7 +42,7 @@ PHRASES: Final = {
     "again, over": r"\banew\b",
     "is not a": r"(?<!there )\bis no (layout|time|number|text|multiplexer|file|table|count)\b",
 }
-"""What to write instead, and the words that it replaces in prose."""
+"""Recommended words, and the patterns in prose that they replace."""
 
 NAMES: Final = {
     "report": r"(^|_)(told|tells|tell)(_|$)(?!apart|from)",
@@ -80,7 +80,7 @@ def _words(path: Path) -> Iterator[tuple[int, str, dict[str, str]]]:
 
 
 def _may_be_in(text: str) -> bool:
-    """Whether a word of the tables stands in a text, whatever is around it."""
+    """Return whether a text contains any word of the tables."""
     prose, names = " ".join(text.split()), "\n".join(set(re.findall(r"\w+", text)))
     return bool(
         _loosely(*PHRASES.values()).search(prose) or _loosely(*NAMES.values()).search(names)

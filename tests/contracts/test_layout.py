@@ -1,4 +1,4 @@
-"""What holds for the text of every module: formatting is ruff's, with few exceptions."""
+"""Laws of the text of every module: formatting is ruff's, with few exceptions."""
 
 import re
 from pathlib import Path

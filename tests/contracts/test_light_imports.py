@@ -60,7 +60,7 @@ card = "card.toml"
 def without(
     modules: tuple[str, ...], code: str, *arguments: str, folder: Path | None = None
 ) -> str:
-    """What Python prints that cannot import ``modules``; any attempt fails, also a guarded one."""
+    """Output of a Python that cannot import ``modules``; any attempt fails, even a guarded one."""
     done = subprocess.run(
         [sys.executable, "-c", BLOCKED_RUN + code, ",".join(modules), *arguments],
         capture_output=True,

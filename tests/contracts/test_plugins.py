@@ -135,7 +135,7 @@ print("kept")
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What pip would have installed of the user's package."""
+    """Files that pip would install of the user's package."""
     folder = tmp_path_factory.mktemp("site")
     (folder / "dummy_package.py").write_text(MODULE)
     info = folder / "dummy_package-1.2.dist-info"

@@ -1,4 +1,4 @@
-"""How modules lean on each other may get better, not worse.
+"""Measures of the import graph may improve, not deteriorate.
 
 The goals of architecture.md are a longest chain of 12, 3.5 imports a module and about a dozen files
 a folder; lower the bounds when the numbers fall.

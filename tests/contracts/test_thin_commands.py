@@ -90,7 +90,7 @@ CALLS: Final = {
 """The public functions that a command is made of."""
 WITHOUT: Final = {"completion": "it is about the shell"}
 ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|safe_text))?")
-"""What a command may import of ours: the public interface, options, and safe text.
+"""Modules that a command may import: the public interface, options, and safe text.
 
 Constants, too, for the help."""
 

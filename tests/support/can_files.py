@@ -265,7 +265,7 @@ def read_back(
 
 
 def by_bus(frames: Sequence[Sent], spelled: str = "can/{}") -> dict[str, list[Sent]]:
-    """What a reader should give for ``frames``, when bus ``1`` becomes ``spelled``."""
+    """Expected columns of a reader for ``frames``, if bus ``1`` is renamed to ``spelled``."""
     found: dict[str, list[Sent]] = {}
     for f in frames:
         name = spelled.format(f.bus)

@@ -40,7 +40,7 @@ class Kind:
         return frames if self.buses else [replace(f, bus="1") for f in frames]
 
     def expected(self, frames: Sequence[Sent]) -> dict[str, list[Sent]]:
-        """What a reader should give."""
+        """Expected columns of a reader."""
         shifted = [replace(f, t_ns=f.t_ns - START_NS + self.start_ns) for f in frames]
         return by_bus(shifted, "can{}" if self.suffix == ".log" else "can/{}")
 
@@ -64,7 +64,7 @@ KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How a damaged copy was read.
+    """Result of reading a damaged copy.
 
     Attributes:
         word: ``refused``, ``same``, ``reported``, ``undetectable`` or, in capitals, a fault.
@@ -108,7 +108,7 @@ def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: P
 
 
 def hit(kind: Kind, whole: bytes, copy: bytes) -> int:
-    """How many frames the damage may have changed where no checksum could show it."""
+    """Number of frames that the damage may have changed without a checksum to detect it."""
     if kind.suffix == ".blf":
         # A span of 64 bytes touches three objects of 48 at most.
         return 3 if kind is KINDS["blf-stored"] else 0

@@ -27,7 +27,7 @@ SCHEMA = pa.schema([("t_ns", pa.int64()), ("letter", pa.string())])
 
 @dataclass(frozen=True, slots=True)
 class Letters:
-    """What the work on a made-up drive gave."""
+    """Result of the work on a synthetic drive."""
 
     rows: int
     exit_status: int

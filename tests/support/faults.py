@@ -27,7 +27,7 @@ CHANGES = WRITES | {"os.remove", "os.rmdir"}
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a forked command ended.
+    """Outcome of a forked command.
 
     Attributes:
         status: Exit status; minus the signal's number if it was killed.

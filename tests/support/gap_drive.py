@@ -85,7 +85,7 @@ kind = "{CHOICE}"
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """What becomes of true times in the log.
+    """Mapping from true times to the log's.
 
     Attributes:
         set_at_s: The clock is set then,

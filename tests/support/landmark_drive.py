@@ -17,7 +17,7 @@ from support.simulated_drive import Truth
 
 
 def there(xy_m: Floats) -> Features:
-    """What a camera sees at a place: in this simulation, the place itself."""
+    """Camera image at a place: in this simulation, the place itself."""
     where = np.ascontiguousarray(xy_m, np.float64).view(np.uint8).reshape(1, 16)
     return Features(640, 480, np.zeros((1, 2), np.float32), where)
 

@@ -23,7 +23,7 @@ from support.mcap_files import (
 )
 
 UNCOVERED = ("no checksum covers", "checksum is wrong", "has no checksums")
-"""What the account says where a changed byte need not show."""
+"""Text of the account if a changed byte cannot be detected."""
 TOPICS = ("/imu", "/can", "/camera")
 
 
@@ -73,7 +73,7 @@ def sound_files() -> Iterator[tuple[str, bytes]]:
 
 
 class Kind(Enum):
-    """What became of one damaged copy."""
+    """Outcome of one damaged copy."""
 
     REFUSED = "refused with one line"
     SAME = "everything read, nothing to report"
@@ -87,7 +87,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of one damaged copy, and the fraction of messages kept."""
+    """Outcome of one damaged copy, and the fraction of messages kept."""
 
     kind: Kind
     kept: float = 0.0

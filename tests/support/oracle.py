@@ -34,7 +34,7 @@ class Oracle:
 
     @property
     def identity(self) -> str:
-        """Which truth it knows."""
+        """Truth that it reports."""
         return f"oracle {self._text}"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:

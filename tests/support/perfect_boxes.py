@@ -38,7 +38,7 @@ def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
 
 
 def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
-    """What the nearest true car does, or that none exists."""
+    """Motion of the nearest true car, or that none exists."""
     best, nearest = "no car", MIN_NEAR
     for one in cars:
         x0, y0, width, height = one["bbox"]
@@ -71,6 +71,6 @@ def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
 
 
 def is_there(truth: Truth, cue: str, t_ns: int) -> bool | None:
-    """Whether the thing is there in the frame; None where the truth does not say."""
+    """Truth of a cue in the frame; None if unknown."""
     at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
     return None if at.present[0] < 0 else bool(at.present[0])

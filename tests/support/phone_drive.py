@@ -22,7 +22,7 @@ PHONE: Final = (
 START_S: Final = 1_523_201_497
 """10:31:37 on the wall clock of a place five hours behind UTC."""
 LATE_S: Final = 1.1
-"""How old a position is when the phone logs it."""
+"""Age of a position when the phone logs it."""
 
 
 def phone_drive(path: Path, count: int = 60) -> Path:

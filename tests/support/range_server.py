@@ -12,7 +12,7 @@ from threading import Thread
 
 @dataclass(slots=True)
 class Served:
-    """What the server holds and has done.
+    """Content and log of the server.
 
     Attributes:
         base: Its URL.

@@ -35,7 +35,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one pass over a log gave."""
+    """Result of one pass over a log."""
 
     rows: tuple[Row, ...]
     ledger: Ledger

@@ -183,7 +183,7 @@ CUES: Final[Mapping[str, Mapping[int, int]]] = {
 
 
 def good_tables() -> RunTables:
-    """What a fine run has."""
+    """Tables of a valid run."""
     return tables(CUES, belief_table(BELIEF), range_table(8, 45, 0.5), frames=50)
 
 

@@ -17,7 +17,7 @@ BASE_M = 2.7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What the car really did.
+    """True motion of the car.
 
     Attributes:
         t_ns: Shape (N,).

@@ -34,7 +34,7 @@ classes = ["stop sign"]
 
 @dataclass(frozen=True, slots=True)
 class StandIn:
-    """What is served, and where it was made.
+    """Served content, and its origin.
 
     Attributes:
         known: The recording's entry, ``pandaset_002`` to the product.
