@@ -39,7 +39,9 @@ class IntersectionStudy:
             UsageError: A value is out of range.
         """
         if self.runs < 1 or self.seed < 0:
-            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 and 0 or more")
+            raise UsageError(
+                f"runs {self.runs}, seed {self.seed}: expected 1 or more runs, a seed of 0 or more"
+            )
         if not 64 <= self.width_px <= 3840 or self.width_px % 16:
             raise UsageError(f"width {self.width_px}: expected a multiple of 16 from 64 to 3840")
         unknown = [name for name in self.layouts if name not in SCORED]

@@ -54,7 +54,9 @@ class LayoutStudy:
                 "and at least as many blocks"
             )
         if self.runs < 1 or self.seed < 0:
-            raise UsageError(f"runs {self.runs}, seed {self.seed}: expected 1 and 0 or more")
+            raise UsageError(
+                f"runs {self.runs}, seed {self.seed}: expected 1 or more runs, a seed of 0 or more"
+            )
         camera_of_width(self.width_px)
 
     @property
