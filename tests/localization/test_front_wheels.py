@@ -45,10 +45,15 @@ def test_four_scaled_wheels_agree_on_the_way() -> None:
     exact = replace(CAR, slip_per_sqrt_m=0.0)
     car = four_wheels(truth, np.random.default_rng(seed=6))
     ways = [
-        float(np.abs(integrate(car, replace(exact, **REAR, **FRONT, use_front_wheels=front))
-        .increments.distance_m).sum())
+        float(
+            np.abs(
+                integrate(
+                    car, replace(exact, **REAR, **FRONT, use_front_wheels=front)
+                ).increments.distance_m
+            ).sum()
+        )
         for front in (False, True)
-    ]  # fmt: skip
+    ]
 
     assert ways[1] == pytest.approx(ways[0], rel=2e-3)
 

@@ -266,7 +266,7 @@ CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
     ("more", "said"),
     [
         ({"approaches": [ONE, ONE | {"id": 1, "start_ns": 30, "enter_ns": 60}]}, "overlap"),
-        ({"approaches": [ONE, ONE | {"start_ns": 50, "enter_ns": 60}]}, "twice"),
+        ({"approaches": [ONE, ONE | {"start_ns": 50, "enter_ns": 60}]}, "duplicate id"),
         ({"approaches": [ONE | {"enter_ns": 101}]}, "from 0 to 100"),
         ({"approaches": [ONE | {"control": "yield"}]}, "approaches.0.control"),
         ({"cues": [CUE | {"t_ns": 100}]}, "from 0 to 100"),
