@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import open_run
+from crosscue.eval.runs.folder import DetectorRow, EstimateManifest, open_run
 from support.onnx_models import constant_model
 from support.pictures import picture_folder
 
@@ -104,6 +104,14 @@ def positive(out: Path) -> dict[str, int]:
     return counts
 
 
+def detector_of(out: Path) -> DetectorRow:
+    """Manifest entry of the only detector of a run."""
+    detected = open_run(out).drive_manifest().detected
+    assert detected is not None
+    (detector,) = detected.detectors
+    return detector
+
+
 @pytest.mark.parametrize("nose", ["left", "right"])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_mask_shows_which_way_a_parked_car_faces(tmp_path: Path, layout: str, nose: str) -> None:
@@ -114,7 +122,7 @@ def test_a_mask_shows_which_way_a_parked_car_faces(tmp_path: Path, layout: str, 
     found = positive(out)
     other = "right" if nose == "left" else "left"
     assert (found[f"parked_{nose}"], found[f"parked_{other}"]) == (2, 0)
-    (detector,) = open_run(out).drive_manifest().detected.detectors
+    detector = detector_of(out)
     assert (detector.with_mask, detector.boxes_only) == (("car",), ())
 
 
@@ -125,8 +133,10 @@ def test_without_masks_parked_cars_are_not_looked_for(tmp_path: Path) -> None:
     assert "parked_left" not in found
     assert found["cross_traffic_left"] == 0
     manifest = open_run(out).drive_manifest()
+    assert isinstance(manifest, EstimateManifest)
+    assert manifest.scene is not None
     assert "only masks show" in manifest.scene.not_looked_for["parked_left"]
-    (detector,) = manifest.detected.detectors
+    detector = detector_of(out)
     assert (detector.with_mask, detector.boxes_only) == ((), ("car",))
 
 

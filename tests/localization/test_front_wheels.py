@@ -9,10 +9,15 @@ from crosscue.localization.fit.front_wheels import front_wheels
 from crosscue.localization.odometry import OdometrySettings, WheelSpeeds, integrate
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
 
-REAR = {"wheel_scale": 1.02, "right_wheel_scale": 0.995}
 FRONT = {"front_left_scale": 1.008, "front_right_scale": 0.991}
 CAR = OdometrySettings(
     track_width_m=TRACK_M, wheelbase_m=BASE_M, slip_per_sqrt_m=0.005, gyro_noise_rad_per_sqrt_s=1e-3
+)
+REAR_SCALES = replace(CAR, wheel_scale=1.02, right_wheel_scale=0.995)
+FOUR_SCALES = replace(
+    REAR_SCALES,
+    front_left_scale=FRONT["front_left_scale"],
+    front_right_scale=FRONT["front_right_scale"],
 )
 
 
@@ -21,14 +26,14 @@ def four_wheels(truth: Truth, rng: np.random.Generator) -> WheelSpeeds:
     rear = wheels(truth, CAR, rng).wheels_mps
     across = BASE_M * truth.yaw_radps[:, None]
     front = np.sign(rear) * np.hypot(rear, across)
-    scales = replace(CAR, **REAR, **FRONT).wheel_scales
+    scales = FOUR_SCALES.wheel_scales
     return WheelSpeeds(truth.t_ns, np.hstack([front, rear]) / scales)
 
 
 def test_distinct_scales_of_four_wheels_are_recovered() -> None:
     rng = np.random.default_rng(seed=3)
     truth = drive(rng, seconds=300.0)
-    car, settings = four_wheels(truth, rng), replace(CAR, **REAR)
+    car, settings = four_wheels(truth, rng), REAR_SCALES
     made = integrate(car, settings, gyro(truth, CAR, rng)).increments
 
     found = front_wheels(car, made, settings, (int(truth.t_ns[0]), int(truth.t_ns[-1])))
@@ -42,14 +47,12 @@ def test_distinct_scales_of_four_wheels_are_recovered() -> None:
 
 def test_four_scaled_wheels_agree_on_the_way() -> None:
     truth = drive(np.random.default_rng(seed=5))
-    exact = replace(CAR, slip_per_sqrt_m=0.0)
+    exact = replace(FOUR_SCALES, slip_per_sqrt_m=0.0)
     car = four_wheels(truth, np.random.default_rng(seed=6))
     ways = [
         float(
             np.abs(
-                integrate(
-                    car, replace(exact, **REAR, **FRONT, use_front_wheels=front)
-                ).increments.distance_m
+                integrate(car, replace(exact, use_front_wheels=front)).increments.distance_m
             ).sum()
         )
         for front in (False, True)
