@@ -2,7 +2,7 @@
 
 Run it as ``python benchmarks/range_consistency.py [TRACKS]``. Two lights of one make are drawn with
 sizes, shapes and errors of boxes as the estimate assumes them; the car creeps 17 m towards them in
-8 s. Printed is the normalised error squared (NEES; 1 is honest) over the simulated tracks, and how
+8 s. It prints the NEES (1 is consistent) over the simulated tracks, and how
 often a single track's mean lies as low as that of the real drive, which is one draw.
 """
 

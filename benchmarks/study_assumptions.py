@@ -100,8 +100,8 @@ def field(drives: int, seed: int) -> None:
 
 
 def nees(drives: int, seed: int) -> None:
-    print(f"\nmean NEES of x, y, heading at the end, 3 where honest; seed {seed}")
-    print(f"{'':42} {'as it is':>24} {f'encoders of {FINE_M * 1e3:g} mm':>24} {'honest':>18}")
+    print(f"\nmean NEES of x, y, heading at the end, 3 for a consistent filter; seed {seed}")
+    print(f"{'':42} {'as studied':>24} {f'encoders of {FINE_M * 1e3:g} mm':>24} {'consistent':>18}")
     fewer = 3 * drives // 40
     for name, compass_deg, goals, count in (
         ("10 degrees, to the goal", 10.0, 1, drives),

@@ -122,14 +122,14 @@ def _compared(
     ranges: Mapping[str, FilterAndSmoother],
 ) -> SmootherScore:
     apart: list[tuple[float, float, float]] = []
-    honest: list[NeesSummary] = []
+    nees_of_tracks: list[NeesSummary] = []
     for track, cov in (filtered, smoothed):
         paired = pair(true, track, MAX_DIFFERENCE_NS, cov)
         errors = paired.estimate.xyz_m[:, :2] - paired.truth.xyz_m[:, :2]
         metres = np.hypot(*errors.T)
         turns = wrap_all(heading_rad(paired.estimate) - heading_rad(paired.truth))
         apart.append((_rms(metres), _rms(turns), float(metres[-1])))
-        honest.append(summarise_nees(nees(paired, 3), 3))
+        nees_of_tracks.append(summarise_nees(nees(paired, 3), 3))
     (filter_m, filter_rad, filter_end), (smoother_m, smoother_rad, smoother_end) = apart
     return SmootherScore(
         len(true),
@@ -139,8 +139,8 @@ def _compared(
         smoother_rad,
         filter_end,
         smoother_end,
-        honest[0],
-        honest[1],
+        nees_of_tracks[0],
+        nees_of_tracks[1],
         ranges,
     )
 
@@ -161,11 +161,11 @@ def smoother_text(result: SmootherScore) -> str:
             f"{degrees * result.smoother_heading_rmse_rad:.3f} deg, at the end "
             f"{result.filter_end_m:.3f} and {result.smoother_end_m:.3f} m,",
             f"  mean NEES {result.filter_nees_xyh.mean:.2f} and "
-            f"{result.smoother_nees_xyh.mean:.2f} (3 is honest)",
+            f"{result.smoother_nees_xyh.mean:.2f} (3 is consistent)",
             *(
                 f"range to {name}, filter and smoother, {one.rows} rows: rmse "
                 f"{one.filter_rmse_m:.2f} and {one.smoother_rmse_m:.2f} m, mean NEES "
-                f"{one.filter_nees:.2f} and {one.smoother_nees:.2f} (1 is honest)"
+                f"{one.filter_nees:.2f} and {one.smoother_nees:.2f} (1 is consistent)"
                 for name, one in result.range.items()
             ),
         ]

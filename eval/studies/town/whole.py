@@ -142,7 +142,7 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
                 "shortest..longest",
                 "curve at 100 m",
                 "r ds D",
-                "NEES (honest)",
+                "NEES (consistent)",
             ),
             tuple(
                 (
