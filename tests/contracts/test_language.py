@@ -40,6 +40,10 @@ PHRASES: Final = {
     "exits, fails": r"\bway out\b",
     "expected": r"[:;,] wants?\b(?! to)",
     "again, over": r"\banew\b",
+    "a noun, at the start of a docstring": r'"""(What|Which|How (far|many|much|often)|Likewise) ',
+    "permanently": r"\bfor ever\b",
+    "consistent, of a filter": r"\bhonest\b",
+    "where known": r"\bas far as (it |that )?(is|can be) (known|said)\b",
     "is not a": r"(?<!there )\bis no (layout|time|number|text|multiplexer|file|table|count)\b",
 }
 """Recommended words, and the patterns in prose that they replace."""
