@@ -12,6 +12,7 @@ import difflib
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
+from inspect import getattr_static
 from operator import attrgetter
 from typing import Final, cast
 
@@ -36,6 +37,9 @@ EMBEDDED: Final = "mask-rcnn,road,signs"
 
 _EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoint", None)}
 """Setting that selects a network, and its default, which selects the embedded one."""
+
+_PARTS: Final = ("view", "identity", "__call__")
+"""Attributes that every ``Detector`` has."""
 
 
 def chosen(names: str, sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
@@ -85,7 +89,7 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
 
     Raises:
         UsageError: The detector does not exist or cannot be imported.
-        VehicleError: Its settings are invalid.
+        VehicleError: Its settings are invalid, or the factory returns no detector.
     """
     if choice.kind in catalog.names() and choice.kind not in table:
         card = str(catalog.card_path(choice.kind))
@@ -102,9 +106,17 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
     except (ImportError, AttributeError) as error:
         raise UsageError(f"detector {place}: {error}; check the module and the name") from None
     try:
-        return build(**choice.settings)
+        built = build(**choice.settings)
     except TypeError as error:
         raise VehicleError(f"detector {choice.name}: settings do not fit: {error}") from None
+    # Static, because a property may hash a network's weights.
+    lacking = [name for name in _PARTS if getattr_static(built, name, None) is None]
+    if lacking:
+        raise VehicleError(
+            f"detector {choice.name}: {place} returned a {type(built).__name__} without "
+            f"{', '.join(lacking)}; derive from crosscue.BoxDetector, or see crosscue.Detector"
+        )
+    return built
 
 
 def _offered(name: str) -> str | None:

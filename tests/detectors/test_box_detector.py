@@ -58,6 +58,20 @@ def test_a_class_is_named_with_its_factory() -> None:
     assert found.side_px == 3
 
 
+class NoDetector:
+    """An object with one of a detector's three parts."""
+
+    def __call__(self, frames: object) -> object:
+        """Return nothing of use."""
+
+
+def test_what_a_factory_leaves_out_is_named() -> None:
+    place = f"{__name__}:NoDetector"
+
+    with pytest.raises(VehicleError, match=f"{place}.* without view, identity; .*BoxDetector"):
+        make(Choice("mine", place, {}))
+
+
 def test_detections_of_one_label_with_their_heights() -> None:
     boxes = np.array([[0, 0, 2, 5], [0, 0, 2, 7], [1, 1, 2, 2]], np.float64)
     found = Detections(0, (9, 9), boxes, np.ones(3), ("a", "b", "a"), (b"",) * 3)
