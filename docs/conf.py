@@ -31,10 +31,12 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "crosscue_reference",
+    "crosscue_math",
 ]
 exclude_patterns = ["_build", "extensions"]
 html_theme = "furo"
 html_title = "crosscue"
+html_math_renderer = "mathml"
 nitpicky = True
 nitpick_ignore_regex = [
     # Types of libraries whose own documentation is not consulted offline.
