@@ -1,7 +1,7 @@
-"""Cut and damage ROS bags by a seed and count how our reader did.
+"""Truncate and damage ROS bags reproducibly, and count the results of our reader.
 
-Silent columns must be zero. "undetectable" are payload bytes changed where the format has no
-checksum; the ledger then says that such a change cannot be seen.
+The columns of silent errors must be zero. "undetectable" counts payload bytes that were changed
+where the format has no checksum; the account reports that such changes cannot be detected.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def main() -> None:
 def run_one(
     name: str, what: str, path: Path, cuts: int, flips: int, seed: int, is_shown: bool
 ) -> None:
-    """Judge all damaged copies of one file and print the line."""
+    """Classify all damaged copies of one file and print the line."""
     undamaged = read_rows(path)
     truth: tuple[Row, ...] = undamaged.rows
     calm = frozenset(undamaged.ledger.notices)

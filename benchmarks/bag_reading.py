@@ -1,13 +1,13 @@
-"""Reading a drive from ROS 1 bags and ROS 2 SQLite bags: ours beside rosbags, in one run.
+"""Read a drive from ROS 1 bags and ROS 2 SQLite bags: our readers beside rosbags, in one run.
 
     python benchmarks/bag_reading.py [rounds] [seconds of drive]
     python benchmarks/bag_reading.py memory [megabytes]    # peak memory, a tenth of it against it
 
-The drive: 15 camera pictures of 150 kB, 2,258 CAN frames and 100 IMU messages a second; noise for
-pictures, which is as incompressible as JPEG. The cases run in rotation in one process, their CPU
-times are compared round by round. "blocks" is our reader alone, every message accounted for;
-"columns" decodes CAN and IMU and finds the pictures' bytes. rosbags "raw" gives the bytes of each
-message, "objects" deserialises.
+The drive has 15 camera pictures of 150 kB, 2,258 CAN frames and 100 IMU messages per second. The
+pictures are noise, which is as incompressible as JPEG. The cases alternate in one process, and
+their CPU times are compared round by round. "blocks" is our reader alone, with every message
+accounted for; "columns" also decodes CAN and IMU and locates the pictures' bytes. "raw" is rosbags
+returning the bytes of each message, "objects" is rosbags deserialising them.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ TYPES: Final = {
 
 
 def store_of(which: Stores) -> Typestore:
-    """A type store that knows CAN frames."""
+    """Return a type store with the type of CAN frames."""
     store = get_typestore(which)
     store.register(get_types_from_msg(FRAME, "can_msgs/msg/Frame"))
     return store

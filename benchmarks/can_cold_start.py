@@ -1,14 +1,14 @@
-"""All signals of a candump log with a large DBC file, from a fresh process: ours and its peers.
+"""Decode all signals of a candump log with a large DBC file in a new process, beside two peers.
 
     python benchmarks/can_cold_start.py [--rounds 5]
 
-Each run is a process of its own, so each parses the DBC file again, but for ours after the first,
-which finds its layout in the user's cache. Two CPU times are taken (user and system, all threads):
-of opening, parsing and decoding, with all imports done before ("work"), and of the whole process
-with Python's start and all imports. Values are counted, not compared; the counts are printed.
-The cases run in rotation; ratios are taken round by round. Ours yields columns, the others a
-dictionary for each frame. hilspy (``pip install hilspy``) is the strongest peer known; a peer that
-is not installed is left out, with a line that says so.
+Each run is a separate process that parses the DBC file again, except ours after the first run,
+which finds the layout in the user's cache. Two CPU times are measured (user and system, all
+threads): opening, parsing and decoding after all imports ("work"), and the whole process with
+Python's start and all imports. Values are counted, not compared; the counts are printed. The cases
+alternate, and ratios are taken round by round. Ours yields columns, the others a dictionary for
+each frame. hilspy (``pip install hilspy``) is the strongest peer known. A peer that is not
+installed is left out, with a message.
 """
 
 from __future__ import annotations

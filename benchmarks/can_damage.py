@@ -1,7 +1,7 @@
-"""Cut and damage CAN logs by a seed and count how our readers did.
+"""Truncate and damage CAN logs reproducibly, and count the results of our readers.
 
-The columns in capitals must be zero. "undetectable" are changed digits where a format has no
-checksum, and text cut exactly at a line's end; the ledger says so for each of these formats.
+The columns in capitals must be zero. "undetectable" counts changed digits where a format has no
+checksum, and text cut exactly at a line's end; the account states this for each of these formats.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ COLUMNS = ("refused", "same", "reported", "undetectable", "SILENT", "INVENTED", 
 def count(
     kind: Kind, folder: Path, what: str, copies: int, show: bool
 ) -> tuple[Counter[str], float]:
-    """Verdicts over ``copies`` copies, and the longest time one took."""
+    """Return the verdicts over ``copies`` copies, and the longest time of one."""
     frames = kind.frames(60)
     whole = kind.spell(frames)
     chance = random.Random(1)

@@ -1,14 +1,13 @@
-"""Signals out of real CAN buses: ours with NumPy and with Numba beside cantools, in one run.
+"""Decode the signals of real CAN buses: ours with NumPy and Numba beside cantools, in one run.
 
     python benchmarks/can_decoding.py [rounds]
 
-Every case decodes all frames of a bus that its DBC file knows. cantools gets them as bytes with
-their message already looked up, and does ``message.decode(decode_choices=False)`` on each; ours
-also looks up, checks and accounts for every frame of the bus, and sorts the rows by message. The
-cases run in rotation; ratios are taken round by round. Before that, every value is compared.
-Times are CPU seconds of this one thread, since other work on the machine would drown milliseconds;
-a case of a few milliseconds is run ten times in a row and divided.
-The recordings are looked for in $CROSSCUE_DATA or ../shared/data.
+Every case decodes all frames of a bus that its DBC file defines. cantools receives them as bytes
+with their message already looked up, and runs ``message.decode(decode_choices=False)`` on each.
+Ours also looks up, checks and accounts for every frame of the bus, and sorts the rows by message.
+The cases alternate, and ratios are taken round by round. Every value is compared before. Times are
+CPU seconds of one thread, because other work on the machine would hide milliseconds; a case of a
+few milliseconds is repeated ten times. The recordings are in $CROSSCUE_DATA or ../shared/data.
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ def block_of(
 
 
 class Cantools:
-    """Frame by frame, each with its message at hand."""
+    """Decode frame by frame, with the message of each already looked up."""
 
     def __init__(self, bus: Bus, database: CanDatabase) -> None:
         parsed = dbc.load_string(bus.dbc.read_text(encoding="utf-8"), False).messages

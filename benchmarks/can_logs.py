@@ -1,7 +1,7 @@
-"""Read CAN logs with our readers and with python-can, in rotation, and print the ratios.
+"""Read CAN logs with our readers and with python-can, alternating, and print the ratios.
 
 The Ford candump is real; the other formats hold the same frames, written by python-can. Both
-sides must give the same number of frames. Ours yields columns, python-can's one object a frame.
+sides must return the same number of frames. Ours yields columns, python-can an object per frame.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """False car cues of a simulated study: each positive car beside the true one.
 
 Run it as ``python benchmarks/car_cues.py STUDY`` on the folder of ``crosscue study intersections``.
-Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is looked up in the drive's
-``objects.json``: the true car whose middle is nearest, and what that one does there.
+Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is matched with the nearest true
+car of the drive's ``objects.json``, and counted by what that car does.
 """
 
 from __future__ import annotations

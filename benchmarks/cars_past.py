@@ -1,9 +1,9 @@
 """Reasons why the cues of oncoming and outgoing cars miss frames of PandaSet's sequence 002.
 
 Run it as ``python benchmarks/cars_past.py RUN SEQUENCE``. RUN is a run of ``replay`` over SEQUENCE,
-which has its 3-D boxes in ``annotations/cuboids.parquet``. In every frame with a car that moves
-past the far kerb, the one that gets furthest through the conditions of the rule counts, and its
-first unmet condition is the reason.
+which has its 3-D boxes in ``annotations/cuboids.parquet``. Frames with a car that moves past the
+far kerb count. The reason of a missed frame is the first unmet condition of the rule, for the car
+that meets most of them.
 """
 
 from __future__ import annotations

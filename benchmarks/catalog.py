@@ -1,8 +1,8 @@
-"""A catalog of 100,000 made-up runs opened from its index, and a million approaches grouped.
+"""Open a catalog of 100,000 synthetic runs from its index, and group a million approaches.
 
     python benchmarks/catalog.py [--runs 100000] [--approaches 10]
 
-Manifests are small and made up: no tables beside them. The peer of the grouping is plain pyarrow:
+The manifests are small and synthetic, without tables. The peer of the grouping is plain pyarrow:
 the same columns of the same rows, read from a Parquet file and grouped. Times are CPU seconds of
 this process (all threads) and wall seconds, the best of three.
 """

@@ -1,12 +1,12 @@
-"""ROS 1 bag to MCAP: ours beside ``rosbags.convert``, doing the same work in one run.
+"""Convert a ROS 1 bag to MCAP: ours beside ``rosbags.convert``, the same work in one run.
 
     python benchmarks/conversion.py [rounds]
 
-Two simulated logs: a drive (30 s: 450 pictures of 150 kB of noise, which is as incompressible as
-JPEG, 60,000 CAN frames, 3,000 IMU messages) and the same without pictures. Both write zstd chunks;
-ours with checksums, which the peer does not write. "and read back" is the whole command, which
-reads the new file again with every checksum. The cases run in rotation after one round to warm up;
-ratios are taken round by round. Before timing, the messages of both outputs are compared.
+There are two simulated logs: a drive (30 s with 450 pictures of 150 kB of noise, which is as
+incompressible as JPEG, 60,000 CAN frames and 3,000 IMU messages) and the same without pictures.
+Both write zstd chunks; only ours writes checksums. "and read back" is the whole command, which
+reads the new file again with every checksum. The cases alternate after one warm-up round, and
+ratios are taken round by round. The messages of both outputs are compared before timing.
 """
 
 from __future__ import annotations

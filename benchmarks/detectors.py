@@ -1,8 +1,9 @@
-"""Cues from stored detections, pictures decoded as small as serves, a run from the cache.
+"""Speed of cues from stored detections, of reduced decoding, and of the cache of detections.
 
-Prints frames a second of the two-frame car rules from stored masks (CPU time); for each width that
-a network asks for, a JPEG of 1280 x 720 decoded at full size and shrunk beside ours; and for a
-camera of made-up pictures the time of a run that detects and of one that finds all in the cache.
+Prints the frames per second of the two-frame car rules with stored masks (CPU time). For each
+input width of a network, it compares reduced decoding of a JPEG of 1280 x 720 with full decoding
+and resizing. For a camera with synthetic pictures, it compares a run that detects with one that
+finds all results in the cache.
 """
 
 from __future__ import annotations

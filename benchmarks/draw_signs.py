@@ -1,10 +1,10 @@
-"""Draws the sign pictures stored in the repository; they were drawn with OpenCV 5.0.0.
+"""Draw the sign pictures stored in the repository; they were drawn with OpenCV 5.0.0.
 
-Another version of OpenCV has other fonts and gives other pictures: run this only to change a sign.
+Another version of OpenCV has other fonts and draws other pictures: run this only to change a sign.
 
     python benchmarks/draw_signs.py FOLDER
 
-writes ``FOLDER/detectors`` and ``FOLDER/scenes``, to be compared with ``detectors/signs/drawings``
+writes ``FOLDER/detectors`` and ``FOLDER/scenes``, for comparison with ``detectors/signs/drawings``
 and ``datasets/scenes/rendering/drawings``.
 """
 
@@ -29,7 +29,7 @@ RED: Final[Rgb] = (178, 28, 38)
 WHITE: Final[Rgb] = (238, 238, 234)
 BLACK: Final[Rgb] = (22, 22, 22)
 OVER: Final = 4
-"""Drawn so many times larger, then averaged: smooth edges."""
+"""Factor of the drawing's size; averaging it down makes smooth edges."""
 SCENE_PX: Final = 128
 """Width of the signs of simulated scenes."""
 

@@ -1,10 +1,10 @@
-"""Estimating again from cached detections: drive time over run time.
+"""Estimate again from cached detections: drive time over run time.
 
-A simulated ten-minute town drive (no scene in its pictures) with a camera of 10 pictures a second,
-150 kB each, and stored detections as dense as a busy street's: six objects with masks a frame, two
-of them cars seen from the side. What is timed is ``crosscue estimate`` as a library call: reading
-the log's other topics, pose, cues, range and belief, all tables written. Run it as
-``python benchmarks/estimate.py [MINUTES]``.
+The drive is a simulated ten-minute town drive (without scenes in its pictures) with a camera of 10
+pictures per second, 150 kB each. Its stored detections are as dense as a busy street's: six objects
+with masks per frame, two of them cars seen from the side. The timed work is ``crosscue estimate``
+as a library call: reading the log's other topics, pose, cues, range and belief, and writing all
+tables. Run it as ``python benchmarks/estimate.py [MINUTES]``.
 """
 
 from __future__ import annotations

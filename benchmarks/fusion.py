@@ -1,10 +1,10 @@
 """Frames per second of the fusion, and its belief beside GTSAM's.
 
-A made-up drive of ten minutes at ten frames a second passes an intersection every 130 m. The whole
-loop has no peer (its range filter is filterpy's); its belief is measured beside GTSAM's discrete
-factor graph (the belief before as priors, a factor for each message, marginals after each frame).
-They alternate within one run, since timings of different runs do not compare; time is of the
-process, so that a busy machine counts for little.
+A synthetic drive of ten minutes at ten frames per second passes an intersection every 130 m. The
+whole loop has no peer (its range filter is filterpy's). Its belief is measured beside GTSAM's
+discrete factor graph (the previous belief as priors, a factor for each message, marginals after
+each frame). Both alternate within one run, because timings of different runs are not comparable.
+Times are CPU times of the process, which a busy machine affects little.
 """
 
 from __future__ import annotations

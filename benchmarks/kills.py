@@ -1,10 +1,10 @@
-"""Replays killed at random moments: is a run folder ever taken for whole that is not?
+"""Kill replays at random times, and check that no partial run is ever taken for complete.
 
-Run it as ``python benchmarks/kills.py [KILLS [SEED]]``. A replay of a small simulated drive, its
-detectors included, is killed (SIGKILL) after a random time; then the same command with ``--resume``
-runs to its end, and every file of the run is compared with those of a replay that nobody disturbed.
-The cache of detectors' results is kept from kill to kill in one half of the rounds and thrown away
-in the other, so that kills fall into detection as well.
+Run it as ``python benchmarks/kills.py [KILLS [SEED]]``. A replay of a small simulated drive, with
+detectors, is killed (SIGKILL) after a random time. Then the same command with ``--resume`` runs to
+its end, and every file of the run is compared with that of an undisturbed replay. The cache of
+detection results is kept between kills in half of the rounds and deleted in the others, so that
+kills also occur during detection.
 """
 
 from __future__ import annotations

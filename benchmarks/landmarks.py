@@ -1,12 +1,12 @@
-"""Landmarks: time per frame as the database grows, and what the ellipse is good for.
+"""Landmarks: time per frame as the database grows, and the effect of the search ellipse.
 
     python benchmarks/landmarks.py [--sizes 100 10000 1000000] [--skip-growth]
 
-Growth: landmarks on a 10 m grid (the denser question is the one with more candidates, not with more
-landmarks), 32 made-up descriptors each, 500 in the frame; 2-sigma ellipse of 20 m radius. Each size
-in a fresh process, so that its peak memory is its own. Ellipse: the same frames against the same
-landmarks with and without the search ellipse, on simulated walls of which a quarter have a twin
-elsewhere, and on real pictures where they are at hand (`CROSSCUE_DATA` or ../shared/data).
+Growth: landmarks on a 10 m grid with 32 synthetic descriptors each, 500 descriptors in the frame,
+and a 2-sigma ellipse of 20 m radius. Each size runs in a new process, so that peak memory is its
+own. Ellipse: the same frames against the same landmarks with and without the search ellipse, on
+simulated walls of which a quarter have a twin elsewhere, and on real pictures where available
+(`CROSSCUE_DATA` or ../shared/data).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def growth(sizes: list[int]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A frame, where it was taken, and where the filter believed it was."""
+    """A frame, its true position, and the position estimated by the filter."""
 
     seen: Features
     true_m: Floats
@@ -196,7 +196,7 @@ def real_street(data: Path) -> None:
 
 
 def real_days(data: Path) -> None:
-    """Eight pairs of one place on different days, known by eye; 178 pairs of two places."""
+    """Eight pairs of one place on different days, labelled by eye; 178 pairs of two places."""
     folder = data / "place_recognition"
     if not folder.is_dir():
         return

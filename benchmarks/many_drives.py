@@ -1,12 +1,12 @@
-"""Many drives: what the engine costs beside the work, what a drive hour costs, and merging.
+"""Many drives: overhead of the engine, cost of a drive hour, and merging.
 
     python benchmarks/many_drives.py [--rounds 5] [--tiny 204] [--drives 4] [--minutes 1.5]
 
-First tiny drives (a run folder with eight small tables each), so that nothing but the engine and
-the merging counts: a plain loop, our engines with their journal, also with everything merged, and
-``concurrent.futures`` as the peer, all in rotation. Then
-``crosscue replay`` of simulated town drives with a camera, its detections cached, with one worker
-and with two. Last the merging of tables, beside reading them all and writing one.
+The first part uses tiny drives (a run folder with eight small tables each) to measure the engine
+and merging: a plain loop, our engines with their journal, with and without merging, and
+``concurrent.futures`` as the peer, alternating. The second part is ``crosscue replay`` of simulated
+town drives with a camera and cached detections, with one worker and with two. The third part is the
+merging of tables, beside reading all of them and writing one.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Written:
 
 
 def tiny(job: Job) -> Written:
-    """The least that a drive can be."""
+    """A minimal drive."""
     run = create(job.run, overwrite=True)
     with locked(run):
         clear(run)
@@ -255,7 +255,7 @@ def _with_name(table: pa.Table, name: str) -> pa.Table:
 
 
 def _peak_mb(work: Callable[[dict[str, RunFolder]], None], runs: dict[str, RunFolder]) -> float:
-    """In a fresh process: a memory pool's peak cannot be set back."""
+    """Measure in a new process, because the peak of a memory pool cannot be reset."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:

@@ -1,16 +1,15 @@
 """Mask R-CNN: our detector beside a plain torchvision loop, with the same weights and pictures.
 
-Times are of one thread, in rotation, medians: CPU seconds a picture, and how many times as fast as
-the plain loop by CPU and by wall time. The plain loop is torchvision's own: 1000 proposals, scores
-from 0.05, every mask pasted into the picture. Then it is counted which of its detections above a
-score ours has too (the same class, every side within half a pixel), and, since the pictures are
-simulated, what is true: right, a second time the same object, or false.
+Times are medians on one thread, alternating: CPU seconds per picture, and the ratio to the plain
+loop by CPU and by wall time. The plain loop is torchvision's: 1000 proposals, scores from 0.05,
+every mask pasted into the picture. The script then counts which of its detections above a score
+ours has as well (same class, every side within half a pixel). As the pictures are simulated, it
+also counts correct, duplicate and false detections.
 
-The ResNet-50 has random weights, since COCO's are not at hand. Its scores are set by a proposal's
-rank (the 5 likeliest are sure, 60 compete, 20 detections remain), so its equal detections report
-that levels, proposals and boxes agree, and nothing of what fewer proposals cost.
-
-That cost as average precision: crosscue train mask-rcnn --measure embedded --proposals 100 1000.
+The ResNet-50 has random weights, because COCO's are not available here. Its scores follow from a
+proposal's rank (5 are certain, 60 compete, 20 detections remain). Its equal detections show that
+levels, proposals and boxes agree, and not what fewer proposals cost. Average precision against
+proposals: crosscue train mask-rcnn --measure embedded --proposals 100 1000.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ SURE, COMPETING, REMAINING = 5, 60, 20
 
 Way = Callable[[Frame], Any]
 Least = Callable[[str], float]
-"""From a class to the least raw score of its detections."""
+"""Map from a class to the min raw score of its detections."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ class Scene:
 
 
 def scenes() -> list[Scene]:
-    """Simulated pictures of intersections that nothing was trained on."""
+    """Simulated pictures of intersections that no network was trained on."""
     taken = []
     for layout in LAYOUTS:
         _, _, world = world_of(SceneSettings(layout=layout))
@@ -97,7 +96,7 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True, slots=True)
 class PlainLoop:
-    """Torchvision's own way, on the part of the picture that ours examines."""
+    """Torchvision's own loop, on the part of the picture that ours examines."""
 
     network: Any
     plan: Plan
@@ -254,7 +253,7 @@ def _faster(first: Sequence[float], other: Sequence[float]) -> float:
 
 
 def above(found: Detections, min_score: Least) -> list[int]:
-    """Those whose score is at least what their class asks, the best first."""
+    """Detections whose score reaches the min score of their class, best first."""
     kept = [i for i, label in enumerate(found.labels) if found.scores[i] >= min_score(label)]
     return sorted(kept, key=lambda i: -float(found.scores[i]))
 
@@ -302,7 +301,7 @@ def reported_equality(
     levels: Mapping[str, Least],
     is_true: bool,
 ) -> None:
-    """Print what ours finds of what the plain loop finds, and where truth counts, what is right."""
+    """Print the plain loop's detections that ours finds, and with truth, the correct ones."""
     theirs = [plain.detections(scene.frame) for scene in seen]
     found = {name: [one_result(d, s.frame) for s in seen] for name, d in ours.items()}
     for level, min_score in levels.items():

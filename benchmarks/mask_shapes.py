@@ -1,7 +1,7 @@
-"""Are masks as high as the things, and is a car's nose at the right end? On labelled pictures.
+"""Compare the heights of masks and the noses of cars with the truth of labelled pictures.
 
-Range follows from the height of a sign's or light's mask, a parked car's direction from which end
-of its mask is lower. Takes what crosscue train frames writes:
+Range follows from the height of a sign's or light's mask, and a parked car's direction from the
+lower end of its mask. The input is what crosscue train frames writes:
 
     crosscue train frames L900-L959 L1000-L1059 --per-layout 5 -o held_out
     python benchmarks/mask_shapes.py held_out --after 300
@@ -29,7 +29,7 @@ from crosscue.replay.base import Floats
 CLASSES: Final = ("car", "stop sign", "traffic light")
 SAME_OBJECT: Final = 0.5
 LONG: Final = 2.0
-"""Length over height of cars that the cues look at."""
+"""Min length over height of cars that the cues evaluate."""
 
 Pair = tuple[Floats, Floats, bytes, bytes, LabelledPicture]
 """The box found, the true box, the mask found, the true mask, the picture."""

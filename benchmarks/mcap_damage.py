@@ -1,11 +1,11 @@
-"""Damaged MCAP files by the ten thousand: nothing may be lost in silence, nothing given wrong.
+"""Read ten thousand damaged MCAP files: no silent loss, and no wrong message, is allowed.
 
     python benchmarks/mcap_damage.py [copies per file] [seed]
 
-A third of the copies is cut at a random byte, the rest has 1 to 64 bytes overwritten. Every copy is
-read to its end and compared with what the sound file gave. Prints for every file what became of
-its copies, how much of the messages damaged copies kept, and the slowest reading; exits with 1 if
-a single copy was read wrong in silence, or raised anything but one line.
+A third of the copies are cut at a random byte; the others have 1 to 64 bytes overwritten. Every
+copy is read to its end and compared with the undamaged file. The script prints for every file the
+outcomes of its copies, the fraction of messages kept, and the slowest reading. It exits with 1 if
+any copy was read wrongly without a report, or raised anything but a one-line error.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Reading a ROS 2 MCAP drive: ours beside Rerun, rosbags, mcap and bare decompression, in one run.
+"""Read a ROS 2 MCAP drive: ours beside Rerun, rosbags, mcap and bare decompression, in one run.
 
     python benchmarks/mcap_reading.py [rounds]            # speed
     python benchmarks/mcap_reading.py memory [megabytes]  # peak memory, 200 MB against 2 GB
 
-The drive: one minute of 900 camera pictures (JPEG of made-up scenes, 145 kB each), 135,468 real CAN
-frames (comma2k19) and 30,000 small frames, in 1 MiB chunks. Ours verifies every checksum; Rerun's
-``McapReader`` (which decodes all messages to Arrow), rosbags and bare decompression verify none.
-The cases run in rotation, ratios are taken round by round, once by the clock and once by processor
-seconds of all threads. The recording is looked for in $CROSSCUE_DATA or ../shared/data.
+The drive has one minute of 900 camera pictures (JPEG of synthetic scenes, 145 kB each), 135,468
+real CAN frames (comma2k19) and 30,000 small frames, in 1 MiB chunks. Ours verifies every checksum.
+Rerun's ``McapReader`` (which decodes all messages to Arrow), rosbags and bare decompression verify
+none. The cases alternate, and ratios are taken round by round, of wall time and of CPU time over
+all threads. The recording is in $CROSSCUE_DATA or ../shared/data.
 """
 
 from __future__ import annotations
@@ -288,7 +288,7 @@ def timed(case: Callable[[Path], int], path: Path) -> Took:
 def _pairs(
     peer: list[Took], own: list[Took], is_gain: bool
 ) -> Iterator[tuple[list[float], list[float]]]:
-    """By the clock, then by processor time: what to divide by what."""
+    """Yield the numerators and denominators of the ratios: wall times, then CPU times."""
     for k in range(2):
         theirs, ours_s = [one[k] for one in peer], [one[k] for one in own]
         yield (theirs, ours_s) if is_gain else (ours_s, theirs)

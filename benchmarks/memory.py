@@ -1,11 +1,11 @@
-"""Peak memory of `convert` and `replay`, each in a process of its own, by format and length.
+"""Peak memory of `convert` and `replay`, each in a separate process, by format and length.
 
     python benchmarks/memory.py [megabytes]
 
-Every log holds 500 vectors and 500 CAN frames a second and, where the format has them, 15 pictures
-of 145 kB of noise; one is a tenth as long as the other. Peaks are Linux's ``VmHWM``, imports
-included. The replay is of wheel speeds, yaw rates and pictures, with the tests' detector of bright
-spots.
+Every log holds 500 vectors and 500 CAN frames per second and, if the format supports them, 15
+pictures of 145 kB of noise. The short log is a tenth as long as the long one. Peaks are Linux's
+``VmHWM``, imports included. The replay uses wheel speeds, yaw rates and pictures, with the tests'
+detector of bright spots.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Are ranges from motion as unsure as they say, on a way like that of PandaSet 002?
+"""Consistency of ranges from motion on a path like that of PandaSet 002, simulated.
 
-Run it as ``python benchmarks/range_consistency.py [TRACKS]``. Two lights of one make are drawn with
-sizes, shapes and errors of boxes as the estimate assumes them; the car creeps 17 m towards them in
-8 s. It prints the NEES (1 is consistent) over the simulated tracks, and how
-often a single track's mean lies as low as that of the real drive, which is one draw.
+Run it as ``python benchmarks/range_consistency.py [TRACKS]``. Sizes, shapes and box errors of two
+lights of one make are sampled from the estimator's model; the car creeps 17 m towards them in 8 s.
+The script prints the NEES (1 is consistent) over the simulated tracks, and the fraction of tracks
+whose mean is as low as that of the real drive, which is one sample.
 """
 
 from __future__ import annotations

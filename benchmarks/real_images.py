@@ -1,7 +1,8 @@
-"""Count what runs of crosscue detect found, as docs/real_images.md reports it.
+"""Count the detections of runs of crosscue detect, for docs/explanation/real_images.md.
 
-For each run: in how many frames a label was found at a score, with how many boxes; frames in which
-each cue is positive. With --road, how far the other runs' road agrees with that run's.
+For each run, it prints the number of frames and boxes of each label at a score, and the number of
+frames with each positive cue. With --road, it prints the agreement of the other runs' road masks
+with that run's.
 
     python benchmarks/real_images.py embedded_stop yolox_stop --scores 0.5 0.9
     python benchmarks/real_images.py embedded_dashcam twinlitenet_dashcam --road adas_dashcam

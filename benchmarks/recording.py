@@ -1,13 +1,13 @@
-"""A run to Rerun: ours in bulk columns beside a logger frame by frame, in one run.
+"""Record a run for Rerun: ours in bulk columns beside logging frame by frame, in one run.
 
     python benchmarks/recording.py [MINUTES]
 
-A simulated town drive (no scene in its pictures) with 10 pictures a second of 150 kB and six masked
-objects in each, as in ``estimate.py``. The peer does what tutorials do: set the time, log the
-picture, boxes with labels, masks as a segmentation image, beliefs and ranges, frame by frame; it
-draws neither map nor way ahead, cars, regions or cues, which ours does. Cases run in rotation;
-ratios are taken round by round. Peak memory of ours is reported for the drive and for one twice as
-long, each in a process of its own: it should hardly grow.
+The drive is a simulated town drive (without scenes in its pictures) with 10 pictures of 150 kB per
+second and six masked objects in each, as in ``estimate.py``. The peer follows Rerun's tutorials: it
+sets the time and logs the picture, boxes with labels, masks as a segmentation image, beliefs and
+ranges, frame by frame. Unlike ours, it draws neither map, plan, cars, regions nor cues. The cases
+alternate, and ratios are taken round by round. Our peak memory is printed for the drive and for one
+twice as long, each in a separate process; it should hardly grow.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Our sign search beside one ORB for every window of every level, on the same simulated scenes.
+"""Our sign search beside one ORB run per window and level, on the same simulated scenes.
 
-Both look for the same drawings on the same levels of the pyramid, with points of the same kind and
-the same ratio test. The peer slides one window of each of the drawings' sizes, 16 pixels a step,
-and runs ORB once in each window, for all drawings of that size; a window's score is the fraction of
-a drawing's points that it has. "one size" does it with a single window that is as large as the
-largest drawing, which is as few runs of ORB as can be.
+Both search for the same templates on the same pyramid levels, with the same kind of features and
+the same ratio test. The peer slides a window of each template size in steps of 16 pixels, and runs
+ORB once per window for all templates of that size; a window's score is the fraction of a template's
+features that it contains. "one size" uses a single window as large as the largest template, which
+is the min number of ORB runs.
 
-On small pictures (our drawings over clutter) both look everywhere and the signs found are counted.
-In simulated streets of a usual camera's size the peer examines every 40th window, on all levels
-alike, and its time is scaled up; what shrinking the picture takes it is not charged for.
+On small pictures (templates over clutter), both search everywhere, and the signs found are counted.
+In simulated streets of a usual camera's size, the peer examines every 40th window on all levels,
+and its time is scaled up. The time for resizing the picture is not charged to it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Found = list[tuple[str, Floats]]
 
 
 class Drawn(NamedTuple):
-    """A drawing as the peer compares it."""
+    """A template in the peer's form."""
 
     kind: Kind
     size_px: Size
@@ -53,14 +53,14 @@ class Drawn(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A place where the peer looks: a view of a level, and where that is in the picture."""
+    """A window of the peer: a view of a level, and its position in the picture."""
 
     pixels: Bytes
     box: Floats
 
 
 class WindowSearch:
-    """The source's way: a window slides over each level; ORB and the matcher run in each."""
+    """The dissertation's search: ORB and the matcher run in every window of each level."""
 
     def __init__(self, has_one_size: bool) -> None:
         """Describe the drawings once."""
@@ -152,7 +152,7 @@ def ours(grey: Bytes) -> Found:
 
 
 def is_right(found: Found, kind: str, box: Floats) -> bool:
-    """Is the sign among what was found, by its name?"""
+    """Return whether the sign is among the detections, with its label."""
     return any(label == kind and overlaps(box, b[None])[0] > 0.25 for label, b in found)
 
 

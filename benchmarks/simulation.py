@@ -1,7 +1,7 @@
 """Speed of simulating drives: pictures per second, stage by stage, on one core.
 
-There is no peer that draws these scenes without a GPU; each stage stands as a fraction of the
-whole, and OpenCV's encoding of the same picture as JPEG serves as the unit to compare machines by.
+No peer renders these scenes without a GPU. Each stage is printed as a fraction of the whole, and
+OpenCV's JPEG encoding of the same picture is the unit for comparing machines.
 
     python benchmarks/simulation.py
 """

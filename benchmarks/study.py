@@ -2,10 +2,10 @@
 
     python benchmarks/study.py [--rounds 5] [--drives 200]
 
-A trial-step's CPU time of whole compiled drives (town, vehicle, sensors, filter, decisions) beside
-that of filterpy's ExtendedKalmanFilter alone, with the source's four states, fed with the readings
-of a recorded drive. Both end in the same state. Then cost and memory against the number of drives.
-``crosscue study landmarks`` itself prints the time of the whole study.
+The script compares the CPU time per step of complete compiled drives (town, vehicle, sensors,
+filter, decisions) with that of filterpy's ExtendedKalmanFilter alone, with the dissertation's four
+states and the readings of a recorded drive. Both end in the same state. It also prints cost and
+memory against the number of drives. ``crosscue study landmarks`` prints the time of the study.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Odometry(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no t
 
 
 def wrapped(a: Floats, b: Floats) -> Floats:
-    """The shorter way round."""
+    """Return the angle wrapped to the shorter turn."""
     return np.array([[wrap(float(a[0, 0] - b[0, 0]))]])
 
 
@@ -128,7 +128,7 @@ def largest_gap(a: Floats, b: Floats) -> float:
 
 
 def check(traced: Traced) -> None:
-    """Both filters end in the same state, or nothing is worth timing."""
+    """Check that both filters end in the same state, before timing them."""
     row = traced.steps[STEPS - 1]
     gap = largest_gap(filterpy_alone(traced, STEPS, 4), row[7:10].copy())
     print(f"filter, {STEPS} steps: filterpy's four states and ours differ by {gap:.1e}\n")

@@ -3,11 +3,11 @@
     python benchmarks/study_assumptions.py [--only field|nees|landmarks] [--drives 200]
         [--field-drives 400] [--nees-drives 20000] [--seed 77]
 
-First the field protocol's range runs: distance at loss. Then how wrong the filter is against what
-it says, with the encoders as they are and with fine ones. Last the landmark study on its 25 pairs
-of density and rate: how much farther than straight to goal the other two strategies drive, by three
-ways of averaging. Seeds are neither those of the studies nor of the calibration; drives of one row
-have the seeds of every other row. About five CPU minutes.
+The first part is the field protocol's range runs: distance at loss. The second is the consistency
+of the filter, with the studied encoders and with fine ones. The third is the landmark study on its
+25 pairs of density and rate: the extra distance of the other two strategies over straight to goal,
+averaged in three ways. Seeds differ from those of the studies and of the calibration, and all rows
+use the same seeds. It takes about five CPU minutes.
 """
 
 from __future__ import annotations

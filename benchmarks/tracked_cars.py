@@ -1,10 +1,9 @@
-"""Followed cars with perfect boxes: precision and recall of each cue, and the gate that says no.
+"""Tracked cars with perfect boxes: precision and recall of each cue, and the rejecting conditions.
 
-Run it as ``python benchmarks/tracked_cars.py DRIVES [LAYOUTS]`` on what ``crosscue simulate`` made;
-LAYOUTS, such as ``ACEG``, names the first letters of the drives to take. Every car of
-``objects.json`` of which at least half is visible becomes a detection with its true mask; the
-car's motion and the place of the intersection are the true ones. What is missed then is missed by
-the rule.
+Run it as ``python benchmarks/tracked_cars.py DRIVES [LAYOUTS]`` on drives of ``crosscue simulate``;
+LAYOUTS, such as ``ACEG``, are the first letters of the drives to use. Every car of
+``objects.json`` that is at least half visible becomes a detection with its true mask. The ego
+motion and the position of the intersection are true as well, so all misses are those of the rule.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from support.perfect_boxes import frames, is_there
 
 VISIBLE = 0.5
 PLACE_SD_M = 2.0
-"""Of the true range, so that rules ask for what they would ask of a good estimate."""
+"""Standard deviation of the true range, so that rules treat it like a good estimate."""
 
 
 class Totals(NamedTuple):
