@@ -1,17 +1,16 @@
-"""Signals out of MF4 bus logs: ours beside asammdf, DBC parsed before and from a cold start.
+"""Decode signals of MF4 bus logs: ours beside asammdf, with a parsed DBC and from a cold start.
 
     python benchmarks/mf4_decoding.py [rounds]
 
-Three logs: a CANedge one with its DBC; the Ford candump, many times over, with a DBC of 0.8 MB, as
-a logger leaves it on its card, unfinalized and unsorted; and the same log as asammdf finalizes and
-sorts it. asammdf extracts with ``extract_bus_logging``; ours reads and decodes the same bus or
-buses with its NumPy engine, looks every frame up and accounts for it. Before anything is timed
-all values are compared, by bus, identifier and signal, in order; ours are numbers where asammdf
-gives a table's text, so there its numbers are taken.
-Warm: one process, DBC parsed before by each, in rotation, CPU seconds of the process; ratios are
+There are three logs: a CANedge log with its DBC; the Ford candump, repeated, with a DBC of 0.8 MB,
+unfinalized and unsorted as loggers leave it; and the same log finalized and sorted by asammdf.
+asammdf extracts with ``extract_bus_logging``. Ours reads and decodes the same bus or buses with its
+NumPy engine, looks up every frame and accounts for it. All values are compared before timing, by
+bus, identifier and signal, in order; where asammdf returns a table's text, its number is compared.
+Warm: one process, DBC parsed before by each, alternating, CPU seconds of the process; ratios are
 taken round by round. Cold: a process for each pass, imports and DBC included, CPU seconds of the
-child; the first start fills whatever is cached, the second one finds it.
-The recordings are looked for in $CROSSCUE_DATA or ../shared/data.
+child; the first start fills the caches, and the second uses them. The recordings are in
+$CROSSCUE_DATA or ../shared/data.
 """
 
 from __future__ import annotations
@@ -118,7 +117,7 @@ def compared(log: Path, dbc: Path) -> int:
 
 
 def ford_logs(folder: Path) -> list[Path]:
-    """The Ford frames many times over: as they are on a logger's card, and finalized."""
+    """The repeated Ford frames: unfinalized as on a logger's card, and finalized."""
     import asammdf
     import can
 

@@ -1,9 +1,9 @@
 """Speed of decoding a Mobileye's frames, beside cantools frame by frame.
 
-Both get the same simulated frames and the same layout: an in-memory cantools database is made from
-our table (classic revision, family extended). cantools gives a dictionary a frame; ours gives
-joined obstacles and lanes in the vehicle frame, with every check and the account. They alternate
-within one run, since timings of different runs do not compare.
+Both receive the same simulated frames and the same layout, for which our table (classic revision,
+family extended) is converted to an in-memory cantools database. cantools returns a dictionary per
+frame; ours returns joined obstacles and lanes in the vehicle frame, with every check and the
+account. Both alternate within one run, because timings of different runs are not comparable.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def simulated_bus() -> Block:
 
 
 def peer() -> cantools.database.Database:
-    """The layout table as a cantools database, an instance of a message a message."""
+    """Return the layout table as a cantools database, with a message per instance."""
     messages = [_db_message(m, k) for m in layout().messages for k in range(len(m.ids))]
     return cantools.database.Database(messages)
 
@@ -96,7 +96,7 @@ def _signal(f: Field) -> Signal:
 
 
 def ours(block: Block) -> int:
-    """Rows of all tables, decoded block by block as a reader would give them."""
+    """Rows of all tables, decoded block by block as from a reader."""
     decoder = MobileyeDecoder("can1", Ledger("bench"), SETTINGS)
     rows = 0
     for start in range(0, len(block), BLOCK_ROWS):
@@ -105,13 +105,13 @@ def ours(block: Block) -> int:
 
 
 def theirs(database: cantools.database.Database, ids: list[int], payloads: list[bytes]) -> int:
-    """Dictionaries, one a frame."""
+    """One dictionary per frame."""
     decode = database.decode_message
     return sum(1 for i, p in zip(ids, payloads, strict=True) if decode(i, p, decode_choices=False))
 
 
 def check_equal(block: Block, database: cantools.database.Database) -> None:
-    """Both say the same of where obstacles are; else the race means nothing."""
+    """Check that both return the same positions of obstacles, before timing them."""
     decoder = MobileyeDecoder("can1", Ledger("bench"), MobileyeSettings(mounting=Mounting()))
     tables = [b for b in (*decoder(block), *decoder.flush()) if b.topic.endswith("/obstacles")]
     mine = np.concatenate([b.rows["y_m"] for b in tables if isinstance(b.rows, Table)])

@@ -53,7 +53,7 @@ class TrueCar(NamedTuple):
 
 
 def true_cars(drive: Path) -> dict[int, list[TrueCar]]:
-    """From a frame's time to its cars of which enough is visible."""
+    """Map from a frame's time to its sufficiently visible cars."""
     content = json.loads((drive / "objects.json").read_text())
     times = {one["id"]: one["t_ns"] for one in content["images"]}
     cars: dict[int, list[TrueCar]] = {t_ns: [] for t_ns in times.values()}
@@ -66,7 +66,7 @@ def true_cars(drive: Path) -> dict[int, list[TrueCar]]:
 
 
 def motions(drive: Path) -> dict[int, Motion]:
-    """From a frame's time to the true motion of the rear axle since the frame before."""
+    """Map from a frame's time to the true motion of the rear axle since the previous frame."""
     found = {}
     last: tuple[float, float, float, int] | None = None
     for line in (drive / "pose.tum").read_text().splitlines():
@@ -84,7 +84,7 @@ def motions(drive: Path) -> dict[int, Motion]:
 
 
 def places(drive: Path) -> dict[int, Place]:
-    """From a frame's time to where the intersection truly is."""
+    """Map from a frame's time to the true position of the intersection."""
     with (drive / "ranges.csv").open() as file:
         return {
             int(row["t_ns"]): Place(float(row["start_m"]), float(row["end_m"]), PLACE_SD_M)
@@ -129,7 +129,7 @@ def _past(
     vehicle: Vehicle,
     totals: Totals,
 ) -> None:
-    """Cars that come or go past the end, one by one."""
+    """Count oncoming and outgoing cars past the end of the intersection, one by one."""
     counted = [car for car in along(cars, vehicle.cars) if is_past(car, vehicle.camera, place)]
     named = Counter[TrueCar]()
     for car in counted:
@@ -147,7 +147,7 @@ def _past(
 
 
 def known_as(car: CarMotion, known: Sequence[TrueCar]) -> TrueCar | None:
-    """The true car whose box a followed car has."""
+    """Return the true car that has the box of a tracked car."""
     return next((one for one in known if np.allclose(one.box_px, car.box_px, atol=0.5)), None)
 
 

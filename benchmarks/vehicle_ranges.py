@@ -61,7 +61,7 @@ def _projected(folder: Path, focal_px: float, center_px: tuple[float, float]) ->
 
 
 def _pairs(run: Path, folder: Path) -> Iterator[tuple[dict[str, Any], float]]:
-    """Detections that nothing cuts, with their true range."""
+    """Detections that are not cut by the image border, with their true range."""
     opened = open_run(run)
     camera = opened.drive_manifest().settings.camera
     boxes = _projected(folder, camera.focal_px or 0.0, camera.center_px or (0.0, 0.0))
