@@ -62,7 +62,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .clocks import clock_changes, clock_rows
 from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments
 from .empty_result import empty_result, silent_roles
-from .landmarks import looking
+from .landmarks import landmark_stage
 from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
 from .progress import OnTime, report_time, unwatched_time
 
@@ -151,8 +151,8 @@ def _pose_stage(reading: _Reading) -> PoseStage:
     )
     if reading.camera is not None and landmarks is not None:
         at = reading.camera[0]
-        looks = looking(landmarks, vehicle, reading.ledgers[at])
-        stage.landmarks, reading.extractors[at].on_pictures = looks, looks.see
+        search = landmark_stage(landmarks, vehicle, reading.ledgers[at])
+        stage.landmarks, reading.extractors[at].on_pictures = search, search.see
     return stage
 
 

@@ -146,7 +146,7 @@ class LandmarkStage:
             return None
 
 
-def looking(database: LandmarkDatabase, vehicle: Vehicle, ledger: Ledger) -> LandmarkStage:
+def landmark_stage(database: LandmarkDatabase, vehicle: Vehicle, ledger: Ledger) -> LandmarkStage:
     """Return a stage that searches for the landmarks of a database, set up by the vehicle file."""
     search = LandmarkSearch(database, matcher_for(vehicle), landmark_settings(vehicle))
     return LandmarkStage(search, ledger, round(vehicle.landmarks.interval_s * 1e9))

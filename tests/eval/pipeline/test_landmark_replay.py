@@ -19,7 +19,7 @@ from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
-from crosscue.eval.pipeline.landmarks import LandmarkStage, looking
+from crosscue.eval.pipeline.landmarks import LandmarkStage, landmark_stage
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.pose.measured import read_measured
 from crosscue.localization.ekf import PoseBelief
@@ -320,7 +320,7 @@ def block(payloads: list[bytes], first_ns: int = 0, step_ns: int = 500_000_000) 
 
 def stage_at(path: Path, ledger: Ledger, **section: float) -> LandmarkStage:
     vehicle = Vehicle.model_validate({"version": 1, "landmarks": section})
-    return looking(LandmarkDatabase(path), vehicle, ledger)
+    return landmark_stage(LandmarkDatabase(path), vehicle, ledger)
 
 
 def belief_at(t_ns: int) -> PoseBelief:
