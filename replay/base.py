@@ -62,7 +62,7 @@ from .errors import (
 )
 from .files.bounded import PIECE_BYTES, read_at_most
 from .files.closing import Closing
-from .files.tree_text import MAX_DEPTH, json_tree, strict_json, toml_tree
+from .files.tree_text import MAX_DEPTH, json_tree, strict_json, toml_tree, yaml_tree
 from .files.whole_file import (
     cannot_write,
     file_sha256,
@@ -167,6 +167,7 @@ __all__ = [
     "write_bytes",
     "write_text",
     "write_whole",
+    "yaml_tree",
 ]
 
 

@@ -31,6 +31,7 @@ from crosscue.replay.base import (
     EmptyResultError,
     UsageError,
     read_at_most,
+    yaml_tree,
 )
 
 from .coco import read_coco
@@ -279,13 +280,10 @@ def _names_of(path: Path) -> tuple[str, ...]:
 
 
 def _yaml_names(file: Path) -> tuple[str, ...]:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
-        names = YAML(typ="safe").load("\n".join(_lines(file, is_whole=True)))["names"]
+        names = yaml_tree("\n".join(_lines(file, is_whole=True)))["names"]
         listed = [names[i] for i in range(len(names))]
-    except (YAMLError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         raise AnnotationError(f"{file}: expected class names under names") from None
     return tuple(map(str, listed))
 

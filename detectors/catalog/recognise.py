@@ -25,13 +25,12 @@ from crosscue.detectors.networks.backends import Network, load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.picture_input import prepared
 from crosscue.detectors.networks.weights import Weights
-from crosscue.replay.base import UsageError, one_line, read_at_most
+from crosscue.replay.base import UsageError, one_line, read_at_most, yaml_tree
 
 from .architectures import WEIGHTS_SUFFIXES
 from .card import MAX_BYTES, Input
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
-_MAX_BRACKETS: Final = 200
 """Maximum number of brackets in metadata; parsing more is slow."""
 DEFAULT_SIDE_PX: Final = 640
 """Default side of a network's input, where the file declares no size."""
@@ -137,17 +136,14 @@ def _yaml_metadata(path: Path) -> dict[str, str]:
     Raises:
         UsageError: The file is damaged.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     if not path.is_file():
         return {}
     try:
         content = read_at_most(path, _MAX_NAMES_CHARACTERS)
-        if content is None or content.count(b"[") + content.count(b"{") > _MAX_BRACKETS:
-            raise ValueError("too large or too deeply nested")
-        found = YAML(typ="safe", pure=True).load(content.decode("utf-8"))
-    except (YAMLError, ValueError, RecursionError) as error:
+        if content is None:
+            raise ValueError(f"over {_MAX_NAMES_CHARACTERS:,} bytes")
+        found = yaml_tree(content.decode("utf-8"))
+    except ValueError as error:
         why = one_line(error, 160)
         raise UsageError(f"{path}: not readable as metadata: {why}; correct or remove it") from None
     if not isinstance(found, dict):

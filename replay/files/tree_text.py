@@ -1,4 +1,4 @@
-"""Parse JSON and TOML text with a limit on nesting.
+"""Parse JSON, TOML and YAML text with a limit on nesting.
 
 The parsers recurse, and so does most code that uses their results. The limit turns a hostile file
 into an error of one clear line in every command.
@@ -11,7 +11,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -58,6 +58,34 @@ def toml_tree(text: str) -> dict[str, Any]:
     if level:
         raise ValueError(_TOO_DEEP)
     return tree
+
+
+def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
+    """Parse a YAML text.
+
+    Args:
+        text: The text. An alias is refused, because a few of them can stand for gigabytes.
+        scalars: "base" returns every scalar as a string, "safe" also numbers and booleans.
+
+    Raises:
+        ValueError: The text is not YAML, nested too deeply, or uses an alias.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
+
+    depth = 0
+    try:
+        for event in YAML(typ=scalars, pure=True).parse(text):
+            depth += isinstance(event, CollectionStartEvent)
+            depth -= isinstance(event, CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise ValueError(_TOO_DEEP)
+            if isinstance(event, AliasEvent):
+                raise ValueError("an alias, which is not supported")
+        return YAML(typ=scalars, pure=True).load(text)
+    except (YAMLError, RecursionError) as error:
+        raise ValueError(str(error)) from None
 
 
 def strict_json(value: object) -> str:

@@ -106,6 +106,12 @@ def test_what_is_outside_is_cut_or_counted(tmp_path: Path) -> None:
         ),
         ({"7.txt": "0 .5 .5 x .1", "classes.txt": "car"}, AnnotationError, "expected numbers"),
         ({"7.txt": "", "data.yaml": "path: x"}, AnnotationError, "class names under names"),
+        ({"7.txt": "", "data.yaml": "names: " + "[" * 9000}, AnnotationError, "class names under"),
+        (
+            {"7.txt": "", "data.yaml": "a: &a [x, x]\nnames: [*a, *a]"},
+            AnnotationError,
+            "class names under names",
+        ),
         ({"7.txt": "car" + " 1" * 14 + "\nbus 1 2"}, AnnotationError, "7.txt:2: 3 columns"),
         (
             {"7.xml": "<!DOCTYPE a [<!ENTITY b 'c'>]><annotation/>"},

@@ -1,4 +1,4 @@
-"""Deeply nested JSON and TOML: every command that reads them fails with one clear line."""
+"""Deeply nested JSON, TOML and YAML: every command that reads them fails with one clear line."""
 
 import ast
 import json
@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
-from crosscue.replay.base import MAX_DEPTH, json_tree, toml_tree
+from crosscue.replay.base import MAX_DEPTH, json_tree, toml_tree, yaml_tree
 from support.pictures import picture_folder
 from support.scoring import run_folder, truth_folder
 
@@ -81,6 +81,25 @@ def test_toml_at_the_limit_is_read() -> None:
     assert toml_tree("a = " + "[" * (MAX_DEPTH - 1) + "]" * (MAX_DEPTH - 1))["a"]
     with pytest.raises(ValueError, match="nested"):
         toml_tree("a = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("[" * 9_000, "nested"),
+        ("\n".join(" " * i + "a:" for i in range(70)), "nested"),
+        ("a: &a [x, x]\nb: [*a, *a]", "alias"),
+        ("a: [", "found"),
+    ],
+)
+def test_hostile_yaml_is_refused(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        yaml_tree(text)
+
+
+def test_yaml_is_read_with_or_without_types() -> None:
+    assert yaml_tree("a: [1, no]\n2: b") == {"a": [1, "no"], 2: "b"}
+    assert yaml_tree("a: [1, no]\n2: b", "base") == {"a": ["1", "no"], "2": "b"}
 
 
 @pytest.mark.parametrize(
@@ -195,7 +214,7 @@ def _refused_in_a_line(
 
 
 @pytest.mark.slow
-def test_nothing_else_parses_json_or_toml() -> None:
+def test_nothing_else_parses_json_toml_or_yaml() -> None:
     """New readers of such files must use the limit."""
     paths = [path for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
     assert len(paths) > 700
@@ -203,6 +222,7 @@ def test_nothing_else_parses_json_or_toml() -> None:
         if path.name == "tree_text.py":
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            assert not (isinstance(node, ast.Name) and node.id == "YAML"), path
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
                 name = f"{node.value.id}.{node.attr}"
                 assert name not in ("json.loads", "json.load", "tomllib.loads", "tomllib.load"), (

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from crosscue.replay.base import read_at_most
+from crosscue.replay.base import read_at_most, yaml_tree
 
 METADATA_BYTES: Final = 1 << 20
-_BRACKETS: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +44,14 @@ class Metadata:
 
 def read_metadata(path: Path) -> Metadata:
     """Read ``metadata.yaml``; if it is missing or unreadable, only ``fault`` is set."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
         raw = read_at_most(path, METADATA_BYTES)
-        if raw is None or raw.count(b"[") + raw.count(b"{") > _BRACKETS:
-            return Metadata(fault="implausibly large or deeply nested")
-        said = YAML(typ="base", pure=True).load(raw.decode("utf-8", "backslashreplace"))
+        if raw is None:
+            return Metadata(fault="implausibly large")
+        said = yaml_tree(raw.decode("utf-8", "backslashreplace"), "base")
     except FileNotFoundError:
         return Metadata(fault="missing")
-    except (OSError, YAMLError, RecursionError, ValueError, TypeError, LookupError) as error:
+    except (OSError, ValueError, TypeError, LookupError) as error:
         return Metadata(fault=f"unreadable ({type(error).__name__})")
     about = _mapping(_mapping(said).get("rosbag2_bagfile_information"))
     if not about:
