@@ -78,6 +78,11 @@ def knows_simulated_only(choice: Choice) -> bool:
     return bool(choice.settings.get(setting, embedded) == embedded)
 
 
+def is_plugin(choice: Choice) -> bool:
+    """Whether a detector is code of the user's: a ``module:factory`` or an entry point."""
+    return choice.kind not in BUILTIN and choice.kind not in catalog.names()
+
+
 def known(sections: Mapping[str, Choice]) -> list[str]:
     """List all names that can be used."""
     offered = (point.name for point in entry_points(group=GROUP))

@@ -53,6 +53,8 @@ myst_heading_anchors = 3
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 napoleon_google_docstring = True
-nb_execution_mode = "cache"
+# Not "cache": it compares the text of a notebook, and the code that it calls may have changed.
+nb_execution_mode = "force"
 nb_execution_raise_on_error = True
+nb_execution_show_tb = True
 nb_execution_timeout = 600

@@ -28,7 +28,7 @@ from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.detection_range import detection_range
-from crosscue.detectors.registry import knows_simulated_only, make
+from crosscue.detectors.registry import is_plugin, knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
@@ -141,7 +141,7 @@ def detect_into(
     began = time.monotonic()
     camera = _only_camera(logs, vehicle)
     named = [Named(choice.name, make(choice)) for choice in choices]
-    _refuse_uncounted(named, vehicle)
+    uncounted = _uncounted(named, choices, vehicle)
     reading = _Reading(logs, camera, vehicle, selection, timeline)
     with ResultCache(cache) as results:
         runner = Runner(
@@ -163,6 +163,7 @@ def detect_into(
             [choice.kind == "signs" for choice in choices],
             reading.timeline,
             reading.clock,
+            notices=uncounted,
         )
         _run_detectors(reading, runner, tables, on_frames)
         frames = runner.counts.frames
@@ -348,24 +349,36 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
     ]
 
 
-def _refuse_uncounted(named: Sequence[Named], vehicle: Vehicle) -> None:
-    """Refuse detectors whose labels no cue counts.
+def _uncounted(named: Sequence[Named], choices: Sequence[Choice], vehicle: Vehicle) -> list[str]:
+    """Return notices about plug-ins whose labels no cue counts; a network is refused.
+
+    A network's card is then likely wrong, or lacks ``[labels]``. A plug-in states its labels
+    itself, and its cue is often written after it.
 
     Raises:
-        VehicleError: A detector reports no label of a cue.
+        VehicleError: No cue counts any label of a network.
     """
     if vehicle.counts_any_label:
-        return
+        return []
     counted = {label for labels in vehicle.cue_labels().values() for label in labels}
-    for one in named:
+    notices = []
+    for one, choice in zip(named, choices, strict=True):
         labels = reportable(one.detector)
-        if labels and counted.isdisjoint(labels):
+        if not labels or not counted.isdisjoint(labels):
+            continue
+        shown = f"({', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''})"
+        own = f'[cues.own.NAME] labels = ["{labels[0]}"]'
+        if not is_plugin(choice):
             raise VehicleError(
-                f"{one.name}: no cue counts any of its {len(labels)} labels "
-                f"({', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}); state what its "
-                "classes mean under [labels] in its card, or count them in the vehicle file: "
-                f'[cues.own.NAME] labels = ["{labels[0]}"]'
+                f"{one.name}: no cue counts any of its {len(labels)} labels {shown}; state what "
+                "its classes mean under [labels] in its card, or count them in the vehicle file: "
+                f"{own}"
             )
+        notices.append(
+            f"{one.name}: no cue counts its labels {shown}: detections.parquet has its boxes, and "
+            f"the belief does not use them; to count them, state in the vehicle file: {own}"
+        )
+    return notices
 
 
 def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:

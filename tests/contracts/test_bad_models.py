@@ -5,11 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import crosscue
+from crosscue.detectors.base import Frame, View
+from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.eval import cli
 from support.onnx_models import constant_model
 from support.pictures import picture_folder
@@ -31,6 +35,16 @@ BAD = {
     "not-counted": "net: no cue counts any of its 2 labels (cat, dog); state what its classes mean",
 }
 """Defects of a network for three pictures, and a part of the error line."""
+
+
+class Everything(BoxDetector):
+    """A detector with a label of its own, which sees the whole picture."""
+
+    name, labels, view = "everything", ("whatever",), View(is_grey=True)
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Yield one box."""
+        yield "whatever", 1.0, (0, 0, frame.pixels.shape[1], frame.pixels.shape[0])
 
 
 def card(folder: Path, model: bytes, classes: list[str], width_px: int = 64) -> str:
@@ -83,6 +97,16 @@ def test_a_network_that_does_not_fit_stops_the_run_in_one_line(
     assert captured.err.count("\n") == 1
     assert BAD[bad] in captured.err
     assert not out.exists()
+
+
+def test_a_detector_in_python_runs_before_a_cue_counts_its_label(log: Path, tmp_path: Path) -> None:
+    detectors, vehicle = [f"{__name__}:Everything.build"], crosscue.Vehicle(version=1)
+
+    run = crosscue.detect_drive(log, tmp_path / "out", vehicle, detectors)
+
+    assert set(run.detections["label"].to_pylist()) == {"whatever"}
+    assert "no cue counts its labels (whatever)" in str(run)
+    assert '[cues.own.NAME] labels = ["whatever"]' in str(run)
 
 
 def test_no_card_is_left_for_a_network_without_numbers(

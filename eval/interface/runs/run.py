@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import Manifest, RunFolder, json_schema
 from crosscue.eval.runs.folder import open_run as open_folder
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, RunError, UsageError
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, RunError, UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 if TYPE_CHECKING:
@@ -90,7 +90,9 @@ class Run:
         for name in self.tables:
             columns = self.folder.schema(name).names
             rows.append((name, ", ".join(columns), self._rows(name)))
-        return f"{self.path}\n{listing(('table', 'columns', 'rows'), rows, 2)}"
+        tables = listing(("table", "columns", "rows"), rows, 2)
+        notices = (f"note: {visible(text)}" for text in self.folder.drive_manifest().notices)
+        return "\n".join((str(self.path), tables, *notices))
 
     def _rows(self, name: str) -> int:
         import pyarrow.parquet as pq

@@ -31,7 +31,10 @@ def test_a_run_is_tables(run: crosscue.Run) -> None:
     assert "pose" in run.tables
     head, *lines = repr(run).splitlines()[1:]
     assert head.split() == ["table", "columns", "rows"]
-    assert [line.split()[0] for line in lines] == list(run.tables)
+    notes = [f"note: {text}" for text in run.folder.drive_manifest().notices]
+    assert notes
+    assert [line.split()[0] for line in lines[: -len(notes)]] == list(run.tables)
+    assert lines[-len(notes) :] == notes
     with pytest.raises(crosscue.RunError, match="there are: "):
         run["nonsense"]
 
