@@ -20,7 +20,7 @@ from .entries import entry, place_of
 
 MIRROR: Final = "CROSSCUE_MODEL_MIRROR"
 DATA: Final = "CROSSCUE_DATA"
-OTHERWISE: Final = f"pass it with --weights FILE, or name a mirror in {MIRROR}"
+OTHERWISE: Final = f"pass it with --from FILE, or name a mirror in {MIRROR}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,7 +92,7 @@ def download(
         file: Expected name, size and hash.
         place: Path of the file; it is ``NAME.part`` in the same folder until it is complete.
         owner: Owner of the file, for errors.
-        otherwise: Alternative remedy, for errors: ``give it with --weights FILE``.
+        otherwise: Alternative remedy, for errors: ``give it with --from FILE``.
         on_progress: Called after each chunk.
 
     Raises:

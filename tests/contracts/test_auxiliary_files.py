@@ -137,7 +137,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("model init", "--class-names"): ("{onnx} -o {there}/new.toml --class-names {gone}", SETTINGS),
     ("model init", "--picture"): ("{onnx} -o {there}/new.toml --picture {gone}", INPUT),
     ("model check", "--picture"): ("{card} --picture {gone} -o {out}.jpg", INPUT),
-    ("model fetch", "--weights"): ("yolox-nano --weights {gone}", SETTINGS),
+    ("model fetch", "--from"): ("yolox-nano --from {gone}", SETTINGS),
     ("demo", "--data"): ("--real --data {gone} -o {out}", INPUT),
     ("study intersections", "--vehicle"): ("-o {out} --vehicle {gone}", SETTINGS),
     ("study range", "--settings"): ("-o {out} --settings {gone}", SETTINGS),

@@ -168,7 +168,7 @@ def test_without_a_network_the_line_says_what_else_there_is(
         fetch.fetch("net")
 
     assert str(error.value).startswith("http://127.0.0.1:9/net.onnx: not fetched: ")
-    assert "--weights FILE" in str(error.value)
+    assert "--from FILE" in str(error.value)
     assert fetch.MIRROR in str(error.value)
 
 

@@ -6,7 +6,7 @@ publisher's, and $CROSSCUE_MODELS is the folder to keep the weights in.
 
 example:
   crosscue model fetch yolox-nano
-  crosscue model fetch yolox-s --weights Downloads/object_detection_yolox_2022nov.onnx
+  crosscue model fetch yolox-s --from Downloads/object_detection_yolox_2022nov.onnx
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options to the parser."""
     parser.add_argument("models", nargs="+", metavar="MODEL", help="names from crosscue model list")
     parser.add_argument(
-        "--weights",
+        "--from",
         dest="given",
         type=Path,
         metavar="FILE",
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fetch the models."""
     if args.given is not None and len(args.models) > 1:
-        raise crosscue.UsageError("--weights: one model at a time")
+        raise crosscue.UsageError("--from: one model at a time")
     found: dict[str, object] = {}
     for name in args.models:
         with progress_line(args, "fetching") as line:
