@@ -19,7 +19,7 @@ ENDLESS = Path("/dev/zero")
 
 
 @given(content=st.binary(max_size=40), max_count=st.integers(0, 40))
-def test_a_file_comes_whole_or_not_at_all(content: bytes, max_count: int) -> None:
+def test_file_over_limit_is_not_read(content: bytes, max_count: int) -> None:
     with tempfile.NamedTemporaryFile() as file:
         file.write(content)
         file.flush()
@@ -31,6 +31,6 @@ def test_a_file_comes_whole_or_not_at_all(content: bytes, max_count: int) -> Non
 
 @pytest.mark.skipif(not ENDLESS.exists(), reason="no /dev/zero here")
 @pytest.mark.parametrize("read", [vehicle.load, read_card, load_gates, truth.load, pairs_of_table])
-def test_a_file_without_an_end_is_refused(read: Callable[[Path], object]) -> None:
+def test_endless_file_is_refused(read: Callable[[Path], object]) -> None:
     with pytest.raises(CrosscueError, match=r"/dev/zero: over \d+ MiB"):
         read(ENDLESS)

@@ -16,14 +16,14 @@ from crosscue.replay.files import checksum
 
 @settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=9000), st.binary(max_size=300))
-def test_equals_zlib_in_one_piece_and_in_two(first: bytes, second: bytes) -> None:
+def test_crc32_equals_zlib_in_one_or_two_pieces(first: bytes, second: bytes) -> None:
     whole = zlib.crc32(first + second)
     assert checksum.crc32(first + second) == whole
     assert checksum.crc32(memoryview(second), checksum.crc32(first)) == whole
     assert checksum.crc32(np.frombuffer(first, np.uint8)) == zlib.crc32(first)
 
 
-def test_zlib_serves_where_isal_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zlib_is_used_without_isal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
     try:
         importlib.reload(checksum)

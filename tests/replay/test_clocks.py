@@ -21,13 +21,13 @@ MS = 1_000_000
 quick = settings(max_examples=40, deadline=None)
 
 
-def header_of(stream: Stream, rows_per_block: int = 700) -> StampReport:
+def header_report(stream: Stream, rows_per_block: int = 700) -> StampReport:
     header = watch_stream(stream, rows_per_block).header
     assert header is not None
     return header
 
 
-def log_of(log_ns: Int64s, rows_per_block: int = 700) -> StampReport:
+def log_report(log_ns: Int64s, rows_per_block: int = 700) -> StampReport:
     return watch(table_of("/s", log_ns), rows_per_block).log
 
 
@@ -43,11 +43,11 @@ def steady(rows: int = 2000, period_ns: int = 10 * MS) -> Int64s:
     period_ns=st.sampled_from([1 * MS, 10 * MS, 50 * MS, 100 * MS]),
     seed=st.integers(0, 1000),
 )
-def test_offset_and_drift_are_found_again(
+def test_simulated_offset_and_drift_are_estimated(
     offset_ns: int, drift_ppm: float, wait_ns: int, period_ns: int, seed: int
 ) -> None:
     rows = 60_000 * MS // period_ns
-    header = header_of(Stream(rows, period_ns, offset_ns, drift_ppm, wait_ns, seed=seed))
+    header = header_report(Stream(rows, period_ns, offset_ns, drift_ppm, wait_ns, seed=seed))
 
     line = header.line
     assert line is not None
@@ -59,10 +59,10 @@ def test_offset_and_drift_are_found_again(
     assert header.jumps == header.resets == 0
 
 
-def test_the_error_claimed_for_drift_is_as_large_as_the_error_made() -> None:
+def test_drift_error_matches_actual_error() -> None:
     scaled = []
     for seed in range(60):
-        line = header_of(Stream(1200, drift_ppm=80.0, wait_ns=4 * MS, seed=seed)).line
+        line = header_report(Stream(1200, drift_ppm=80.0, wait_ns=4 * MS, seed=seed)).line
         assert line is not None
         assert line.drift_ppm is not None
         assert line.drift_error_ppm is not None
@@ -78,13 +78,13 @@ def test_the_error_claimed_for_drift_is_as_large_as_the_error_made() -> None:
     signs=st.lists(st.sampled_from([-1, 1]), min_size=4, max_size=4),
     rows_per_block=st.sampled_from([17, 50, 700, 5000]),
 )
-def test_jumps_are_counted_and_placed(
+def test_clock_jumps_are_counted_and_located(
     rows: list[int], by_ms: list[int], signs: list[int], rows_per_block: int
 ) -> None:
     jumps = {100 + 140 * r: m * MS * s for r, m, s in zip(sorted(rows), by_ms, signs, strict=False)}
     stream = Stream(1900, 50 * MS, 3 * SECOND_NS, 40.0, 2 * MS, jumps)
 
-    header = header_of(stream, rows_per_block)
+    header = header_report(stream, rows_per_block)
 
     log_ns = stream.log_ns()
     assert header.jumps == len(jumps)
@@ -97,7 +97,7 @@ def test_jumps_are_counted_and_placed(
     assert header.line.drift_ppm == pytest.approx(40.0, abs=60.0)
 
 
-def test_a_recorder_that_stalls_for_a_second_is_no_jump() -> None:
+def test_stalled_recorder_is_not_reported_as_jump() -> None:
     stream = Stream(20_000, 1 * MS, wait_ns=MS // 10)
     log_ns = stream.log_ns()
     stalled = (log_ns > log_ns[8000]) & (log_ns < log_ns[8000] + SECOND_NS)
@@ -108,25 +108,25 @@ def test_a_recorder_that_stalls_for_a_second_is_no_jump() -> None:
     assert header is not None
     assert header.jumps == 0
     assert header.gaps == 0
-    assert log_of(log_ns).gaps == 1
+    assert log_report(log_ns).gaps == 1
 
 
-def test_the_same_stream_in_other_pieces_gives_the_same_report() -> None:
+def test_report_does_not_depend_on_block_size() -> None:
     stream = Stream(9000, 10 * MS, 5 * MS, -30.0, MS, {4000: -SECOND_NS, 7000: 80 * MS})
 
     assert watch_stream(stream, 9000) == watch_stream(stream, 37) == watch_stream(stream, 1)
 
 
-def test_a_report_may_be_asked_for_before_the_end() -> None:
+def test_report_is_available_before_the_end() -> None:
     stream = Stream(9000, 10 * MS, wait_ns=MS)
     block = table_of("/s", stream.log_ns(), stream.header_ns())
-    seen = ClockWatch()
-    seen.see(block.take(slice(0, 5000)))
-    half = seen.reports()["/s"]
-    seen.see(block.take(slice(5000, 9000)))
+    clock_watch = ClockWatch()
+    clock_watch.see(block.take(slice(0, 5000)))
+    half = clock_watch.reports()["/s"]
+    clock_watch.see(block.take(slice(5000, 9000)))
 
     assert half == watch(block.take(slice(0, 5000)), 5000)
-    assert seen.reports()["/s"].count == 9000
+    assert clock_watch.reports()["/s"].count == 9000
 
 
 @quick
@@ -139,7 +139,7 @@ def test_gaps_are_counted_exactly(gaps: dict[int, int], rows_per_block: int) -> 
     for row, percent in gaps.items():
         log_ns[row + 1 :] += percent * 100_000
 
-    log = log_of(log_ns, rows_per_block)
+    log = log_report(log_ns, rows_per_block)
 
     assert log.median_period_ns == 10 * MS
     assert log.gaps == len(gaps)
@@ -149,10 +149,10 @@ def test_gaps_are_counted_exactly(gaps: dict[int, int], rows_per_block: int) -> 
         assert (log.longest_step_ns, log.longest_step_at_ns) == (longest_ns, log_ns[row])
 
 
-def test_more_gaps_than_are_kept_are_still_counted() -> None:
+def test_gaps_beyond_the_kept_ones_are_counted() -> None:
     steps = np.full(60_000, 10 * MS)
     steps[::10] = 100 * MS
-    log = log_of(START_NS + np.cumsum(steps), 60_000)
+    log = log_report(START_NS + np.cumsum(steps), 60_000)
 
     assert log.gaps == 6000 - 1
 
@@ -170,7 +170,7 @@ def test_duplicates_are_counted_exactly(rows: list[int], repeats: int, rows_per_
         log_ns, np.where(np.isin(np.arange(2000), [10 * r for r in rows]), 1 + repeats, 1)
     )
 
-    assert log_of(repeated, rows_per_block).duplicates == repeats * len(rows)
+    assert log_report(repeated, rows_per_block).duplicates == repeats * len(rows)
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_duplicates_are_counted_exactly(rows: list[int], repeats: int, rows_per_
     ),
     rows_per_block=st.sampled_from([1, 113, 2000]),
 )
-def test_late_rows_are_counted_exactly_and_make_no_gaps(
+def test_late_rows_are_counted_exactly_and_are_not_gaps(
     stretches: dict[int, tuple[int, int]], rows_per_block: int
 ) -> None:
     """A few rows are stored later by a number of places, with unchanged stamps."""
@@ -192,7 +192,7 @@ def test_late_rows_are_counted_exactly_and_make_no_gaps(
             [np.arange(row + n, row + n + late), np.arange(row, row + n)]
         )
 
-    log = log_of(steady()[order], rows_per_block)
+    log = log_report(steady()[order], rows_per_block)
 
     assert log.late_rows == sum(n for n, _ in stretches.values())
     assert log.late_stretches == len(stretches)
@@ -209,45 +209,48 @@ def test_late_rows_are_counted_exactly_and_make_no_gaps(
     back_ns=st.integers(31 * MS, START_NS // 10),
     rows_per_block=st.sampled_from([1, 113, 2000]),
 )
-def test_a_clock_set_back_is_a_reset_and_nothing_else(
+def test_clock_set_back_is_counted_only_as_reset(
     rows: list[int], back_ns: int, rows_per_block: int
 ) -> None:
     log_ns = steady()
     for row in rows:
         log_ns[200 * row + 150 :] -= back_ns
 
-    log = log_of(log_ns, rows_per_block)
+    log = log_report(log_ns, rows_per_block)
 
     assert log.resets == len(rows)
     assert {s.by_ns for s in log.reset_steps} <= {10 * MS - back_ns}
     assert (log.late_rows, log.gaps, log.duplicates) == (0, 0, 0)
 
 
-def test_a_clock_that_starts_again_at_zero_keeps_its_eras_apart() -> None:
+def test_clock_restarted_at_zero_is_reset_without_gap() -> None:
     log_ns = np.concatenate([steady(500), np.arange(1, 501) * 10 * MS])
 
-    log = log_of(log_ns)
+    log = log_report(log_ns)
 
     assert log.resets == 1
     assert log.reset_steps[0].at_log_ns == 10 * MS
     assert (log.gaps, log.late_rows, log.longest_step_ns) == (0, 0, 10 * MS)
 
 
-def test_a_gap_after_a_reset_is_seen() -> None:
+def test_gap_after_reset_is_counted() -> None:
     after = np.arange(1, 501) * 10 * MS
     after[300:] += SECOND_NS
-    log = log_of(np.concatenate([steady(500), after]))
+    log = log_report(np.concatenate([steady(500), after]))
 
     assert (log.resets, log.gaps) == (1, 1)
     assert log.longest_step_ns == SECOND_NS + 10 * MS
 
 
-def test_a_clock_whose_rate_changes_has_a_larger_error_of_its_drift() -> None:
+def test_changing_clock_rate_increases_drift_error() -> None:
     stream = Stream(1200, 50 * MS, wait_ns=MS)
     bent_ns = stream.header_ns()
     bent_ns[600:] += np.arange(600) * 10_000
 
-    straight, bent = header_of(stream).line, watch(table_of("/s", stream.log_ns(), bent_ns)).header
+    straight, bent = (
+        header_report(stream).line,
+        watch(table_of("/s", stream.log_ns(), bent_ns)).header,
+    )
 
     assert straight is not None
     assert straight.drift_error_ppm is not None
@@ -258,12 +261,12 @@ def test_a_clock_whose_rate_changes_has_a_larger_error_of_its_drift() -> None:
     assert bent.line.drift_error_ppm == pytest.approx(200.0 / 4.0, rel=0.2)
 
 
-def test_times_that_only_go_back_end_soon() -> None:
-    log = log_of(steady(200_000)[::-1], 50_000)
+def test_strictly_decreasing_times_yield_resets() -> None:
+    log = log_report(steady(200_000)[::-1], 50_000)
 
     assert log.rows == 200_000
     assert log.resets == pytest.approx(200_000 / 128, rel=0.01)
-    assert log_of(steady(20_000)[::-1], 5_000) == log_of(steady(20_000)[::-1], 777)
+    assert log_report(steady(20_000)[::-1], 5_000) == log_report(steady(20_000)[::-1], 777)
 
 
 @pytest.mark.parametrize(
@@ -279,9 +282,7 @@ def test_times_that_only_go_back_end_soon() -> None:
     ],
     ids=["zero", "constant", "half", "boot", "backwards", "drift", "jump"],
 )
-def test_a_header_stamp_that_does_not_agree_is_not_used(
-    header: Int64s, unset: int, why: str
-) -> None:
+def test_inconsistent_header_stamp_is_not_used(header: Int64s, unset: int, why: str) -> None:
     report = watch(table_of("/s", steady(), header.astype(np.int64)))
 
     assert report.used is Clock.LOG
@@ -290,7 +291,7 @@ def test_a_header_stamp_that_does_not_agree_is_not_used(
     assert report.header.unset == unset
 
 
-def test_the_header_stamp_is_used_when_it_agrees_else_the_publish_time() -> None:
+def test_header_stamp_is_preferred_then_publish_time() -> None:
     log_ns = steady()
     good, bad = log_ns - 3 * MS, log_ns - 37 * SECOND_NS
 
@@ -302,7 +303,7 @@ def test_the_header_stamp_is_used_when_it_agrees_else_the_publish_time() -> None
     assert watch(table_of("/s", log_ns)).why == "no other clock in the log"
 
 
-def test_times_of_a_block_fall_back_row_by_row() -> None:
+def test_unset_header_stamps_fall_back_to_log_time() -> None:
     log_ns = steady(4)
     header = log_ns - 7
     header[1], header[2] = 0, -5
@@ -316,7 +317,7 @@ def test_times_of_a_block_fall_back_row_by_row() -> None:
 
 @quick
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), max_size=300), st.integers(1, 200))
-def test_any_stamps_at_all_are_taken_without_overflow(stamps: list[int], per_block: int) -> None:
+def test_arbitrary_stamps_cause_no_overflow(stamps: list[int], per_block: int) -> None:
     wild = np.array(stamps, dtype=np.int64)
     log_ns = steady(len(stamps))
 
@@ -333,7 +334,7 @@ def test_any_stamps_at_all_are_taken_without_overflow(stamps: list[int], per_blo
 
 @quick
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=60), st.integers(1, 70))
-def test_windows_hold_their_extremes(values: list[int], width: int) -> None:
+def test_forward_windows_return_max_and_min(values: list[int], width: int) -> None:
     column = np.array(values, dtype=np.int64)
 
     assert forward_max(column, width).tolist() == [
@@ -346,7 +347,7 @@ def test_windows_hold_their_extremes(values: list[int], width: int) -> None:
 
 @quick
 @given(st.lists(st.integers(0, 2**61), min_size=1, max_size=300), st.floats(0.0, 1.0))
-def test_a_quantile_is_right_to_the_width_of_a_bin(steps: list[int], fraction: float) -> None:
+def test_quantile_is_accurate_to_one_bin(steps: list[int], fraction: float) -> None:
     sketch = PeriodSketch()
     sketch.add(np.array(steps, dtype=np.int64), np.arange(len(steps), dtype=np.int64))
 
@@ -354,21 +355,21 @@ def test_a_quantile_is_right_to_the_width_of_a_bin(steps: list[int], fraction: f
     assert sketch.quantile_ns(fraction) == pytest.approx(exact, rel=0.023, abs=1.0)
 
 
-def test_an_irregular_stream_of_bursts_has_no_gaps_of_its_own_making() -> None:
+def test_irregular_stream_has_no_gaps() -> None:
     steps = np.random.default_rng(3).exponential(2 * MS, 50_000).astype(np.int64)
-    log = log_of(START_NS + np.cumsum(steps), 50_000)
+    log = log_report(START_NS + np.cumsum(steps), 50_000)
 
     assert not log.is_steady
     assert log.gaps == 0
 
 
-def test_memory_does_not_grow_with_the_log() -> None:
+def test_memory_is_independent_of_log_length() -> None:
     def peak(blocks: int) -> int:
-        seen = ClockWatch()
+        clock_watch = ClockWatch()
         tracemalloc.start()
         for i in range(blocks):
             log_ns = steady(5000, 10 * MS) + i * 50 * SECOND_NS
-            seen.see(table_of("/s", log_ns, log_ns - MS))
+            clock_watch.see(table_of("/s", log_ns, log_ns - MS))
         _, top = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         return top

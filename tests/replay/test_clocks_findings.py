@@ -18,34 +18,34 @@ MS = 1_000_000
 STREAM = Stream(1200, 50 * MS, wait_ns=2 * MS)
 
 
-def said_of(*blocks: Block) -> tuple[str, ...]:
-    seen = ClockWatch()
+def findings_of(*blocks: Block) -> tuple[str, ...]:
+    clock_watch = ClockWatch()
     for block in blocks:
-        seen.see(block)
-    return findings(seen.reports())
+        clock_watch.see(block)
+    return findings(clock_watch.reports())
 
 
 def with_header(header_ns: Int64s) -> Block:
     return table_of("/camera", STREAM.log_ns(), header_ns)
 
 
-def test_nothing_is_said_of_a_healthy_log() -> None:
+def test_healthy_log_has_no_findings() -> None:
     other = replace(STREAM, period_ns=10 * MS, rows=6000, offset_ns=-4 * MS, drift_ppm=5.0)
 
     assert (
-        said_of(
+        findings_of(
             with_header(STREAM.header_ns()), table_of("/imu", other.log_ns(), other.header_ns())
         )
         == ()
     )
 
 
-def test_gaps_are_reported_with_the_longest_and_its_place() -> None:
+def test_gaps_are_reported_with_position_of_longest() -> None:
     log_ns = START_NS + 50 * MS * np.arange(1200, dtype=np.int64)
     log_ns[400:] += 500 * MS
     log_ns[800:] += 1150 * MS
 
-    assert said_of(table_of("/camera", log_ns)) == (
+    assert findings_of(table_of("/camera", log_ns)) == (
         "/camera: 2 gaps over 250 ms (5 periods), the longest 1.2 s at 40.45 s",
     )
 
@@ -61,36 +61,36 @@ def test_gaps_are_reported_with_the_longest_and_its_place() -> None:
         (12 * SECOND_NS - START_NS, "counts from boot or start, log time counts from 1970"),
     ],
 )
-def test_another_epoch_is_named(ahead_ns: int, words: str) -> None:
-    (said,) = said_of(with_header(STREAM.header_ns() + ahead_ns))
+def test_different_epoch_is_identified(ahead_ns: int, words: str) -> None:
+    (reported,) = findings_of(with_header(STREAM.header_ns() + ahead_ns))
 
-    assert said.startswith("/camera: header stamp ")
-    assert words in said
+    assert reported.startswith("/camera: header stamp ")
+    assert words in reported
 
 
-def test_a_stamp_that_is_zero_constant_drifting_or_jumping_is_reported() -> None:
+def test_faulty_header_stamp_is_reported() -> None:
     drifting = replace(STREAM, drift_ppm=200.0).header_ns()
     jumping = replace(STREAM, jumps={600: 4 * SECOND_NS}).header_ns()
     set_back = replace(STREAM, jumps={600: -4 * SECOND_NS}).header_ns()
 
-    assert said_of(with_header(np.zeros(1200, dtype=np.int64))) == (
+    assert findings_of(with_header(np.zeros(1200, dtype=np.int64))) == (
         "/camera: header stamp is 0 on 1200 of 1200 rows",
     )
-    assert said_of(with_header(np.full(1200, START_NS))) == (
+    assert findings_of(with_header(np.full(1200, START_NS))) == (
         "/camera: header stamp is the same on all 1200 rows",
     )
-    assert said_of(with_header(drifting)) == (
+    assert findings_of(with_header(drifting)) == (
         "/camera: header stamp runs 200 ppm fast against the log clock (12 ms a minute)",
     )
-    assert said_of(with_header(jumping)) == (
+    assert findings_of(with_header(jumping)) == (
         "/camera: header stamp jumps against the log clock once by 4 s at 30.00 s",
     )
-    assert said_of(with_header(set_back)) == (
+    assert findings_of(with_header(set_back)) == (
         "/camera: header stamp was set back once by -3.95 s at 30.00 s",
     )
 
 
-def test_log_times_out_of_order_repeated_or_set_back_are_reported() -> None:
+def test_faulty_log_time_is_reported() -> None:
     log_ns = START_NS + 50 * MS * np.arange(1200, dtype=np.int64)
     late = log_ns.copy()
     late[[500, 501]] = late[[501, 500]]
@@ -99,22 +99,22 @@ def test_log_times_out_of_order_repeated_or_set_back_are_reported() -> None:
     back = log_ns.copy()
     back[600:] -= 3600 * SECOND_NS
 
-    assert said_of(table_of("/a", late)) == (
+    assert findings_of(table_of("/a", late)) == (
         "/a: 1 row in 1 stretch out of order on log time, by up to 50 ms",
     )
-    assert said_of(with_header(twice)) == (
+    assert findings_of(with_header(twice)) == (
         "/camera: 1 row with the header stamp of the row before",
     )
-    assert said_of(table_of("/a", back))[0].startswith(
+    assert findings_of(table_of("/a", back))[0].startswith(
         "/a: log time was set back once by -3600 s at "
     )
 
 
-def test_topics_that_share_no_clock_are_reported() -> None:
+def test_topics_without_common_clock_are_reported() -> None:
     boot = STREAM.log_ns() - START_NS
 
-    apart_all = said_of(table_of("/can", boot), table_of("/camera", STREAM.log_ns()))
-    one_apart = said_of(
+    apart_all = findings_of(table_of("/can", boot), table_of("/camera", STREAM.log_ns()))
+    one_apart = findings_of(
         table_of("/can", boot),
         table_of("/camera", STREAM.log_ns()),
         table_of("/imu", STREAM.log_ns() + 50 * MS),
@@ -127,29 +127,29 @@ def test_topics_that_share_no_clock_are_reported() -> None:
     assert [s.split(":")[0] for s in one_apart] == ["/can"]
 
 
-def test_a_single_latched_row_is_not_called_apart() -> None:
+def test_single_latched_row_is_not_a_separate_clock() -> None:
     latched = table_of("/tf_static", STREAM.log_ns()[:1] - 60 * SECOND_NS)
 
-    assert said_of(latched, with_header(STREAM.header_ns())) == ()
+    assert findings_of(latched, with_header(STREAM.header_ns())) == ()
 
 
-def test_a_latched_message_sent_long_ago_is_not_called_off() -> None:
+def test_old_latched_message_is_not_a_clock_offset() -> None:
     log_ns = STREAM.log_ns()
     latched = table_of("/map", log_ns[:1], log_ns[:1] - 900 * SECOND_NS)
 
-    assert said_of(latched, with_header(STREAM.header_ns())) == ()
+    assert findings_of(latched, with_header(STREAM.header_ns())) == ()
 
 
-def test_a_queue_emptied_when_recording_starts_is_no_jump() -> None:
+def test_initial_queue_burst_is_not_a_jump() -> None:
     log_ns, header_ns = STREAM.log_ns(), STREAM.header_ns()
     log_ns[:20] = log_ns[20] - np.arange(20, 0, -1) * 10_000
 
-    said = said_of(table_of("/camera", log_ns, header_ns))
+    reported = findings_of(table_of("/camera", log_ns, header_ns))
 
-    assert not any("jumps" in sentence for sentence in said)
+    assert not any("jumps" in sentence for sentence in reported)
 
 
-def test_spans_that_touch_are_not_apart() -> None:
+def test_touching_spans_are_not_apart() -> None:
     assert apart({"a": (0, 10), "b": (10, 20)}) == ()
     assert apart({"a": (0, 10)}) == ()
     assert apart({}) == ()
@@ -167,11 +167,11 @@ def test_spans_that_touch_are_not_apart() -> None:
         (7_200 * SECOND_NS, "7200 s"),
     ],
 )
-def test_durations_read_well(ns: int, text: str) -> None:
+def test_duration_is_formatted_with_suitable_unit(ns: int, text: str) -> None:
     assert duration_text(ns) == text
 
 
-def test_instants_are_dates_only_where_they_count_from_1970() -> None:
+def test_instant_is_formatted_as_date_only_for_unix_time() -> None:
     assert instant_text(1_500_000_000) == "1.500 s"
     assert instant_text(START_NS + 5 * MS) == "2025-11-13 02:13:20.005 UTC"
     assert instant_text((1 << 62) - 1).startswith("2116-")
@@ -183,11 +183,11 @@ def test_instants_are_dates_only_where_they_count_from_1970() -> None:
         st.tuples(*[st.integers(-(2**63), 2**63 - 1) | st.integers(0, 10**11)] * 3), max_size=60
     )
 )
-def test_any_times_at_all_are_reported_in_plain_lines(rows: list[tuple[int, int, int]]) -> None:
+def test_findings_of_arbitrary_times_are_printable(rows: list[tuple[int, int, int]]) -> None:
     columns = np.array(rows, dtype=np.int64).reshape(-1, 3)
 
-    said = said_of(table_of("/a", *columns.T), table_of("/b", columns[:, 1]))
+    reported = findings_of(table_of("/a", *columns.T), table_of("/b", columns[:, 1]))
 
-    for sentence in said:
+    for sentence in reported:
         assert sentence.isprintable()
         assert "nan" not in sentence

@@ -16,12 +16,12 @@ def fusion_of(text: str) -> Fusion:
     return parse("version = 1\n" + text, "car.toml").fusion
 
 
-def test_a_file_that_says_nothing_has_the_published_table() -> None:
+def test_empty_file_uses_published_cues() -> None:
     assert fusion_of("") == Fusion(kind="persistent")
     assert fusion_of("").cues == usual_cues()
 
 
-def test_one_number_changes_and_the_rest_of_the_entry_stays() -> None:
+def test_setting_one_field_keeps_other_fields_of_cue() -> None:
     fusion = fusion_of("[fusion.cues]\nstop_sign = { precision = 0.99 }")
 
     assert fusion.cues["stop_sign"] == usual_cues()["stop_sign"].model_copy(
@@ -30,7 +30,7 @@ def test_one_number_changes_and_the_rest_of_the_entry_stays() -> None:
     assert fusion.cues["traffic_light"] == usual_cues()["traffic_light"]
 
 
-def test_a_cue_and_a_feature_of_ones_own_are_a_line_each() -> None:
+def test_user_defined_cue_and_feature_are_fused() -> None:
     fusion = fusion_of(
         "[fusion]\nkind = 'source'\n[fusion.features]\nzebra = { prior = 0.2 }\n"
         "[fusion.cues]\nstripes = { precision = 0.8, supports = ['zebra'], speaks_first = true }"
@@ -45,14 +45,14 @@ def test_a_cue_and_a_feature_of_ones_own_are_a_line_each() -> None:
     assert step.probabilities["left"] == 0.5
 
 
-def test_a_cue_that_is_not_used_is_no_part_of_the_graph() -> None:
+def test_disabled_cue_is_not_in_graph() -> None:
     graph = graph_of(fusion_of("[fusion.cues]\nlanes_past = { use = false }"))
 
     assert "lanes_past" not in {cue.name for cue in graph.cues}
     assert "lanes_past" not in {edge.cue for edge in graph.edges}
 
 
-def test_edges_to_a_feature_that_is_not_used_are_gone() -> None:
+def test_edges_to_disabled_feature_are_removed() -> None:
     graph = graph_of(fusion_of("[fusion.features]\nstraight = { use = false }"))
 
     assert graph.feature_names == ("intersection", "left", "right")
@@ -87,12 +87,12 @@ def test_edges_to_a_feature_that_is_not_used_are_gone() -> None:
         ("[fusion]\nkind = 'best'", "kind"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_with_the_choices(text: str, match: str) -> None:
+def test_invalid_fusion_setting_is_refused_with_hint(text: str, match: str) -> None:
     with pytest.raises(VehicleError, match=match):
         fusion_of(text)
 
 
-def test_no_cue_that_speaks_first_is_refused() -> None:
+def test_fusion_without_cue_that_speaks_first_is_refused() -> None:
     silent = "\n".join(
         f"{name} = {{ speaks_first = false }}"
         for name in usual_cues()

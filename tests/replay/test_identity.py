@@ -21,7 +21,7 @@ def _log(path: Path, content: bytes | bytearray = b"rows") -> Path:
     return path
 
 
-def test_place_and_age_do_not_matter_and_name_does(tmp_path: Path) -> None:
+def test_identity_depends_on_name_but_not_folder_or_age(tmp_path: Path) -> None:
     first = _log(tmp_path / "a" / "drive.mcap")
     second = _log(tmp_path / "b" / "drive.mcap")
     os.utime(second, (0, 0))
@@ -31,7 +31,7 @@ def test_place_and_age_do_not_matter_and_name_does(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("at", [0, 1, SHARE_BYTES // 3, SHARE_BYTES // 2 + 7, SHARE_BYTES - 1])
-def test_any_byte_of_a_log_that_is_hashed_whole_counts(tmp_path: Path, at: int) -> None:
+def test_any_byte_of_a_small_log_changes_identity(tmp_path: Path, at: int) -> None:
     content = bytearray(SHARE_BYTES)
     before = identity_of(_log(tmp_path / "a.mcap", content))
     content[at] ^= 1
@@ -42,7 +42,7 @@ def test_any_byte_of_a_log_that_is_hashed_whole_counts(tmp_path: Path, at: int) 
 @pytest.mark.parametrize(
     "at", [0, SHARE_BYTES // 4 - 1, LARGE - 1, LARGE - SHARE_BYTES // 4, SHARE_BYTES // 4 + 1]
 )
-def test_head_tail_and_samples_of_a_large_log_count(tmp_path: Path, at: int) -> None:
+def test_head_tail_and_samples_of_large_log_change_identity(tmp_path: Path, at: int) -> None:
     content = bytearray(LARGE)
     before = identity_of(_log(tmp_path / "a.mcap", content))
     content[at] ^= 1
@@ -65,7 +65,7 @@ def _with_index(kind: str, start: int) -> bytearray:
 
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
-def test_the_whole_index_of_a_large_log_counts(tmp_path: Path, kind: str) -> None:
+def test_any_index_byte_of_large_log_changes_identity(tmp_path: Path, kind: str) -> None:
     # Between the last sample and the tail, where only the index is hashed.
     place = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
     for start, counts in ((place - 10, True), (place + 1, False)):
@@ -76,12 +76,12 @@ def test_the_whole_index_of_a_large_log_counts(tmp_path: Path, kind: str) -> Non
 
 
 @pytest.mark.parametrize("start", [0, 1 << 63, LARGE * 2])
-def test_an_index_that_is_not_there_is_not_believed(tmp_path: Path, start: int) -> None:
+def test_identity_ignores_invalid_index_position(tmp_path: Path, start: int) -> None:
     for kind in ("mcap", "bag"):
         identity_of(_log(tmp_path / f"a.{kind}", _with_index(kind, start)))
 
 
-def test_all_files_of_a_folder_count_and_what_we_put_there_does_not(tmp_path: Path) -> None:
+def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "images"
     for i in range(5):
         _log(folder / f"{i}.png", bytes([i]))
@@ -105,15 +105,15 @@ def test_all_files_of_a_folder_count_and_what_we_put_there_does_not(tmp_path: Pa
     assert len({before.digest, *changed}) == 5
 
 
-def test_what_is_read_beside_a_log_belongs_to_it(tmp_path: Path) -> None:
-    for log, beside in (("a.db3", "a.db3-wal"), ("v.mp4", "v.csv"), ("v.mp4", "v.txt")):
+def test_companion_files_change_identity(tmp_path: Path) -> None:
+    for log, companion in (("a.db3", "a.db3-wal"), ("v.mp4", "v.csv"), ("v.mp4", "v.txt")):
         path = _log(tmp_path / log)
         before = identity_of(path)
-        _log(tmp_path / beside, b"more")
+        _log(tmp_path / companion, b"more")
         assert identity_of(path) != before
 
 
-def test_a_drive_is_its_logs_in_any_order(tmp_path: Path) -> None:
+def test_drive_identity_is_independent_of_log_order(tmp_path: Path) -> None:
     logs = [identity_of(_log(tmp_path / name, name.encode())) for name in ("a.mcap", "b.blf")]
 
     assert identity_of_all(logs) == identity_of_all(logs[::-1])
@@ -121,7 +121,7 @@ def test_a_drive_is_its_logs_in_any_order(tmp_path: Path) -> None:
     assert "a.mcap + b.blf" in str(identity_of_all(logs))
 
 
-def test_a_log_of_a_hundred_gigabytes_is_known_in_no_time(tmp_path: Path) -> None:
+def test_identity_of_100_gib_log_is_fast(tmp_path: Path) -> None:
     path = tmp_path / "large.bag"
     with path.open("wb") as file:
         file.truncate(100 << 30)
@@ -131,6 +131,6 @@ def test_a_log_of_a_hundred_gigabytes_is_known_in_no_time(tmp_path: Path) -> Non
     assert time.process_time() - began < 0.5
 
 
-def test_a_log_that_is_gone_is_said(tmp_path: Path) -> None:
+def test_identity_of_missing_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="gone"):
         identity_of(tmp_path / "gone.mcap")

@@ -1,4 +1,4 @@
-"""The identity in file = used + skipped + dropped holds for any order of events."""
+"""Ledger: rows in file = used + skipped + dropped, for any order of events."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _COUNTS = st.integers(0, 1000)
     skips=st.lists(st.sampled_from("abc")),
     dropped=_COUNTS,
 )
-def test_the_identity_holds(
+def test_rows_in_file_equal_used_skipped_and_dropped(
     found: int, declared: int | None, skips: list[str], dropped: int
 ) -> None:
     ledger = Ledger("log")
@@ -35,7 +35,7 @@ def test_the_identity_holds(
     assert ledger.is_whole == (account.dropped.total() == 0)
 
 
-def test_fewer_than_declared_is_a_loss_and_more_is_only_said() -> None:
+def test_missing_declared_rows_are_a_loss_and_surplus_is_a_notice() -> None:
     ledger = Ledger("log")
     for topic, found in (("/few", 3), ("/many", 9)):
         ledger.declare(topic, 5)
@@ -47,14 +47,14 @@ def test_fewer_than_declared_is_a_loss_and_more_is_only_said() -> None:
     assert any("/many" in sentence for sentence in ledger.notices)
 
 
-def test_a_loss_nobody_can_count_still_is_a_loss() -> None:
+def test_loss_of_unknown_size_is_a_loss() -> None:
     ledger = Ledger("log")
     ledger.drop("", "cut", None)
 
     assert not ledger.is_whole
 
 
-def test_counts_go_on_when_details_stop() -> None:
+def test_rows_are_counted_beyond_kept_details() -> None:
     ledger = Ledger("log")
     ledger.find("/t", 2 * DETAILS_KEPT)
     for _ in range(2 * DETAILS_KEPT):
@@ -73,11 +73,11 @@ class _Rows:
         return self.rows
 
 
-def _read(ledger: Ledger, found: int, handed: int, skipped: int) -> None:
+def _read_through(ledger: Ledger, found: int, yielded: int, skipped: int) -> None:
     def blocks() -> Iterator[_Rows]:
         ledger.find("/t", found)
         ledger.skip("/t", "not wanted", skipped)
-        yield _Rows("/t", handed)
+        yield _Rows("/t", yielded)
 
     for _ in ledger.handing_on(blocks()):
         ledger.skip("/t", "not understood", 1)
@@ -85,9 +85,9 @@ def _read(ledger: Ledger, found: int, handed: int, skipped: int) -> None:
         ledger.spoil("/t", "damaged", 1)
 
 
-def test_what_a_reader_hands_on_is_held_against_its_account() -> None:
+def test_account_is_checked_against_yielded_rows() -> None:
     ledger = Ledger("log")
-    _read(ledger, found=10, handed=7, skipped=3)
+    _read_through(ledger, found=10, yielded=7, skipped=3)
 
     ledger.check({"/t": 4})
 
@@ -99,18 +99,16 @@ def test_what_a_reader_hands_on_is_held_against_its_account() -> None:
         ledger.check({"/t": 5})
 
 
-@pytest.mark.parametrize(("found", "handed", "skipped"), [(11, 7, 3), (10, 8, 3), (10, 7, 2)])
-def test_one_row_too_many_or_too_few_is_a_bug_and_loud(
-    found: int, handed: int, skipped: int
-) -> None:
+@pytest.mark.parametrize(("found", "yielded", "skipped"), [(11, 7, 3), (10, 8, 3), (10, 7, 2)])
+def test_account_that_does_not_add_up_raises(found: int, yielded: int, skipped: int) -> None:
     ledger = Ledger("log")
-    _read(ledger, found, handed, skipped)
+    _read_through(ledger, found, yielded, skipped)
 
     with pytest.raises(AccountError, match="does not add up"):
         ledger.check()
 
 
-def test_as_many_as_declared_is_neither_a_loss_nor_worth_a_word() -> None:
+def test_declared_count_causes_one_detail_or_notice_on_mismatch() -> None:
     for declared, missing, notices in ((5, 0, 0), (6, 1, 0), (4, 0, 1)):
         ledger = Ledger("log")
         ledger.declare("/t", declared)
@@ -122,7 +120,7 @@ def test_as_many_as_declared_is_neither_a_loss_nor_worth_a_word() -> None:
         assert len(ledger.notices) == notices
 
 
-def test_rows_that_are_dropped_already_are_not_missing_again() -> None:
+def test_dropped_rows_are_not_counted_as_missing() -> None:
     ledger = Ledger("log")
     ledger.declare("/t", 5)
     ledger.find("/t", 3)

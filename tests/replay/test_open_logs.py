@@ -12,8 +12,8 @@ from crosscue.replay.base import DEFAULT_LIMITS, Limits, Log, LogError
 from support.memory_log import MemoryLog
 
 
-class Opened:
-    """Opens synthetic logs, refuses one, and records which were closed."""
+class RecordingOpener:
+    """Open synthetic logs, except one, and record the closed ones."""
 
     def __init__(self) -> None:
         self.closed: list[str] = []
@@ -24,37 +24,37 @@ class Opened:
             raise LogError("broken: not a log")
         closed = self.closed
 
-        class Remembered(MemoryLog):
+        class RecordedLog(MemoryLog):
             def close(self) -> None:
                 closed.append(str(self.path))
 
-        return Remembered((), (), Path(path))
+        return RecordedLog((), (), Path(path))
 
 
 @pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
-    made = Opened()
-    monkeypatch.setattr(interface, "open_one", made)
-    return made
+def opener(monkeypatch: pytest.MonkeyPatch) -> RecordingOpener:
+    recorder = RecordingOpener()
+    monkeypatch.setattr(interface, "open_one", recorder)
+    return recorder
 
 
-def test_logs_come_in_the_order_asked_for_and_are_closed_at_the_end(opened: Opened) -> None:
+def test_logs_keep_requested_order_and_are_closed_at_end(opener: RecordingOpener) -> None:
     with crosscue.open("a", "b") as drive:
         assert [str(one.path) for one in drive.logs] == ["a", "b"]
-        assert opened.closed == []
+        assert opener.closed == []
 
-    assert sorted(opened.closed) == ["a", "b"]
+    assert sorted(opener.closed) == ["a", "b"]
 
 
-def test_when_one_cannot_be_opened_those_before_it_are_closed(opened: Opened) -> None:
+def test_logs_opened_before_a_failure_are_closed(opener: RecordingOpener) -> None:
     with pytest.raises(LogError, match="broken"), crosscue.open("a", "broken", "c"):
         pytest.fail("it was opened")
 
-    assert opened.closed == ["a"]
+    assert opener.closed == ["a"]
 
 
-def test_when_the_work_fails_all_are_closed(opened: Opened) -> None:
+def test_all_logs_are_closed_when_the_body_raises(opener: RecordingOpener) -> None:
     with pytest.raises(ZeroDivisionError), crosscue.open("a", "b"):
         raise ZeroDivisionError
 
-    assert sorted(opened.closed) == ["a", "b"]
+    assert sorted(opener.closed) == ["a", "b"]

@@ -23,7 +23,7 @@ for _ in range(3):
 
 
 @pytest.mark.slow
-def test_a_process_that_has_read_a_table_ends_well(tmp_path: Path) -> None:
+def test_process_exits_cleanly_after_reading_table(tmp_path: Path) -> None:
     # With reads through a Python file, 26 of 60 processes were aborted on exit.
     columns = {f"column_{i}": np.arange(2000.0) for i in range(30)}
     pq.write_table(
@@ -36,7 +36,7 @@ def test_a_process_that_has_read_a_table_ends_well(tmp_path: Path) -> None:
         assert run.returncode == 0, run.stderr
 
 
-def test_a_name_that_is_no_utf_8_is_read(tmp_path: Path) -> None:
+def test_table_at_path_that_is_not_utf_8_is_read(tmp_path: Path) -> None:
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
     try:
         folder.mkdir()
@@ -48,6 +48,6 @@ def test_a_name_that_is_no_utf_8_is_read(tmp_path: Path) -> None:
     assert RunFolder(folder).table("one").num_rows == 2
 
 
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+def test_missing_table_is_named_in_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="absent"):
         opened(tmp_path / "absent.parquet")

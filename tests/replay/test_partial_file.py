@@ -28,7 +28,7 @@ def _partials(folder: Path) -> list[str]:
 
 
 @contextmanager
-def _child(code: str) -> Iterator[subprocess.Popen[str]]:
+def _child_process(code: str) -> Iterator[subprocess.Popen[str]]:
     """A process that prints a line when it has started, and runs until it is killed."""
     lines = f"{code}\nprint('begun', flush=True)\nimport time; time.sleep(60)\n"
     with subprocess.Popen(
@@ -42,17 +42,17 @@ def _child(code: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def _begun(folder: Path) -> str:
+def _begin_partial_file(folder: Path) -> str:
     return (
         "from pathlib import Path\nfrom crosscue.replay.files.partial_file import PartialFile\n"
         f"held = PartialFile(Path({str(folder)!r}, 'a.txt'))"
     )
 
 
-def test_a_file_of_a_killed_process_is_swept_and_one_of_a_living_process_is_not(
+def test_only_partial_files_of_dead_processes_are_swept(
     tmp_path: Path,
 ) -> None:
-    with _child(_begun(tmp_path)) as process:
+    with _child_process(_begin_partial_file(tmp_path)) as process:
         sweep(tmp_path, again=True)
         write_text(tmp_path / "b.txt", "b")
         assert len(_partials(tmp_path)) == 1
@@ -64,7 +64,7 @@ def test_a_file_of_a_killed_process_is_swept_and_one_of_a_living_process_is_not(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.txt"]
 
 
-def test_only_our_own_files_are_swept(tmp_path: Path) -> None:
+def test_files_of_other_programs_are_not_swept(tmp_path: Path) -> None:
     others = [".a.txt.1234.partial", "a.partial", ".drive.crosscue-xyz.partial", ".a.partial"]
     for name in others:
         (tmp_path / name).write_text("of another program")
@@ -79,13 +79,13 @@ def test_only_our_own_files_are_swept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["ä" * 120, "x" * 255, "line\nbreak.json"])
-def test_any_name_that_a_file_can_have_can_be_written(tmp_path: Path, name: str) -> None:
+def test_any_valid_file_name_is_written(tmp_path: Path, name: str) -> None:
     write_text(tmp_path / name, "whole")
 
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_a_file_system_without_locks_keeps_what_nobody_can_know_of(
+def test_partial_files_are_kept_without_file_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left = tmp_path / f".a.crosscue-{'0' * 16}.partial"
@@ -98,7 +98,7 @@ def test_a_file_system_without_locks_keeps_what_nobody_can_know_of(
     assert (tmp_path / "b.txt").read_text() == "b"
 
 
-def test_a_file_that_is_kept_or_dropped_is_let_go(tmp_path: Path) -> None:
+def test_kept_or_dropped_partial_file_is_closed(tmp_path: Path) -> None:
     open_before = len(list(Path("/proc/self/fd").iterdir()))
     kept, dropped = PartialFile(tmp_path / "a"), PartialFile(tmp_path / "b")
     assert is_partial(kept.path.name)
@@ -120,7 +120,7 @@ def test_temporary_folders_of_killed_processes_are_removed(
         "from crosscue.replay.files.partial_file import Scratch\n"
         "held = Scratch(); (held.path / 'copy.db3').write_text('large')"
     )
-    with _child(code) as process:
+    with _child_process(code) as process:
         with Scratch():
             assert len(list(tmp_path.iterdir())) == 2
         assert len(list(tmp_path.iterdir())) == 1
@@ -132,13 +132,13 @@ def test_temporary_folders_of_killed_processes_are_removed(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_whose_holder_died_is_free_though_its_number_is_in_use(tmp_path: Path) -> None:
+def test_run_of_dead_process_is_unlocked_despite_reused_pid(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     code = (
         "from pathlib import Path\nfrom crosscue.eval.runs.folder import RunFolder, locked\n"
         f"held = locked(RunFolder(Path({str(run.path)!r}))); held.__enter__()"
     )
-    with _child(code) as process:
+    with _child_process(code) as process:
         process.kill()
         process.wait()
     text = run.file(".lock").read_text()
@@ -165,7 +165,7 @@ def _simulate(folder: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [_convert, _simulate])
-def test_killed_anywhere_the_next_start_leaves_no_half_file(
+def test_run_after_kill_leaves_no_partial_files(
     tmp_path: Path, command: Callable[[Path], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Inherited by the forked processes.

@@ -23,23 +23,23 @@ def fail_at_two(number: int) -> int:
 
 
 @pytest.mark.slow
-def test_results_come_in_order_from_other_processes() -> None:
+def test_results_of_other_processes_are_ordered() -> None:
     found = list(in_processes(slow_square, range(6), 2))
 
     assert [square for square, _ in found] == [0, 1, 4, 9, 16, 25]
     assert os.getpid() not in {process for _, process in found}
 
 
-@pytest.mark.parametrize(("things", "workers"), [([1, 2, 3], 1), ([4], 8), ([], 8)])
-def test_one_worker_or_one_thing_needs_no_process(things: list[int], workers: int) -> None:
-    found = list(in_processes(slow_square, things, workers))
+@pytest.mark.parametrize(("items", "workers"), [([1, 2, 3], 1), ([4], 8), ([], 8)])
+def test_one_worker_or_item_runs_in_this_process(items: list[int], workers: int) -> None:
+    found = list(in_processes(slow_square, items, workers))
 
-    assert [square for square, _ in found] == [number * number for number in things]
+    assert [square for square, _ in found] == [number * number for number in items]
     assert {process for _, process in found} <= {os.getpid()}
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_failure_comes_after_what_was_done_before_it(workers: int) -> None:
+def test_failure_is_raised_after_earlier_results(workers: int) -> None:
     found = in_processes(fail_at_two, range(4), workers)
 
     assert [next(found), next(found)] == [0, 1]

@@ -41,7 +41,7 @@ def _put(url: str, content: bytes) -> str:
     return url
 
 
-def test_a_remote_log_reads_like_a_local_one(bucket: str, tmp_path: Path) -> None:
+def test_remote_log_reads_like_local_log(bucket: str, tmp_path: Path) -> None:
     frames = made(300)
     here = tmp_path / "can.log"
     here.write_bytes(candump(frames))
@@ -57,9 +57,7 @@ def test_a_remote_log_reads_like_a_local_one(bucket: str, tmp_path: Path) -> Non
     assert ledger.is_whole
 
 
-def test_it_is_fetched_once_and_again_when_it_changed(
-    bucket: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_log_is_fetched_once_until_it_changes(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fetches: list[str] = []
     download = remote._download
 
@@ -84,7 +82,7 @@ def test_it_is_fetched_once_and_again_when_it_changed(
     assert version_of(url) != before
 
 
-def test_a_folder_comes_whole_and_a_file_with_its_companions(bucket: str) -> None:
+def test_folder_and_companion_files_are_fetched(bucket: str) -> None:
     for name in ("bag/metadata.yaml", "bag/part/a.db3", "v.mp4", "v.csv", "v.mp4.txt", "vv.csv"):
         _put(f"{bucket}/{name}", name.encode())
 
@@ -106,7 +104,7 @@ def test_a_folder_comes_whole_and_a_file_with_its_companions(bucket: str) -> Non
         ("a.db3", ["a.db3", "a.db3-wal", "a.yaml"]),
     ],
 )
-def test_the_identity_of_a_log_of_several_files_takes_parts_of_them(
+def test_identity_of_several_remote_files_needs_no_download(
     log: str, files: list[str], bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = np.random.default_rng(3).bytes(3 * SHARE_BYTES)
@@ -124,14 +122,14 @@ def test_the_identity_of_a_log_of_several_files_takes_parts_of_them(
     assert not list((tmp_path / "empty").glob("*/log"))
 
 
-def test_the_longest_unused_goes_first_and_one_in_use_never(bucket: str, tmp_path: Path) -> None:
+def test_store_evicts_least_recently_used_log_not_in_use(bucket: str, tmp_path: Path) -> None:
     store = Store(tmp_path / "small", max_bytes=250)
     urls = [_put(f"{bucket}/{name}.log", name.encode() * 100) for name in "abcd"]
 
-    with fetch(urls[0], store) as held:
+    with fetch(urls[0], store) as in_use:
         fetch(urls[1], store).close()
         fetch(urls[2], store).close()
-        assert held.path.exists()
+        assert in_use.path.exists()
         with fetch(urls[3], store), pytest.raises(OutputError, match="full of logs in use"):
             fetch(urls[1], store)
 
@@ -141,7 +139,7 @@ def test_the_longest_unused_goes_first_and_one_in_use_never(bucket: str, tmp_pat
         fetch(_put(f"{bucket}/large.log", bytes(300)), store)
 
 
-def test_a_fetch_that_fails_leaves_nothing(
+def test_failed_fetch_leaves_no_file(
     bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = _put(f"{bucket}/a.log", b"abc")
@@ -154,17 +152,17 @@ def test_a_fetch_that_fails_leaves_nothing(
     assert not list((tmp_path / "store").rglob("a.log"))
 
 
-def test_a_log_that_grows_while_fetched_is_refused(
+def test_log_that_changes_during_fetch_is_refused(
     bucket: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = _put(f"{bucket}/a.log", b"abc")
     chunks = remote._chunks
 
-    def then_grow(*args: object) -> Iterator[bytes]:
+    def grow_after_reading(*args: object) -> Iterator[bytes]:
         yield from chunks(*args)  # type: ignore[arg-type]
         _put(url, b"abcdef")
 
-    monkeypatch.setattr(remote, "_chunks", then_grow)
+    monkeypatch.setattr(remote, "_chunks", grow_after_reading)
 
     with pytest.raises(LogError, match="changed while it was fetched"):
         fetch(url)
@@ -172,31 +170,31 @@ def test_a_log_that_grows_while_fetched_is_refused(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "message"),
     [
         ("memory://nowhere/a.log", "no such object"),
         ("s3://bucket/a.log", "s3"),
         ("nonsense://a/b.log", "nonsense"),
     ],
 )
-def test_what_cannot_be_fetched_is_reported(
-    url: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_unavailable_url_is_refused_in_one_line(
+    url: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path))
 
-    with pytest.raises(LogError, match=said) as caught:
+    with pytest.raises(LogError, match=message) as caught:
         open_log(url)
 
     assert "\n" not in str(caught.value)
     assert url in str(caught.value)
 
 
-def test_a_name_that_would_leave_the_store_is_refused() -> None:
+def test_object_name_outside_store_is_refused() -> None:
     with pytest.raises(LogError, match="not a valid file name"):
         remote._object("log/../../etc/passwd", {"name": "b/log/../../etc/passwd", "size": 1})
 
 
-def test_a_file_url_is_read_in_place(tmp_path: Path) -> None:
+def test_file_url_is_read_in_place(tmp_path: Path) -> None:
     path = tmp_path / "can.log"
     path.write_bytes(candump(made(3)))
 
@@ -205,14 +203,14 @@ def test_a_file_url_is_read_in_place(tmp_path: Path) -> None:
     assert version_of(path.as_uri()) == version_of(str(path))
 
 
-def test_patterns_find_urls(bucket: str) -> None:
+def test_pattern_matches_urls(bucket: str) -> None:
     for name in ("a/x.mcap", "b/x.mcap", "b/y.log"):
         _put(f"{bucket}/{name}", b"")
 
     assert matches(f"{bucket}/*/x.mcap") == (f"{bucket}/a/x.mcap", f"{bucket}/b/x.mcap")
 
 
-def test_versions_of_folders_see_every_file(tmp_path: Path) -> None:
+def test_folder_version_changes_with_any_file(tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "a").write_text("1")
     before = version_of(str(tmp_path / "bag"))
@@ -224,7 +222,9 @@ def test_versions_of_folders_see_every_file(tmp_path: Path) -> None:
         version_of(str(tmp_path / "gone"))
 
 
-def test_only_texts_are_urls(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remote_urls_are_strings_and_store_limit_is_validated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert is_remote("s3://bucket/a.mcap")
     assert not is_remote("folder/a.mcap")
     assert not is_remote(Path("s3://bucket/a.mcap"))

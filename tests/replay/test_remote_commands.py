@@ -28,7 +28,7 @@ MS = 1_000_000
 FIXED_BYTES = 192 << 10
 """Bytes for the head and tail of a log, which determine its identity, and for the read-ahead."""
 BRIGHT = "support.detecting:build"
-COMMANDS = {
+ARGUMENTS = {
     "info": ["info"],
     "convert": ["convert", "-o", "OUT.mcap", "-q"],
     "decode": ["decode", "-o", "OUT", "-q"],
@@ -82,10 +82,11 @@ def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
         yield served
 
 
-def cost(path: Path, start_ns: int, end_ns: int) -> int:
-    """1.5 times the chunks of a span and the summary, as the mcap package finds them.
+def max_transfer_bytes(path: Path, start_ns: int, end_ns: int) -> int:
+    """Return 1.5 times the bytes of a span's chunks, plus those of the summary.
 
-    The log's first chunk is among them: ``--from`` and ``--to`` count from its first row.
+    The mcap package locates the chunks. The log's first chunk is included, because ``--from``
+    and ``--to`` count from its first row.
     """
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -105,8 +106,8 @@ def cost(path: Path, start_ns: int, end_ns: int) -> int:
     )
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_part_of_a_log_at_a_url_costs_its_chunks(
+@pytest.mark.parametrize("command", ARGUMENTS)
+def test_window_of_remote_log_transfers_only_its_chunks(
     command: str,
     drive: Path,
     tmp_path: Path,
@@ -114,21 +115,21 @@ def test_a_part_of_a_log_at_a_url_costs_its_chunks(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     web.files["logs/drive.mcap"] = drive.read_bytes()
-    words = [word.replace("OUT", str(tmp_path / "out")) for word in COMMANDS[command]]
+    words = [word.replace("OUT", str(tmp_path / "out")) for word in ARGUMENTS[command]]
 
     status = crosscue(
         [words[0], f"{web.base}/logs/drive.mcap", *words[1:], "--from", "30", "--to", "34"]
     )
 
     assert status == 0, capsys.readouterr().err
-    assert web.sent <= cost(drive, 31_000 * MS, 35_000 * MS) + FIXED_BYTES
+    assert web.sent <= max_transfer_bytes(drive, 31_000 * MS, 35_000 * MS) + FIXED_BYTES
     assert web.sent < 0.25 * drive.stat().st_size
     assert not list((tmp_path / "store").glob("*/log"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "convert", "decode", "replay", "detect"])
-def test_a_log_at_a_url_gives_what_it_gives_on_disk(
+def test_remote_log_yields_same_output_as_local_log(
     command: str,
     drive: Path,
     tmp_path: Path,
@@ -138,7 +139,7 @@ def test_a_log_at_a_url_gives_what_it_gives_on_disk(
     web.files["drive.mcap"] = drive.read_bytes()
     part = ["--from", "10", "--to", "13"]
     for name, log in (("here", str(drive)), ("there", f"{web.base}/drive.mcap")):
-        words = [word.replace("OUT", str(tmp_path / name)) for word in COMMANDS[command]]
+        words = [word.replace("OUT", str(tmp_path / name)) for word in ARGUMENTS[command]]
         assert crosscue([words[0], log, *words[1:], *part]) == 0
 
     files = sorted(one.relative_to(tmp_path / "here") for one in tmp_path.glob("here/*.parquet"))
@@ -158,7 +159,7 @@ def test_a_log_at_a_url_gives_what_it_gives_on_disk(
 
 
 @pytest.mark.slow
-def test_a_replay_of_a_long_part_fetches_nothing_twice(
+def test_replay_of_long_window_transfers_each_byte_once(
     drive: Path, tmp_path: Path, web: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A tenth of it fits into memory, so the rest uses the temporary file.
@@ -175,7 +176,7 @@ def test_a_replay_of_a_long_part_fetches_nothing_twice(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "bag", "log"])
-def test_the_identity_is_the_same_at_a_url_and_on_disk(
+def test_remote_identity_equals_local_identity(
     kind: str, drive: Path, tmp_path: Path, web: Served
 ) -> None:
     path = drive
@@ -198,7 +199,7 @@ def test_the_identity_is_the_same_at_a_url_and_on_disk(
 
 
 @pytest.mark.parametrize("name", ["can.log", "can.blf", "can.MF4", "drive.db3", "front.mp4"])
-def test_the_identity_of_a_large_log_of_any_format_takes_a_part_of_it(
+def test_identity_of_large_remote_log_transfers_a_fraction(
     name: str, tmp_path: Path, web: Served
 ) -> None:
     path = tmp_path / name
@@ -211,7 +212,7 @@ def test_the_identity_of_a_large_log_of_any_format_takes_a_part_of_it(
 
 
 @pytest.mark.slow
-def test_a_run_of_a_part_of_a_log_at_a_url_is_estimated_again_from_that_part(
+def test_estimate_of_remote_window_transfers_only_the_window(
     drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()
@@ -225,7 +226,7 @@ def test_a_run_of_a_part_of_a_log_at_a_url_is_estimated_again_from_that_part(
     assert crosscue(["estimate", str(out), "-q"]) == 0
 
     assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
-    assert web.sent <= cost(drive, 31_000 * MS, 35_000 * MS) + FIXED_BYTES
+    assert web.sent <= max_transfer_bytes(drive, 31_000 * MS, 35_000 * MS) + FIXED_BYTES
     web.files["drive.mcap"] = drive.read_bytes()[:-9] + b"x" + drive.read_bytes()[-8:]
     assert crosscue(["estimate", str(out), "-q"]) == 4
     assert "has changed since" in capsys.readouterr().err
@@ -235,7 +236,7 @@ def test_a_run_of_a_part_of_a_log_at_a_url_is_estimated_again_from_that_part(
 
 
 @pytest.mark.slow
-def test_a_run_of_a_whole_log_at_a_url_is_estimated_again_from_the_copy_here(
+def test_estimate_of_complete_remote_log_uses_local_copy(
     drive: Path, tmp_path: Path, web: Served
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()
@@ -253,7 +254,7 @@ def test_a_run_of_a_whole_log_at_a_url_is_estimated_again_from_the_copy_here(
 
 
 @pytest.mark.slow
-def test_a_run_of_a_log_at_a_url_can_be_resumed(
+def test_run_of_remote_log_can_be_resumed(
     drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()
@@ -271,7 +272,7 @@ def test_a_run_of_a_log_at_a_url_can_be_resumed(
     assert "not of drive.mcap" in capsys.readouterr().err
 
 
-def test_a_missing_topic_of_a_log_at_a_url_fetches_its_index_only(
+def test_missing_topic_of_remote_log_transfers_only_index(
     drive: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()

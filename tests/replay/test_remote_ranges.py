@@ -61,7 +61,7 @@ def times(blocks: Iterator[Block]) -> dict[str, list[int]]:
     return found
 
 
-def test_a_window_of_a_remote_mcap_costs_its_chunks(tmp_path: Path, web: Served) -> None:
+def test_window_of_remote_mcap_transfers_only_its_chunks(tmp_path: Path, web: Served) -> None:
     path = mcap_log(tmp_path / "log.mcap")
     web.files["drives/log.mcap"] = path.read_bytes()
     window = Selection(None, 20_000 * MS, 24_000 * MS)
@@ -81,11 +81,11 @@ def test_a_window_of_a_remote_mcap_costs_its_chunks(tmp_path: Path, web: Served)
     # Four seconds of 40, and the chunks at both ends of them.
     fraction = (4 + 2 * 2) / 40
     assert web.sent - opened < 1.5 * fraction * path.stat().st_size
-    assert any("bytes were fetched" in said for said in there.notices)
+    assert any("bytes were fetched" in notice for notice in there.notices)
     assert not (tmp_path / "store").exists()
 
 
-def test_one_topic_of_a_remote_log_comes_as_columns(tmp_path: Path, web: Served) -> None:
+def test_one_topic_of_remote_log_is_read(tmp_path: Path, web: Served) -> None:
     web.files["log.mcap"] = mcap_log(tmp_path / "log.mcap").read_bytes()
 
     with open_log(f"{web.base}/log.mcap") as log:
@@ -96,7 +96,7 @@ def test_one_topic_of_a_remote_log_comes_as_columns(tmp_path: Path, web: Served)
 
 
 @pytest.mark.slow
-def test_a_span_of_a_remote_bag_costs_its_chunks(tmp_path: Path, web: Served) -> None:
+def test_window_of_remote_bag_transfers_only_its_chunks(tmp_path: Path, web: Served) -> None:
     rows = rows_of(20_000)
     path = write_bag(tmp_path / "a.bag", rows, chunk_bytes=64_000)
     web.files["a.bag"] = path.read_bytes()
@@ -114,7 +114,7 @@ def test_a_span_of_a_remote_bag_costs_its_chunks(tmp_path: Path, web: Served) ->
     assert opened < 0.1 * path.stat().st_size
 
 
-def test_all_of_a_remote_log_is_fetched_once_and_kept(tmp_path: Path, web: Served) -> None:
+def test_complete_remote_log_is_fetched_once_and_stored(tmp_path: Path, web: Served) -> None:
     path = mcap_log(tmp_path / "log.mcap", seconds=4)
     web.files["log.mcap"] = path.read_bytes()
     ledger = Ledger("there")
@@ -126,10 +126,12 @@ def test_all_of_a_remote_log_is_fetched_once_and_kept(tmp_path: Path, web: Serve
     assert found == again
     assert len(found["/speed"]) == 400
     assert web.sent < 1.5 * path.stat().st_size
-    assert any("downloaded completely: all of it was requested" in said for said in ledger.notices)
+    assert any(
+        "downloaded completely: all of it was requested" in notice for notice in ledger.notices
+    )
 
 
-def test_a_format_that_needs_a_file_is_fetched_whole(tmp_path: Path, web: Served) -> None:
+def test_format_without_range_reads_is_downloaded_completely(tmp_path: Path, web: Served) -> None:
     web.files["can.log"] = b"(1.000000) can0 123#00\n(2.000000) can0 123#01\n"
     ledger = Ledger("there")
 
@@ -138,10 +140,10 @@ def test_a_format_that_needs_a_file_is_fetched_whole(tmp_path: Path, web: Served
         rows = sum(map(len, log.read(ledger, Selection(end_ns=1_500 * MS))))
 
     assert rows == 1
-    assert any("downloaded completely" in said for said in ledger.notices)
+    assert any("downloaded completely" in notice for notice in ledger.notices)
 
 
-def test_a_log_that_changes_while_it_is_read_is_refused(tmp_path: Path, web: Served) -> None:
+def test_log_that_changes_while_read_is_refused(tmp_path: Path, web: Served) -> None:
     path = mcap_log(tmp_path / "log.mcap")
     web.files["log.mcap"] = path.read_bytes()
 
@@ -155,7 +157,7 @@ def test_a_log_that_changes_while_it_is_read_is_refused(tmp_path: Path, web: Ser
     assert "\n" not in str(caught.value)
 
 
-def test_a_lost_connection_is_tried_again_but_not_for_ever(tmp_path: Path, web: Served) -> None:
+def test_lost_connection_is_retried_a_limited_number_of_times(tmp_path: Path, web: Served) -> None:
     web.files["log.mcap"] = mcap_log(tmp_path / "log.mcap").read_bytes()
     with open_log(f"{web.base}/log.mcap") as log:
         web.failing = 2
@@ -166,7 +168,7 @@ def test_a_lost_connection_is_tried_again_but_not_for_ever(tmp_path: Path, web: 
             list(log.read(Ledger("there"), Selection(None, 30_000 * MS, 31_000 * MS)))
 
 
-def test_decode_takes_a_window_of_a_url(
+def test_decode_of_remote_window_transfers_only_a_part(
     tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = mcap_log(tmp_path / "log.mcap")
@@ -180,7 +182,7 @@ def test_decode_takes_a_window_of_a_url(
 
 
 @pytest.mark.slow
-def test_a_window_of_an_object_in_an_s3_store(
+def test_window_of_s3_object_transfers_only_its_chunks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     moto_server = pytest.importorskip("moto.server", reason="moto[s3] is not installed")

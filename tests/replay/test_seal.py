@@ -49,8 +49,8 @@ def _flip(path: Path, at: int) -> None:
         file.write(bytes([byte ^ 0x10]))
 
 
-def _said(log: Path) -> str:
-    """All reports of losses from reading a log."""
+def _losses_text(log: Path) -> str:
+    """Return all losses that reading a log reports."""
     try:
         _, ledger = read(log)
     except LogError as error:
@@ -69,12 +69,12 @@ def long_log(tmp_path: Path) -> Path:
     return log
 
 
-def test_every_format_has_a_log_here() -> None:
+def test_every_format_has_a_sample_log() -> None:
     assert set(EVERY_FORMAT) == set(FORMATS)
 
 
 @pytest.mark.parametrize("kind", EVERY_FORMAT)
-def test_an_untouched_sealed_log_is_whole(tmp_path: Path, kind: str) -> None:
+def test_unchanged_sealed_log_is_complete(tmp_path: Path, kind: str) -> None:
     log = EVERY_FORMAT[kind](tmp_path)
     before, _ = read(log)
     assert run(["seal", str(log)]) == 0
@@ -90,7 +90,7 @@ def test_an_untouched_sealed_log_is_whole(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", EVERY_FORMAT)
-def test_a_flipped_byte_anywhere_is_reported_with_its_block(
+def test_changed_byte_is_reported_with_its_block(
     tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = _sealed(tmp_path, kind)
@@ -100,7 +100,7 @@ def test_a_flipped_byte_anywhere_is_reported_with_its_block(
         name = path.relative_to(log).as_posix() if log.is_dir() else log.name
         for at in {0, size - 1, int(rng.integers(size)), int(rng.integers(size))}:
             _flip(path, at)
-            assert f"{name}: bytes 0 to {size}" in _said(log), (name, at)
+            assert f"{name}: bytes 0 to {size}" in _losses_text(log), (name, at)
             _flip(path, at)
     assert read(log)[1].is_whole
 
@@ -113,7 +113,7 @@ def test_a_flipped_byte_anywhere_is_reported_with_its_block(
     assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().err
 
 
-def test_the_block_is_named_to_one_mib_and_its_rows_are_delivered(long_log: Path) -> None:
+def test_changed_block_is_located_to_one_mib_and_still_read(long_log: Path) -> None:
     rows = sum(len(block) for block in read(long_log)[0])
     # A digit of a payload: the line remains valid, and no reader can detect it.
     at = long_log.read_bytes().index(b"#AA", 2 * MIB) + 2
@@ -130,7 +130,7 @@ def test_the_block_is_named_to_one_mib_and_its_rows_are_delivered(long_log: Path
     assert "some differ" in ledger.integrity
 
 
-def test_neighbouring_blocks_are_one_span(long_log: Path) -> None:
+def test_adjacent_changed_blocks_are_one_span(long_log: Path) -> None:
     for at in (5, MIB + 5, 3 * MIB + 5):
         _flip(long_log, at)
 
@@ -141,7 +141,7 @@ def test_neighbouring_blocks_are_one_span(long_log: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_command_that_reads_a_sealed_log_reports(
+def test_commands_report_changed_block_of_sealed_log(
     long_log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     at = long_log.read_bytes().index(b"#", MIB) + 2
@@ -154,7 +154,7 @@ def test_every_command_that_reads_a_sealed_log_reports(
     assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().out.split())
 
 
-def test_who_keeps_no_account_warns_and_the_command_exits_with_3(
+def test_reader_without_ledger_warns_and_command_exits_with_3(
     long_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = f"can.log: bytes {MIB} to {2 * MIB}"
@@ -162,15 +162,15 @@ def test_who_keeps_no_account_warns_and_the_command_exits_with_3(
     assert run(draft) == 0
     _flip(long_log, long_log.read_bytes().index(b"#AA", MIB) + 2)
 
-    with losses_heard() as heard:
+    with losses_heard() as warned:
         log_span(long_log)
         log_span(long_log)
-    assert sum(where in loss for loss in heard) == 1
+    assert sum(where in loss for loss in warned) == 1
     assert run(draft) == 3
     assert where in capsys.readouterr().err
 
 
-def test_stored_pictures_of_a_sealed_log_are_held_against_it(tmp_path: Path) -> None:
+def test_stored_pictures_are_checked_against_seal(tmp_path: Path) -> None:
     log = picture_folder(tmp_path / "front", 12, "rate_hz: 10\n")
     assert run(["seal", str(log)]) == 0
     with open_log(log) as opened:
@@ -178,15 +178,15 @@ def test_stored_pictures_of_a_sealed_log_are_held_against_it(tmp_path: Path) -> 
     camera = StoredCamera(log, topic, Clock.LOG, Selection())
     (log / "frame_3.png").write_bytes((log / "frame_4.png").read_bytes())
 
-    with losses_heard() as heard:
+    with losses_heard() as warned:
         read_pictures(camera, lambda _: None)
 
-    assert heard
-    assert "frame_3.png" in "".join(heard)
+    assert warned
+    assert "frame_3.png" in "".join(warned)
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
-def test_another_size_is_reported_in_one_line(long_log: Path, is_cut: bool) -> None:
+def test_changed_size_is_reported_in_one_line(long_log: Path, is_cut: bool) -> None:
     size = long_log.stat().st_size
     with long_log.open("r+b") as file:
         if is_cut:
@@ -209,15 +209,15 @@ def test_missing_and_new_files_are_reported_in_one_line_each(tmp_path: Path) -> 
         (log / f"frame_{number}.png").unlink()
     (log / "frame_99.png").write_bytes((log / "frame_7.png").read_bytes())
 
-    said = [drop.detail for drop in read(log)[1].drops() if drop.reason == CHANGED]
+    reported = [drop.detail for drop in read(log)[1].drops() if drop.reason == CHANGED]
 
-    assert said == [
+    assert reported == [
         "missing: frame_0.png, frame_1.png, frame_2.png and 2 more",
         "not in the seal: frame_99.png",
     ]
 
 
-def test_a_seal_is_not_replaced_by_accident(
+def test_seal_of_changed_log_is_replaced_only_with_overwrite(
     long_log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = seal_path(long_log).read_bytes()
@@ -234,7 +234,7 @@ def test_a_seal_is_not_replaced_by_accident(
     assert run(["seal", "--check", str(long_log)]) == 0
 
 
-def test_info_says_whether_a_log_is_sealed(
+def test_info_shows_whether_log_is_sealed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT["candump"](tmp_path)
@@ -249,25 +249,25 @@ def test_info_says_whether_a_log_is_sealed(
         assert f"sealed at {sealed_at} (xxh3_128" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_log_and_its_seal_can_be_renamed_together(tmp_path: Path) -> None:
+def test_log_and_seal_can_be_renamed_together(tmp_path: Path) -> None:
     log = _sealed(tmp_path, "rosbag1")
     moved = log.rename(tmp_path / "other.bag")
     seal_path(log).rename(seal_path(moved))
 
     assert "none differs" in read(moved)[1].integrity
     _flip(moved, moved.stat().st_size // 2)
-    assert "other.bag: bytes 0 to" in _said(moved)
+    assert "other.bag: bytes 0 to" in _losses_text(moved)
 
 
-def test_a_write_ahead_log_and_a_time_file_are_sealed_too(tmp_path: Path) -> None:
+def test_time_file_of_video_is_sealed(tmp_path: Path) -> None:
     film = _sealed(tmp_path, "video")
 
     assert set(read_seal(seal_path(film)).files) == {".", "front.txt"}
     _flip(tmp_path / "front.txt", 30)
-    assert "front.txt" in _said(film)
+    assert "front.txt" in _losses_text(film)
 
 
-def _hostile() -> Iterator[tuple[str, bytes]]:
+def _damaged_seals() -> Iterator[tuple[str, bytes]]:
     def entry(**changes: object) -> bytes:
         one = {"name": ".", "size": 3, "blocks": "00" * 16} | changes
         tree: dict[str, object] = {
@@ -301,8 +301,8 @@ def _hostile() -> Iterator[tuple[str, bytes]]:
     yield "wrong entry", entry(size="3")
 
 
-@pytest.mark.parametrize(("why", "content"), list(_hostile()))
-def test_a_damaged_or_hostile_seal_is_one_clear_line(
+@pytest.mark.parametrize(("why", "content"), list(_damaged_seals()))
+def test_damaged_seal_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], why: str, content: bytes
 ) -> None:
     log = EVERY_FORMAT["candump"](tmp_path)
@@ -310,14 +310,14 @@ def test_a_damaged_or_hostile_seal_is_one_clear_line(
 
     for command in (["info"], ["seal", "--check"]):
         assert run([*command, str(log)]) == 4
-        said = capsys.readouterr().err
-        assert why in said
-        assert said.count("\n") == 1
-        assert "delete it and seal the log again" in said
+        reported = capsys.readouterr().err
+        assert why in reported
+        assert reported.count("\n") == 1
+        assert "delete it and seal the log again" in reported
     assert run(["seal", str(log)]) == 1
 
 
-def test_a_flipped_byte_in_the_seal_is_not_taken_for_one_in_the_log(tmp_path: Path) -> None:
+def test_damaged_seal_never_reports_a_different_log(tmp_path: Path) -> None:
     log = _sealed(tmp_path, "candump")
     whole, sound = seal_path(log).read_bytes(), read_seal(seal_path(log))
     refused = 0
@@ -343,7 +343,7 @@ def test_a_flipped_byte_in_the_seal_is_not_taken_for_one_in_the_log(tmp_path: Pa
         (["--check", "can.asc"], 1, "not sealed"),
     ],
 )
-def test_what_cannot_be_sealed_is_refused(
+def test_seal_of_invalid_log_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str], status: int, why: str
 ) -> None:
     EVERY_FORMAT["asc"](tmp_path)
@@ -353,7 +353,7 @@ def test_what_cannot_be_sealed_is_refused(
     assert why in capsys.readouterr().err
 
 
-def test_a_converted_file_does_not_come_under_an_old_seal(
+def test_convert_does_not_overwrite_a_sealed_log(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT["candump"](tmp_path)
@@ -367,14 +367,14 @@ def test_a_converted_file_does_not_come_under_an_old_seal(
     assert out.read_bytes() == before
 
 
-def test_a_log_whose_name_is_as_long_as_a_name_can_be_opens(tmp_path: Path) -> None:
+def test_log_with_longest_file_name_is_read(tmp_path: Path) -> None:
     log = tmp_path / ("x" * 251 + ".log")
     log.write_bytes(candump(made(30)))
 
     assert read(log)[1].is_whole
 
 
-def test_hidden_files_and_links_in_a_circle(tmp_path: Path) -> None:
+def test_hidden_files_and_circular_links_are_not_sealed(tmp_path: Path) -> None:
     log = picture_folder(tmp_path / "front", 3, "rate_hz: 10\n")
     (log / ".hidden").write_bytes(b"x")
     (log / "again").symlink_to(log)
@@ -390,7 +390,7 @@ def test_hidden_files_and_links_in_a_circle(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
-def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, kind: str) -> None:
+def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str) -> None:
     rows = rows_of(40_000)
     if kind == "mcap":
         log = next(write_folder(tmp_path / "bag", rows, "mcap").glob("*.mcap"))
@@ -422,11 +422,11 @@ def test_a_window_of_an_indexed_log_checks_its_own_blocks_alone(tmp_path: Path, 
 
 
 _PICTURES = {"kitti-raw": "image_02/data", "pandaset": "camera/front_camera"}
-"""Positions of pictures."""
+"""Folder of the pictures of each format."""
 
 
-def _in_window(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:
-    """A log, a window at its beginning, and whether the window reads files or parts of it."""
+def _window_case(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:
+    """Return a log, a window at its beginning, and for each of two files whether it is read."""
     if kind == "images":
         times = "".join(f"{0.5 * i:.1f}\n" for i in range(12))
         log = picture_folder(folder / "front", 12, times)
@@ -456,8 +456,8 @@ def _in_window(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool
 
 
 @pytest.mark.parametrize("kind", ["blf", "mf4", "images", "kitti-raw", "pandaset"])
-def test_a_window_checks_only_what_it_reads(tmp_path: Path, kind: str) -> None:
-    log, window, files = _in_window(kind, tmp_path)
+def test_window_checks_only_blocks_that_it_reads(tmp_path: Path, kind: str) -> None:
+    log, window, files = _window_case(kind, tmp_path)
     assert run(["seal", str(log)]) == 0
     total = read_seal(seal_path(log)).blocks
 
@@ -488,7 +488,7 @@ def test_a_window_checks_only_what_it_reads(tmp_path: Path, kind: str) -> None:
         _flip(log / name, size - 1)
 
 
-def test_one_file_of_a_sealed_folder_is_held_against_the_folders_seal(
+def test_file_of_sealed_folder_is_checked_against_folder_seal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = write_folder(tmp_path / "bag", rows_of(50))
@@ -499,24 +499,24 @@ def test_one_file_of_a_sealed_folder_is_held_against_the_folders_seal(
     assert f"by {place.name}.seal of the folder" in " ".join(capsys.readouterr().out.split())
 
     _flip(database, database.stat().st_size - 5)
-    assert f"{database.name}: bytes 0 to {database.stat().st_size}" in _said(database)
+    assert f"{database.name}: bytes 0 to {database.stat().st_size}" in _losses_text(database)
     assert run(["seal", "--check", str(database)]) == 3
     # Read as a part of its folder, it is reported once.
     details = [drop.detail for drop in read(place)[1].drops() if drop.reason == DIFFERS]
     assert details == [f"{database.name}: bytes 0 to {database.stat().st_size}"]
 
 
-def test_a_folder_in_a_sealed_folder_is_held_against_its_seal(tmp_path: Path) -> None:
+def test_subfolder_of_sealed_folder_is_checked_against_seal(tmp_path: Path) -> None:
     drive = _sealed(tmp_path, "kitti-raw")
     camera = drive / "image_02" / "data"
     one = sorted(camera.iterdir())[3]
     assert "none differs" in read(camera)[1].integrity
 
     _flip(one, one.stat().st_size - 1)
-    assert f"{one.name}: bytes 0 to {one.stat().st_size}" in _said(camera)
+    assert f"{one.name}: bytes 0 to {one.stat().st_size}" in _losses_text(camera)
 
 
-def test_a_log_that_joined_a_sealed_folder_later_is_not_sealed(tmp_path: Path) -> None:
+def test_log_added_to_sealed_folder_is_not_sealed(tmp_path: Path) -> None:
     place = write_folder(tmp_path / "bag", rows_of(50))
     assert run(["seal", str(place)]) == 0
     late = place / "can.log"
@@ -527,7 +527,7 @@ def test_a_log_that_joined_a_sealed_folder_later_is_not_sealed(tmp_path: Path) -
     assert not read(place)[1].is_whole
 
 
-def test_an_interrupted_seal_leaves_nothing_half_written(
+def test_interrupted_seal_leaves_files_unchanged(
     long_log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = seal_path(long_log).read_bytes()

@@ -11,8 +11,8 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.logs.topic_part import read_topic
 
 
-def stored(path: Path) -> Path:
-    """Write 200 vectors on /speed (20 per chunk), and as many messages of an unknown type."""
+def two_topic_log(path: Path) -> Path:
+    """Write 200 vectors on /speed and 200 messages of an unknown type, in chunks of 1200 bytes."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1200)
         writer.start(profile="ros2")
@@ -29,8 +29,8 @@ def stored(path: Path) -> Path:
     return path
 
 
-def test_rows_of_the_span_come_as_columns(tmp_path: Path) -> None:
-    with open_log(stored(tmp_path / "x.mcap")) as log:
+def test_rows_of_time_range_are_read_as_columns(tmp_path: Path) -> None:
+    with open_log(two_topic_log(tmp_path / "x.mcap")) as log:
         part = read_topic(log, "/speed", 50, 75)
 
     values: list[float] = []
@@ -44,8 +44,8 @@ def test_rows_of_the_span_come_as_columns(tmp_path: Path) -> None:
     assert part.ledger.accounts["/other"].skipped == {"topic not selected": 200}
 
 
-def test_a_type_that_nobody_knows_comes_as_messages(tmp_path: Path) -> None:
-    with open_log(stored(tmp_path / "x.mcap")) as log:
+def test_unknown_type_is_read_as_messages(tmp_path: Path) -> None:
+    with open_log(two_topic_log(tmp_path / "x.mcap")) as log:
         part = read_topic(log, "/other", end_ns=3)
 
     found = [
@@ -57,9 +57,9 @@ def test_a_type_that_nobody_knows_comes_as_messages(tmp_path: Path) -> None:
     assert found == [b"0", b"1", b"2"]
 
 
-def test_a_topic_that_is_missing_lists_those_there_are(tmp_path: Path) -> None:
+def test_missing_topic_error_lists_available_topics(tmp_path: Path) -> None:
     with (
-        open_log(stored(tmp_path / "x.mcap")) as log,
+        open_log(two_topic_log(tmp_path / "x.mcap")) as log,
         pytest.raises(UsageError, match=r"no topic '/spede'; there are: /speed, /other"),
     ):
         read_topic(log, "/spede")

@@ -45,7 +45,7 @@ _VALUES: Final = st.recursive(
 # There is no limit on time, because generating nested values is slow on some machines.
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(_VALUES, st.integers(0, MAX_DEPTH + 5))
-def test_what_nests_little_is_read_as_json_reads_it(value: object, around: int) -> None:
+def test_json_within_depth_limit_equals_json_loads(value: object, around: int) -> None:
     text = "[" * around + json.dumps(value) + "]" * around
     depth = _depth(json.loads(text))
 
@@ -65,19 +65,19 @@ def _depth(value: object) -> int:
 
 
 @pytest.mark.parametrize("text", DEEP_JSON)
-def test_deep_json_is_refused(text: str) -> None:
+def test_deeply_nested_json_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="nested"):
         json_tree(text)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", DEEP_TOML)
-def test_deep_toml_is_refused(text: str) -> None:
+def test_deeply_nested_toml_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="nested"):
         toml_tree(text)
 
 
-def test_toml_at_the_limit_is_read() -> None:
+def test_toml_at_depth_limit_is_read() -> None:
     assert toml_tree("a = " + "[" * (MAX_DEPTH - 1) + "]" * (MAX_DEPTH - 1))["a"]
     with pytest.raises(ValueError, match="nested"):
         toml_tree("a = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH)
@@ -92,12 +92,12 @@ def test_toml_at_the_limit_is_read() -> None:
         ("a: [", "found"),
     ],
 )
-def test_hostile_yaml_is_refused(text: str, why: str) -> None:
+def test_deeply_nested_or_invalid_yaml_is_refused(text: str, why: str) -> None:
     with pytest.raises(ValueError, match=why):
         yaml_tree(text)
 
 
-def test_yaml_is_read_with_or_without_types() -> None:
+def test_yaml_is_read_with_or_without_typed_values() -> None:
     assert yaml_tree("a: [1, no]\n2: b") == {"a": [1, "no"], 2: "b"}
     assert yaml_tree("a: [1, no]\n2: b", "base") == {"a": ["1", "no"], "2": "b"}
 
@@ -105,7 +105,7 @@ def test_yaml_is_read_with_or_without_types() -> None:
 @pytest.mark.parametrize(
     "text", ['"' + '\\"' * 2_000_000, '"\\' * 2_000_000, "[" * 70 + '"\\"' * 900_000]
 )
-def test_quotes_without_end_take_no_time(text: str) -> None:
+def test_unterminated_quotes_are_refused_quickly(text: str) -> None:
     began = time.process_time()
     with pytest.raises(ValueError):  # noqa: PT011
         json_tree("[" * 70 + text)
@@ -177,28 +177,28 @@ def _metrics(folder: Path) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("deep", DEEP_TOML)
 @pytest.mark.parametrize("command", [_vehicle, _gates, _study])
-def test_every_command_refuses_deep_toml_in_a_line(
+def test_commands_refuse_deeply_nested_toml_in_one_line(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     command: Callable[[Path], list[str]],
     deep: str,
 ) -> None:
-    _refused_in_a_line(tmp_path, capsys, command, deep)
+    _assert_refused_in_one_line(tmp_path, capsys, command, deep)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deep", DEEP_JSON)
 @pytest.mark.parametrize("command", [_truth, _coco, _training, _manifest, _metrics])
-def test_every_command_refuses_deep_json_in_a_line(
+def test_commands_refuse_deeply_nested_json_in_one_line(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     command: Callable[[Path], list[str]],
     deep: str,
 ) -> None:
-    _refused_in_a_line(tmp_path, capsys, command, deep)
+    _assert_refused_in_one_line(tmp_path, capsys, command, deep)
 
 
-def _refused_in_a_line(
+def _assert_refused_in_one_line(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
     command: Callable[[Path], list[str]],
@@ -214,8 +214,8 @@ def _refused_in_a_line(
 
 
 @pytest.mark.slow
-def test_nothing_else_parses_json_toml_or_yaml() -> None:
-    """New readers of such files must use the limit."""
+def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
+    """All readers of such files must enforce the depth limit."""
     paths = [path for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
     assert len(paths) > 700
     for path in paths:

@@ -8,12 +8,12 @@ from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
 
-def test_an_empty_file_of_version_1_is_all_defaults() -> None:
+def test_file_with_only_a_version_has_all_defaults() -> None:
     assert parse("version = 1", "car.toml") == Vehicle(version=1)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("version = 1\n[odometry]\nwheel_scal = 1.0", r"car.toml:3: odometry.* wheel_scale"),
         ("version = 1\n[compass]\nheading_sd_deg = 3.0", r":3: .*did you mean heading_sd_rad"),
@@ -28,23 +28,23 @@ def test_an_empty_file_of_version_1_is_all_defaults() -> None:
         ("version = 1\n[radar]\nx = 1", r":2: radar: no such key; there are: .*topics"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_its_line(text: str, said: str) -> None:
-    with pytest.raises(VehicleError, match=said):
+def test_invalid_setting_is_refused_with_line_number(text: str, message: str) -> None:
+    with pytest.raises(VehicleError, match=message):
         parse(text, "car.toml")
 
 
-def test_dbc_files_are_found_beside_the_vehicle_file(tmp_path: Path) -> None:
+def test_dbc_paths_are_relative_to_vehicle_file(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text('version = 1\n[can]\ndbc = ["bus.dbc"]\n')
 
     assert load(tmp_path / "car.toml").can.dbc == (str((tmp_path / "bus.dbc").resolve()),)
 
 
-def test_a_missing_file_says_how_to_make_one(tmp_path: Path) -> None:
+def test_missing_vehicle_file_error_names_init_command(tmp_path: Path) -> None:
     with pytest.raises(VehicleError, match="crosscue vehicle init"):
         load(tmp_path / "none.toml")
 
 
-def test_a_typo_inside_a_named_entry_is_met_with_the_right_name() -> None:
+def test_misspelt_key_of_cue_suggests_correct_key() -> None:
     with pytest.raises(VehicleError, match="no such key; did you mean precision"):
         parse(
             "version = 1\n[fusion.cues]\nzebra = { precison = 0.8, precision = 0.8, "

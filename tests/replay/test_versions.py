@@ -24,7 +24,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_commit_is_what_git_says(checkout: Path) -> None:
+def test_commit_equals_git_head(checkout: Path) -> None:
     head = _git(checkout, "rev-parse", "HEAD").strip()
 
     assert commit(checkout) == head
@@ -38,16 +38,16 @@ def test_the_commit_is_what_git_says(checkout: Path) -> None:
     assert commit(checkout) == head
 
 
-def test_a_folder_without_a_commit_has_none(tmp_path: Path) -> None:
+def test_folder_without_commit_returns_none(tmp_path: Path) -> None:
     (tmp_path / ".git").mkdir()
     (tmp_path / ".git/HEAD").write_text("nonsense")
 
     assert commit(tmp_path) is None
 
 
-def test_a_commit_is_beside_versions_and_not_among_them() -> None:
-    beside = versions_and_commit()
+def test_commit_is_added_to_versions_separately() -> None:
+    with_commit = versions_and_commit()
 
     assert "crosscue_commit" not in versions()
-    assert versions().items() <= beside.items()
-    assert beside.keys() - versions().keys() <= {"crosscue_commit"}
+    assert versions().items() <= with_commit.items()
+    assert with_commit.keys() - versions().keys() <= {"crosscue_commit"}

@@ -40,7 +40,7 @@ _SIZES = st.lists(st.integers(1, 9), max_size=12)
 
 @settings(deadline=None, max_examples=60)
 @given(wheels=_TIMES, gyro=_TIMES, wheel_sizes=_SIZES, gyro_sizes=_SIZES, apart=st.booleans())
-def test_every_sample_comes_once_and_in_order(
+def test_every_sample_is_returned_once_in_order(
     wheels: list[int], gyro: list[int], wheel_sizes: list[int], gyro_sizes: list[int], apart: bool
 ) -> None:
     one = [wheel_block(t, [x * 1e-9 for x in t]) for t in _chunks(wheels, wheel_sizes)]
@@ -63,13 +63,13 @@ def test_every_sample_comes_once_and_in_order(
             assert ((part.t_ns >= window.start_ns) & (part.t_ns < window.end_ns)).all()
 
 
-def test_a_sensor_that_falls_silent_does_not_hold_up_the_rest() -> None:
+def test_silent_sensor_does_not_delay_other_sensors() -> None:
     seconds = range(0, 3 * HORIZON_NS // SECOND)
     blocks: list[Block] = [gyro_block([5], [0.0])]
     blocks += [wheel_block([s * SECOND], [1.0]) for s in seconds]
     read: list[int] = []
 
-    log = MemoryLog((WHEELS, GYRO), _Watched(blocks, read))
+    log = MemoryLog((WHEELS, GYRO), _CountingBlocks(blocks, read))
     vehicle = Vehicle(version=1)
     planned = plan([(0, WHEELS), (0, GYRO)], vehicle)
     first = next(
@@ -80,8 +80,8 @@ def test_a_sensor_that_falls_silent_does_not_hold_up_the_rest() -> None:
     assert len(read) <= HORIZON_NS // SECOND + 4
 
 
-class _Watched(list[Block]):
-    """Records how far it was read."""
+class _CountingBlocks(list[Block]):
+    """Blocks that record the index of each block read."""
 
     def __init__(self, blocks: list[Block], read: list[int]) -> None:
         super().__init__(blocks)
@@ -93,7 +93,7 @@ class _Watched(list[Block]):
             yield block
 
 
-def test_rows_that_come_too_late_are_reported_not_mixed_in() -> None:
+def test_rows_that_arrive_too_late_are_skipped_and_counted() -> None:
     late = wheel_block([7], [9.0])
     blocks = [wheel_block([s * SECOND], [1.0]) for s in range(10)]
     ledger = Ledger("late")
@@ -105,14 +105,14 @@ def test_rows_that_come_too_late_are_reported_not_mixed_in() -> None:
     assert ledger.topic("wheels").used == 10
 
 
-def test_two_candidates_for_a_role_are_listed() -> None:
+def test_two_topics_for_one_role_are_refused_and_listed() -> None:
     other = Topic("imu2", "sensor_msgs/msg/Imu", "columns")
 
     with pytest.raises(VehicleError, match=r"gyro, imu2; name one as topics\.imu"):
         plan([(0, GYRO), (0, other)], Vehicle(version=1))
 
 
-def test_a_column_that_its_role_needs_and_lacks_is_counted() -> None:
+def test_rows_without_required_column_are_skipped_and_counted() -> None:
     block = Block("gyro", np.array([1], np.int64), wheel_block([1], [1.0]).rows)
     ledger = Ledger("odd")
 
