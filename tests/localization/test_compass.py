@@ -1,4 +1,4 @@
-"""Properties of the compass and of its fit. The magnetic fields are simulated."""
+"""Tests of the compass and of its calibration. The magnetic fields are simulated."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def times(n: int, period_s: float = 0.1) -> Int64s:
     return np.round(np.arange(n) * period_s * 1e9).astype(np.int64)
 
 
-def apart_deg(a: Floats, b: Floats) -> float:
+def max_difference_deg(a: Floats, b: Floats) -> float:
     return float(np.degrees(np.abs(wrap_all(a - b)).max()))
 
 
-def around(fraction: float, n: int = 600) -> Floats:
+def headings_over(fraction: float, n: int = 600) -> Floats:
     return wrap_all(np.linspace(0.0, fraction * 2 * math.pi, n) + 0.3)
 
 
@@ -87,43 +87,46 @@ def test_corrections_undo_iron_mounting_and_tilt(true: float, roll: float, pitch
     field = readings(np.array([true]), IRON, roll, pitch)
 
     found = heading(field, IRON, np.array([roll]), np.array([pitch]))
-    assert apart_deg(found, np.array([true])) < 1e-9
+    assert max_difference_deg(found, np.array([true])) < 1e-9
 
 
-def test_levelling_keeps_the_fields_strength_and_finds_down() -> None:
-    field = readings(around(1.0, 20), IRON, roll=0.3, pitch=-0.2)
+def test_level_field_keeps_vertical_and_horizontal_strength() -> None:
+    field = readings(headings_over(1.0, 20), IRON, roll=0.3, pitch=-0.2)
     level = level_field(field, IRON, np.full(20, 0.3), np.full(20, -0.2))
 
     np.testing.assert_allclose(level[:, 2], -DOWN_T)
     np.testing.assert_allclose(np.hypot(level[:, 0], level[:, 1]), LEVEL_T)
 
 
-def test_tilt_not_reported_is_an_error_not_a_crash() -> None:
+def test_unreported_tilt_causes_a_limited_heading_error() -> None:
     field = readings(np.array([0.0]), IRON, roll=0.1)
 
-    assert 2.0 < apart_deg(heading(field, IRON), np.zeros(1)) < 20.0
+    assert 2.0 < max_difference_deg(heading(field, IRON), np.zeros(1)) < 20.0
 
 
-def test_readings_without_a_direction_are_nan() -> None:
+def test_vertical_or_nan_field_has_nan_heading() -> None:
     field = np.array([[0.0, 0.0, 1.0], [np.nan, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
     np.testing.assert_array_equal(np.isnan(heading(field, CompassSettings())), [True, True, False])
 
 
 def check_correct(fit: CompassFit, limit_deg: float) -> None:
-    everywhere = around(1.0)
-    assert apart_deg(heading(readings(everywhere, IRON), fit.settings), everywhere) < limit_deg
+    everywhere = headings_over(1.0)
+    assert (
+        max_difference_deg(heading(readings(everywhere, IRON), fit.settings), everywhere)
+        < limit_deg
+    )
 
 
-def given_mounting(compass: CompassSettings) -> CompassSettings:
+def without_calibration(compass: CompassSettings) -> CompassSettings:
     return CompassSettings(
         mounting_rotation=compass.mounting_rotation, declination_rad=compass.declination_rad
     )
 
 
-def test_a_drive_all_the_way_round_shows_everything() -> None:
-    truth = around(2.5)
-    fit = fit_compass(times(600), readings(truth, IRON), truth, given_mounting(IRON))
+def test_full_circle_makes_mounting_and_iron_observable() -> None:
+    truth = headings_over(2.5)
+    fit = fit_compass(times(600), readings(truth, IRON), truth, without_calibration(IRON))
 
     assert fit.observable == (MOUNTING, HARD_IRON, SOFT_IRON)
     assert fit.coverage_deg == 360
@@ -132,21 +135,21 @@ def test_a_drive_all_the_way_round_shows_everything() -> None:
     check_correct(fit, 1e-6)
 
 
-def test_noise_comes_out_as_the_residual() -> None:
+def test_residual_sd_of_the_fit_matches_the_noise() -> None:
     """Simulated noise of 0.5 uT on a level field of 23 uT: about 1.25 degrees."""
-    truth = around(2.5, 3000)
+    truth = headings_over(2.5, 3000)
     noisy = readings(truth, IRON, sd_t=0.5e-6)
-    fit = fit_compass(times(3000), noisy, truth, given_mounting(IRON))
+    fit = fit_compass(times(3000), noisy, truth, without_calibration(IRON))
 
     assert math.degrees(fit.residual_sd_rad) == pytest.approx(1.25, rel=0.15)
     assert abs(fit.residual_autocorrelation) < 0.1
     check_correct(fit, 0.4)
 
 
-def test_a_half_turn_shows_hard_iron_but_not_soft() -> None:
+def test_half_circle_makes_hard_iron_observable_but_not_soft_iron() -> None:
     hard = replace(IRON, soft_iron=CompassSettings().soft_iron)
-    truth = around(0.6)
-    fit = fit_compass(times(600), readings(truth, hard), truth, given_mounting(hard))
+    truth = headings_over(0.6)
+    fit = fit_compass(times(600), readings(truth, hard), truth, without_calibration(hard))
 
     assert fit.observable == (MOUNTING, HARD_IRON)
     assert "soft iron" in [missing.parameter for missing in fit.not_observable]
@@ -155,18 +158,18 @@ def test_a_half_turn_shows_hard_iron_but_not_soft() -> None:
 
 
 def test_known_soft_iron_is_kept_when_hard_iron_is_fitted() -> None:
-    truth = around(0.6)
-    known = replace(given_mounting(IRON), soft_iron=IRON.soft_iron)
+    truth = headings_over(0.6)
+    known = replace(without_calibration(IRON), soft_iron=IRON.soft_iron)
     fit = fit_compass(times(600), readings(truth, IRON), truth, known)
 
     assert fit.settings.soft_iron == IRON.soft_iron
     check_correct(fit, 1e-6)
 
 
-def test_a_straight_drive_shows_the_mounting_alone_and_says_so() -> None:
+def test_straight_drive_makes_only_the_mounting_observable() -> None:
     rng = np.random.default_rng(1)
     truth = 1.3 + rng.normal(0.0, 0.01, 600)
-    given = replace(given_mounting(IRON), hard_iron_t=(1e-6, 2e-6, 0.0))
+    given = replace(without_calibration(IRON), hard_iron_t=(1e-6, 2e-6, 0.0))
     fit = fit_compass(times(600), readings(truth, IRON), truth, given)
 
     assert fit.observable == (MOUNTING,)
@@ -177,12 +180,12 @@ def test_a_straight_drive_shows_the_mounting_alone_and_says_so() -> None:
     assert fit.settings.hard_iron_t == given.hard_iron_t
     assert fit.settings.soft_iron == given.soft_iron
     found = heading(readings(np.array([1.3]), IRON), fit.settings)
-    assert apart_deg(found, np.array([1.3])) < 0.2
+    assert max_difference_deg(found, np.array([1.3])) < 0.2
 
 
-def test_without_a_reference_an_ellipse_shows_the_iron_but_not_the_mounting() -> None:
-    truth = around(1.5)
-    fit = fit_compass(times(600), readings(truth, IRON), None, given_mounting(IRON))
+def test_full_circle_without_reference_makes_only_iron_observable() -> None:
+    truth = headings_over(1.5)
+    fit = fit_compass(times(600), readings(truth, IRON), None, without_calibration(IRON))
 
     assert fit.observable == (HARD_IRON, SOFT_IRON)
     assert MOUNTING in [missing.parameter for missing in fit.not_observable]
@@ -191,10 +194,10 @@ def test_without_a_reference_an_ellipse_shows_the_iron_but_not_the_mounting() ->
     assert np.std(wrap_all(apart - circular_mean(apart))) < 1e-8
 
 
-def test_without_a_reference_a_straight_drive_shows_nothing() -> None:
+def test_straight_drive_without_reference_makes_nothing_observable() -> None:
     truth = 1.2 + np.random.default_rng(1).normal(0.0, 0.01, 600)
     field = readings(truth, IRON, sd_t=0.3e-6)
-    given = given_mounting(IRON)
+    given = without_calibration(IRON)
     fit = fit_compass(times(600), field, None, given)
 
     assert fit.observable == ()
@@ -202,9 +205,9 @@ def test_without_a_reference_a_straight_drive_shows_nothing() -> None:
     assert fit.settings == given
 
 
-def test_without_a_reference_half_an_ellipse_is_not_enough() -> None:
-    truth = around(0.6)
-    fit = fit_compass(times(600), readings(truth, IRON), None, given_mounting(IRON))
+def test_half_circle_without_reference_makes_nothing_observable() -> None:
+    truth = headings_over(0.6)
+    fit = fit_compass(times(600), readings(truth, IRON), None, without_calibration(IRON))
 
     assert fit.observable == ()
     assert dict(fit.not_observable)["soft iron"].startswith("headings cover 2")
@@ -212,33 +215,35 @@ def test_without_a_reference_half_an_ellipse_is_not_enough() -> None:
 
 @pytest.mark.parametrize("fraction", [0.6, 2.0])
 def test_mirrored_axes_are_refused(fraction: float) -> None:
-    truth = around(fraction)
+    truth = headings_over(fraction)
     mirrored = readings(truth, IRON) * [1.0, -1.0, 1.0]
     with pytest.raises(VehicleError, match="turn in the wrong direction"):
-        fit_compass(times(600), mirrored, truth, given_mounting(IRON))
+        fit_compass(times(600), mirrored, truth, without_calibration(IRON))
 
 
 def test_too_few_readings_are_refused() -> None:
     truth = np.full(600, np.nan)
     truth[:7] = 0.1
     with pytest.raises(VehicleError, match="7 of 600 readings are finite and have a reference"):
-        fit_compass(times(600), readings(around(1.0), IRON), truth, given_mounting(IRON))
+        fit_compass(
+            times(600), readings(headings_over(1.0), IRON), truth, without_calibration(IRON)
+        )
 
 
-def test_dead_and_missing_readings_are_left_out_and_counted() -> None:
-    truth = around(2.0)
+def test_zero_and_nan_readings_are_left_out_and_counted() -> None:
+    truth = headings_over(2.0)
     field = readings(truth, IRON)
     field[3] = 0.0
     field[5, 1] = np.nan
-    fit = fit_compass(times(600), field, truth, given_mounting(IRON))
+    fit = fit_compass(times(600), field, truth, without_calibration(IRON))
 
     assert (fit.readings, fit.readings_used) == (600, 598)
     check_correct(fit, 1e-6)
 
 
 @pytest.mark.parametrize("persists_s", [0.5, 3.0])
-def test_a_lasting_error_is_recognised_as_lasting(persists_s: float) -> None:
-    """Simulated residuals that fade exponentially, read ten times per second for an hour."""
+def test_persistence_recovers_the_correlation_time_of_errors(persists_s: float) -> None:
+    """Residuals are simulated with exponential correlation at 10 Hz for an hour."""
     rng = np.random.default_rng(2)
     n, kept = 36_000, math.exp(-0.1 / persists_s)
     residual = np.zeros(n)
@@ -253,7 +258,7 @@ def test_a_lasting_error_is_recognised_as_lasting(persists_s: float) -> None:
     assert not found.is_bound
 
 
-def test_a_drift_all_drive_long_counts_as_one_reading_or_so() -> None:
+def test_linear_drift_counts_as_few_independent_readings() -> None:
     found = persistence(times(100), np.linspace(-1.0, 1.0, 100))
 
     assert found.seconds > 1.5
@@ -263,10 +268,10 @@ def test_a_drift_all_drive_long_counts_as_one_reading_or_so() -> None:
 def test_coverage_counts_directions_not_readings() -> None:
     assert coverage_deg(np.full(1000, 0.1)) == 10
     assert coverage_deg(np.array([0.1, 0.1])) == 0
-    assert coverage_deg(around(1.0)) == 360
+    assert coverage_deg(headings_over(1.0)) == 360
 
 
-def test_a_slow_car_has_no_course() -> None:
+def test_course_is_nan_at_low_speed() -> None:
     t_ns = times(5, 1.0)
     course = np.array([0.0, 0.2, 3.0, 0.6, 0.8])
     speed = np.array([9.0, 9.0, 0.5, 9.0, 9.0])
@@ -277,16 +282,16 @@ def test_a_slow_car_has_no_course() -> None:
     )
 
 
-def test_angles_between_neighbours_go_the_shorter_way() -> None:
+def test_interpolated_angles_take_the_shorter_way() -> None:
     t_ns = np.array([0, 10], np.int64)
     found = interpolate_angle(np.array([-1, 0, 5, 10, 11]), t_ns, np.array([3.0, -3.0]))
 
     assert np.isnan(found[[0, 4]]).all()
-    assert apart_deg(found[1:4], np.array([3.0, math.pi, -3.0])) < 1e-9
+    assert max_difference_deg(found[1:4], np.array([3.0, math.pi, -3.0])) < 1e-9
     assert np.isnan(interpolate_angle(t_ns, np.empty(0, np.int64), np.empty(0))).all()
 
 
-def test_opposite_angles_have_no_mean() -> None:
+def test_mean_of_opposite_or_no_angles_is_refused() -> None:
     with pytest.raises(ValueError, match="cancel out"):
         circular_mean(np.array([0.0, math.pi]))
     with pytest.raises(ValueError, match="at least one"):
@@ -299,7 +304,7 @@ def test_readings_unrelated_to_the_heading_are_refused() -> None:
         fit_compass(times(100), field, np.full(100, 0.2), CompassSettings())
 
 
-def test_nonsense_is_refused_by_name() -> None:
+def test_invalid_settings_and_shapes_are_refused() -> None:
     mirror: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
     stretch: Matrix = ((2.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="got a reflection"):

@@ -1,4 +1,4 @@
-"""Properties of the pose filter, and comparison with filterpy."""
+"""Tests of the pose filter, and comparison with filterpy."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def belief(
     return PoseBelief(1_000, np.array([x, y, heading, speed]), root @ root.T)
 
 
-def slope(function: Callable[[Floats], Floats], at: Floats) -> Floats:
-    """Central differences, with wrapped angles."""
+def central_differences(function: Callable[[Floats], Floats], at: Floats) -> Floats:
+    """Compute a Jacobian by central differences, with wrapped angles."""
     columns = []
     for i in range(len(at)):
         step = np.zeros(len(at))
@@ -56,7 +56,7 @@ def slope(function: Callable[[Floats], Floats], at: Floats) -> Floats:
     return np.column_stack(columns)
 
 
-def test_a_quarter_circle_ends_where_geometry_says() -> None:
+def test_prediction_along_a_quarter_circle_matches_geometry() -> None:
     radius_m = 10.0
     start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 5.0]), np.zeros((4, 4)))
     dt_s = radius_m * math.pi / 2 / 5.0
@@ -66,7 +66,7 @@ def test_a_quarter_circle_ends_where_geometry_says() -> None:
     assert after.t_ns == round(dt_s * 1e9)
 
 
-def test_backing_along_the_same_circle_returns_to_the_start() -> None:
+def test_reversing_along_the_same_circle_returns_to_the_start() -> None:
     start = PoseBelief(0, np.array([4.0, 1.0, 2.9, 6.0]), np.zeros((4, 4)))
     noise = MotionNoise(wheelbase_m=2.7)
     there = predict(start, 0.0, 0.3, 1.5, noise)
@@ -76,7 +76,7 @@ def test_backing_along_the_same_circle_returns_to_the_start() -> None:
     np.testing.assert_allclose(back.mean[:3], start.mean[:3], atol=1e-12)
 
 
-def test_acceleration_from_rest() -> None:
+def test_prediction_from_rest_matches_constant_acceleration() -> None:
     start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 0.0]), np.zeros((4, 4)))
     after = predict(start, 2.0, 0.0, 3.0, NOISE)
 
@@ -85,7 +85,7 @@ def test_acceleration_from_rest() -> None:
 
 @given(turn=st.floats(-3.0, 3.0), distance=st.floats(-50.0, 50.0))
 @settings(max_examples=60, deadline=None)
-def test_one_arc_is_two_half_arcs(turn: float, distance: float) -> None:
+def test_two_half_arcs_equal_one_arc(turn: float, distance: float) -> None:
     whole, half = arc(distance, turn), arc(distance / 2, turn / 2)
     c, s = math.cos(turn / 2), math.sin(turn / 2)
 
@@ -94,7 +94,7 @@ def test_one_arc_is_two_half_arcs(turn: float, distance: float) -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 9.999e-3, 1.0001e-2, -9.999e-3, 0.5, -2.0])
-def test_an_arc_is_smooth_through_zero_turn(turn: float) -> None:
+def test_arc_derivatives_match_differences_around_zero_turn(turn: float) -> None:
     here = arc(7.0, turn)
     ahead, behind = arc(7.0, turn + 1e-6), arc(7.0, turn - 1e-6)
 
@@ -104,7 +104,7 @@ def test_an_arc_is_smooth_through_zero_turn(turn: float) -> None:
     assert here.dy_by_distance == pytest.approx(here.dy_m / 7.0, abs=1e-14)
 
 
-def test_series_and_closed_form_meet() -> None:
+def test_arc_series_and_closed_form_agree_at_the_switch() -> None:
     below, above = arc(1.0, math.nextafter(1e-2, 0.0)), arc(1.0, 1e-2)
 
     np.testing.assert_allclose(below, above, rtol=0, atol=1e-13)
@@ -112,13 +112,13 @@ def test_series_and_closed_form_meet() -> None:
 
 @given(heading=HEADINGS, speed=SPEEDS, accel=st.floats(-5.0, 5.0), steering=STEERINGS)
 @settings(max_examples=60, deadline=None)
-def test_bicycle_jacobians_are_the_slopes(
+def test_bicycle_jacobians_match_central_differences(
     heading: float, speed: float, accel: float, steering: float
 ) -> None:
     mean, inputs = np.array([2.0, -1.0, heading, speed]), np.array([accel, steering])
     motion = bicycle(mean, accel, steering, 0.1, 2.7)
-    by_state = slope(lambda m: bicycle(m, accel, steering, 0.1, 2.7).mean, mean)
-    by_input = slope(lambda u: bicycle(mean, u[0], u[1], 0.1, 2.7).mean, inputs)
+    by_state = central_differences(lambda m: bicycle(m, accel, steering, 0.1, 2.7).mean, mean)
+    by_input = central_differences(lambda u: bicycle(mean, u[0], u[1], 0.1, 2.7).mean, inputs)
 
     np.testing.assert_allclose(motion.by_state, by_state, atol=1e-7)
     np.testing.assert_allclose(motion.by_input, by_input, atol=1e-7)
@@ -126,11 +126,13 @@ def test_bicycle_jacobians_are_the_slopes(
 
 @given(heading=HEADINGS, speed=SPEEDS, yaw_rate=st.floats(-1.0, 1.0))
 @settings(max_examples=60, deadline=None)
-def test_yaw_rate_jacobians_are_the_slopes(heading: float, speed: float, yaw_rate: float) -> None:
+def test_yaw_rate_jacobians_match_central_differences(
+    heading: float, speed: float, yaw_rate: float
+) -> None:
     mean, inputs = np.array([2.0, -1.0, heading, speed]), np.array([0.7, yaw_rate])
     motion = turning(mean, 0.7, yaw_rate, 0.1)
-    by_state = slope(lambda m: turning(m, 0.7, yaw_rate, 0.1).mean, mean)
-    by_input = slope(lambda u: turning(mean, u[0], u[1], 0.1).mean, inputs)
+    by_state = central_differences(lambda m: turning(m, 0.7, yaw_rate, 0.1).mean, mean)
+    by_input = central_differences(lambda u: turning(mean, u[0], u[1], 0.1).mean, inputs)
 
     np.testing.assert_allclose(motion.by_state, by_state, atol=1e-7)
     np.testing.assert_allclose(motion.by_input, by_input, atol=1e-7)
@@ -138,7 +140,7 @@ def test_yaw_rate_jacobians_are_the_slopes(heading: float, speed: float, yaw_rat
 
 @given(heading=HEADINGS, speed=SPEEDS, steering=STEERINGS)
 @settings(max_examples=40, deadline=None)
-def test_steering_and_the_yaw_rate_it_makes_drive_the_same_arc(
+def test_steering_and_equivalent_yaw_rate_predict_the_same_pose(
     heading: float, speed: float, steering: float
 ) -> None:
     start = belief(heading=heading, speed=speed)
@@ -149,7 +151,7 @@ def test_steering_and_the_yaw_rate_it_makes_drive_the_same_arc(
     np.testing.assert_allclose(turned.mean, steered.mean, atol=1e-12)
 
 
-def test_odometry_drives_the_same_arc_too() -> None:
+def test_odometry_and_equivalent_yaw_rate_predict_the_same_pose() -> None:
     start = belief()
     turned = predict_yaw_rate(start, 0.0, 0.3, 0.5, NOISE)
     counted = predict_odometry(start, 8.0 * 0.5, 0.15, 0.0, 0.0, 0.5, 0.0)
@@ -159,7 +161,9 @@ def test_odometry_drives_the_same_arc_too() -> None:
 
 @given(heading=HEADINGS, turn=st.floats(-1.0, 1.0), seed=st.integers(0, 50))
 @settings(max_examples=30, deadline=None)
-def test_a_turned_map_turns_the_belief_with_it(heading: float, turn: float, seed: int) -> None:
+def test_prediction_commutes_with_rotation_of_the_map(
+    heading: float, turn: float, seed: int
+) -> None:
     start = belief(heading=heading, seed=seed)
     c, s = math.cos(turn), math.sin(turn)
     rotation = np.eye(4)
@@ -176,7 +180,7 @@ def test_a_turned_map_turns_the_belief_with_it(heading: float, turn: float, seed
     np.testing.assert_allclose(wrap_all(first.mean - last.mean), 0.0, atol=1e-9)
 
 
-def test_two_short_coasts_are_one_long_one() -> None:
+def test_two_short_coasts_equal_one_long_coast() -> None:
     start = belief(speed=9.0)
     long = coast(start, 2.0, 0.5, 0.01)
     short = coast(coast(start, 0.7, 0.5, 0.01), 1.3, 0.5, 0.01)
@@ -185,7 +189,7 @@ def test_two_short_coasts_are_one_long_one() -> None:
     np.testing.assert_allclose(short.cov, long.cov, rtol=1e-9, atol=1e-9)
 
 
-def test_a_heading_across_the_seam_pulls_the_shorter_way() -> None:
+def test_heading_update_across_half_a_turn_takes_the_shorter_way() -> None:
     start = belief(heading=math.radians(179.0))
     updated = update_heading(start, math.radians(-179.0), 1e-12)
 
@@ -193,7 +197,7 @@ def test_a_heading_across_the_seam_pulls_the_shorter_way() -> None:
     assert updated.belief.mean[2] == pytest.approx(math.radians(-179.0), abs=1e-6)
 
 
-def test_equally_sure_speeds_meet_in_the_middle() -> None:
+def test_speed_update_averages_equally_certain_speeds() -> None:
     start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 10.0]), np.diag([1.0, 1.0, 0.1, 4.0]))
     after = update_speed(start, 12.0, 4.0).belief
 
@@ -201,7 +205,7 @@ def test_equally_sure_speeds_meet_in_the_middle() -> None:
     assert after.cov[3, 3] == pytest.approx(2.0)
 
 
-def test_a_position_is_worth_as_much_as_its_covariance_says() -> None:
+def test_position_update_weighs_by_covariance() -> None:
     start = PoseBelief(0, np.zeros(4), np.diag([4.0, 9.0, 0.1, 1.0]))
     after = update_position(start, np.array([2.0, 3.0]), np.diag([4.0, 9.0])).belief
 
@@ -219,7 +223,7 @@ def test_order_of_measurements_at_one_time_does_not_matter() -> None:
     np.testing.assert_allclose(one.cov, other.cov, atol=1e-12)
 
 
-def test_the_gate_refuses_and_reports() -> None:
+def test_gate_rejects_outlier_and_reports_its_nis() -> None:
     start = belief(heading=0.0)
     refused = update_heading(start, 2.0, 1e-4, gate_nis=10.8)
     taken = update_heading(start, 2.0, 1e-4)
@@ -246,7 +250,7 @@ def test_covariance_stays_symmetric_and_positive(seed: int, steps: int) -> None:
         assert -math.pi < now.mean[2] <= math.pi
 
 
-def test_major_axis_is_four_sigma_whatever_the_direction() -> None:
+def test_major_axis_is_four_sigma_in_any_direction() -> None:
     c, s = math.cos(0.7), math.sin(0.7)
     turned = np.array([[c, -s], [s, c]])
     cov = np.eye(4)
@@ -258,8 +262,8 @@ def test_major_axis_is_four_sigma_whatever_the_direction() -> None:
     assert not is_lost(at_limit, lost_m=100.1)
 
 
-def test_straight_driving_grows_lateral_variance_as_the_range_law_says() -> None:
-    """A compass of variance r every ds metres: lateral variance r * ds * D."""
+def test_lateral_variance_on_a_straight_drive_follows_the_range_law() -> None:
+    """A compass of variance r, read every ds metres, yields a lateral variance of r * ds * D."""
     r, ds_m, distance_m = math.radians(15.0) ** 2, 1.0, 2_000
     now = PoseBelief(0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros((4, 4)))
     for _ in range(distance_m):
@@ -269,7 +273,7 @@ def test_straight_driving_grows_lateral_variance_as_the_range_law_says() -> None
     assert now.cov[1, 1] == pytest.approx(r * ds_m * distance_m, rel=0.05)
 
 
-def test_same_inputs_same_numbers_as_filterpy() -> None:
+def test_filter_matches_filterpy_on_the_same_inputs() -> None:
     from filterpy.kalman import ExtendedKalmanFilter
 
     def observe(rows: list[int]) -> Callable[[Floats], Floats]:
@@ -315,7 +319,7 @@ def test_same_inputs_same_numbers_as_filterpy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("call", "says"),
+    ("call", "message"),
     [
         (lambda: predict(belief(), math.nan, 0.0, 0.1, NOISE), "accel_mps2: expected a finite"),
         (lambda: predict(belief(), 0.0, math.inf, 0.1, NOISE), "steering_rad: expected a finite"),
@@ -345,8 +349,8 @@ def test_same_inputs_same_numbers_as_filterpy() -> None:
         (lambda: PoseBelief(0, np.zeros(4), -np.eye(4)), "expected variances >= 0"),
     ],
 )
-def test_nonsense_is_refused_by_name(call: Callable[[], object], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_arguments_are_refused(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         call()
 
 
@@ -361,7 +365,7 @@ def test_wrapping_keeps_the_direction(angle: float) -> None:
     assert wrap_all(np.array([angle]))[0] == wrapped
 
 
-def test_wrapping_leaves_half_a_turn_alone() -> None:
+def test_half_a_turn_wraps_to_plus_pi() -> None:
     assert wrap(math.pi) == math.pi
     assert wrap(-math.pi) == pytest.approx(math.pi)
     assert wrap(0.3) == 0.3

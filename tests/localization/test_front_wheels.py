@@ -1,4 +1,4 @@
-"""Each front wheel's scale is found from how the rear axle moves."""
+"""Tests of the fit of each front wheel's scale to the motion of the rear axle."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ FOUR_SCALES = replace(
 
 
 def four_wheels(truth: Truth, rng: np.random.Generator) -> WheelSpeeds:
-    """Speeds that wheels of these four scales report."""
+    """Simulate the speeds reported by wheels with the scales of ``FOUR_SCALES``."""
     rear = wheels(truth, CAR, rng).wheels_mps
     across = BASE_M * truth.yaw_radps[:, None]
     front = np.sign(rear) * np.hypot(rear, across)
@@ -45,11 +45,11 @@ def test_distinct_scales_of_four_wheels_are_recovered() -> None:
         assert one.sd < 0.5 * abs(FRONT[one.setting] - 1.0)
 
 
-def test_four_scaled_wheels_agree_on_the_way() -> None:
+def test_scaled_front_and_rear_wheels_measure_the_same_distance() -> None:
     truth = drive(np.random.default_rng(seed=5))
     exact = replace(FOUR_SCALES, slip_per_sqrt_m=0.0)
     car = four_wheels(truth, np.random.default_rng(seed=6))
-    ways = [
+    distances_m = [
         float(
             np.abs(
                 integrate(car, replace(exact, use_front_wheels=front)).increments.distance_m
@@ -58,10 +58,10 @@ def test_four_scaled_wheels_agree_on_the_way() -> None:
         for front in (False, True)
     ]
 
-    assert ways[1] == pytest.approx(ways[0], rel=2e-3)
+    assert distances_m[1] == pytest.approx(distances_m[0], rel=2e-3)
 
 
-def test_wheels_that_share_one_speed_have_no_scale_of_their_own() -> None:
+def test_equal_front_and_rear_speeds_yield_no_front_scales() -> None:
     truth = drive(np.random.default_rng(seed=7))
     rear = wheels(truth, CAR).wheels_mps
     car = WheelSpeeds(truth.t_ns, np.hstack([rear, rear]))

@@ -1,4 +1,4 @@
-"""Tests of eq. 4 and its memory: invariances of angles, and the cost of repeated decisions."""
+"""Tests of eq. 4 and its memory: invariance to rotation, and the cost of repeated decisions."""
 
 import math
 
@@ -28,7 +28,7 @@ _PENALTY = st.floats(0.0, 3.0)
 EACH_RAD, SAME_RAD, RADIUS_M = 0.5, 0.5, 30.0
 
 
-def test_the_car_of_fig_13_goes_straight() -> None:
+def test_car_of_fig_13_goes_straight() -> None:
     headings = np.array([0.0, -math.pi / 2])
     bearings = np.array([bearing_after(0.0, 0.0, h, 80.0, 10.0, 10.0) for h in headings])
 
@@ -36,7 +36,7 @@ def test_the_car_of_fig_13_goes_straight() -> None:
 
 
 @given(heading=_ANGLE, bearing=_ANGLE, added=_PENALTY, turn=_ANGLE)
-def test_turning_or_mirroring_the_map_changes_no_cost(
+def test_option_cost_is_invariant_to_rotation_and_mirroring(
     heading: float, bearing: float, added: float, turn: float
 ) -> None:
     cost = option_cost(heading, bearing, added)
@@ -46,7 +46,7 @@ def test_turning_or_mirroring_the_map_changes_no_cost(
 
 
 @given(st.lists(st.tuples(_ANGLE, _ANGLE, _PENALTY), min_size=1, max_size=6))
-def test_the_choice_costs_least_and_of_equal_ones_is_the_first(
+def test_choice_is_the_first_option_of_lowest_cost(
     options: list[tuple[float, float, float]],
 ) -> None:
     costs = [option_cost(*option) for option in options]
@@ -54,7 +54,7 @@ def test_the_choice_costs_least_and_of_equal_ones_is_the_first(
     assert choose(*np.array(options).T) == costs.index(min(costs))
 
 
-def test_without_options_there_is_no_choice() -> None:
+def test_choice_without_options_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one option"):
         choose(np.empty(0), np.empty(0), np.empty(0))
 
@@ -63,7 +63,7 @@ def _decided(memory: Memory, x: float, y: float, heading: float) -> Memory:
     return remember(memory, recognise(memory, x, y, RADIUS_M), x, y, heading, SAME_RAD)
 
 
-def test_a_repeated_decision_costs_more_each_time_until_another_wins() -> None:
+def test_penalty_grows_until_a_repeated_decision_changes() -> None:
     memory, headings, bearings = empty_memory(), np.array([0.0, math.pi / 2]), np.array([0.1, 0.1])
     taken = []
     for visit in range(6):
@@ -79,14 +79,14 @@ def test_a_repeated_decision_costs_more_each_time_until_another_wins() -> None:
     assert memory.sizes[PLACES] == 1
 
 
-def test_another_intersection_remembers_nothing() -> None:
+def test_distant_intersection_has_no_penalty() -> None:
     memory = _decided(empty_memory(), 0.0, 0.0, 0.0)
 
     assert recognise(memory, 100.0, 0.0, RADIUS_M) == NONE
     assert penalty(memory, NONE, 0.0, SAME_RAD, EACH_RAD) == 0.0
 
 
-def test_the_memory_holds_more_than_it_has_room_for_at_first() -> None:
+def test_memory_grows_beyond_its_initial_capacity() -> None:
     memory = empty_memory()
     for i in range(200):
         memory = _decided(memory, 100.0 * i, 0.0, 0.0)
@@ -97,7 +97,7 @@ def test_the_memory_holds_more_than_it_has_room_for_at_first() -> None:
     assert {penalty(memory, one, math.pi / 2, SAME_RAD, EACH_RAD) for one in places} == {EACH_RAD}
 
 
-def test_a_landmark_must_be_on_the_way() -> None:
+def test_landmark_ahead_skips_landmarks_off_the_route_or_visited() -> None:
     behind, beside, further = (-5.0, 0.0), (30.0, 5.0), (130.0, 0.0)
     landmarks = np.array([behind, beside, further])
 
@@ -109,7 +109,7 @@ def test_a_landmark_must_be_on_the_way() -> None:
     assert ahead(np.empty((0, 2))) == NONE
 
 
-def test_the_hybrid_seeks_landmarks_only_when_unsure() -> None:
+def test_hybrid_strategy_seeks_landmarks_only_when_uncertain() -> None:
     assert [seeks_landmarks(Strategy.HYBRID, m, 50.0) for m in (49.0, 51.0)] == [False, True]
     assert not seeks_landmarks(Strategy.STRAIGHT, 99.0, 50.0)
     assert seeks_landmarks(Strategy.LANDMARKS, 0.0, 50.0)

@@ -1,4 +1,4 @@
-"""Properties of dead reckoning from wheel speeds."""
+"""Tests of dead reckoning from wheel speeds."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_straight_distance_is_speed_times_time_times_scale(speed: float, scale: 
 
 
 @pytest.mark.parametrize("use_front_wheels", [False, True])
-def test_a_left_circle_turns_left_by_its_own_angle(use_front_wheels: bool) -> None:
+def test_left_circle_yields_its_arc_length_and_angle(use_front_wheels: bool) -> None:
     car = replace(CAR, use_front_wheels=use_front_wheels)
     made = integrate(on_circle(8.0, 4.0), car).increments
 
@@ -85,7 +85,7 @@ def test_wheels_steering_and_gyro_agree_on_a_circle() -> None:
     assert set(by_gyro.turn_source) == {BY_YAW_RATE}
 
 
-def test_backing_with_wheels_to_the_left_turns_the_car_right() -> None:
+def test_reversing_with_left_steering_turns_the_car_right() -> None:
     backwards = WheelSpeeds(times(51), -on_circle(10.0, 2.0, 51).wheels_mps)
     steering = TurnSignal(times(51), np.full(51, 0.2), "steering")
 
@@ -95,7 +95,7 @@ def test_backing_with_wheels_to_the_left_turns_the_car_right() -> None:
     assert (integrate(backwards, CAR).increments.turn_rad < 0).all()
 
 
-def test_a_reverse_flag_is_a_minus_sign() -> None:
+def test_reverse_flag_negates_wheel_speeds() -> None:
     forward = on_circle(10.0, 2.0, 51)
     flagged = WheelSpeeds(forward.t_ns, forward.wheels_mps, np.ones(51, np.bool_))
     signed = WheelSpeeds(forward.t_ns, -forward.wheels_mps)
@@ -105,7 +105,7 @@ def test_a_reverse_flag_is_a_minus_sign() -> None:
     np.testing.assert_array_equal(ours.turn_rad, theirs.turn_rad)
 
 
-def test_mirrored_wheels_mirror_the_turn() -> None:
+def test_swapped_left_and_right_wheels_negate_the_turn() -> None:
     speeds = on_circle(9.0, 3.0)
     mirrored = WheelSpeeds(speeds.t_ns, speeds.wheels_mps[:, [1, 0, 3, 2]])
     car = replace(CAR, use_front_wheels=True)
@@ -115,24 +115,24 @@ def test_mirrored_wheels_mirror_the_turn() -> None:
     np.testing.assert_allclose(ours.distance_m, theirs.distance_m)
 
 
-def test_a_larger_right_tyre_is_corrected() -> None:
+def test_right_wheel_scale_corrects_a_larger_tyre() -> None:
     turning = np.tile([10.0, 10.0 / 1.001], (101, 1))
     made = integrate(WheelSpeeds(times(101), turning), replace(CAR, right_wheel_scale=1.001))
 
     np.testing.assert_allclose(made.increments.turn_rad, 0.0, atol=1e-15)
 
 
-def test_a_gyro_faster_than_the_wheels_is_integrated_not_sampled() -> None:
-    """A bump between two wheel rows that only the gyro measures is not lost."""
-    bump = np.zeros(11)
-    bump[5] = 1.0
-    rate = TurnSignal(times(11, 10_000_000), bump, "yaw rate")
+def test_gyro_is_integrated_between_wheel_rows() -> None:
+    """A pulse of the yaw rate between two wheel rows counts towards the turn."""
+    pulse = np.zeros(11)
+    pulse[5] = 1.0
+    rate = TurnSignal(times(11, 10_000_000), pulse, "yaw rate")
     slow = WheelSpeeds(times(2, 100_000_000), np.zeros((2, 2)))
 
     assert integrate(slow, CAR, rate).increments.turn_rad[0] == pytest.approx(0.01)
 
 
-def test_a_hole_in_the_gyro_is_bridged_by_the_wheels_and_counted() -> None:
+def test_gyro_gap_is_bridged_by_the_wheels_and_counted() -> None:
     speeds = on_circle(20.0, 5.0)
     has = np.abs(times(101) - 1_000_000_000) >= 300_000_000
     rate = TurnSignal(times(101)[has], np.full(int(has.sum()), 0.25), "yaw rate")
@@ -144,7 +144,7 @@ def test_a_hole_in_the_gyro_is_bridged_by_the_wheels_and_counted() -> None:
     assert (made.increments.turn_var_rad2[by_wheels] > made.increments.turn_var_rad2[0]).all()
 
 
-def test_bad_rows_are_dropped_and_counted() -> None:
+def test_invalid_wheel_rows_are_dropped_and_counted() -> None:
     t_ns = np.array([0, 10, 10, 5, 20, 30, 40], np.int64) * 1_000_000
     speeds = np.full((7, 2), 3.0)
     speeds[4, 1] = np.nan
@@ -158,7 +158,7 @@ def test_bad_rows_are_dropped_and_counted() -> None:
     assert made.increments.stop_ns.tolist() == [10_000_000, 40_000_000]
 
 
-def test_bad_turn_rows_are_dropped_and_counted() -> None:
+def test_invalid_turn_rows_are_dropped_and_counted() -> None:
     t_ns = np.array([0, 50, 50, 40, 60, 100], np.int64) * 1_000_000
     values = np.array([0.1, 0.1, 9.0, 9.0, np.nan, 0.1])
     speeds = WheelSpeeds(times(6, 20_000_000), np.zeros((6, 2)))
@@ -168,7 +168,7 @@ def test_bad_turn_rows_are_dropped_and_counted() -> None:
     assert made.increments.turn_rad.sum() == pytest.approx(0.01)
 
 
-def test_a_gap_is_reported_and_makes_unsure() -> None:
+def test_gap_is_counted_and_raises_the_distance_variance() -> None:
     t_ns = np.array([0, 100, 200, 3_200, 3_300], np.int64) * 1_000_000
     made = integrate(WheelSpeeds(t_ns, np.full((5, 2), 10.0)), CAR)
 
@@ -178,8 +178,8 @@ def test_a_gap_is_reported_and_makes_unsure() -> None:
     assert made.increments.distance_var_m2[3] < 0.1**2
 
 
-def test_a_gap_contains_what_a_car_may_do_meanwhile() -> None:
-    """Brake at the limit and accelerate again: the error is within three stated s.d."""
+def test_gap_variance_covers_hard_braking_and_acceleration() -> None:
+    """After maximum braking and acceleration, the error is within three claimed s.d."""
     t_ns = np.array([0, 4_000], np.int64) * 1_000_000
     made = integrate(WheelSpeeds(t_ns, np.full((2, 2), 15.0)), CAR).increments
     true_m = 15.0 * 4.0 - 3.0 * 2.0**2
@@ -203,8 +203,8 @@ def test_variances_do_not_depend_on_the_sampling_rate(kind: str) -> None:
     np.testing.assert_allclose(sums(100.0), sums(25.0), rtol=0.01)
 
 
-def test_rounding_of_the_wheel_speed_is_in_the_variance() -> None:
-    """Simulated: random true speeds, rounded; the distance's error matches its variance."""
+def test_distance_variance_includes_rounding_of_wheel_speeds() -> None:
+    """For simulated random speeds, rounded, the distance's error matches its variance."""
     rng = np.random.default_rng(8)
     car = replace(CAR, wheel_step_mps=0.5, slip_per_sqrt_m=0.0)
     misses, claims = [], []
@@ -219,8 +219,8 @@ def test_rounding_of_the_wheel_speed_is_in_the_variance() -> None:
     assert np.mean(np.square(misses)) == pytest.approx(np.mean(claims), rel=0.25)
 
 
-def test_speed_readings_alone_lead_to_the_distances_variance() -> None:
-    """White speed errors of the stated variance yield the stated variance of the distance."""
+def test_speed_variance_implies_the_distance_variance() -> None:
+    """White speed errors of the reported variance yield the reported distance variance."""
     for rate_hz in (10.0, 100.0):
         dt_s = 1.0 / rate_hz
         t_ns = times(round(rate_hz) + 1, round(dt_s * 1e9))
@@ -228,7 +228,7 @@ def test_speed_readings_alone_lead_to_the_distances_variance() -> None:
         assert (made.speed_var_m2ps2 * dt_s**2).sum() == pytest.approx(made.distance_var_m2.sum())
 
 
-def test_a_share_of_every_turn_may_be_wrong() -> None:
+def test_turn_per_turn_adds_an_sd_proportional_to_the_turn() -> None:
     rate = TurnSignal(times(101), np.full(101, 0.5), "yaw rate")
     exact = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0)
     made = integrate(both_wheels(5.0), replace(exact, turn_per_turn=0.02), rate).increments
@@ -238,7 +238,7 @@ def test_a_share_of_every_turn_may_be_wrong() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10, 100])
-def test_noise_per_radian_does_not_depend_on_the_rate(rate_hz: int) -> None:
+def test_noise_per_radian_does_not_depend_on_the_sampling_rate(rate_hz: int) -> None:
     t_ns = times(2 * rate_hz + 1, 1_000_000_000 // rate_hz)
     turn = TurnSignal(t_ns, np.full(len(t_ns), -0.5), "yaw rate")
     car = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0, turn_rad_per_sqrt_rad=0.02)
@@ -247,7 +247,7 @@ def test_noise_per_radian_does_not_depend_on_the_rate(rate_hz: int) -> None:
     assert integrate(speeds, car, turn).increments.turn_var_rad2.sum() == pytest.approx(0.02**2)
 
 
-def test_a_delayed_turn_signal_is_taken_back_by_its_delay() -> None:
+def test_turn_delay_shifts_the_turn_signal_back() -> None:
     at_s = times(101) * 1e-9
     late = TurnSignal(times(101) + 130_000_000, np.sin(at_s), "yaw rate")
     on_time = TurnSignal(times(101), np.sin(at_s), "yaw rate")
@@ -260,7 +260,7 @@ def test_a_delayed_turn_signal_is_taken_back_by_its_delay() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.5])
-def test_steering_noise_is_the_slope_of_the_turn(angle: float) -> None:
+def test_steering_noise_scales_with_the_derivative_of_the_turn(angle: float) -> None:
     def turned(by: float) -> float:
         steering = TurnSignal(times(2), np.full(2, by), "steering")
         speeds = WheelSpeeds(times(2), np.full((2, 2), 10.0))
@@ -275,7 +275,7 @@ def test_steering_noise_is_the_slope_of_the_turn(angle: float) -> None:
     assert math.sqrt(made.turn_var_rad2[0]) == pytest.approx(abs(slope) * density)
 
 
-def test_a_gap_in_the_wheels_makes_their_heading_unsure_but_not_the_gyros() -> None:
+def test_wheel_gap_raises_the_turn_variance_only_without_gyro() -> None:
     t_ns = np.array([0, 4_000], np.int64) * 1_000_000
     speeds = WheelSpeeds(t_ns, np.full((2, 2), 10.0))
     rate = TurnSignal(times(41, 100_000_000), np.zeros(41), "yaw rate")
@@ -284,7 +284,7 @@ def test_a_gap_in_the_wheels_makes_their_heading_unsure_but_not_the_gyros() -> N
     assert integrate(speeds, CAR, rate).increments.turn_var_rad2[0] < 0.01**2
 
 
-def test_nothing_in_nothing_out() -> None:
+def test_empty_inputs_yield_no_increments() -> None:
     empty = WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
     one = WheelSpeeds(times(1), np.ones((1, 2)))
     no_turn = TurnSignal(np.empty(0, np.int64), np.empty(0), "yaw rate")
@@ -302,7 +302,7 @@ def test_nothing_in_nothing_out() -> None:
     delay=st.integers(-60, 60),
 )
 @settings(max_examples=60, deadline=None)
-def test_windows_give_the_same_increments_bit_for_bit(
+def test_windowed_increments_are_bit_identical(
     cuts: list[int], turn_period: int, lag: int, delay: int
 ) -> None:
     rng = np.random.default_rng(0)
@@ -333,7 +333,7 @@ def test_windows_give_the_same_increments_bit_for_bit(
     assert counts == whole.counts
 
 
-def test_waiting_rows_stay_few() -> None:
+def test_pending_rows_do_not_accumulate() -> None:
     """The pending rows of a window do not grow with the length of the drive."""
     pending = Pending()
     for k in range(50):
@@ -344,7 +344,7 @@ def test_waiting_rows_stay_few() -> None:
         assert len(pending.t_ns) + len(pending.turn_t_ns) <= 2
 
 
-def test_nonsense_is_refused_by_name() -> None:
+def test_invalid_settings_and_shapes_are_refused() -> None:
     with pytest.raises(
         ValueError, match=r"wheels_mps: expected \(3, 2\) or \(3, 4\), got \(3, 3\)"
     ):

@@ -1,4 +1,4 @@
-"""Properties of the fit of odometry to known positions, on simulated drives."""
+"""Tests of the fit of odometry to known positions, on simulated drives."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def wrong_gyro(truth: Truth, rng: np.random.Generator) -> TurnSignal:
     return TurnSignal(right.t_ns, values, "yaw rate")
 
 
-def known(truth: Truth, rng: np.random.Generator, sd_m: float = 0.5) -> KnownDrive:
-    """Drive of a car whose wheels report too low speeds and whose gyro is biased."""
+def simulated_drive(truth: Truth, rng: np.random.Generator, sd_m: float = 0.5) -> KnownDrive:
+    """Simulate a drive with wheels that report too low speeds and a biased gyro."""
     car = wheels(truth, CAR, rng)
     car = replace(car, wheels_mps=car.wheels_mps / TRUE["wheel_scale"])
     return KnownDrive(car, wrong_gyro(truth, rng), positions(truth, sd_m, rng), LEVER)
@@ -59,12 +59,12 @@ def rms_m(found: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> fl
 @pytest.fixture(scope="module")
 def turning() -> tuple[KnownDrive, OdometryFit]:
     rng = np.random.default_rng(seed=4)
-    found = known(drive(rng, seconds=120.0), rng)
+    found = simulated_drive(drive(rng, seconds=120.0), rng)
     half = found.until(int(found.fixes.t_ns[60]))
     return found, fit_odometry(half, CAR, 120.0)
 
 
-def test_a_drive_with_turns_shows_scales_and_bias_within_their_deviations(
+def test_turning_drive_recovers_scales_and_bias_within_four_sd(
     turning: tuple[KnownDrive, OdometryFit],
 ) -> None:
     _, fit = turning
@@ -77,7 +77,7 @@ def test_a_drive_with_turns_shows_scales_and_bias_within_their_deviations(
     assert fit.fix_sd_m == pytest.approx(0.5, rel=0.5)
 
 
-def test_the_half_that_was_not_fitted_is_nearer_to_its_positions(
+def test_fit_to_half_of_a_drive_reduces_the_position_error(
     turning: tuple[KnownDrive, OdometryFit],
 ) -> None:
     found, fit = turning
@@ -85,7 +85,7 @@ def test_the_half_that_was_not_fitted_is_nearer_to_its_positions(
     assert rms_m(found, fit.settings, fit) < 0.2 * rms_m(found, CAR, fit)
 
 
-def test_errors_of_what_was_not_fitted_are_as_large_as_claimed(
+def test_nees_of_the_fitted_path_is_in_its_band(
     turning: tuple[KnownDrive, OdometryFit],
 ) -> None:
     found, fit = turning
@@ -97,7 +97,7 @@ def test_errors_of_what_was_not_fitted_are_as_large_as_claimed(
     assert 0.05 < nees.mean() < 7.4  # 95 % of a chi-square with two degrees of freedom
 
 
-def test_the_claimed_error_is_about_what_the_uncertain_parameters_would_cause(
+def test_claimed_error_matches_the_effect_of_uncertain_parameters(
     turning: tuple[KnownDrive, OdometryFit],
 ) -> None:
     found, fit = turning
@@ -123,9 +123,9 @@ def straight(seconds: float = 60.0) -> Truth:
     return Truth(there.t_ns, np.column_stack([x, zero, zero]), speed, zero)
 
 
-def test_a_straight_drive_does_not_show_what_only_turns_show() -> None:
+def test_straight_drive_leaves_turn_parameters_unobservable() -> None:
     rng = np.random.default_rng(seed=2)
-    fit = fit_odometry(known(straight(), rng), CAR)
+    fit = fit_odometry(simulated_drive(straight(), rng), CAR)
     missing = {one.parameter for one in fit.not_observable}
 
     assert {"yaw_rate_scale", "turn_delay_s"} <= missing
@@ -141,7 +141,7 @@ def steered(truth: Truth) -> TurnSignal:
     return TurnSignal(truth.t_ns, values, "steering")
 
 
-def test_wide_turns_show_the_steering_ratio_only_together_with_the_wheelbase() -> None:
+def test_wide_turns_fit_the_steering_ratio_but_keep_the_wheelbase() -> None:
     rng = np.random.default_rng(seed=6)
     there = drive(rng, seconds=60.0)
     speed = np.full(len(there.t_ns), 12.0)
@@ -162,21 +162,21 @@ def test_wide_turns_show_the_steering_ratio_only_together_with_the_wheelbase() -
     assert fit.value("steering_offset_rad") == pytest.approx(0.05, abs=0.01)
 
 
-def test_too_short_a_drive_is_refused() -> None:
+def test_drive_with_too_few_positions_is_refused() -> None:
     rng = np.random.default_rng(seed=3)
     there = straight()
 
     with pytest.raises(VehicleError, match="5 positions are within the wheel speeds; expected 15"):
-        fit_odometry(known(there, rng).until(int(there.t_ns[81])), CAR)
+        fit_odometry(simulated_drive(there, rng).until(int(there.t_ns[81])), CAR)
 
 
-def test_a_car_that_stands_is_refused() -> None:
+def test_drive_of_a_stationary_car_is_refused() -> None:
     still = straight()
     zero = np.zeros_like(still.xyh)
     still = Truth(still.t_ns, zero, zero[:, 0], zero[:, 0])
 
     with pytest.raises(VehicleError, match="the car went 0 m while its position is known"):
-        fit_odometry(known(still, np.random.default_rng(0)), CAR)
+        fit_odometry(simulated_drive(still, np.random.default_rng(0)), CAR)
 
 
 def shifted(fixes: Fixes, turn_rad: float, by_m: Floats) -> Fixes:
@@ -184,7 +184,7 @@ def shifted(fixes: Fixes, turn_rad: float, by_m: Floats) -> Fixes:
     return replace(fixes, xy_m=fixes.xy_m @ np.array([[cos, sin], [-sin, cos]]) + by_m)
 
 
-def test_the_start_is_laid_onto_the_first_positions_and_moves_with_them() -> None:
+def test_start_pose_matches_and_rotates_with_the_first_positions() -> None:
     truth = drive(np.random.default_rng(seed=8), seconds=30.0)
     odometry = integrate(wheels(truth, CAR), CAR, gyro(truth, CAR)).increments
     exact = positions(truth, 1e-6, np.random.default_rng(0))
@@ -199,7 +199,7 @@ def test_the_start_is_laid_onto_the_first_positions_and_moves_with_them() -> Non
     )
 
 
-def test_a_car_that_has_not_moved_does_not_know_its_heading() -> None:
+def test_start_heading_of_a_stationary_car_is_unknown() -> None:
     still = straight()
     zero = np.zeros_like(still.xyh)
     still = Truth(still.t_ns, zero, zero[:, 0], zero[:, 0])

@@ -1,4 +1,4 @@
-"""Tests of pose tracks: equal to the filter's functions, independent of windows, and consistent.
+"""Tests of pose tracks: agreement with the filter, independence of windows, and consistency.
 
 All drives are simulated, with exactly the noise that the filter assumes.
 """
@@ -52,8 +52,8 @@ ODOMETRY = OdometrySettings(
 EVERY_READING = TrackSettings(heading_interval_m=0.0, heading_gate_nis=None)
 
 
-def begin(truth: Truth, rng: np.random.Generator, heading_sd: float = 0.05) -> PoseBelief:
-    """A start whose errors match its covariance."""
+def draw_start(truth: Truth, rng: np.random.Generator, heading_sd: float = 0.05) -> PoseBelief:
+    """Draw a start pose with errors that match its covariance."""
     x, y, heading = truth.xyh[0] + rng.normal(0.0, [1.0, 1.0, heading_sd])
     speed = truth.speed_mps[0] + rng.normal(0.0, 1.0)
     return start_belief(int(truth.t_ns[0]), x, y, heading, speed, 1.0, heading_sd, 1.0)
@@ -73,11 +73,11 @@ def run(seed: int, settings: TrackSettings, persists_s: float = 0.0) -> tuple[Ad
     truth = drive(rng)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng))
     headings = compass(truth, 0.1, rng, persists_s=persists_s)
-    first = TrackState(begin(truth, rng))
+    first = TrackState(draw_start(truth, rng))
     return advance(first, made.increments, settings, headings, truth.t_ns[::200]), truth
 
 
-def test_simulated_errors_are_as_large_as_claimed() -> None:
+def test_simulated_nees_and_nis_are_in_their_bands() -> None:
     runs = [run(seed, EVERY_READING) for seed in range(100)]
 
     for row in (2, -1):
@@ -89,8 +89,8 @@ def test_simulated_errors_are_as_large_as_claimed() -> None:
     assert low < nis.mean() < high
 
 
-def test_simulated_compass_errors_that_last_need_an_interval() -> None:
-    """An error that decays over 2 s, read at 10 Hz: overconfident unless readings are thinned."""
+def test_correlated_compass_errors_require_thinned_readings() -> None:
+    """With an error that decays over 2 s, the filter is overconfident at 10 Hz unless thinned."""
     thinned = TrackSettings(heading_interval_m=0.0, heading_interval_s=4.0, heading_gate_nis=None)
 
     def mean_nees(settings: TrackSettings) -> float:
@@ -131,13 +131,13 @@ def reference(
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_plain_floats_give_the_filters_own_numbers(seed: int) -> None:
+def test_advance_matches_the_filter_functions_step_by_step(seed: int) -> None:
     rng = np.random.default_rng(seed)
     truth = drive(rng, seconds=20.0)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
     on_time = compass(truth, 0.1, rng, every=7)
     headings = Headings(on_time.t_ns - 7_654_321, on_time.heading_rad, on_time.var_rad2)
-    belief = begin(truth, rng)
+    belief = draw_start(truth, rng)
     mixed = belief.cov + 0.01 * np.outer([1.0, 2.0, 0.1, 0.5], [1.0, 2.0, 0.1, 0.5])
     belief = PoseBelief(belief.t_ns, belief.mean, mixed)
 
@@ -161,10 +161,10 @@ def cut(t_ns: Int64s, low: int, high: int) -> slice:
     every_interval=st.booleans(),
 )
 @settings(max_examples=40, deadline=None)
-def test_windows_give_the_same_track_bit_for_bit(
+def test_windowed_track_is_bit_identical(
     cuts: list[int], seed: int, hole: int, every_interval: bool
 ) -> None:
-    """Gyro with a separate clock and a gap, headings between samples, rows at frame times."""
+    """The gyro has a separate clock and a gap; headings and rows are between the samples."""
     rng = np.random.default_rng(seed)
     truth = drive(rng, seconds=12.0)
     zero = int(truth.t_ns[0])
@@ -177,7 +177,7 @@ def test_windows_give_the_same_track_bit_for_bit(
     heading_t = readings.t_ns - 4_321_000
     frames = np.arange(zero + 10_000_000, zero + 12_000_000_000, 51_000_000)
     track = TrackSettings(heading_interval_m=2.0, heading_interval_s=0.3)
-    belief = begin(truth, rng)
+    belief = draw_start(truth, rng)
 
     def windowed(edges: list[int]) -> tuple[list[Floats], TrackState, TrackCounts]:
         pending, state, counts = Pending(), TrackState(belief), TrackCounts()
@@ -215,7 +215,7 @@ def test_windows_give_the_same_track_bit_for_bit(
     assert counts.headings_accepted > 0
 
 
-def test_without_noise_the_track_is_the_truth() -> None:
+def test_noise_free_track_matches_ground_truth() -> None:
     truth = drive(np.random.default_rng(5))
     exact = OdometrySettings(track_width_m=TRACK_M)
     made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
@@ -228,12 +228,12 @@ def test_without_noise_the_track_is_the_truth() -> None:
     assert poses.travelled_m[-1] == pytest.approx(np.abs(made.distance_m).sum())
 
 
-def test_a_missing_compass_only_costs_certainty() -> None:
+def test_missing_compass_raises_the_heading_variance() -> None:
     with_compass, truth = run(3, EVERY_READING)
     rng = np.random.default_rng(3)
     truth = drive(rng)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
-    first = TrackState(begin(truth, np.random.default_rng(3)))
+    first = TrackState(draw_start(truth, np.random.default_rng(3)))
     without = advance(first, made, EVERY_READING, NO_HEADINGS, truth.t_ns[::200])
 
     assert len(without.poses) == len(with_compass.poses)
@@ -281,14 +281,14 @@ def test_every_heading_is_accounted_for() -> None:
 
 
 @pytest.mark.parametrize("var", [np.inf, np.nan, 0.0, -1.0])
-def test_a_heading_without_a_usable_variance_is_bad(var: float) -> None:
+def test_heading_with_invalid_variance_is_counted_as_bad(var: float) -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
     done = advance(TrackState(belief), straight(), TrackSettings(), headings_at(0.5, var=var))
 
     assert (done.counts.headings_bad, done.counts.headings) == (1, 0)
 
 
-def test_a_standing_car_does_not_count_readings_twice() -> None:
+def test_stationary_car_accepts_one_compass_reading() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
     many = headings_at(*np.arange(0.0, 1.0, 0.05))
     done = advance(TrackState(belief), straight(speed=0.0), TrackSettings(), many)
@@ -296,7 +296,7 @@ def test_a_standing_car_does_not_count_readings_twice() -> None:
     assert done.counts.headings_accepted == 1
 
 
-def test_time_without_odometry_is_driven_blind_and_reported() -> None:
+def test_time_without_odometry_is_coasted_and_counted() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0, speed_sd_mps=0.5)
     done = advance(TrackState(belief), straight(first_ns=2_000_000_000), TrackSettings())
 
@@ -307,7 +307,7 @@ def test_time_without_odometry_is_driven_blind_and_reported() -> None:
     assert done.poses.cov_xyh[0, 0] > (0.5 * 2.0) ** 2
 
 
-def test_rows_come_at_the_times_asked_for() -> None:
+def test_poses_are_reported_at_the_requested_times() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0)
     wanted = np.array([-5, 50_000_000, 333_000_000, 333_000_000, 9_000_000_000], np.int64)
     done = advance(TrackState(belief), straight(), TrackSettings(), rows_ns=wanted)

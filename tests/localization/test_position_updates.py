@@ -1,4 +1,4 @@
-"""Updates of the pose with GNSS positions: equal to those with landmarks. Simulated."""
+"""Tests of pose updates with GNSS positions. The positions are simulated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def fixes(*rows: tuple[int, float, float]) -> Fixes:
     )
 
 
-def test_a_position_is_weighed_in_as_the_antennas() -> None:
+def test_position_update_applies_the_antenna_lever() -> None:
     belief = start_belief(SECOND, 4.0, 5.0, 0.7, 8.0, 1.5, 0.02, 0.5)
     measurements = PositionUpdates(LEVER_M)
     measurements.add(fixes((SECOND, 5.5, 5.2)))
@@ -38,7 +38,7 @@ def test_a_position_is_weighed_in_as_the_antennas() -> None:
     np.testing.assert_allclose(found.cov, wanted.cov, atol=2e-3)
 
 
-def test_a_position_stamped_late_is_carried_ahead() -> None:
+def test_delayed_position_is_moved_ahead_by_the_delay() -> None:
     belief = start_belief(SECOND, 0.0, 0.0, math.pi / 2, 10.0, 1.0, 1e-6, 1e-6)
     measurements = PositionUpdates(delay_s=0.2)
     measurements.add(fixes((SECOND, 0.0, -2.0)))
@@ -48,7 +48,7 @@ def test_a_position_stamped_late_is_carried_ahead() -> None:
     np.testing.assert_allclose(found.mean[:2], 0.0, atol=1e-9)
 
 
-def test_positions_too_soon_or_too_far_off_do_not_count() -> None:
+def test_late_rejected_and_thinned_positions_are_counted() -> None:
     belief = start_belief(SECOND, 0.0, 0.0, 0.0, 0.0, 1.0)
     measurements = PositionUpdates(interval_s=1.0)
     measurements.add(
@@ -68,7 +68,7 @@ def test_positions_too_soon_or_too_far_off_do_not_count() -> None:
 
 
 @pytest.mark.parametrize("is_second", [False, True])
-def test_each_is_asked_at_its_own_times(is_second: bool) -> None:
+def test_both_sources_update_at_their_own_times(is_second: bool) -> None:
     belief = start_belief(2 * SECOND, 0.0, 0.0, 0.0, 0.0, 1.0)
     early, due = PositionUpdates(), PositionUpdates()
     early.add(fixes((SECOND, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""Batch smoother: exact in the linear case, never worse than the filter, consistent. Simulated."""
+"""Tests of the batch smoother: exactness in the linear case, and consistency in simulation."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def straight(n: int, slip: float) -> Increments:
     return integrate(WheelSpeeds(t_ns, np.full((n + 1, 2), 10.0)), settings).increments
 
 
-def test_along_a_straight_line_it_is_the_least_squares_solution() -> None:
-    """With known heading and slip only, positions are a chain of Gaussians, solved by hand."""
+def test_straight_drive_matches_the_least_squares_solution() -> None:
+    """With known heading and slip only, positions are a chain of Gaussians with a closed form."""
     slip, fix_var, start_var = 0.5, 4.0, 9.0
     made = straight(10, slip)
     start = start_belief(0, 3.0, 0.0, 0.0, 10.0, math.sqrt(start_var), 1e-4, 1.0)
@@ -73,7 +73,7 @@ def test_along_a_straight_line_it_is_the_least_squares_solution() -> None:
     np.testing.assert_allclose(found.xyh[:, 1], 0.0, atol=1e-6)
 
 
-def test_without_measurements_it_is_dead_reckoning_with_the_filters_covariance() -> None:
+def test_smoother_without_measurements_matches_dead_reckoning() -> None:
     rng = np.random.default_rng(2)
     truth = drive(rng, seconds=20.0)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
@@ -89,7 +89,7 @@ def test_without_measurements_it_is_dead_reckoning_with_the_filters_covariance()
     np.testing.assert_allclose(upper, track.cov_xyh[rows], rtol=0.02, atol=2e-3)
 
 
-def one(seed: int) -> tuple[Truth, PoseBelief, Increments, Headings, Fixes]:
+def simulate(seed: int) -> tuple[Truth, PoseBelief, Increments, Headings, Fixes]:
     rng = np.random.default_rng(seed)
     truth = drive(rng, seconds=30.0)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
@@ -104,7 +104,7 @@ def one(seed: int) -> tuple[Truth, PoseBelief, Increments, Headings, Fixes]:
 
 
 class FixMeasurements:
-    """Provides the fixes as measurements of the filter."""
+    """Fixes as measurements of the filter."""
 
     def __init__(self, fixes: Fixes) -> None:
         self.fixes = fixes
@@ -126,11 +126,11 @@ def errors(truth: Truth, t_ns: Int64s, xyh: Floats) -> Floats:
 
 
 @pytest.mark.slow
-def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> None:
-    """Seeds 0 to 29: at the end both are equal; in the middle the smoother is better."""
+def test_smoother_is_consistent_and_more_accurate_than_the_filter() -> None:
+    """Seeds 0 to 29: both agree at the end of a drive, and the smoother is better before it."""
     nees, filter_m2, smoother_m2, ends = [], [], [], []
     for seed in range(30):
-        truth, first, made, headings, fixes = one(seed)
+        truth, first, made, headings, fixes = simulate(seed)
         at = truth.t_ns[20::20]
         measurements = FixMeasurements(fixes)
         track = advance(TrackState(first), made, EVERY_READING, headings, at, measurements).poses
@@ -150,8 +150,8 @@ def test_simulated_errors_are_as_claimed_and_no_larger_than_the_filters() -> Non
 
 
 @pytest.mark.slow
-def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() -> None:
-    """The position's information is 1e-8 of each step's: seed 5, 24 km."""
+def test_smoother_matches_the_filter_at_the_end_of_a_long_drive() -> None:
+    """Seed 5, 24 km: the position's information is 1e-8 of that of each step."""
     rng, n = np.random.default_rng(5), 12_000
     settings = OdometrySettings(
         track_width_m=TRACK_M, slip_per_sqrt_m=2e-3, wheel_turn_rad_per_sqrt_m=3e-3, max_gap_s=2.0
@@ -172,7 +172,7 @@ def test_at_the_end_of_hours_without_landmarks_it_knows_what_the_filter_knows() 
     assert sd_m == pytest.approx(math.sqrt(end.cov_xyh[-1, 3]), rel=0.1)
 
 
-def test_the_camera_ahead_of_the_axle_is_where_the_fix_is() -> None:
+def test_fix_is_applied_at_the_camera_position() -> None:
     made = straight(4, 0.5)
     start = start_belief(0, 0.0, 0.0, 0.0, 10.0, 10.0, 1e-4, 1.0)
     fix = Fixes(np.array([2_000_000_000]), np.array([[25.0, 1.0]]), 1e-4 * np.eye(2)[None])
@@ -181,7 +181,7 @@ def test_the_camera_ahead_of_the_axle_is_where_the_fix_is() -> None:
     np.testing.assert_allclose(found.xyh[0, :2], [23.0, 0.5], atol=0.01)
 
 
-def test_holes_and_odd_columns_are_refused() -> None:
+def test_gaps_and_inconsistent_shapes_are_refused() -> None:
     made = straight(4, 0.5)
     late = start_belief(9_000_000_000, 0.0, 0.0, 0.0)
     early = start_belief(-1, 0.0, 0.0, 0.0)
@@ -193,7 +193,9 @@ def test_holes_and_odd_columns_are_refused() -> None:
         Fixes(np.zeros(1, np.int64), np.zeros((2, 2)), np.zeros((1, 2, 2)))
 
 
-def test_without_the_package_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_gtsam_is_reported_with_its_install_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(UsageError, match=r"pip install 'crosscue\[gtsam\]'"):
         smooth(start_belief(0, 0.0, 0.0, 0.0), straight(2, 0.1), NO_HEADINGS)

@@ -1,4 +1,4 @@
-"""Landmark database: round trip, queries by ellipse, and rejection of damaged files."""
+"""Tests of the landmark database: round trip, queries by ellipse, and damaged files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from support.landmark_files import database_of, place_at, some_features
 GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2) * 50.0
 
 
-def test_what_goes_in_comes_out(tmp_path: Path) -> None:
+def test_places_and_features_survive_a_round_trip(tmp_path: Path) -> None:
     cov = np.array([[4.0, 1.0], [1.0, 9.0]])
     place = Place("north\nwest ☃", np.array([4.1e5, 5.3e6]), cov, -1.25, "survey")
     given_features = some_features(3)
@@ -65,7 +65,7 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sigmas=st.floats(0.1, 4.0),
 )
 @settings(max_examples=60, deadline=None)
-def test_the_ellipse_holds_just_the_landmarks_that_a_full_look_finds(
+def test_ellipse_query_matches_an_exhaustive_search(
     grid: Path, x: float, y: float, sd: tuple[float, float], correlation: float, sigmas: float
 ) -> None:
     off = correlation * sd[0] * sd[1]
@@ -84,7 +84,7 @@ def test_the_ellipse_holds_just_the_landmarks_that_a_full_look_finds(
     assert [one.sigmas for one in found] == sorted(one.sigmas for one in found)
 
 
-def test_no_more_candidates_than_asked_for_and_the_nearest_of_them(grid: Path) -> None:
+def test_query_returns_the_nearest_candidates_up_to_max_count(grid: Path) -> None:
     with LandmarkDatabase(grid) as database:
         centre = np.array([110.0, 60.0]) + 5e6
         nearest = database.near(centre, 1e4 * np.eye(2), max_count=3)
@@ -94,7 +94,7 @@ def test_no_more_candidates_than_asked_for_and_the_nearest_of_them(grid: Path) -
     assert names == ["0", "1", "10"]
 
 
-def test_an_empty_database_has_no_candidates(tmp_path: Path) -> None:
+def test_empty_database_has_no_candidates(tmp_path: Path) -> None:
     path = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
 
     with LandmarkDatabase(path) as database:
@@ -103,7 +103,7 @@ def test_an_empty_database_has_no_candidates(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cov", "why"),
+    ("cov", "message"),
     [
         ([[1.0, 2.0], [2.0, 1.0]], "positive definite"),
         ([[0.0, 0.0], [0.0, 1.0]], "positive definite"),
@@ -113,26 +113,26 @@ def test_an_empty_database_has_no_candidates(tmp_path: Path) -> None:
         ([[np.nan, 0.0], [0.0, 1.0]], "finite"),
     ],
 )
-def test_a_covariance_that_is_none_is_refused(cov: list[list[float]], why: str) -> None:
-    with pytest.raises(ValueError, match=why):
+def test_invalid_covariance_is_refused(cov: list[list[float]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Place("bad", np.zeros(2), np.array(cov))
 
 
 @given(st.floats(0.01, 1e3), st.floats(0.01, 1e3), st.floats(-0.99, 0.99))
 @settings(max_examples=50, deadline=None)
-def test_every_real_covariance_is_taken(sd_x: float, sd_y: float, correlation: float) -> None:
+def test_valid_covariance_is_positive(sd_x: float, sd_y: float, correlation: float) -> None:
     off = correlation * sd_x * sd_y
     assert is_positive(np.array([[sd_x**2, off], [off, sd_y**2]]))
 
 
-def test_coordinates_that_are_no_numbers_are_refused() -> None:
+def test_coordinates_that_are_not_finite_are_refused() -> None:
     with pytest.raises(ValueError, match="landmark x: expected finite numbers"):
         Place("x", np.array([np.nan, 0.0]), np.eye(2))
     with pytest.raises(ValueError, match="heading inf"):
         Place("x", np.zeros(2), np.eye(2), np.inf)
 
 
-def test_a_nameless_landmark_and_odd_features_are_refused() -> None:
+def test_invalid_names_and_feature_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="name"):
         Place("", np.zeros(2), np.eye(2))
     with pytest.raises(ValueError, match="expected Unicode"):
@@ -141,7 +141,7 @@ def test_a_nameless_landmark_and_odd_features_are_refused() -> None:
         Features(1, 1, np.zeros((2, 2), np.float32), np.zeros((3, 32), np.uint8))
 
 
-def test_a_search_wider_than_the_boxes_is_refused(grid: Path) -> None:
+def test_query_wider_than_the_index_boxes_is_refused(grid: Path) -> None:
     with LandmarkDatabase(grid) as database:
         with pytest.raises(ValueError, match=r"sigmas: expected 0 to 4\.0, got 5"):
             database.near(np.zeros(2), np.eye(2), sigmas=5.0)
@@ -150,7 +150,9 @@ def test_a_search_wider_than_the_boxes_is_refused(grid: Path) -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.5, 0.02, 0.99])
-def test_a_file_cut_short_is_refused(grid: Path, tmp_path: Path, fraction: float) -> None:
+def test_truncated_file_is_refused_and_unchanged(
+    grid: Path, tmp_path: Path, fraction: float
+) -> None:
     whole = grid.read_bytes()
     cut = tmp_path / "cut.sqlite"
     cut.write_bytes(whole[: int(fraction * len(whole))])
@@ -162,7 +164,7 @@ def test_a_file_cut_short_is_refused(grid: Path, tmp_path: Path, fraction: float
     assert cut.read_bytes() == whole[: int(fraction * len(whole))]
 
 
-def test_another_version_is_refused_and_left_alone(grid: Path, tmp_path: Path) -> None:
+def test_newer_file_version_is_refused(grid: Path, tmp_path: Path) -> None:
     path = tmp_path / "new.sqlite"
     path.write_bytes(grid.read_bytes())
     later = sqlite3.connect(path)
@@ -175,7 +177,7 @@ def test_another_version_is_refused_and_left_alone(grid: Path, tmp_path: Path) -
         LandmarkWriter(path, "orb")
 
 
-def test_foreign_files_are_refused(tmp_path: Path) -> None:
+def test_other_missing_and_non_sqlite_files_are_refused(tmp_path: Path) -> None:
     other = sqlite3.connect(tmp_path / "other.sqlite")
     other.execute("CREATE TABLE landmark (x)")
     other.close()
@@ -191,18 +193,18 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
         LandmarkDatabase(tmp_path)
 
 
-def test_foreign_tables_under_our_mark_are_refused(grid: Path, tmp_path: Path) -> None:
+def test_unexpected_tables_are_refused(grid: Path, tmp_path: Path) -> None:
     path = tmp_path / "strange.sqlite"
     path.write_bytes(grid.read_bytes())
-    strange = sqlite3.connect(path)
-    strange.execute("CREATE TABLE extra (x)")
-    strange.close()
+    changed = sqlite3.connect(path)
+    changed.execute("CREATE TABLE extra (x)")
+    changed.close()
 
     with pytest.raises(LogFormatError, match="damaged: its tables"):
         LandmarkDatabase(path)
 
 
-def test_a_changed_byte_is_found_before_the_features_are_used(tmp_path: Path) -> None:
+def test_changed_feature_byte_is_found_by_checksum(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     whole = bytearray(path.read_bytes())
     where = whole.index(some_features(1).descriptors.tobytes())
@@ -216,7 +218,7 @@ def test_a_changed_byte_is_found_before_the_features_are_used(tmp_path: Path) ->
             database.features(keys[1])
 
 
-def test_a_moved_landmark_is_found(tmp_path: Path) -> None:
+def test_changed_coordinates_and_covariance_are_found(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     hand = sqlite3.connect(path)
     hand.execute("UPDATE landmark SET x_m = x_m + 1 WHERE id = 2")
@@ -234,7 +236,7 @@ def test_a_moved_landmark_is_found(tmp_path: Path) -> None:
 @given(st.integers(0, 10_000), st.integers(1, 255))
 @example(where=3379, flip=128)
 @settings(max_examples=60, deadline=None)
-def test_damage_is_refused_or_harmless_never_a_crash(
+def test_damaged_byte_is_refused_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, where: int, flip: int
 ) -> None:
     path = tmp_path_factory.mktemp("hurt") / "lm.sqlite"
@@ -254,7 +256,7 @@ def test_damage_is_refused_or_harmless_never_a_crash(
         assert message.startswith(str(path))
 
 
-def test_adding_goes_on_where_it_ended(tmp_path: Path) -> None:
+def test_landmarks_are_appended_to_an_existing_file(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     with LandmarkWriter(path, "orb") as writer:
         writer.add(place_at(1.0, 1.0, "more"), some_features(9))
@@ -270,7 +272,7 @@ def _add(path: Path, names: list[str], max_pages: int = 1_000_000) -> None:
             writer.add(place_at(1.0, 1.0, name), some_features(9, 200))
 
 
-def test_a_failure_leaves_all_as_it_was(tmp_path: Path) -> None:
+def test_failed_write_leaves_files_unchanged(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     before = path.read_bytes()
 
@@ -283,14 +285,14 @@ def test_a_failure_leaves_all_as_it_was(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
-def test_features_of_another_matcher_are_refused(tmp_path: Path) -> None:
+def test_features_of_another_matcher_kind_are_refused(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:1], kind="learned")
 
     with pytest.raises(UsageError, match="matcher 'learned', not 'orb'"):
         LandmarkWriter(path, "orb")
 
 
-def test_a_second_writer_is_reported_of_the_first(
+def test_second_concurrent_writer_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("crosscue.localization.landmarks.file._BUSY_S", 0.05)
@@ -305,7 +307,7 @@ def test_a_second_writer_is_reported_of_the_first(
 
 
 @pytest.mark.parametrize("name", ["a%41.sqlite", "q?mode=x.sqlite", "h#sh.sqlite", "ü b.sqlite"])
-def test_a_file_is_opened_by_just_its_name(tmp_path: Path, name: str) -> None:
+def test_special_characters_in_file_names_are_literal(tmp_path: Path, name: str) -> None:
     database_of(tmp_path / name, GRID[:2])
 
     assert [p.name for p in tmp_path.iterdir()] == [name]
@@ -313,7 +315,7 @@ def test_a_file_is_opened_by_just_its_name(tmp_path: Path, name: str) -> None:
         assert len(database) == 2
 
 
-def test_a_name_that_is_not_utf8_works(tmp_path: Path) -> None:
+def test_file_name_that_is_not_utf8_is_accepted(tmp_path: Path) -> None:
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xfe.sqlite"))
     database_of(path, GRID[:2])
 
@@ -354,8 +356,8 @@ def _in_child(
     )
 
 
-def test_a_writer_killed_half_way_leaves_what_was_there(tmp_path: Path) -> None:
-    """Its pages are already on disk, because of a tiny cache; reading rolls them back."""
+def test_killed_writer_leaves_previous_landmarks(tmp_path: Path) -> None:
+    """A tiny cache writes pages to disk before the kill; the next read rolls them back."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     before = path.stat().st_size
 
@@ -369,8 +371,8 @@ def test_a_writer_killed_half_way_leaves_what_was_there(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
-def test_a_disk_that_fills_up_is_reported_and_leaves_what_was_there(tmp_path: Path) -> None:
-    """The kernel limits the file's size, with the effect of a full disk."""
+def test_full_disk_is_reported_and_leaves_previous_landmarks(tmp_path: Path) -> None:
+    """A size limit of the kernel has the effect of a full disk."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
 
     done = _in_child(path, 200, max_bytes=200_000)
@@ -384,7 +386,7 @@ def test_a_disk_that_fills_up_is_reported_and_leaves_what_was_there(tmp_path: Pa
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
-def test_a_database_that_may_not_grow_says_the_disk_is_full(tmp_path: Path) -> None:
+def test_page_limit_is_reported_as_a_full_disk(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
 
     with pytest.raises(OutputError, match=r"lm\.sqlite: the disk is full"):
@@ -393,12 +395,12 @@ def test_a_database_that_may_not_grow_says_the_disk_is_full(tmp_path: Path) -> N
         assert len(database) == 3
 
 
-def test_a_folder_that_may_not_be_written_is_reported(tmp_path: Path) -> None:
+def test_missing_output_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"lm\.sqlite: .*check the path and its mode"):
         LandmarkWriter(tmp_path / "missing" / "lm.sqlite", "orb")
 
 
-def test_distance_counts_the_landmarks_own_covariance(tmp_path: Path) -> None:
+def test_query_distance_includes_the_landmark_covariance(tmp_path: Path) -> None:
     positions: Floats = np.array([[30.0, 0.0]])
     sharp = database_of(tmp_path / "sharp.sqlite", positions, sd_m=1.0)
     vague = database_of(tmp_path / "vague.sqlite", positions, sd_m=20.0)

@@ -1,4 +1,4 @@
-"""Matcher: it distinguishes the same place from others; some pictures are real."""
+"""Tests of landmark matchers on simulated walls and on some real pictures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAMES = ("orb", "orb-essential")
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_wall_is_known_again_and_another_is_not(name: str) -> None:
+def test_wall_matches_itself_and_no_other_wall(name: str) -> None:
     matcher = make_matcher(name, CAMERA)
     here = matcher.describe(wall(1))
     again = matcher.describe(seen_from(wall(1), turn_deg=8.0, scale=1.15, noise=4.0, seed=3))
@@ -44,7 +44,7 @@ def test_a_wall_is_known_again_and_another_is_not(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_answer_is_the_same_every_time(name: str) -> None:
+def test_matching_is_deterministic(name: str) -> None:
     first, second = make_matcher(name, CAMERA), make_matcher(name, CAMERA)
     near, far = seen_from(wall(1), 20.0, 0.7, 8.0, 3), wall(1)
 
@@ -54,7 +54,7 @@ def test_the_answer_is_the_same_every_time(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("shade", [0, 128, 255])
-def test_a_picture_without_texture_matches_nothing(name: str, shade: int) -> None:
+def test_picture_without_texture_matches_nothing(name: str, shade: int) -> None:
     matcher = make_matcher(name, CAMERA)
     blank = matcher.describe(np.full((120, 160), shade, np.uint8))
 
@@ -65,7 +65,7 @@ def test_a_picture_without_texture_matches_nothing(name: str, shade: int) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_points_on_one_spot_are_no_place(name: str) -> None:
+def test_coincident_points_have_score_zero(name: str) -> None:
     matcher = make_matcher(name, CAMERA)
     made = some_features(1, 40)
     spot = Features(640, 480, np.full((40, 2), 5.0, np.float32), made.descriptors)
@@ -75,14 +75,14 @@ def test_points_on_one_spot_are_no_place(name: str) -> None:
 
 @given(st.integers(0, 1000), st.integers(0, 60), st.integers(0, 60))
 @settings(max_examples=30, deadline=None)
-def test_any_features_can_be_compared(seed: int, one: int, other: int) -> None:
+def test_random_features_of_any_count_can_be_matched(seed: int, one: int, other: int) -> None:
     match = ORB.match(some_features(seed, one), some_features(seed + 1, other))
 
     assert 0 <= match.agreeing <= match.pairs <= min(one, other)
 
 
 @pytest.mark.parametrize("size", [(31, 31), (1, 1), (3000, 40), (40, 3000)])
-def test_pictures_of_any_size_are_described_in_their_own_pixels(size: tuple[int, int]) -> None:
+def test_features_of_any_picture_size_are_in_its_pixels(size: tuple[int, int]) -> None:
     width, height = size
     features = ORB.describe(wall(5, width, height))
 
@@ -92,13 +92,13 @@ def test_pictures_of_any_size_are_described_in_their_own_pixels(size: tuple[int,
         assert features.points_px.max() > 0.5 * max(size)
 
 
-def test_descriptors_of_other_lengths_do_not_match() -> None:
+def test_descriptors_of_different_lengths_do_not_match() -> None:
     other = Features(9, 9, np.zeros((5, 2), np.float32), np.zeros((5, 16), np.uint8))
 
     assert ORB.match(some_features(1), other).score == 0.0
 
 
-def test_a_matcher_of_ones_own_is_named_by_module_and_factory() -> None:
+def test_custom_matcher_is_named_by_module_and_factory() -> None:
     made = make_matcher("crosscue.localization.landmarks.matcher:orb_essential", CAMERA)
 
     assert made.kind == "orb"
@@ -116,7 +116,7 @@ def test_a_matcher_of_ones_own_is_named_by_module_and_factory() -> None:
         make_matcher("builtins:repr")
 
 
-def test_settings_that_mean_nothing_are_refused() -> None:
+def test_invalid_orb_settings_are_refused() -> None:
     with pytest.raises(ValueError, match=r"ratio: expected 0 to 1, got 1\.5"):
         OrbSettings(ratio=1.5)
     with pytest.raises(ValueError, match="features: expected > 0, got 0"):
@@ -124,7 +124,7 @@ def test_settings_that_mean_nothing_are_refused() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
-def test_a_picture_file_gives_its_pixels(tmp_path: Path, suffix: str) -> None:
+def test_picture_file_is_decoded_and_truncated_one_refused(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"wall{suffix}"
     content = encoded(wall(1, 120, 90), suffix)
     path.write_bytes(content)
@@ -137,7 +137,7 @@ def test_a_picture_file_gives_its_pixels(tmp_path: Path, suffix: str) -> None:
         grey_of(read_picture(path))
 
 
-def test_files_that_are_no_pictures_are_reported(tmp_path: Path) -> None:
+def test_files_that_are_not_pictures_are_reported(tmp_path: Path) -> None:
     (tmp_path / "text.png").write_text("hello")
     with pytest.raises(LogFormatError, match=r"text\.png: not a JPEG, PNG or WebP picture"):
         read_picture(tmp_path / "text.png")
@@ -162,7 +162,7 @@ def _raw(picture: Bytes, pixel_format: str, step: int | None = None) -> Images:
     )
 
 
-def test_raw_pictures_are_grey_whatever_their_colours() -> None:
+def test_raw_pictures_of_each_format_convert_to_grey() -> None:
     grey = wall(3, 40, 30)
     colour = np.repeat(grey[:, :, None], 3, axis=2)
 
@@ -185,7 +185,7 @@ def test_raw_pictures_are_grey_whatever_their_colours() -> None:
     np.testing.assert_array_equal(grey_of(picture_of(narrow, 0)), grey)
 
 
-def test_real_street_pictures_match_their_neighbours_and_no_other_street() -> None:
+def test_real_street_pictures_match_only_their_neighbours() -> None:
     """KITTI, frames at intervals of about 1 m, in a turn of 98 degrees."""
     folder = shared("sequences", "kitti_seq2_right_turn_98deg", "image_l")
     seen = [ORB.describe(grey_of(read_picture(folder / f"{i:06d}.png"))) for i in (0, 3, 47, 50)]
@@ -195,8 +195,8 @@ def test_real_street_pictures_match_their_neighbours_and_no_other_street() -> No
     assert max(ORB.match(seen[i], seen[j]).score for i in (0, 1) for j in (2, 3)) < 12
 
 
-def test_real_pictures_of_other_days_mostly_do_not_match() -> None:
-    """Two of eight known pairs are distinct: ORB is not robust to seasons and restyling."""
+def test_real_pictures_of_other_days_rarely_match() -> None:
+    """Few of eight known pairs match: ORB is not robust to seasons and changed facades."""
     folder = shared("place_recognition")
     orb = OrbMatcher(OrbSettings(features=1000))
     seen = {p.stem: orb.describe(grey_of(read_picture(p))) for p in folder.rglob("*.jpg")}

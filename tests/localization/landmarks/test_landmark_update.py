@@ -1,4 +1,4 @@
-"""Updates with landmarks: consistent, symmetric, once per visit. All drives are simulated."""
+"""Tests of updates with landmarks: consistency, and one update per visit. Drives are simulated."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def some_belief(seed: int, heading: float = 0.3) -> PoseBelief:
 
 @given(st.integers(0, 1000), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
 @settings(max_examples=40, deadline=None)
-def test_without_a_lever_it_is_the_filters_own_update(seed: int, x: float, y: float) -> None:
+def test_update_without_lever_equals_position_update(seed: int, x: float, y: float) -> None:
     belief, measured = some_belief(seed), np.array([x, y])
 
     ours = update_camera_position(belief, measured, COV)
@@ -64,7 +64,7 @@ def test_without_a_lever_it_is_the_filters_own_update(seed: int, x: float, y: fl
     heading=st.floats(-3.14, 3.14),
 )
 @settings(max_examples=40, deadline=None)
-def test_an_update_keeps_the_covariance_symmetric_positive_and_smaller(
+def test_update_keeps_covariance_symmetric_positive_and_smaller(
     seed: int, ahead: float, left: float, heading: float
 ) -> None:
     belief = some_belief(seed, heading)
@@ -76,7 +76,7 @@ def test_an_update_keeps_the_covariance_symmetric_positive_and_smaller(
     assert -math.pi < done.belief.mean[2] <= math.pi
 
 
-def test_the_levers_jacobian_is_that_of_the_cameras_place() -> None:
+def test_lever_jacobian_matches_the_camera_position() -> None:
     belief, lever = some_belief(1), (1.7, -0.4)
     step = 1e-6
     turned = PoseBelief(0, belief.mean + np.array([0.0, 0.0, step, 0.0]), belief.cov)
@@ -88,7 +88,7 @@ def test_the_levers_jacobian_is_that_of_the_cameras_place() -> None:
     )
 
 
-def test_a_heading_across_the_seam_is_turned_the_shorter_way() -> None:
+def test_update_wraps_the_heading_across_half_a_turn() -> None:
     cov = np.diag([1.0, 1.0, 0.04, 0.0])
     cov[1, 2] = cov[2, 1] = 0.15
     belief = PoseBelief(0, np.array([0.0, 0.0, math.pi - 0.01, 5.0]), cov)
@@ -97,7 +97,7 @@ def test_a_heading_across_the_seam_is_turned_the_shorter_way() -> None:
     assert done.belief.mean[2] == pytest.approx(math.pi - 0.01 + 0.3 / 1.1 - 2 * math.pi)
 
 
-def test_the_gate_refuses_what_is_far_off_and_changes_nothing() -> None:
+def test_gate_rejects_outlier_and_keeps_the_belief() -> None:
     belief = some_belief(2)
     far = update_camera_position(belief, np.array([500.0, 0.0]), COV, gate_nis=13.8)
 
@@ -116,12 +116,14 @@ def test_the_gate_refuses_what_is_far_off_and_changes_nothing() -> None:
         ([0.0, 0.0], [[1.0, 0.5], [0.0, 1.0]]),
     ],
 )
-def test_no_number_and_no_covariance_is_let_in(xy: list[float], cov: list[list[float]]) -> None:
+def test_nan_position_and_invalid_covariance_are_refused(
+    xy: list[float], cov: list[list[float]]
+) -> None:
     with pytest.raises(ValueError, match=r"xy_m|cov_m2"):
         update_camera_position(some_belief(1), np.array(xy), np.array(cov))
 
 
-def test_settings_that_mean_nothing_are_refused() -> None:
+def test_invalid_landmark_settings_are_refused() -> None:
     with pytest.raises(ValueError, match=r"sigmas: expected 0 to 4\.0, got 9"):
         LandmarkSettings(sigmas=9.0)
     with pytest.raises(ValueError, match="revisit_m: expected >= 0, got nan"):
@@ -171,7 +173,7 @@ SEEDS = 24
 
 
 @pytest.mark.slow
-def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
+def test_simulated_nees_and_nis_are_in_their_bands(tmp_path: Path) -> None:
     """NEES of the last pose and NIS of all landmarks, seeds 0 to 23."""
     runs = [run(tmp_path, seed) for seed in range(SEEDS)]
 
@@ -184,7 +186,7 @@ def test_simulated_errors_are_as_large_as_claimed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_camera_ahead_of_the_axle_is_no_bias(tmp_path: Path) -> None:
+def test_nis_with_a_camera_lever_is_in_its_band(tmp_path: Path) -> None:
     """Heading errors rotate the camera's position, and its covariance includes this."""
     runs = [run(tmp_path, seed, (5.0, 1.0)) for seed in range(SEEDS)]
 
@@ -192,7 +194,7 @@ def test_a_camera_ahead_of_the_axle_is_no_bias(tmp_path: Path) -> None:
     assert mean_band(2, len(nis))[0] < nis.mean() < mean_band(2, len(nis))[1]
 
 
-def test_every_frame_is_accounted_for_and_every_row_named(tmp_path: Path) -> None:
+def test_every_frame_is_accounted_for(tmp_path: Path) -> None:
     done, _, measurements = run(tmp_path, 3)
     counts = measurements.search.counts
 
@@ -238,8 +240,8 @@ def follow(
         ), measurements
 
 
-def test_a_landmark_counts_once_at_its_best(tmp_path: Path) -> None:
-    """Odometry starts 8 m off; the measurement is the position at the peak, moved ahead."""
+def test_landmark_is_applied_once_at_its_peak_score(tmp_path: Path) -> None:
+    """Odometry starts with an error of 8 m; the measurement is the peak position, moved ahead."""
     done, measurements = follow(
         tmp_path / "lm.sqlite", straight(), {"gate": np.array([100.0, 0.0])}, SETTINGS, x_m=8.0
     )
@@ -254,7 +256,7 @@ def test_a_landmark_counts_once_at_its_best(tmp_path: Path) -> None:
     assert measurements.search.counts.matched > 10
 
 
-def test_backing_past_a_landmark_carries_its_place_backwards(tmp_path: Path) -> None:
+def test_landmark_passed_in_reverse_is_moved_backwards(tmp_path: Path) -> None:
     ahead = straight()
     truth = Truth(ahead.t_ns, ahead.xyh * [-1.0, 1.0, 1.0], -ahead.speed_mps, ahead.yaw_radps)
     _, measurements = follow(
@@ -265,7 +267,7 @@ def test_backing_past_a_landmark_carries_its_place_backwards(tmp_path: Path) -> 
     assert sighting.xy_m[0] == pytest.approx(-10.0 * sighting.t_ns * 1e-9, abs=0.3)
 
 
-def test_a_standing_car_does_not_count_a_landmark_again_and_again(tmp_path: Path) -> None:
+def test_stationary_car_applies_no_landmark(tmp_path: Path) -> None:
     moving = straight()
     still = np.tile(moving.xyh[200], (len(moving.xyh), 1))
     truth = Truth(moving.t_ns, still, np.zeros(len(still)), moving.yaw_radps)
@@ -277,7 +279,7 @@ def test_a_standing_car_does_not_count_a_landmark_again_and_again(tmp_path: Path
     assert measurements.search.counts.thinned == len(truth.t_ns) - 1
 
 
-def test_a_second_visit_counts_only_after_a_while(tmp_path: Path) -> None:
+def test_second_visit_counts_only_beyond_the_revisit_distance(tmp_path: Path) -> None:
     there_and_back = straight(300.0)
     n = len(there_and_back.t_ns)
     xyh = there_and_back.xyh.copy()
@@ -291,8 +293,8 @@ def test_a_second_visit_counts_only_after_a_while(tmp_path: Path) -> None:
     assert measurements.search.counts.repeated == 1
 
 
-def test_only_landmarks_inside_the_ellipse_are_compared(tmp_path: Path) -> None:
-    """An identical landmark at a distance of 100 m is not compared."""
+def test_only_landmarks_inside_the_ellipse_are_matched(tmp_path: Path) -> None:
+    """An identical landmark at a distance of 100 m is not matched."""
     place = np.array([100.0, 0.0])
     path = tmp_path / "twins.sqlite"
     with LandmarkWriter(path, "nearness") as writer:
@@ -310,7 +312,7 @@ def test_only_landmarks_inside_the_ellipse_are_compared(tmp_path: Path) -> None:
     assert wide.search.counts.candidates > 4 * measurements.search.counts.candidates
 
 
-def test_no_landmarks_at_all_leave_the_track_as_it_was(tmp_path: Path) -> None:
+def test_empty_database_leaves_the_track_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "none.sqlite"
     with LandmarkWriter(path, "nearness"):
         pass
@@ -321,8 +323,8 @@ def test_no_landmarks_at_all_leave_the_track_as_it_was(tmp_path: Path) -> None:
     assert done.poses.x_m[-1] == pytest.approx(400.0)
 
 
-def test_a_lost_car_is_found_again_by_a_landmark(tmp_path: Path) -> None:
-    """A start with an error of tens of metres, lost above 100 m of major axis, and one landmark."""
+def test_landmark_relocates_a_lost_car(tmp_path: Path) -> None:
+    """The start is wrong by 30 m and its major axis is above 100 m, the limit of a lost car."""
     done, measurements = follow(
         tmp_path / "lm.sqlite",
         straight(),

@@ -1,4 +1,4 @@
-"""Random cities are connected: every goal can be reached from every reachable place."""
+"""Tests of random cities: every goal can be reached from every reachable place."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def stream(seed: int, purpose: int = 7) -> Stream:
 
 
 def reachable(streets: Streets, start: int, *, backward: bool = False) -> set[int]:
-    """Intersections that can be reached from ``start``, or from which it can be reached."""
+    """Intersections reachable from ``start``, or with ``backward`` those that lead to it."""
     seen, queue = {start}, deque([start])
     while queue:
         node = queue.popleft()
@@ -54,7 +54,7 @@ def reachable(streets: Streets, start: int, *, backward: bool = False) -> set[in
 @pytest.mark.slow
 @given(seed=st.integers(0, 2**63))
 @checked(deadline=None, max_examples=25)
-def test_every_goal_can_be_reached_from_wherever_the_car_may_go(seed: int) -> None:
+def test_goal_is_reachable_from_every_reachable_intersection(seed: int) -> None:
     streets = streets_of(SMALL, seed)
     with np.errstate(over="ignore"):
         start, after = draw_place(stream(seed), streets.inside)
@@ -66,7 +66,7 @@ def test_every_goal_can_be_reached_from_wherever_the_car_may_go(seed: int) -> No
 
 @given(seed=st.integers(0, 2**63))
 @checked(deadline=None, max_examples=25)
-def test_every_street_leads_to_an_intersection_that_can_be_left(seed: int) -> None:
+def test_every_street_leads_to_an_intersection_with_an_exit(seed: int) -> None:
     streets = streets_of(SMALL, seed)
     for node in range(len(streets.ways)):
         x, y = place_of(streets, node)
@@ -78,7 +78,7 @@ def test_every_street_leads_to_an_intersection_that_can_be_left(seed: int) -> No
                 assert streets.ways[there] != 0
 
 
-def test_the_compiled_city_is_the_plain_one_and_the_same_seed_makes_the_same() -> None:
+def test_compiled_city_matches_python_and_is_reproducible() -> None:
     with np.errstate(over="ignore"):
         plain = make_streets(stream(5, 1), parameters_of(SMALL))
 
@@ -87,7 +87,7 @@ def test_the_compiled_city_is_the_plain_one_and_the_same_seed_makes_the_same() -
             np.testing.assert_array_equal(mine, other)
 
 
-def test_blocks_and_area_are_as_asked() -> None:
+def test_block_lengths_and_area_are_in_their_ranges() -> None:
     for seed in range(20):
         city = streets_of(Drive(), seed)
         for coordinates in (city.xs_m, city.ys_m):
@@ -97,7 +97,7 @@ def test_blocks_and_area_are_as_asked() -> None:
         assert 1.0 <= city.area_km2 <= 100.0
 
 
-def test_landmarks_are_as_dense_as_asked_and_all_different() -> None:
+def test_landmarks_are_distinct_and_of_the_requested_density() -> None:
     streets = streets_of(Drive(city=drive_settings.City(smallest_km2=50.0)), 2)
     draw = compiled(draw_landmarks)
     drawn = [draw(stream(i), streets, 2.0)[0] for i in range(40)]
@@ -106,14 +106,14 @@ def test_landmarks_are_as_dense_as_asked_and_all_different() -> None:
     assert all(len(set(one.tolist())) == len(one) for one in drawn)
 
 
-def test_a_single_street_is_no_city() -> None:
+def test_single_street_has_no_intersection() -> None:
     ways = np.array([1, 5, 4], np.uint8)
     street = Streets(np.arange(3.0), np.zeros(1), ways, np.ones(3, np.bool_), 1.0)
 
     assert not has_intersection(street)
 
 
-def test_random_numbers_are_uniform_normal_and_independent() -> None:
+def test_random_streams_are_uniform_normal_and_independent() -> None:
     n = 20_000
     uniforms, normals = np.empty(n), np.empty(n)
     one, other = stream(1, 2), stream(1, 3)

@@ -1,4 +1,4 @@
-"""Simulated drives: equal with and without compilation, consistent, and lost as predicted."""
+"""Tests of simulated drives: compilation, consistency, and the distance until the car is lost."""
 
 import importlib.util
 import math
@@ -81,13 +81,13 @@ def many(settings: Drive, count: int, first: int = 0) -> Floats:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_the_compiled_drive_is_the_plain_one(kind: str) -> None:
+def test_compiled_drive_matches_python(kind: str) -> None:
     plain = np.array([drive(KINDS[kind], seed) for seed in range(3)], np.float64)
 
     np.testing.assert_allclose(drive_many(KINDS[kind], seeds(3)), plain, rtol=1e-9, atol=1e-9)
 
 
-def test_a_traced_drive_is_the_plain_one_step_by_step() -> None:
+def test_traced_drive_matches_python_step_by_step() -> None:
     settings = KINDS["landmark to landmark"]
     traced = drive_traced(settings, 3)
     n_steps, n_events = len(traced.steps), len(traced.events)
@@ -101,7 +101,7 @@ def test_a_traced_drive_is_the_plain_one_step_by_step() -> None:
     np.testing.assert_allclose(traced.events, log.events, rtol=1e-9, atol=1e-9)
 
 
-def test_code_kept_by_the_compiler_is_named_after_every_file_that_it_was_made_of(
+def test_compiled_code_fingerprint_changes_with_a_called_module(
     tmp_path: Path,
 ) -> None:
     def named() -> str:
@@ -124,7 +124,7 @@ def test_code_kept_by_the_compiler_is_named_after_every_file_that_it_was_made_of
     assert before == again != named()
 
 
-def test_events_report_all_goals_and_landmarks() -> None:
+def test_event_counts_match_the_result() -> None:
     traced = drive_traced(KINDS["field"], 2)
     result = traced.result
 
@@ -136,7 +136,7 @@ def test_events_report_all_goals_and_landmarks() -> None:
     assert len(passed) == result.passed
 
 
-def test_rows_and_records_are_the_same() -> None:
+def test_result_record_equals_its_row() -> None:
     row = drive_many(KINDS["town"], seeds(1))[0]
     result = as_result(row)
 
@@ -144,7 +144,7 @@ def test_rows_and_records_are_the_same() -> None:
     np.testing.assert_array_equal(np.array(result, float), row)
 
 
-def test_parts_of_the_seeds_give_the_same_bytes_as_all_at_once() -> None:
+def test_drives_in_parts_are_bit_identical_to_all_at_once() -> None:
     whole = drive_many(KINDS["town"], seeds(9))
     parts = [drive_many(KINDS["town"], seeds(3, first)) for first in (0, 3, 6)]
 
@@ -165,16 +165,16 @@ def test_parts_of_the_seeds_give_the_same_bytes_as_all_at_once() -> None:
     ],
     ids=["30 degrees", "20 degrees", "10 degrees", "landmarks"],
 )
-def test_errors_are_as_large_as_the_filter_says(settings: Drive) -> None:
-    """Within the resolution of 400 drives; 20,000 show 4 % too much at 20 to 30 degrees."""
+def test_nees_of_drives_is_in_its_band(settings: Drive) -> None:
+    """400 drives cannot resolve the 4 % excess that 20,000 drives show at 20 to 30 degrees."""
     rows = many(settings, 400)
     low, high = mean_band(3, 400)
 
     assert low < rows[:, FIELD["nees"]].mean() < high
 
 
-def test_a_heading_off_by_five_degrees_is_more_than_a_linear_filter_admits() -> None:
-    """Without a compass the true errors are on an arc, but the filter's ellipse is straight."""
+def test_nees_without_a_compass_exceeds_its_band() -> None:
+    """Without a compass, true positions spread along an arc, but the filter assumes an ellipse."""
     rows = many(Drive(sensors=Sensors(compass_2sigma_deg=None)), 400)
     _, high = mean_band(3, 400)
 
@@ -182,8 +182,8 @@ def test_a_heading_off_by_five_degrees_is_more_than_a_linear_filter_admits() -> 
 
 
 @pytest.mark.parametrize("compass_deg", [20.0, 30.0])
-def test_straight_driving_spreads_as_r_ds_d(compass_deg: float) -> None:
-    """N readings bound the summed heading, regardless of the heading's noise."""
+def test_lateral_variance_on_a_straight_drive_follows_the_range_law(compass_deg: float) -> None:
+    """The lateral variance is r * ds * D, regardless of the heading's process noise."""
     interval_m, way_m = 2.0, 4000.0
     r = math.radians(compass_deg / 2.0) ** 2
     for slip in (1e-4, 1e-3):
@@ -195,8 +195,8 @@ def test_straight_driving_spreads_as_r_ds_d(compass_deg: float) -> None:
         assert belief.cov[1, 1] == pytest.approx(r * interval_m * way_m, rel=0.15)
 
 
-def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None:
-    """With few turns the mean is near 25^2 / (r ds), apart from turns and the start."""
+def test_cars_on_long_streets_are_lost_at_the_predicted_distance() -> None:
+    """Without turns, the mean distance is near 25^2 / (r ds)."""
     city = City(
         smallest_km2=400.0,
         largest_km2=400.0,
@@ -206,7 +206,7 @@ def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None
         longest_block_m=1000.0,
         goal_at_least_m=250.0,
     )
-    # The slip is large enough for the start's heading to lose its effect soon.
+    # The slip is large enough that the start heading soon loses its effect.
     sensors = Sensors(compass_2sigma_deg=60.0, compass_interval_m=4.0, slip_per_sqrt_m=0.03)
     rows = many(Drive(city=city, sensors=sensors), 200)
     lost = rows[(rows[:, FIELD["outcome"]] == Outcome.LOST) & (rows[:, FIELD["turns"]] == 0)]
@@ -216,7 +216,7 @@ def test_simulated_cars_in_one_long_street_are_lost_where_the_law_says() -> None
     assert lost[:, FIELD["travelled_m"]].mean() == pytest.approx(law_m, rel=0.15)
 
 
-def test_zero_landmarks_and_zero_detections_give_the_same_drive() -> None:
+def test_landmarks_are_passed_but_not_detected_at_zero_rate() -> None:
     none = drive_many(Drive(city=TOWN), seeds(6))
     blind = Drive(city=TOWN, landmarks_per_km2=5.0, sensors=Sensors(detection_rate=0.0))
     unseen = drive_many(blind, seeds(6))
@@ -226,7 +226,7 @@ def test_zero_landmarks_and_zero_detections_give_the_same_drive() -> None:
     assert (unseen[:, FIELD["detected"]] == 0).all()
 
 
-def test_a_city_without_intersections_is_refused() -> None:
+def test_city_without_intersections_is_refused() -> None:
     blocks = City(
         smallest_km2=0.25, largest_km2=0.25, shortest_block_m=900.0, longest_block_m=950.0
     )
@@ -247,7 +247,7 @@ def test_a_city_without_intersections_is_refused() -> None:
         (City, "shortest_block_m", 10.0),
     ],
 )
-def test_values_out_of_range_are_refused(
+def test_settings_out_of_range_are_refused(
     section: type[Drive] | type[Sensors] | type[City], field: str, value: float
 ) -> None:
     with pytest.raises(ValidationError, match=field):

@@ -1,4 +1,4 @@
-"""Consistency of the simulator's filter: NEES and NIS are within their chi-square bands.
+"""Tests of the simulator's filter: NEES and NIS are within their chi-square bands.
 
 The wheel encoders' resolution is too fine to be a source of error here, because the filter ignores
 it. docs/studies.md reports where the filter is overconfident, and by how much.
@@ -28,13 +28,13 @@ FINE_M = 1e-4
 NO_GATE = 1e9
 
 
-def fine(compass_2sigma_deg: float | None, *, goals: int = 1) -> Drive:
+def fine_encoders(compass_2sigma_deg: float | None, *, goals: int = 1) -> Drive:
     sensors = Sensors(compass_2sigma_deg=compass_2sigma_deg, encoder_step_m=FINE_M)
     return Drive(sensors=sensors, goals=goals)
 
 
 def compass_innovations(settings: Drive, traced: Traced) -> tuple[Floats, Floats]:
-    """Innovations of the compass, and the filter's variances of them."""
+    """Innovations of the compass, and their variances according to the filter."""
     sensors, track_m = settings.sensors, settings.car.track_width_m
     assert sensors.compass_2sigma_deg is not None
     left, right, compass = traced.steps[1:, 4:7].T
@@ -58,9 +58,9 @@ def landmark_nis(traced: Traced) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("goals", [1, 1_000_000], ids=["to the goal", "as far as allowed"])
-def test_nees_at_ten_degrees_is_in_its_band(goals: int) -> None:
+def test_nees_with_a_ten_degree_compass_is_in_its_band(goals: int) -> None:
     count = 1000 if goals == 1 else 150
-    settings = fine(10.0, goals=goals).model_copy(update={"longest_m": 20_000.0})
+    settings = fine_encoders(10.0, goals=goals).model_copy(update={"longest_m": 20_000.0})
     rows = drive_many(settings, np.arange(count, dtype=np.uint64))
     low, high = mean_band(3, count)
 
@@ -68,8 +68,8 @@ def test_nees_at_ten_degrees_is_in_its_band(goals: int) -> None:
 
 
 @pytest.mark.parametrize("compass_deg", [10.0, 20.0, 30.0])
-def test_compass_innovations_are_white_and_as_large_as_the_filter_says(compass_deg: float) -> None:
-    settings = fine(compass_deg)
+def test_compass_innovations_are_white_and_consistent(compass_deg: float) -> None:
+    settings = fine_encoders(compass_deg)
     parts = [compass_innovations(settings, drive_traced(settings, seed)) for seed in range(12)]
     nis = np.concatenate([off**2 / spread for off, spread in parts])
     following = np.concatenate(
@@ -82,7 +82,7 @@ def test_compass_innovations_are_white_and_as_large_as_the_filter_says(compass_d
     assert abs(following.mean()) < 2.0 / math.sqrt(len(following))
 
 
-def test_landmark_innovations_are_as_large_as_the_filter_says() -> None:
+def test_landmark_nis_is_in_its_band() -> None:
     settings = Drive(
         city=City(largest_km2=9.0),
         landmarks_per_km2=5.0,
@@ -96,9 +96,9 @@ def test_landmark_innovations_are_as_large_as_the_filter_says() -> None:
     assert low < np.mean(nis) < high
 
 
-def test_without_a_compass_errors_lie_on_an_arc() -> None:
-    """Overconfident as an ellipse in x, y and heading; consistent as a rotation and a shift."""
-    settings = fine(None)
+def test_errors_without_a_compass_are_consistent_along_an_arc() -> None:
+    """NEES is too high in x, y and heading, but consistent in rotation and displacement."""
+    settings = fine_encoders(None)
     ends = [drive_traced(settings, seed).steps[-1] for seed in range(400)]
     rows = drive_many(settings, np.arange(400, dtype=np.uint64))
     low, high = mean_band(3, 400)

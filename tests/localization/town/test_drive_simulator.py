@@ -1,4 +1,4 @@
-"""Simulated drives: reproducible by seed, consistent in their errors, and lost as predicted."""
+"""Tests of single simulated drives: reproducibility, and the effect of the compass."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ from crosscue.localization.town.settings import City, Drive, Sensors
 TOWN = City(largest_km2=2.0)
 
 
-def test_the_same_seed_gives_the_same_drive_and_another_another() -> None:
+def test_drive_depends_only_on_its_seed() -> None:
     settings = Drive(city=TOWN)
 
     assert drive(settings, 4) == drive(settings, 4)
     assert drive(settings, 4) != drive(settings, 5)
 
 
-def test_a_better_compass_keeps_the_ellipse_smaller() -> None:
+def test_better_compass_keeps_the_error_ellipse_smaller() -> None:
     poor, good = (
         drive(Drive(city=TOWN, sensors=Sensors(compass_2sigma_deg=deg)), 6) for deg in (30.0, 10.0)
     )
@@ -24,7 +24,7 @@ def test_a_better_compass_keeps_the_ellipse_smaller() -> None:
     assert per_metre[1] < per_metre[0]
 
 
-def test_without_a_compass_the_car_is_lost_within_a_kilometre() -> None:
+def test_car_without_a_compass_is_lost_within_a_kilometre() -> None:
     settings = Drive(city=City(smallest_km2=20.0), sensors=Sensors(compass_2sigma_deg=None))
     results = [drive(settings, seed) for seed in range(8)]
 
