@@ -65,14 +65,14 @@ ARXML = """<?xml version="1.0" encoding="UTF-8"?>
 """One frame with one signal, in the fewest elements that AUTOSAR allows."""
 
 
-def write(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:
+def write_file(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:
     path = folder / name
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return path
 
 
-def test_a_dbc_file_says_all_there_is_to_a_signal(tmp_path: Path) -> None:
-    database = CanDatabase.load([write(tmp_path, dbc_text([YAW, WHEEL]))])
+def test_dbc_file_defines_all_fields_of_signal(tmp_path: Path) -> None:
+    database = CanDatabase.load([write_file(tmp_path, dbc_text([YAW, WHEEL]))])
 
     yaw = database.named("Yaw")
     assert replace(yaw, source="", topic="") == YAW
@@ -84,8 +84,8 @@ def test_a_dbc_file_says_all_there_is_to_a_signal(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-8-sig", "utf-16"])
-def test_units_are_read_right_in_every_encoding(encoding: str, tmp_path: Path) -> None:
-    path = write(tmp_path, dbc_text([YAW]).encode(encoding))
+def test_units_are_read_in_every_text_encoding(encoding: str, tmp_path: Path) -> None:
+    path = write_file(tmp_path, dbc_text([YAW]).encode(encoding))
 
     assert CanDatabase.load([path]).named("Yaw").signal("rate").unit == "°/s"
 
@@ -103,11 +103,11 @@ def test_units_are_read_right_in_every_encoding(encoding: str, tmp_path: Path) -
         ("BO_ 291", "BO_ 4000", r"bus\.dbc:6: .*more than 11 bits in message Yaw"),
     ],
 )
-def test_a_dbc_file_that_does_not_parse_is_refused_with_its_line(
+def test_invalid_dbc_file_is_refused_with_line_number(
     old: str, new: str, where: str, tmp_path: Path
 ) -> None:
     text = dbc_text([replace(YAW, signals=YAW.signals[:2])])
-    path = write(tmp_path, text.replace(old, new))
+    path = write_file(tmp_path, text.replace(old, new))
 
     with pytest.raises(SchemaError, match=where) as error:
         CanDatabase.load([path])
@@ -127,21 +127,21 @@ def test_a_dbc_file_that_does_not_parse_is_refused_with_its_line(
         ("bus.sym", b"FormatVersion=5.0", r"bus\.sym:1: not a readable SYM file: .*6\.0"),
     ],
 )
-def test_files_that_are_no_database_are_refused(
+def test_file_that_is_not_a_database_is_refused(
     name: str, content: bytes, words: str, tmp_path: Path
 ) -> None:
     with pytest.raises(SchemaError, match=words):
-        CanDatabase.load([write(tmp_path, content, name)])
+        CanDatabase.load([write_file(tmp_path, content, name)])
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "gone.dbc", tmp_path):
         with pytest.raises(SchemaError, match=r"no such file|not a CAN database"):
             CanDatabase.load([path])
 
 
-def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path, dbc_text([YAW]))
+def test_file_over_size_limit_is_refused(tmp_path: Path) -> None:
+    path = write_file(tmp_path, dbc_text([YAW]))
 
     with pytest.raises(LogTooLargeError, match="larger than 100 bytes"):
         CanDatabase.load([path], Limits(message_bytes=100))
@@ -156,23 +156,23 @@ def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
         ("VAL_", "SG_MUL_VAL_ 291 a b 0-4000000000;\nVAL_", r"bus\.dbc:10: multiplexer ranges"),
     ],
 )
-def test_sizes_that_would_eat_the_memory_are_refused(
+def test_excessive_signal_and_message_sizes_are_refused(
     old: str, new: str, words: str, tmp_path: Path
 ) -> None:
     text = dbc_text([replace(YAW, signals=YAW.signals[:2])])
 
     with pytest.raises(LogTooLargeError, match=words):
-        CanDatabase.load([write(tmp_path, text.replace(old, new, 1))])
+        CanDatabase.load([write_file(tmp_path, text.replace(old, new, 1))])
 
 
 @pytest.mark.slow
-def test_a_dbc_file_cut_anywhere_is_refused_or_reported(tmp_path: Path) -> None:
+def test_truncated_dbc_file_is_refused_or_reported(tmp_path: Path) -> None:
     text = dbc_text([YAW, WHEEL]).rstrip()
-    whole = CanDatabase.load([write(tmp_path, text)])
+    whole = CanDatabase.load([write_file(tmp_path, text)])
     reported = 0
     for cut in range(len(text)):
         try:
-            database = CanDatabase.load([write(tmp_path, text[:cut])])
+            database = CanDatabase.load([write_file(tmp_path, text[:cut])])
         except SchemaError:
             continue
         reported += 1
@@ -191,18 +191,18 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
             damaged[drawn.randrange(len(damaged))] = drawn.randrange(256)
         words = ""
         try:
-            CanDatabase.load([write(tmp_path, bytes(damaged))])
+            CanDatabase.load([write_file(tmp_path, bytes(damaged))])
         except CrosscueError as error:
             words = str(error)
         assert "\n" not in words
         assert not words or "bus.dbc" in words
 
 
-def test_two_definitions_of_one_identifier_are_refused_unless_asked(tmp_path: Path) -> None:
+def test_conflicting_definitions_are_refused_without_keep_first(tmp_path: Path) -> None:
     other = replace(YAW, name="Other", signals=(CanSignal("x", 0, 8),))
     paths = [
-        write(tmp_path, dbc_text([YAW, WHEEL]), "a.dbc"),
-        write(tmp_path, dbc_text([other]), "b.dbc"),
+        write_file(tmp_path, dbc_text([YAW, WHEEL]), "a.dbc"),
+        write_file(tmp_path, dbc_text([other]), "b.dbc"),
     ]
 
     with pytest.raises(
@@ -217,15 +217,15 @@ def test_two_definitions_of_one_identifier_are_refused_unless_asked(tmp_path: Pa
     assert any("the first is used" in notice for notice in database.notices)
 
 
-def test_one_identifier_twice_in_one_file_is_found(tmp_path: Path) -> None:
+def test_duplicate_identifier_in_one_file_is_refused(tmp_path: Path) -> None:
     text = dbc_text([replace(WHEEL, name="First"), replace(WHEEL, name="Second")])
 
     with pytest.raises(SchemaError, match=r"0x00000456 \(extended\) is defined as First"):
-        CanDatabase.load([write(tmp_path, text)])
+        CanDatabase.load([write_file(tmp_path, text)])
 
 
-def test_the_same_definition_twice_is_only_noticed(tmp_path: Path) -> None:
-    paths = [write(tmp_path, dbc_text([YAW]), name) for name in ("a.dbc", "b.dbc")]
+def test_identical_duplicate_definition_is_a_notice(tmp_path: Path) -> None:
+    paths = [write_file(tmp_path, dbc_text([YAW]), name) for name in ("a.dbc", "b.dbc")]
 
     database = CanDatabase.load(paths)
 
@@ -237,16 +237,16 @@ def test_the_same_definition_twice_is_only_noticed(tmp_path: Path) -> None:
 def test_11_and_29_bit_identifiers_do_not_conflict(tmp_path: Path) -> None:
     text = dbc_text([YAW, replace(YAW, name="Long", is_extended=True)])
 
-    database = CanDatabase.load([write(tmp_path, text)])
+    database = CanDatabase.load([write_file(tmp_path, text)])
 
     assert database.conflicts == ()
     assert database.find(0x123, True) == database.named("Long")
 
 
-def test_messages_of_one_name_are_told_apart(tmp_path: Path) -> None:
+def test_messages_of_same_name_get_distinct_topic_names(tmp_path: Path) -> None:
     text = dbc_text([YAW, replace(YAW, arbitration_id=0x124)])
 
-    database = CanDatabase.load([write(tmp_path, text)])
+    database = CanDatabase.load([write_file(tmp_path, text)])
 
     assert [m.topic_name for m in database.messages] == ["Yaw_0x123", "Yaw_0x124"]
     assert database.named("Yaw_0x124").arbitration_id == 0x124
@@ -254,32 +254,32 @@ def test_messages_of_one_name_are_told_apart(tmp_path: Path) -> None:
         database.named("Yaw")
 
 
-def test_a_message_whose_signals_do_not_fit_costs_only_itself(tmp_path: Path) -> None:
+def test_only_message_with_oversized_signals_is_not_decodable(tmp_path: Path) -> None:
     broken = replace(YAW, length=4)
 
-    database = CanDatabase.load([write(tmp_path, dbc_text([broken, WHEEL]))])
+    database = CanDatabase.load([write_file(tmp_path, dbc_text([broken, WHEEL]))])
 
     assert database.named("Yaw").problem == "signal load does not fit into 4 bytes"
     assert not database.named("Wheel").problem
     assert any("Yaw cannot be decoded" in notice for notice in database.notices)
 
 
-def test_overlapping_signals_are_noticed_unless_no_frame_has_both(tmp_path: Path) -> None:
+def test_overlapping_signals_are_reported_if_one_frame_has_both(tmp_path: Path) -> None:
     page = CanSignal("page", 0, 4, is_multiplexer=True)
     one = CanSignal("one", 8, 8, multiplexer="page", branches=frozenset({1}))
     two = replace(one, name="two", branches=frozenset({2, 3}))
     three = replace(one, name="three", branches=frozenset({3}))
     message = replace(YAW, signals=(page, one, two, three))
 
-    database = CanDatabase.load([write(tmp_path, dbc_text([message]))])
+    database = CanDatabase.load([write_file(tmp_path, dbc_text([message]))])
 
     assert database.notices == ("bus.dbc:6: Yaw: signals two and three share bits",)
 
 
-def test_a_branch_without_its_multiplexer_is_not_decoded_in_every_frame(tmp_path: Path) -> None:
+def test_message_with_branch_but_no_multiplexer_is_not_decodable(tmp_path: Path) -> None:
     text = dbc_text([YAW, WHEEL]).replace("SG_ state ", "SG_ state m3")
 
-    database = CanDatabase.load([write(tmp_path, text)])
+    database = CanDatabase.load([write_file(tmp_path, text)])
 
     assert (
         database.named("Yaw").problem
@@ -289,8 +289,8 @@ def test_a_branch_without_its_multiplexer_is_not_decoded_in_every_frame(tmp_path
 
 
 @pytest.mark.parametrize("form", ["kcd", "sym"])
-def test_other_formats_give_the_same_messages(form: str, tmp_path: Path) -> None:
-    dbc = write(tmp_path, dbc_text([YAW, WHEEL]))
+def test_kcd_and_sym_files_define_same_messages_as_dbc(form: str, tmp_path: Path) -> None:
+    dbc = write_file(tmp_path, dbc_text([YAW, WHEEL]))
     other = tmp_path / f"bus.{form}"
     parsed = cantools.database.load_file(dbc, encoding="utf-8")
     assert isinstance(parsed, cantools.database.Database)
@@ -305,8 +305,8 @@ def test_other_formats_give_the_same_messages(form: str, tmp_path: Path) -> None
         assert message.same_layout(expected[message.key])
 
 
-def test_an_arxml_file_gives_its_frames(tmp_path: Path) -> None:
-    database = CanDatabase.load([write(tmp_path, ARXML, "bus.arxml")])
+def test_arxml_file_defines_frames(tmp_path: Path) -> None:
+    database = CanDatabase.load([write_file(tmp_path, ARXML, "bus.arxml")])
 
     wheel = database.named("Wheel")
     assert replace(wheel, source="", topic="") == replace(
@@ -315,10 +315,10 @@ def test_an_arxml_file_gives_its_frames(tmp_path: Path) -> None:
     assert wheel.source == "bus.arxml:16"
     huge = ARXML.replace("<LENGTH>16<", "<LENGTH>99999999999<")
     with pytest.raises(LogTooLargeError, match=r"bus\.arxml:30: length or position"):
-        CanDatabase.load([write(tmp_path, huge, "bus.arxml")])
+        CanDatabase.load([write_file(tmp_path, huge, "bus.arxml")])
 
 
-def test_real_databases_load_with_what_is_wrong_in_them_said() -> None:
+def test_real_databases_load_with_notices_of_their_faults() -> None:
     toyota = CanDatabase.load([shared("comma2k19", "toyota_2017.dbc")])
     gnss = CanDatabase.load([shared("can", "css_canedge", "gnss.dbc")])
 

@@ -30,7 +30,7 @@ LAYOUTS = st.one_of(messages(), messages(multiplexed=True))
 SEEDS = st.integers(0, 2**32 - 1)
 ROWS = 24
 
-varied = partial(
+hypothesis_settings = partial(
     settings,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
@@ -38,14 +38,14 @@ varied = partial(
 
 
 def payloads(message: CanMessage, seed: int) -> NDArray[np.uint8]:
-    """Random bytes, and both extremes."""
+    """Return rows of random bytes, after a row of zeros and a row of 255s."""
     drawn = np.random.default_rng(seed).integers(0, 256, (ROWS, message.length), dtype=np.uint8)
     drawn[0], drawn[1] = 0, 255
     return drawn
 
 
-def read_back(message: CanMessage, folder: Path) -> tuple[CanDatabase, Message]:
-    """The message as read by crosscue and by cantools from the DBC text that defines it."""
+def parsed_by_both(message: CanMessage, folder: Path) -> tuple[CanDatabase, Message]:
+    """Write the message as a DBC file, and parse it with crosscue and with cantools."""
     text = dbc_text([message])
     path = folder / "layout.dbc"
     path.write_text(text, encoding="utf-8")
@@ -64,8 +64,8 @@ def decode_all(
     return (blocks[0] if blocks else None), decode, ledger
 
 
-def by_cantools(message: Message, payload: NDArray[np.uint8]) -> list[dict[str, Any] | None]:
-    """Values of each row from cantools; None where it refuses a multiplexer's value."""
+def rows_by_cantools(message: Message, payload: NDArray[np.uint8]) -> list[dict[str, Any] | None]:
+    """Return the values of each row from cantools, or None where it rejects the row."""
     rows: list[dict[str, Any] | None] = []
     for row in payload:
         try:
@@ -76,7 +76,7 @@ def by_cantools(message: Message, payload: NDArray[np.uint8]) -> list[dict[str, 
 
 
 def row_of(table: Table, i: int) -> dict[str, Any]:
-    """One row as Python numbers, without the signals that are not in it."""
+    """Return one row as Python numbers, without the signals that are absent from it."""
     columns = table.columns
     row = {name: column[i].item() for name, column in columns.items()}
     for name in columns:
@@ -99,16 +99,16 @@ def assert_same_values(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @given(message=LAYOUTS, seed=SEEDS)
-@varied(max_examples=60)
-def test_every_value_equals_cantools(
+@hypothesis_settings(max_examples=60)
+def test_decoded_values_equal_cantools(
     message: CanMessage, seed: int, engine: EngineName, tmp_path: Path
 ) -> None:
-    database, theirs = read_back(message, tmp_path)
+    database, theirs = parsed_by_both(message, tmp_path)
     payload = payloads(message, seed)
 
     block, decoder, ledger = decode_all(database, message, payload, engine)
 
-    expected = by_cantools(theirs, payload)
+    expected = rows_by_cantools(theirs, payload)
     good = [i for i, row in enumerate(expected) if row is not None]
     assert sum(decoder.counts.values()) == len(payload) - len(good)
     assert ledger.topic("can0").used == len(good) == (len(block) if block else 0)
@@ -129,7 +129,7 @@ def _is_integral(signal: CanSignal) -> bool:
 
 
 def invertible(message: CanMessage) -> CanMessage:
-    """The same bits, scaled so that neighbouring values are distinct in float64."""
+    """Return the message with scales at which adjacent raw values are distinct in float64."""
     return replace(
         message,
         signals=tuple(
@@ -144,11 +144,11 @@ def invertible(message: CanMessage) -> CanMessage:
 
 @pytest.mark.slow
 @given(message=LAYOUTS.map(invertible), seed=SEEDS)
-@varied(max_examples=60)
-def test_encoding_gives_back_the_bits_and_equals_cantools(
+@hypothesis_settings(max_examples=60)
+def test_encoding_inverts_decoding_and_equals_cantools(
     message: CanMessage, seed: int, tmp_path: Path
 ) -> None:
-    database, theirs = read_back(message, tmp_path)
+    database, theirs = parsed_by_both(message, tmp_path)
     (ours,) = database.messages
     payload = payloads(message, seed)
     block, _, _ = decode_all(database, message, payload, "numpy")
@@ -164,7 +164,7 @@ def test_encoding_gives_back_the_bits_and_equals_cantools(
     assert isinstance(again.rows, Table)
     for name, column in block.rows.columns.items():
         np.testing.assert_array_max_ulp(column.astype(float), again.rows[name].astype(float), 4)
-    good = [row for row in by_cantools(theirs, payload) if row is not None]
+    good = [row for row in rows_by_cantools(theirs, payload) if row is not None]
     for values, row in zip(good, encoded, strict=True):
         if not any(math.isnan(v) or math.isinf(v) for v in values.values()):
             assert theirs.encode(values, strict=False) == row.tobytes()
@@ -179,7 +179,7 @@ WIDE = CanMessage(
 )
 
 
-def test_64_bit_counters_keep_their_last_digit() -> None:
+def test_64_bit_counters_are_exact() -> None:
     top = 2**64 - 1
     column = np.array([0, 2**53 + 1, top - 1, top], dtype=np.uint64)
 
@@ -200,7 +200,7 @@ def test_64_bit_counters_keep_their_last_digit() -> None:
         (float("inf"), "inf does not fit"),
     ],
 )
-def test_values_out_of_range_are_refused_not_clipped(value: float, words: str) -> None:
+def test_encoding_refuses_values_out_of_range(value: float, words: str) -> None:
     signal = CanSignal("speed", start=0, length=8, scale=0.1)
     message = replace(WIDE, signals=(signal,))
 
@@ -208,12 +208,12 @@ def test_values_out_of_range_are_refused_not_clipped(value: float, words: str) -
         encode(message, {"speed": np.array([1.0, value])})
 
 
-def test_whole_numbers_beyond_64_bits_are_refused() -> None:
+def test_encoding_refuses_negative_value_of_unsigned_signal() -> None:
     with pytest.raises(ValueError, match=r"Wide\.counter: -1 does not fit"):
         encode(WIDE, {"counter": np.array([5, -1], dtype=np.int64)})
 
 
-def test_encoding_asks_for_every_signal_and_knows_no_other() -> None:
+def test_encoding_refuses_missing_and_unknown_signals() -> None:
     with pytest.raises(ValueError, match="no signal 'count'; there are"):
         encode(WIDE, {"count": np.array([1])})
     pair = replace(WIDE, signals=(CanSignal("a", 0, 8), CanSignal("b", 8, 8)))
@@ -221,10 +221,10 @@ def test_encoding_asks_for_every_signal_and_knows_no_other() -> None:
         encode(pair, {"a": np.array([1])})
 
 
-def test_the_buses_and_logs_of_a_database_share_the_plan_of_a_message(tmp_path: Path) -> None:
+def test_extractor_of_a_message_is_shared(tmp_path: Path) -> None:
     whole = CanSignal("speed", 0, 16), CanSignal("mode", 16, 4)
     message = CanMessage("drive", 0x123, False, 8, whole)
-    database, _ = read_back(message, tmp_path)
+    database, _ = parsed_by_both(message, tmp_path)
     (known,) = database.messages
     assert database.extractor(known) is database.extractor(known)
     some = database.extractor(known, {"mode"})

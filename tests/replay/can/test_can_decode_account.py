@@ -67,8 +67,8 @@ def one_frame(
 ) -> CanFrames:
     data = np.zeros((1, 64), dtype=np.uint8)
     data[0, : len(payload)] = list(payload)
-    carried = np.array([len(payload) if length is None else length], dtype=np.uint8)
-    frames = frames_of(data, arbitration_id, is_extended, carried)
+    payload_length = np.array([len(payload) if length is None else length], dtype=np.uint8)
+    frames = frames_of(data, arbitration_id, is_extended, payload_length)
     return replace(
         frames, kind=np.array([kind], dtype=np.uint8), is_fd=np.array([is_fd], dtype=np.bool_)
     )
@@ -90,7 +90,7 @@ def one_frame(
         (one_frame(0x500, bytes(8)), "message has no signals"),
     ],
 )
-def test_a_frame_that_cannot_be_decoded_is_counted_by_id_and_reason(
+def test_undecodable_frame_is_counted_by_id_and_reason(
     frame: CanFrames, reason: str, engine: EngineName
 ) -> None:
     decode, ledger = decoder(engine)
@@ -108,7 +108,7 @@ def test_a_frame_that_cannot_be_decoded_is_counted_by_id_and_reason(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_one_number_as_11_and_29_bits_is_two_messages(engine: EngineName) -> None:
+def test_11_and_29_bit_ids_are_different_messages(engine: EngineName) -> None:
     decode, _ = decoder(engine)
 
     (plain,) = decode(block_of(one_frame(0x100, b"\x10\x27")))
@@ -122,7 +122,7 @@ def test_one_number_as_11_and_29_bits_is_two_messages(engine: EngineName) -> Non
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_fd_frames_may_be_padded_to_the_next_length_there_is(engine: EngineName) -> None:
+def test_padded_fd_frame_is_decoded(engine: EngineName) -> None:
     decode, _ = decoder(engine)
     payload = bytes([0] * 8 + [1, 2, 0xFF, 0xFF])
 
@@ -133,7 +133,7 @@ def test_fd_frames_may_be_padded_to_the_next_length_there_is(engine: EngineName)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_longer_frames_are_decoded_only_if_asked_for(engine: EngineName) -> None:
+def test_longer_frames_are_decoded_with_allow_longer(engine: EngineName) -> None:
     decode, ledger = decoder(engine, allow_longer=True)
 
     (block,) = decode(block_of(one_frame(0x100, b"\x64\0\xff\xff")))
@@ -144,7 +144,7 @@ def test_longer_frames_are_decoded_only_if_asked_for(engine: EngineName) -> None
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_frames_of_unknown_length_decode_if_the_bytes_can_be_there(engine: EngineName) -> None:
+def test_frames_of_unknown_length_are_decoded_if_payload_fits(engine: EngineName) -> None:
     decode, _ = decoder(engine)
     lost = np.full(1, LENGTH_UNKNOWN, dtype=np.uint8)
     payload = np.zeros((1, 8), dtype=np.uint8)
@@ -158,7 +158,7 @@ def test_frames_of_unknown_length_decode_if_the_bytes_can_be_there(engine: Engin
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_rows_of_other_branches_are_missing_values(engine: EngineName) -> None:
+def test_signals_of_inactive_branches_are_nan(engine: EngineName) -> None:
     decode, _ = decoder(engine)
     payload = np.array([[0, 7], [9, 9], [3, 0x15], [0, 8]], dtype=np.uint8)
 
@@ -172,12 +172,14 @@ def test_rows_of_other_branches_are_missing_values(engine: EngineName) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_messages_not_asked_for_are_skipped_as_a_choice(engine: EngineName) -> None:
+def test_unselected_messages_are_counted_as_skipped(engine: EngineName) -> None:
     decode, ledger = decoder(engine, wanted=["Speed"])
-    both = frames_of(np.zeros((4, 2), np.uint8), 0x100)
-    both = replace(both, is_extended=np.array([False, True, False, True]))
+    plain_and_extended = frames_of(np.zeros((4, 2), np.uint8), 0x100)
+    plain_and_extended = replace(
+        plain_and_extended, is_extended=np.array([False, True, False, True])
+    )
 
-    (block,) = decode(block_of(both))
+    (block,) = decode(block_of(plain_and_extended))
 
     assert block.topic == "can0/Speed"
     assert block.log_ns.tolist() == [0, 2_000_000]
@@ -186,7 +188,7 @@ def test_messages_not_asked_for_are_skipped_as_a_choice(engine: EngineName) -> N
     assert not ledger.details
 
 
-def test_single_signals_can_be_asked_for() -> None:
+def test_single_signals_can_be_selected() -> None:
     decode = BusDecoder(DATABASE, "can0", Ledger("made up"), [("Switch", "two")])
 
     (block,) = decode(block_of(frames_of(np.array([[2, 0xA5]], np.uint8), 0x400)))
@@ -200,7 +202,7 @@ def test_single_signals_can_be_asked_for() -> None:
         BusDecoder(DATABASE, "can0", Ledger("made up"), ["Sped"])
 
 
-def test_all_times_of_a_frame_go_with_it() -> None:
+def test_decoded_rows_keep_all_timestamps() -> None:
     decode, _ = decoder()
     frames = frames_of(np.zeros((3, 2), np.uint8), np.array([0x100, 0x101, 0x100], np.uint32))
     log_ns = np.array([5, 6, 7], dtype=np.int64)
@@ -216,7 +218,7 @@ def test_all_times_of_a_frame_go_with_it() -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_frames_may_lie_in_memory_as_they_like(engine: EngineName) -> None:
+def test_strided_read_only_frames_are_decoded(engine: EngineName) -> None:
     decode, _ = decoder(engine)
     payload = np.arange(8, dtype=np.uint8).reshape(4, 2)
     frames = frames_of(payload, np.array([0x100, 0x101, 0x100, 0x101], np.uint32)).take(
@@ -231,7 +233,7 @@ def test_frames_may_lie_in_memory_as_they_like(engine: EngineName) -> None:
     np.testing.assert_allclose(block.rows["kph"].astype(float), [2.56, 12.84])
 
 
-def test_a_log_of_nothing_but_new_ids_does_not_fill_memory(
+def test_number_of_counted_unknown_ids_is_bounded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(decoding, "COUNTS_KEPT", 10)
@@ -262,7 +264,7 @@ IDS = st.sampled_from([0x100, 0x101, 0x200, 0x300, 0x400, 0x500])
     allow_longer=st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_decoded_and_counted_frames_are_all_frames_whatever_the_engine(
+def test_engines_decode_or_count_every_frame_equally(
     rows: list[tuple[int, bool, int, int, int, bool]], allow_longer: bool
 ) -> None:
     columns = (
@@ -278,7 +280,7 @@ def test_decoded_and_counted_frames_are_all_frames_whatever_the_engine(
         data=data,
         is_fd=columns[5].astype(np.bool_),
     )
-    seen = []
+    results = []
     for engine in ENGINES:
         decode, ledger = decoder(engine, allow_longer)
         ledger.find("can0", len(rows))
@@ -290,35 +292,35 @@ def test_decoded_and_counted_frames_are_all_frames_whatever_the_engine(
         assert sum(decode.counts.values()) == account.skipped.total()
         times = np.sort(np.concatenate([np.zeros(0, np.int64), *(b.log_ns for b in blocks)]))
         assert len(np.unique(times)) == account.used
-        seen.append((decode.counts, [(b.topic, b.log_ns.tolist()) for b in blocks]))
-    assert seen[0] == seen[1]
+        results.append((decode.counts, [(b.topic, b.log_ns.tolist()) for b in blocks]))
+    assert results[0] == results[1]
 
 
-def test_auto_goes_over_to_compiled_loops_in_mid_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_engine_compiles_loops_after_enough_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decoding, "AUTO_FRAMES", 5)
-    built = []
-    build = decoding.compiled_engine
+    compiled = []
+    compile_engine = decoding.compiled_engine
 
     def counted(rules: Sequence[Rules]) -> Engine:
-        built.append(len(rules))
-        return build(rules)
+        compiled.append(len(rules))
+        return compile_engine(rules)
 
     monkeypatch.setattr(decoding, "compiled_engine", counted)
     decode, _ = decoder("auto")
     block = block_of(frames_of(np.full((4, 2), 3, np.uint8), 0x100))
 
     before = decode(block)
-    assert not built
+    assert not compiled
     after = decode(block)
     decode(block)
 
-    assert built == [6]
+    assert compiled == [6]
     assert isinstance(before[0].rows, Table)
     assert isinstance(after[0].rows, Table)
     np.testing.assert_array_equal(before[0].rows["kph"], after[0].rows["kph"])
 
 
-def test_rows_that_are_no_frames_are_refused() -> None:
+def test_rows_that_are_not_can_frames_are_refused() -> None:
     decode, _ = decoder()
     table = Block("can0", np.zeros(1, np.int64), Table({"a": np.zeros(1)}))
 

@@ -19,7 +19,7 @@ from support.data import shared
 
 
 def canedge_frames() -> Block:
-    """All frames of the first bus of the real CSS logger, joined into one block."""
+    """Return all frames of the first bus of the real CSS log in one block."""
     path = shared("can", "css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4")
     with open_log(path) as log:
         blocks = [b for b in log.read(Ledger("canedge")) if b.topic == "can/1"]
@@ -40,7 +40,7 @@ BUSES: dict[str, tuple[tuple[str, ...], Callable[[], Block]]] = {
 }
 
 
-def test_wheel_speeds_of_a_real_drive_are_those_the_data_set_publishes() -> None:
+def test_wheel_speeds_of_real_drive_equal_published_values() -> None:
     block = comma2k19_frames(bus=0)
     ledger = Ledger("comma2k19")
     ledger.find(block.topic, len(block))
@@ -70,7 +70,7 @@ def test_wheel_speeds_of_a_real_drive_are_those_the_data_set_publishes() -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("bus", sorted(BUSES))
-def test_every_decodable_frame_of_a_real_bus_equals_cantools(bus: str, engine: EngineName) -> None:
+def test_decodable_frames_of_real_bus_equal_cantools(bus: str, engine: EngineName) -> None:
     parts, read = BUSES[bus]
     path, block = shared(*parts), read()
     ledger = Ledger(bus)
@@ -94,15 +94,15 @@ def test_every_decodable_frame_of_a_real_bus_equals_cantools(bus: str, engine: E
         ours = blocks[message.topic_name]
         assert len(ours) == len(rows)
         compared += len(rows)
-        for one in apart(theirs[message.key], any(overlaps(message))):
+        for one in split_messages(theirs[message.key], any(overlaps(message))):
             assert_same_columns(ours, one, rows)
     assert compared == sum(map(len, blocks.values())) == ledger.topic(block.topic).used
     assert set(ledger.topic(block.topic).skipped) <= {UNKNOWN_ID, TOO_SHORT}
     assert sum(decode.counts.values()) == len(block) - compared
 
 
-def apart(message: Message, has_overlaps: bool) -> list[Message]:
-    """The message, or one per signal, because cantools shifts signals after an overlap."""
+def split_messages(message: Message, has_overlaps: bool) -> list[Message]:
+    """Return the message, or one per signal, because cantools shifts signals after an overlap."""
     if not has_overlaps:
         return [message]
     return [

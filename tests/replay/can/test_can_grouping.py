@@ -23,7 +23,7 @@ def _database(folder: Path) -> CanDatabase:
 
 
 def _frames(count: int) -> CanFrames:
-    """Frames of all kinds, mixed, of all messages of the database and of others."""
+    """Return shuffled frames of all kinds, with known and unknown identifiers."""
     rng = np.random.default_rng(7)
     identifier = rng.choice(np.array([*IDS, 5, 0x12345], np.uint32), count)
     return CanFrames(
@@ -37,12 +37,12 @@ def _frames(count: int) -> CanFrames:
     )
 
 
-@pytest.mark.parametrize("few", [0, 1000])
-def test_sorting_and_finding_give_the_same_rows(
-    few: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("few_limit", [0, 1000])
+def test_sorting_and_searching_yield_same_rows(
+    few_limit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {}
-    for name, limit in (("wanted", numpy_engine.FEW), ("other", few)):
+    for name, limit in (("wanted", numpy_engine.FEW), ("other", few_limit)):
         monkeypatch.setattr(numpy_engine, "FEW", limit)
         ledger = Ledger("log")
         settings = DecodeSettings(engine="numpy")
@@ -61,12 +61,12 @@ def test_sorting_and_finding_give_the_same_rows(
     assert found["wanted"] == found["other"]
 
 
-@pytest.mark.parametrize("picked", [np.array([3, 1, 1]), np.arange(40) % 3 == 0, slice(2, 9)])
-def test_columns_without_a_flag_are_taken_as_those_with_one(picked: object) -> None:
+@pytest.mark.parametrize("rows_taken", [np.array([3, 1, 1]), np.arange(40) % 3 == 0, slice(2, 9)])
+def test_taken_rows_keep_every_column(rows_taken: object) -> None:
     frames = _frames(40)
 
-    taken = frames.take(picked)  # type: ignore[arg-type]
+    taken = frames.take(rows_taken)  # type: ignore[arg-type]
 
     for name in ("is_extended", "kind", "is_fd", "is_tx", "arbitration_id", "length", "data"):
-        assert np.array_equal(getattr(taken, name), getattr(frames, name)[picked]), name
+        assert np.array_equal(getattr(taken, name), getattr(frames, name)[rows_taken]), name
         assert getattr(taken, name).dtype == getattr(frames, name).dtype

@@ -56,14 +56,14 @@ SG_MUL_VAL_ 2147484000 whole kind 2-2;
 """
 
 
-def _by_cantools(source: DatabaseText) -> list[CanMessage]:
+def _layout_by_cantools(source: DatabaseText) -> list[CanMessage]:
     parsed = database._parse(source, "dbc")
     distinguishes_fd = database._distinguishes_fd(parsed, "dbc")
     return [database._message(one, "dbc", distinguishes_fd) for one in parsed.messages]
 
 
-def _spelled(messages: list[CanMessage]) -> list[str]:
-    """Include types, because 1 and 1.0 decode to different columns; sort sets."""
+def _reprs(messages: list[CanMessage]) -> list[str]:
+    """Return each message's repr: 1 and 1.0 differ, as their columns do, and sets are sorted."""
     return [
         repr(replace(m, signals=()))
         + "".join(repr((replace(s, branches=frozenset()), sorted(s.branches))) for s in m.signals)
@@ -71,41 +71,41 @@ def _spelled(messages: list[CanMessage]) -> list[str]:
     ]
 
 
-def _all_shared() -> list[Path]:
+def _shared_dbc_files() -> list[Path]:
     return sorted(shared().rglob("*.dbc"))
 
 
 @pytest.mark.slow
-def test_every_real_file_reads_as_cantools_reads_it() -> None:
-    files = _all_shared()
+def test_layouts_of_real_files_equal_cantools() -> None:
+    files = _shared_dbc_files()
 
     assert len(files) >= 11
     for path in files:
         source = read_text(path, DEFAULT_LIMITS)
         quick = read_dbc(source.text)
         assert quick is not None, path
-        assert _spelled(quick) == _spelled(_by_cantools(source)), path
+        assert _reprs(quick) == _reprs(_layout_by_cantools(source)), path
 
 
 @pytest.mark.slow
 @given(message=st.one_of(messages(), messages(multiplexed=True)))
 @settings(max_examples=100, deadline=None)
-def test_every_layout_reads_as_cantools_reads_it(message: CanMessage) -> None:
+def test_random_layouts_equal_cantools(message: CanMessage) -> None:
     source = DatabaseText(Path("x.dbc"), dbc_text([message]))
 
     quick = read_dbc(source.text)
 
     assert quick is not None
-    assert _spelled(quick) == _spelled(_by_cantools(source))
+    assert _reprs(quick) == _reprs(_layout_by_cantools(source))
 
 
-def test_multiplexers_of_multiplexers_floats_and_can_fd_read_as_cantools_reads_them() -> None:
+def test_extended_multiplexing_floats_and_can_fd_equal_cantools() -> None:
     source = DatabaseText(Path("x.dbc"), EXTENDED)
 
     quick = read_dbc(source.text)
 
     assert quick is not None
-    assert _spelled(quick) == _spelled(_by_cantools(source))
+    assert _reprs(quick) == _reprs(_layout_by_cantools(source))
     wide, fd = quick
     assert {s.name: (s.multiplexer, set(s.branches)) for s in wide.signals} == {
         "kind": (None, set()),
@@ -120,7 +120,7 @@ def test_multiplexers_of_multiplexers_floats_and_can_fd_read_as_cantools_reads_t
 
 
 @pytest.mark.parametrize("text", [EXTENDED, "savvycan/bms.dbc", "savvycan/LeafPowertrainBus.dbc"])
-def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
+def test_layouts_of_damaged_files_equal_cantools(text: str) -> None:
     whole = text if "\n" in text else shared("can", *text.split("/")).read_text()
     chance = random.Random(7)
     compared = 0
@@ -132,10 +132,10 @@ def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
         if quick is None:
             continue
         try:
-            theirs = _by_cantools(source)
+            theirs = _layout_by_cantools(source)
         except SchemaError:
             continue  # a statement is broken that decoding does not use
-        assert _spelled(quick) == _spelled(theirs), source.text
+        assert _reprs(quick) == _reprs(theirs), source.text
         compared += 1
     assert compared > 20
 
@@ -158,26 +158,26 @@ def test_no_damage_makes_the_two_readers_differ(text: str) -> None:
         ("7-9;\n", "7-9\n"),
     ],
 )
-def test_what_is_unusual_is_left_to_cantools(old: str, new: str) -> None:
+def test_unusual_statements_are_left_to_cantools(old: str, new: str) -> None:
     assert EXTENDED.count(old) == 1
 
     assert read_dbc(EXTENDED.replace(old, new)) is None
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Use a separate cache."""
+def cache_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Use an empty cache folder."""
     monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
-def _file(tmp_path: Path, text: str = EXTENDED, name: str = "x.dbc") -> Path:
+def _dbc_file(tmp_path: Path, text: str = EXTENDED, name: str = "x.dbc") -> Path:
     path = tmp_path / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def _parses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def _record_parses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Collect the names of the files that are parsed from now on."""
     parsed: list[str] = []
     read = database._read_layout
@@ -190,28 +190,28 @@ def _parses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return parsed
 
 
-def _same(a: CanDatabase, b: CanDatabase) -> bool:
-    return _spelled(list(a.messages)) == _spelled(list(b.messages)) and a.notices == b.notices
+def _are_same(a: CanDatabase, b: CanDatabase) -> bool:
+    return _reprs(list(a.messages)) == _reprs(list(b.messages)) and a.notices == b.notices
 
 
-def test_a_second_start_parses_nothing(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_second_load_parses_no_file(
+    tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    files = [*_all_shared(), _file(tmp_path)]
-    parsed = _parses(monkeypatch)
+    files = [*_shared_dbc_files(), _dbc_file(tmp_path)]
+    parsed = _record_parses(monkeypatch)
     first = [CanDatabase.load([path], keep_first=True) for path in files]
-    assert len(parsed) == len(files) == len(list(folder.iterdir()))
+    assert len(parsed) == len(files) == len(list(cache_dir.iterdir()))
 
     second = [CanDatabase.load([path], keep_first=True) for path in files]
 
     assert len(parsed) == len(files)
-    assert all(_same(a, b) for a, b in zip(first, second, strict=True))
+    assert all(_are_same(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_a_second_start_reads_the_signals_of_the_messages_it_meets_only(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_second_load_reads_only_signals_of_met_messages(
+    tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = _file(tmp_path)
+    path = _dbc_file(tmp_path)
     CanDatabase.load([path])
     lines: list[bytes] = []
     loads = json_tree
@@ -240,28 +240,28 @@ def test_a_second_start_reads_the_signals_of_the_messages_it_meets_only(
     assert b"real" in lines[1]
 
 
-def test_another_text_or_name_or_code_is_another_entry(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_cache_entry_depends_on_text_name_and_code(
+    tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parsed = _parses(monkeypatch)
-    CanDatabase.load([_file(tmp_path)])
-    CanDatabase.load([_file(tmp_path, EXTENDED.replace("-40|100", "-40|101"))])
-    CanDatabase.load([_file(tmp_path, name="y.dbc")])
+    parsed = _record_parses(monkeypatch)
+    CanDatabase.load([_dbc_file(tmp_path)])
+    CanDatabase.load([_dbc_file(tmp_path, EXTENDED.replace("-40|100", "-40|101"))])
+    CanDatabase.load([_dbc_file(tmp_path, name="y.dbc")])
     monkeypatch.setattr("crosscue.replay.can.layout_cache._made_by", lambda: "other code")
-    CanDatabase.load([_file(tmp_path)])
+    CanDatabase.load([_dbc_file(tmp_path)])
 
     assert parsed == ["x.dbc", "x.dbc", "y.dbc", "x.dbc"]
-    assert len(list(folder.iterdir())) == 4
+    assert len(list(cache_dir.iterdir())) == 4
 
 
-def test_a_damaged_entry_is_parsed_again(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_damaged_cache_entry_is_parsed_again(
+    tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = _file(tmp_path)
+    path = _dbc_file(tmp_path)
     whole = CanDatabase.load([path])
-    (entry,) = folder.iterdir()
+    (entry,) = cache_dir.iterdir()
     stored = entry.read_bytes()
-    parsed = _parses(monkeypatch)
+    parsed = _record_parses(monkeypatch)
     chance = random.Random(3)
     copies = [b"", stored[:-1], stored[:20], b"null", b"\n{}"]
     for _ in range(40):
@@ -271,25 +271,25 @@ def test_a_damaged_entry_is_parsed_again(
         )
     for copy in copies:
         entry.write_bytes(copy)
-        assert _same(CanDatabase.load([path]), whole)
+        assert _are_same(CanDatabase.load([path]), whole)
         assert entry.read_bytes() == stored
 
     assert len(parsed) == len(copies)
 
 
 @pytest.mark.parametrize("value", ["off", "", "/dev/null/nowhere", "/proc/nowhere"])
-def test_without_a_place_for_it_files_are_just_parsed(
+def test_files_are_parsed_without_cache_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
 ) -> None:
     monkeypatch.setenv(VARIABLE, value)
-    parsed = _parses(monkeypatch)
-    path = _file(tmp_path)
+    parsed = _record_parses(monkeypatch)
+    path = _dbc_file(tmp_path)
 
-    assert _same(CanDatabase.load([path]), CanDatabase.load([path]))
+    assert _are_same(CanDatabase.load([path]), CanDatabase.load([path]))
     assert len(parsed) == 2
 
 
-def test_the_cache_lies_where_the_environment_says() -> None:
+def test_cache_folder_follows_environment() -> None:
     assert cache_folder({VARIABLE: "/a"}) == Path("/a")
     assert cache_folder({VARIABLE: "off"}) is None
     assert cache_folder({"XDG_CACHE_HOME": "/b"}) == Path("/b/crosscue/can_layouts")
@@ -312,17 +312,17 @@ for _ in range(20):
 
 
 @pytest.mark.slow
-def test_concurrent_starts_do_not_disturb_each_other(tmp_path: Path, folder: Path) -> None:
-    path = _file(tmp_path)
-    command = [sys.executable, "-c", _LOAD_OFTEN, str(path), str(folder)]
+def test_concurrent_loads_do_not_interfere(tmp_path: Path, cache_dir: Path) -> None:
+    path = _dbc_file(tmp_path)
+    command = [sys.executable, "-c", _LOAD_OFTEN, str(path), str(cache_dir)]
     running = [subprocess.Popen(command) for _ in range(3)]
 
     assert [one.wait(timeout=60) for one in running] == [0, 0, 0]
-    assert not list(folder.glob(".*"))
+    assert not list(cache_dir.glob(".*"))
 
 
-def test_old_entries_leave(tmp_path: Path, folder: Path) -> None:
+def test_old_cache_entries_are_removed(tmp_path: Path, cache_dir: Path) -> None:
     for k in range(70):
-        CanDatabase.load([_file(tmp_path, name=f"{k}.dbc")])
+        CanDatabase.load([_dbc_file(tmp_path, name=f"{k}.dbc")])
 
-    assert len(list(folder.iterdir())) == 64
+    assert len(list(cache_dir.iterdir())) == 64

@@ -1,4 +1,4 @@
-"""A bus that carries the car's signals and a Mobileye: every frame is accounted for, once."""
+"""A bus shared by the car and a Mobileye: every frame is accounted for once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAME = st.tuples(
 
 @settings(deadline=None)
 @given(frames=st.lists(FRAME, min_size=1, max_size=30), engine=st.sampled_from(["numpy", "numba"]))
-def test_every_frame_is_decoded_or_reported_of_by_one_of_the_two(
+def test_each_frame_is_accounted_for_by_exactly_one_decoder(
     frames: list[tuple[int, int, bool, bool, int]], engine: EngineName
 ) -> None:
     ids, kinds, extended, fd, lengths = (np.array(column) for column in zip(*frames, strict=True))
@@ -57,7 +57,7 @@ def test_every_frame_is_decoded_or_reported_of_by_one_of_the_two(
     assert decoded + admitted + ledger.topic("can0").skipped.total() == len(frames)
 
 
-def test_the_devices_frames_are_not_unknown_to_the_car() -> None:
+def test_mobileye_ids_include_all_configured_slots() -> None:
     ids = all_ids(MobileyeSettings())
 
     assert {0x700, 0x738, 0x739, 0x756, 0x760} <= ids
