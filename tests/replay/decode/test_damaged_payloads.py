@@ -92,9 +92,7 @@ KINDS: Final[dict[str, tuple[Callable[[np.random.Generator, str], tuple[Topic, b
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 9))
 @settings(max_examples=15, deadline=None)
-def test_of_messages_with_one_damaged_exactly_one_is_dropped(
-    kind: str, seed: int, count: int
-) -> None:
+def test_only_the_damaged_message_is_dropped(kind: str, seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     make, name = KINDS[kind]
     made = [make(rng, name) for _ in range(count)]
@@ -116,7 +114,7 @@ def test_of_messages_with_one_damaged_exactly_one_is_dropped(
     ("encoding", "cut", "status"), [("cdr", 0, 0), ("cdr", 3, 3), ("odd", 3, 0)]
 )
 @pytest.mark.parametrize("command", ["info", "decode"])
-def test_a_command_ends_with_3_for_a_damaged_message_and_not_for_a_foreign_one(
+def test_command_exits_with_3_only_for_damaged_messages(
     command: str, encoding: str, cut: int, status: int, tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Protobuf and JSON messages: the same columns as ROS types, damage refused message by message."""
+"""Protobuf and JSON: the same columns as ROS types; only damaged messages are dropped."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ FIX = (
 
 
 def schema_of(name: str, fields: Any) -> bytes:
-    """A FileDescriptorSet that defines ``foxglove.<name>`` and what it imports."""
+    """Return a FileDescriptorSet that defines ``foxglove.<name>`` and its imports."""
     file = descriptor_pb2.FileDescriptorProto(
         name=f"foxglove/{name}.proto",
         package="foxglove",
@@ -84,20 +84,20 @@ def proto_topic(name: str, fields: Any) -> Topic:
     return Topic("/t", f"foxglove.{name}", "protobuf", schema_of(name, fields), "protobuf")
 
 
-def same_stamp(cls: Any, seconds: int, nanos: int) -> Any:
-    """A message of the class with its time set."""
+def stamped(cls: Any, seconds: int, nanos: int) -> Any:
+    """Return a message of the class with its timestamp set."""
     message = cls()
     message.timestamp.seconds, message.timestamp.nanos = seconds, nanos
     return message
 
 
-def test_compressed_images_are_ranges_of_the_log() -> None:
+def test_compressed_images_are_byte_ranges_of_payloads() -> None:
     topic = proto_topic("CompressedImage", IMAGE)
     cls = message_class(topic.schema, "CompressedImage")
     pictures = [b"\xff\xd8" + bytes(300), b"\x89PNG\r\n\x1a\n" + bytes(9)]
     payloads = []
     for i, picture in enumerate(pictures):
-        message = same_stamp(cls, 5 + i, 7)
+        message = stamped(cls, 5 + i, 7)
         message.data, message.format, message.frame_id = picture, "jpeg", "front"
         payloads.append(message.SerializeToString())
     ledger = Ledger("made")
@@ -112,12 +112,12 @@ def test_compressed_images_are_ranges_of_the_log() -> None:
     assert ledger.topic("/t").skipped == {"empty picture": 1}
 
 
-def test_video_packets_need_a_known_coding() -> None:
+def test_video_packets_of_unknown_coding_are_skipped() -> None:
     topic = proto_topic("CompressedVideo", IMAGE)
     cls = message_class(topic.schema, "CompressedVideo")
     payloads = []
     for coding in ("h264", "h265", "vp9"):
-        message = same_stamp(cls, 1, 0)
+        message = stamped(cls, 1, 0)
         message.data, message.format = b"\x00\x00\x00\x01", coding
         payloads.append(message.SerializeToString())
     ledger = Ledger("made")
@@ -132,7 +132,7 @@ def test_video_packets_need_a_known_coding() -> None:
 def test_raw_images_keep_size_and_pixel_format() -> None:
     topic = proto_topic("RawImage", RAW)
     cls = message_class(topic.schema, "RawImage")
-    message = same_stamp(cls, 1, 0)
+    message = stamped(cls, 1, 0)
     message.width, message.height, message.step, message.encoding = 4, 2, 12, "rgb8"
     message.data = bytes(24)
     short = cls()
@@ -152,14 +152,14 @@ def test_raw_images_keep_size_and_pixel_format() -> None:
     assert ledger.topic("/t").dropped == {"picture has fewer bytes than its size needs": 1}
 
 
-def test_location_fixes_get_the_columns_of_navsatfix() -> None:
+def test_location_fix_has_columns_of_navsatfix() -> None:
     topic = proto_topic("LocationFix", FIX)
     cls = message_class(topic.schema, "LocationFix")
-    message = same_stamp(cls, 3, 4)
+    message = stamped(cls, 3, 4)
     message.latitude, message.longitude, message.altitude = 37.5, -122.25, 11.0
     message.position_covariance.extend(range(9))
-    bare = same_stamp(cls, 4, 4)
-    wrong = same_stamp(cls, 5, 4)
+    bare = stamped(cls, 4, 4)
+    wrong = stamped(cls, 5, 4)
     wrong.position_covariance.extend([1.0, 2.0])
     ledger = Ledger("made")
 
@@ -175,7 +175,7 @@ def test_location_fixes_get_the_columns_of_navsatfix() -> None:
     assert ledger.topic("/t").dropped == {MISFIT: 1}
 
 
-def test_unknown_protobuf_types_become_dotted_columns_of_their_own_types() -> None:
+def test_unknown_protobuf_type_has_dotted_columns() -> None:
     fields = (
         STAMP,
         ("count", 2, F.TYPE_UINT64),
@@ -187,7 +187,7 @@ def test_unknown_protobuf_types_become_dotted_columns_of_their_own_types() -> No
     )
     topic = proto_topic("Made", fields)
     cls = message_class(topic.schema, "Made")
-    message = same_stamp(cls, 9, 1)
+    message = stamped(cls, 9, 1)
     message.count, message.gain, message.on = 2**64 - 1, 0.5, True
     message.list.extend([1, 2, 3])
     message.again.count = 5
@@ -217,7 +217,7 @@ def test_unknown_protobuf_types_become_dotted_columns_of_their_own_types() -> No
         (bytes(2 << 20), "over the limit"),
     ],
 )
-def test_broken_descriptors_are_refused_in_one_line(schema: bytes, complaint: str | None) -> None:
+def test_invalid_descriptor_is_refused_in_one_line(schema: bytes, complaint: str | None) -> None:
     topic = Topic("/cam", "foxglove.CompressedImage", "protobuf", schema, "protobuf")
     if complaint is None:
         assert decoder_for(topic) is None
@@ -229,19 +229,19 @@ def test_broken_descriptors_are_refused_in_one_line(schema: bytes, complaint: st
 
 
 @pytest.mark.parametrize("name", ["CompressedImage", "LocationFix"])
-def test_something_else_called_a_timestamp_is_refused(name: str) -> None:
+def test_timestamp_without_seconds_is_refused(name: str) -> None:
     topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
-    lying = Topic(
+    renamed = Topic(
         topic.name, topic.type_name, "protobuf", topic.schema.replace(b"seconds", b"seconbs")
     )
 
     with pytest.raises(SchemaError, match="lacks the field seconds"):
-        decoder_for(lying)
+        decoder_for(renamed)
 
 
 @given(raw=st.binary(max_size=80), name=st.sampled_from(["CompressedImage", "LocationFix"]))
 @QUICK
-def test_any_bytes_are_decoded_or_refused_and_never_more(raw: bytes, name: str) -> None:
+def test_arbitrary_bytes_are_decoded_or_dropped(raw: bytes, name: str) -> None:
     topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
     ledger = Ledger("made")
     ledger.find("/t", 1)
@@ -258,7 +258,7 @@ def json_block(*values: Any) -> Block:
     return block_of("/t", [v if isinstance(v, bytes) else json.dumps(v).encode() for v in values])
 
 
-def test_json_pictures_and_fixes_match_their_protobuf_twins() -> None:
+def test_json_images_and_fixes_are_decoded() -> None:
     when = {"sec": 5, "nsec": 7}
     picture = b"\xff\xd8" + bytes(40)
     image = {"timestamp": when, "data": b64encode(picture).decode(), "format": "jpeg"}
@@ -303,7 +303,7 @@ def test_json_pictures_and_fixes_match_their_protobuf_twins() -> None:
         b'{"a": ' + b"9" * 5000 + b"}",
     ],
 )
-def test_bad_json_is_dropped_message_by_message(raw: bytes) -> None:
+def test_invalid_json_message_is_dropped_alone(raw: bytes) -> None:
     ledger = Ledger("made")
 
     block = must_decode(Topic("/t", "made.Thing", "json"))(json_block({"a": 1}, raw), ledger)
@@ -312,7 +312,7 @@ def test_bad_json_is_dropped_message_by_message(raw: bytes) -> None:
     assert ledger.topic("/t").dropped == {MISFIT: 1}
 
 
-def test_json_numbers_keep_their_kind_and_missing_ones_are_nan() -> None:
+def test_json_values_keep_dtype_and_missing_values_are_nan() -> None:
     rows: list[Mapping[str, Any]] = [
         {"n": 2**53 + 1, "b": True, "in": {"x": 1}},
         {"n": 2, "b": False, "in": {"x": 0.5, "y": 2}, "s": "text", "l": [1, 2]},
@@ -326,6 +326,6 @@ def test_json_numbers_keep_their_kind_and_missing_ones_are_nan() -> None:
     np.testing.assert_array_equal(table["l.length"], [np.nan, 2.0])
 
 
-def test_a_json_schema_must_be_an_object() -> None:
+def test_json_schema_that_is_not_an_object_is_refused() -> None:
     with pytest.raises(SchemaError, match="not a JSON object"):
         decoder_for(Topic("/t", "made.Thing", "json", b"[1, 2", "jsonschema"))

@@ -1,4 +1,4 @@
-"""Packets of a video are decoded to pictures with their own times, like those of other cameras."""
+"""Packets of a video are decoded to pictures with their own times."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def packets(path: Path) -> tuple[Topic, list[Block]]:
         return log.topics[0], list(log.read(Ledger("video")))
 
 
-def shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Ledger]:
-    """The number shown in each picture, by time, read through the extractor."""
+def numbers_shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Ledger]:
+    """Return the number shown in each picture, keyed by time, and the ledger of the extractor."""
     found: dict[int, int] = {}
 
-    def see(block: Block) -> None:
+    def read_numbers(block: Block) -> None:
         assert isinstance(block.rows, Images)
         for i, t_ns in enumerate(block.log_ns.tolist()):
             pixels = np.frombuffer(block.rows.bytes_.payload(i), np.uint8)
@@ -40,7 +40,7 @@ def shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Ledger]:
 
     ledger = Ledger("video")
     planned = Plan((Source(0, topic, ()),), {})
-    extractor = Extractor(planned, Vehicle(version=1), 0, ledger, on_pictures=see)
+    extractor = Extractor(planned, Vehicle(version=1), 0, ledger, on_pictures=read_numbers)
     for block in blocks:
         for _ in extractor(block):
             pass
@@ -50,22 +50,22 @@ def shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Ledger]:
 
 
 @pytest.mark.parametrize("codec", CODECS)
-def test_every_packet_becomes_the_picture_of_its_time(codec: str, tmp_path: Path) -> None:
+def test_every_packet_is_decoded_to_picture_with_its_time(codec: str, tmp_path: Path) -> None:
     suffix = ".mkv" if codec == "libsvtav1" else ".mp4"
     topic, blocks = packets(video(tmp_path / f"front{suffix}", codec=codec))
 
-    found, ledger = shown(topic, blocks)
+    found, ledger = numbers_shown(topic, blocks)
 
     assert [found[t] for t in sorted(found)] == list(range(24))
     assert sorted(found) == [k * STEP_NS for k in range(24)]
     assert not any(account.skipped for account in ledger.accounts.values())
 
 
-def test_a_stream_that_begins_within_a_group_loses_what_cannot_be_known(tmp_path: Path) -> None:
+def test_stream_that_begins_within_a_group_loses_only_that_group(tmp_path: Path) -> None:
     topic, blocks = packets(video(tmp_path / "front.mp4", options={"g": "12", "bf": "0"}))
     (block,) = blocks
 
-    found, ledger = shown(topic, [block.take(slice(5, None))])
+    found, ledger = numbers_shown(topic, [block.take(slice(5, None))])
 
     account = ledger.topic(topic.name)
     skipped = account.skipped + account.dropped
@@ -75,22 +75,22 @@ def test_a_stream_that_begins_within_a_group_loses_what_cannot_be_known(tmp_path
     assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
 
 
-def test_a_broken_packet_is_reported_and_the_next_group_is_whole(tmp_path: Path) -> None:
+def test_damaged_packet_is_dropped_and_next_group_is_complete(tmp_path: Path) -> None:
     topic, blocks = packets(video(tmp_path / "front.mp4", options={"g": "12", "bf": "0"}))
     (block,) = blocks
     assert isinstance(block.rows, Images)
-    held = block.rows.bytes_
-    buffer = held.buffer.copy()
-    buffer[int(held.start[3]) : int(held.stop[3])] = 0xFF
-    broken = replace(block.rows, bytes_=replace(held, buffer=buffer))
+    packet_bytes = block.rows.bytes_
+    buffer = packet_bytes.buffer.copy()
+    buffer[int(packet_bytes.start[3]) : int(packet_bytes.stop[3])] = 0xFF
+    broken = replace(block.rows, bytes_=replace(packet_bytes, buffer=buffer))
 
-    found, ledger = shown(topic, [replace(block, rows=broken)])
+    found, ledger = numbers_shown(topic, [replace(block, rows=broken)])
 
     assert ledger.topic(topic.name).dropped.total() >= 1
     assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
 
 
-def test_detect_looks_at_every_picture_of_a_video(
+def test_detect_processes_every_picture_of_a_video(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = video(tmp_path / "front.mp4")
