@@ -1,4 +1,4 @@
-"""A magnetometer counts as a compass only where the vehicle file describes it."""
+"""A magnetometer is used as a compass only where the vehicle file describes it."""
 
 import pytest
 
@@ -17,9 +17,7 @@ from support.memory_log import MAGNETOMETER
         (Compass(hard_iron_t=(1e-5, 0.0, 0.0), use=False), False),
     ],
 )
-def test_a_magnetometer_without_calibration_is_used_only_on_request(
-    compass: Compass, is_used: bool
-) -> None:
+def test_magnetometer_is_used_if_calibrated_or_requested(compass: Compass, is_used: bool) -> None:
     vehicle = Vehicle(version=1, compass=compass)
 
     planned = plan([(0, MAGNETOMETER)], vehicle)
@@ -28,7 +26,7 @@ def test_a_magnetometer_without_calibration_is_used_only_on_request(
     assert Vehicle(**vehicle.model_dump()).compass.uses_magnetometer == is_used
 
 
-def test_the_reason_names_the_topic_and_the_remedy() -> None:
+def test_reason_for_unused_magnetometer_names_topic_and_command() -> None:
     planned = plan([(0, MAGNETOMETER)], Vehicle(version=1))
 
     assert (

@@ -14,7 +14,7 @@ from support.memory_log import MemoryLog
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))
-def test_a_quoted_name_reads_back_and_hides_nothing(name: str) -> None:
+def test_quoted_name_round_trips_and_is_printable(name: str) -> None:
     text = _quoted(name)
 
     assert tomllib.loads(f"name = {text}") == {"name": name}
@@ -22,7 +22,7 @@ def test_a_quoted_name_reads_back_and_hides_nothing(name: str) -> None:
 
 
 @pytest.mark.parametrize("size_px", [(1280, 720), (0, 0)])
-def test_the_size_of_calibrated_images_is_written_where_the_log_states_it(
+def test_image_size_is_drafted_only_if_the_log_records_it(
     size_px: tuple[int, int],
 ) -> None:
     k = np.array([[900.0, 0.0, 640.0, 0.0, 900.0, 360.0, 0.0, 0.0, 1.0]])

@@ -77,7 +77,7 @@ def dbc(tmp_path: Path) -> Path:
     return file
 
 
-def test_each_section_is_read_from_its_own_bus(log: MemoryLog, dbc: Path) -> None:
+def test_each_section_is_read_from_its_bus(log: MemoryLog, dbc: Path) -> None:
     file = dbc.with_name("car.toml")
     file.write_text(
         'version = 1\n[can]\nbus = "body"\ndbc = ["car.dbc"]\n'
@@ -99,7 +99,7 @@ def test_each_section_is_read_from_its_own_bus(log: MemoryLog, dbc: Path) -> Non
 
 
 @pytest.mark.parametrize("rows", [1, 2, 30])
-def test_a_log_too_short_to_show_anything_is_drafted(log: MemoryLog, dbc: Path, rows: int) -> None:
+def test_very_short_log_is_drafted_without_yaw_rate(log: MemoryLog, dbc: Path, rows: int) -> None:
     short = MemoryLog(log.topics, [block.take(slice(0, rows)) for block in log.blocks])
 
     can = parse(draft(examine([short], [dbc]), dbc.parent, Mounting()), "the draft").can
@@ -108,7 +108,7 @@ def test_a_log_too_short_to_show_anything_is_drafted(log: MemoryLog, dbc: Path, 
     assert can.yaw_rate is None
 
 
-def test_a_time_that_is_years_away_costs_no_memory(log: MemoryLog, dbc: Path) -> None:
+def test_observed_time_range_is_bounded_despite_outlier_times(log: MemoryLog, dbc: Path) -> None:
     first = log.blocks[1]
     times = first.log_ns.copy()
     times[5], times[6] = -(2**61), 2**61
@@ -116,12 +116,12 @@ def test_a_time_that_is_years_away_costs_no_memory(log: MemoryLog, dbc: Path) ->
         Block(first.topic, times, first.rows) if block is first else block for block in log.blocks
     ]
 
-    seen = observe([MemoryLog(log.topics, damaged)], None)
+    observed = observe([MemoryLog(log.topics, damaged)], None)
 
-    assert seen.end_ns - seen.start_ns <= 600_000_000_000
+    assert observed.end_ns - observed.start_ns <= 600_000_000_000
 
 
-def test_a_draft_names_every_bus_and_that_of_each_signal(log: MemoryLog, dbc: Path) -> None:
+def test_draft_names_every_bus_and_the_bus_of_each_signal(log: MemoryLog, dbc: Path) -> None:
     text = draft(examine([log], [dbc]), dbc.parent, Mounting())
 
     can = parse(text, "the draft").can
@@ -137,7 +137,7 @@ def test_a_draft_names_every_bus_and_that_of_each_signal(log: MemoryLog, dbc: Pa
     assert len(observe([log], None).buses) == 2
 
 
-def test_the_file_of_another_bus_is_left_out_with_why(
+def test_database_of_another_bus_is_omitted_with_reason(
     log: MemoryLog, dbc: Path, tmp_path: Path
 ) -> None:
     """Two buses use one identifier for different messages; the file with the wheels is kept."""

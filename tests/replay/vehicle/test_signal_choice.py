@@ -22,11 +22,11 @@ T_NS: Final = np.arange(SECONDS * 20, dtype=np.int64) * 50_000_000
 T_S: Final = T_NS * 1e-9
 SPEED: Final = 12.0 + 4.0 * np.sin(0.1 * T_S)
 YAW_RATE: Final = 0.15 * np.sin(0.3 * T_S) + 0.02
-"""A winding road."""
+"""Yaw rate on a winding road, in rad/s."""
 STRAIGHT: Final = np.zeros_like(T_S)
 
 
-def named(
+def candidate_signal(
     kind: Kind, name: str, values: Floats, wheel: str = "", unit: str = ""
 ) -> tuple[Candidate, Series]:
     message, _, signal = name.partition(".")
@@ -39,7 +39,7 @@ def wheels(
 ) -> list[tuple[Candidate, Series]]:
     sides = {"left": -1.0, "right": 1.0}
     return [
-        named(
+        candidate_signal(
             Kind.WHEEL,
             f"{message}.{wheel}",
             scale * (speed + sides[wheel.rpartition("_")[2]] * 0.775 * yaw_rate),
@@ -49,25 +49,25 @@ def wheels(
     ]
 
 
-def chosen(
+def choices_among(
     *signals: tuple[Candidate, Series], yaw_rate: Floats | None = None, with_gnss: bool = True
 ) -> Choices:
     """Return the choice from these signals on one bus."""
     course = np.cumsum(YAW_RATE if yaw_rate is None else yaw_rate) * 0.05
-    each = slice(None, None, 20)
-    track = Track.of_course("fix", T_NS[each], SPEED[each], course[each])
+    each_second = slice(None, None, 20)
+    track = Track.of_course("fix", T_NS[each_second], SPEED[each_second], course[each_second])
     bus = Bus("can0", signals=list(signals))
     last_ns = int(T_NS[-1])
     return choose(Observed((bus,), (track,) if with_gnss else (), (), (), 0, last_ns))
 
 
 @pytest.mark.parametrize("with_gnss", [True, False])
-def test_the_yaw_rate_that_follows_the_wheels_is_chosen(with_gnss: bool) -> None:
+def test_yaw_rate_consistent_with_wheels_is_chosen(with_gnss: bool) -> None:
     rng = np.random.default_rng(1)
-    found = chosen(
+    found = choices_among(
         *wheels("ABS", SPEED, YAW_RATE),
-        named(Kind.YAW_RATE, "A.YAW", 0.15 * rng.standard_normal(len(T_S))),
-        named(Kind.YAW_RATE, "B.YAW", YAW_RATE + 0.002),
+        candidate_signal(Kind.YAW_RATE, "A.YAW", 0.15 * rng.standard_normal(len(T_S))),
+        candidate_signal(Kind.YAW_RATE, "B.YAW", YAW_RATE + 0.002),
         with_gnss=with_gnss,
     )
 
@@ -78,10 +78,10 @@ def test_the_yaw_rate_that_follows_the_wheels_is_chosen(with_gnss: bool) -> None
     assert "does not follow" in other.verdict.wrong[0]
 
 
-def test_a_yaw_rate_that_turns_on_a_straight_road_is_never_chosen() -> None:
-    found = chosen(
+def test_yaw_rate_that_turns_on_straight_road_is_rejected() -> None:
+    found = choices_among(
         *wheels("ABS", SPEED, STRAIGHT),
-        named(Kind.YAW_RATE, "A.YAW", STRAIGHT + 0.05 + 1e-6 * T_S),
+        candidate_signal(Kind.YAW_RATE, "A.YAW", STRAIGHT + 0.05 + 1e-6 * T_S),
         yaw_rate=STRAIGHT,
     )
 
@@ -92,12 +92,12 @@ def test_a_yaw_rate_that_turns_on_a_straight_road_is_never_chosen() -> None:
     assert not found.is_chosen(only)
 
 
-def test_a_yaw_rate_that_turns_while_the_car_stands_is_never_chosen() -> None:
+def test_yaw_rate_that_turns_while_stationary_is_rejected() -> None:
     stop = np.where(T_S > 50.0, 0.0, SPEED)
     turn = np.where(T_S > 50.0, 0.0, YAW_RATE)
-    found = chosen(
+    found = choices_among(
         *wheels("ABS", stop, turn),
-        named(Kind.YAW_RATE, "A.YAW", turn + np.where(T_S > 50.0, 0.1, 0.0)),
+        candidate_signal(Kind.YAW_RATE, "A.YAW", turn + np.where(T_S > 50.0, 0.1, 0.0)),
         with_gnss=False,
     )
 
@@ -105,12 +105,12 @@ def test_a_yaw_rate_that_turns_while_the_car_stands_is_never_chosen() -> None:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_sign_is_that_with_which_the_signal_follows(sign: int) -> None:
+def test_sign_of_signal_is_the_consistent_one(sign: int) -> None:
     steering = np.arctan(2.7 * YAW_RATE / SPEED) * 15.0
-    found = chosen(
+    found = choices_among(
         *wheels("ABS", SPEED, YAW_RATE),
-        named(Kind.YAW_RATE, "A.YAW", sign * YAW_RATE),
-        named(Kind.STEERING, "A.ANGLE", sign * steering + 0.05),
+        candidate_signal(Kind.YAW_RATE, "A.YAW", sign * YAW_RATE),
+        candidate_signal(Kind.STEERING, "A.ANGLE", sign * steering + 0.05),
     )
 
     assert found.yaw_rates[0].verdict.sign == sign
@@ -118,15 +118,17 @@ def test_a_sign_is_that_with_which_the_signal_follows(sign: int) -> None:
     assert not found.steering[0].verdict.wrong
 
 
-def test_an_angle_without_its_sign_does_not_follow() -> None:
+def test_unsigned_steering_angle_is_rejected() -> None:
     steering = np.abs(np.arctan(2.7 * YAW_RATE / SPEED) * 15.0)
-    found = chosen(*wheels("ABS", SPEED, YAW_RATE), named(Kind.STEERING, "A.ANGLE", steering))
+    found = choices_among(
+        *wheels("ABS", SPEED, YAW_RATE), candidate_signal(Kind.STEERING, "A.ANGLE", steering)
+    )
 
     assert "does not follow" in found.steering[0].verdict.wrong[0]
 
 
-def test_wheels_that_gnss_contradicts_are_not_chosen() -> None:
-    found = chosen(*wheels("OLD", SPEED, YAW_RATE, 1.6), *wheels("ABS", SPEED, YAW_RATE))
+def test_wheel_speeds_that_contradict_gnss_are_rejected() -> None:
+    found = choices_among(*wheels("OLD", SPEED, YAW_RATE, 1.6), *wheels("ABS", SPEED, YAW_RATE))
 
     best, other = found.wheels
     assert best.wheels["rear_left"].name == "ABS.rear_left"
@@ -134,22 +136,22 @@ def test_wheels_that_gnss_contradicts_are_not_chosen() -> None:
     assert other.verdict.wrong == ("contradicts it",)
 
 
-def test_wheels_in_turns_have_the_radius_that_fits() -> None:
+def test_wheel_radius_is_estimated_from_angular_speeds() -> None:
     turning = [
         (replace(one, unit="rad/s"), replace(series, values=series.values / 0.31))
         for one, series in wheels("ABS", SPEED, YAW_RATE)
     ]
-    (best,) = chosen(*turning).wheels
+    (best,) = choices_among(*turning).wheels
 
     assert best.radius_m == pytest.approx(0.31, rel=0.01)
     assert not best.verdict.wrong
 
 
-def test_without_bends_a_sign_is_not_claimed() -> None:
+def test_yaw_rate_sign_is_undetermined_on_straight_road() -> None:
     rng = np.random.default_rng(2)
-    found = chosen(
+    found = choices_among(
         *wheels("ABS", SPEED, STRAIGHT),
-        named(Kind.YAW_RATE, "A.YAW", 0.001 * rng.standard_normal(len(T_S))),
+        candidate_signal(Kind.YAW_RATE, "A.YAW", 0.001 * rng.standard_normal(len(T_S))),
         yaw_rate=STRAIGHT,
     )
 
@@ -157,13 +159,13 @@ def test_without_bends_a_sign_is_not_claimed() -> None:
     assert not found.yaw_rates[0].verdict.wrong
 
 
-def test_signals_that_only_agree_with_each_other_have_no_sign() -> None:
+def test_signs_are_undetermined_without_wheels_and_gnss() -> None:
     bend = 0.02 * np.sin(0.3 * T_S)
     steering = np.arctan(2.7 * bend / SPEED) * 15.0
-    found = chosen(
-        named(Kind.SPEED, "A.SPEED", SPEED),
-        named(Kind.YAW_RATE, "A.YAW", -bend),
-        named(Kind.STEERING, "A.ANGLE", -steering),
+    found = choices_among(
+        candidate_signal(Kind.SPEED, "A.SPEED", SPEED),
+        candidate_signal(Kind.YAW_RATE, "A.YAW", -bend),
+        candidate_signal(Kind.STEERING, "A.ANGLE", -steering),
         with_gnss=False,
     )
 
@@ -189,7 +191,7 @@ BO_ 103 EPS: 8 A
 """
 
 
-def test_names_and_units_propose_and_requests_are_left_out(tmp_path: Path) -> None:
+def test_candidates_exclude_requested_and_target_signals(tmp_path: Path) -> None:
     file = tmp_path / "car.dbc"
     file.write_text(DBC)
 
@@ -203,11 +205,22 @@ def test_names_and_units_propose_and_requests_are_left_out(tmp_path: Path) -> No
     }
 
 
-def test_a_mobileye_is_known_by_the_lengths_of_its_messages() -> None:
-    of_it = {0x738: {7}, 0x739: {8}, 0x73A: {8}, 0x73B: {8}, 0x700: {8}, 0x669: {8}, 0x737: {8}}
-    others = {key: {4} for key in of_it}
+def test_mobileye_is_recognised_by_message_lengths() -> None:
+    mobileye_lengths = {
+        0x738: {7},
+        0x739: {8},
+        0x73A: {8},
+        0x73B: {8},
+        0x700: {8},
+        0x669: {8},
+        0x737: {8},
+    }
+    other_lengths = {key: {4} for key in mobileye_lengths}
 
-    assert "status" in Bus("can1", ids={(key, False): of for key, of in of_it.items()}).mobileye
-    assert not Bus("can1", ids={(key, False): of for key, of in others.items()}).mobileye
-    assert not Bus("can1", ids={(key, True): of for key, of in of_it.items()}).mobileye
+    assert (
+        "status"
+        in Bus("can1", ids={(key, False): of for key, of in mobileye_lengths.items()}).mobileye
+    )
+    assert not Bus("can1", ids={(key, False): of for key, of in other_lengths.items()}).mobileye
+    assert not Bus("can1", ids={(key, True): of for key, of in mobileye_lengths.items()}).mobileye
     assert not Bus("can1", ids={(0x738, False): {7}}).mobileye
