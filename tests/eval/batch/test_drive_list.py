@@ -1,4 +1,4 @@
-"""Drives that a command line names."""
+"""Drives named on the command line."""
 
 import re
 import uuid
@@ -29,12 +29,12 @@ def _simulated(folder: Path, *names: str) -> Path:
 
 
 def _names(drives: tuple[DriveInput, ...]) -> list[str]:
-    """Return the readable part of the names."""
+    """Return the names without their hash."""
     assert all(re.fullmatch(r".*-[0-9a-f]{8}", one.name, re.DOTALL) for one in drives)
     return [one.name[:-9] for one in drives]
 
 
-def test_logs_named_one_by_one_are_one_drive(tmp_path: Path) -> None:
+def test_several_log_arguments_are_one_drive(tmp_path: Path) -> None:
     _touch(tmp_path, "monday.mcap", "tuesday.blf", "vehicle.toml")
     logs = (str(tmp_path / "monday.mcap"), str(tmp_path / "tuesday.blf"))
 
@@ -56,7 +56,7 @@ def test_one_log_is_one_drive(tmp_path: Path) -> None:
     assert drives_of([log], each=True).is_many
 
 
-def test_a_drive_folder_brings_its_vehicle_and_truth(tmp_path: Path) -> None:
+def test_drive_folder_supplies_vehicle_and_truth_files(tmp_path: Path) -> None:
     folder = _simulated(tmp_path, "A-01") / "A-01"
 
     found = drives_of([str(folder)])
@@ -68,7 +68,7 @@ def test_a_drive_folder_brings_its_vehicle_and_truth(tmp_path: Path) -> None:
     assert (one.vehicle, one.truth) == (folder / "vehicle.toml", folder / "truth.json")
 
 
-def test_a_folder_of_drives_is_many(tmp_path: Path) -> None:
+def test_folder_of_drives_yields_each_of_its_drives(tmp_path: Path) -> None:
     _simulated(tmp_path, "B-02", "A-01")
     _touch(tmp_path, "notes.txt", "runs/A-01/manifest.json", "runs/A-01/pictures/1.jpg")
 
@@ -79,13 +79,13 @@ def test_a_folder_of_drives_is_many(tmp_path: Path) -> None:
     assert found.drives[0].vehicle == tmp_path / "A-01" / "vehicle.toml"
 
 
-def test_bags_side_by_side_are_drives_of_their_own(tmp_path: Path) -> None:
+def test_each_bag_of_a_folder_is_one_drive(tmp_path: Path) -> None:
     _touch(tmp_path, "mon.bag", "tue.bag")
 
     assert _names(drives_of([str(tmp_path)]).drives) == ["mon", "tue"]
 
 
-def test_a_folder_that_may_be_one_drive_or_many_is_refused(tmp_path: Path) -> None:
+def test_folder_of_mixed_formats_needs_a_vehicle_file(tmp_path: Path) -> None:
     _touch(tmp_path, "camera.bag", "can.blf")
 
     with pytest.raises(UsageError, match=r"several formats \(blf, rosbag1\): one drive or many"):
@@ -95,14 +95,14 @@ def test_a_folder_that_may_be_one_drive_or_many_is_refused(tmp_path: Path) -> No
     assert len(drives_of([str(tmp_path)]).drives[0].logs) == 2
 
 
-def test_splits_of_one_bag_are_one_drive_unless_each(tmp_path: Path) -> None:
+def test_split_bag_is_one_drive_unless_each_is_set(tmp_path: Path) -> None:
     _touch(tmp_path, "bag_0.mcap", "bag_1.mcap")
 
     assert drives_of([str(tmp_path)]).drives[0].logs == (str(tmp_path),)
     assert _names(drives_of([str(tmp_path)], each=True).drives) == ["bag_0", "bag_1"]
 
 
-def test_data_sets_in_folders_of_folders(tmp_path: Path) -> None:
+def test_nested_data_set_folders_are_named_by_their_path(tmp_path: Path) -> None:
     for route, segment in (("one", "40"), ("one", "41"), ("two", "40")):
         (tmp_path / route / segment / "processed_log").mkdir(parents=True)
 
@@ -111,7 +111,7 @@ def test_data_sets_in_folders_of_folders(tmp_path: Path) -> None:
     assert _names(found.drives) == ["one__40", "one__41", "two__40"]
 
 
-def test_a_pattern_that_the_shell_left_alone(tmp_path: Path) -> None:
+def test_patterns_of_files_and_folders_are_expanded(tmp_path: Path) -> None:
     _simulated(tmp_path, "A-01", "A-02", "B-01")
 
     files = drives_of([f"{tmp_path}/A-*/drive.mcap"])
@@ -127,7 +127,7 @@ def test_a_pattern_that_the_shell_left_alone(tmp_path: Path) -> None:
     assert len(deep.drives) == 3
 
 
-def test_a_list_names_drives_line_by_line(tmp_path: Path) -> None:
+def test_list_file_names_drives_line_by_line(tmp_path: Path) -> None:
     _touch(tmp_path, "a b.mcap", "can.blf", "c.bag")
     _simulated(tmp_path / "sim", "A-01", "A-02")
     text = "# day one\n'a b.mcap' can.blf\n\nc.bag  # alone\nsim\nmemory://bucket/x.mcap\n"
@@ -141,7 +141,7 @@ def test_a_list_names_drives_line_by_line(tmp_path: Path) -> None:
     assert found.drives[4].logs == ("memory://bucket/x.mcap",)
 
 
-def test_each_makes_every_argument_a_drive_and_names_differ(tmp_path: Path) -> None:
+def test_each_makes_every_log_a_drive_of_unique_name(tmp_path: Path) -> None:
     _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "z/x/drive.mcap")
     logs = [str(tmp_path / place / "drive.mcap") for place in ("x", "y", "z/x")]
 
@@ -151,7 +151,7 @@ def test_each_makes_every_argument_a_drive_and_names_differ(tmp_path: Path) -> N
     assert len({one.name for one in drives_of(logs, each=True).drives}) == 3
 
 
-def test_remote_patterns(tmp_path: Path) -> None:
+def test_remote_patterns_are_expanded(tmp_path: Path) -> None:
     bucket = f"bucket-{uuid.uuid4().hex}"
     system = import_module("fsspec").filesystem("memory")
     for name in ("a/drive.mcap", "b/drive.mcap"):
@@ -165,7 +165,7 @@ def test_remote_patterns(tmp_path: Path) -> None:
     assert not drives_of([f"memory://{bucket}/a/drive.mcap"]).is_many
 
 
-def test_a_name_depends_on_the_logs_alone(tmp_path: Path) -> None:
+def test_drive_name_depends_only_on_its_logs(tmp_path: Path) -> None:
     _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "route/40/drive.mcap", "mon.bag", "tue.bag")
     logs = [str(path) for path in sorted(tmp_path.rglob("*.*"))]
     together = {one.logs: one.name for one in drives_of(logs, each=True).drives}
@@ -179,7 +179,7 @@ def test_a_name_depends_on_the_logs_alone(tmp_path: Path) -> None:
     assert drives_of([logs[0]]).drives[0].name != before
 
 
-def test_a_copy_of_a_drive_is_not_taken_for_another(tmp_path: Path) -> None:
+def test_copy_of_a_recording_is_refused(tmp_path: Path) -> None:
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "monday.bag").write_text("the same")
@@ -189,7 +189,7 @@ def test_a_copy_of_a_drive_is_not_taken_for_another(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("argument", "said"),
+    ("argument", "message"),
     [
         ("{}/nothing-*.mcap", "nothing matches"),
         ("@{}/gone.txt", "No such file"),
@@ -199,19 +199,21 @@ def test_a_copy_of_a_drive_is_not_taken_for_another(tmp_path: Path) -> None:
         ("{}/bare", "no drive found"),
     ],
 )
-def test_errors_are_one_line(tmp_path: Path, argument: str, said: str) -> None:
+def test_invalid_drive_arguments_are_refused_in_one_line(
+    tmp_path: Path, argument: str, message: str
+) -> None:
     _touch(tmp_path, "a.mcap", "bare/readme.md")
     tmp_path.joinpath("empty.txt").write_text("# none\n")
     tmp_path.joinpath("torn.txt").write_text("a.mcap\n'b\n")
     tmp_path.joinpath("twice.txt").write_text("a.mcap\na.mcap\n")
 
-    with pytest.raises(CrosscueError, match=said) as caught:
+    with pytest.raises(CrosscueError, match=message) as caught:
         drives_of([argument.format(tmp_path)])
 
     assert "\n" not in str(caught.value)
 
 
-def test_a_link_that_leads_back_is_not_followed_for_ever(tmp_path: Path) -> None:
+def test_cyclic_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     _simulated(tmp_path, "A-01")
     (tmp_path / "again").symlink_to(tmp_path)
 
@@ -220,7 +222,7 @@ def test_a_link_that_leads_back_is_not_followed_for_ever(tmp_path: Path) -> None
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.text(min_size=1, max_size=300), min_size=1, max_size=6, unique=True))
-def test_names_are_safe_and_apart_whatever_the_logs_are_called(texts: list[str]) -> None:
+def test_drive_names_are_unique_and_safe_file_names(texts: list[str]) -> None:
     logs = [
         f"memory://bucket/{text.replace('*', '').replace('?', '').replace('[', '')}.mcap"
         for text in texts
@@ -236,7 +238,7 @@ def test_names_are_safe_and_apart_whatever_the_logs_are_called(texts: list[str])
         assert len(name.encode()) < 200
 
 
-def test_an_unreadable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(self: Path) -> None:
         raise PermissionError(13, "Permission denied")
 

@@ -1,4 +1,4 @@
-"""Many drives in parallel: a failure affects only its drive, and nothing is done twice."""
+"""Many drives in parallel: a failure affects only its drive, and no drive is processed twice."""
 
 import json
 import os
@@ -61,7 +61,7 @@ def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", [in_turn, TWO])
-def test_losses_met_in_a_worker_are_warned_of_here(tmp_path: Path, engine: Engine) -> None:
+def test_losses_in_a_worker_are_reported_to_the_caller(tmp_path: Path, engine: Engine) -> None:
     jobs = made_jobs(tmp_path, ["plain", "warns"])
 
     with losses_heard() as heard:
@@ -74,7 +74,7 @@ def test_losses_met_in_a_worker_are_warned_of_here(tmp_path: Path, engine: Engin
     assert exit_status_of(results) == 3
 
 
-def test_a_second_start_does_only_what_is_missing(tmp_path: Path) -> None:
+def test_second_start_processes_only_missing_drives(tmp_path: Path) -> None:
     jobs = made_jobs(tmp_path, ["plain", "damaged", "loss", "last"])
     first = run_many(jobs, letters, in_turn)
     before = {job.name: tree(job.run) for job in jobs}
@@ -90,7 +90,7 @@ def test_a_second_start_does_only_what_is_missing(tmp_path: Path) -> None:
         assert tree(jobs[i].run) == before[jobs[i].name]
 
 
-def test_a_changed_log_or_setting_is_not_taken_for_done(tmp_path: Path) -> None:
+def test_run_of_changed_log_or_settings_needs_overwrite(tmp_path: Path) -> None:
     jobs = made_jobs(tmp_path, ["plain", "other"])
     run_many(jobs, letters, in_turn)
     Path(jobs[0].logs[0]).write_text("longer")
@@ -105,20 +105,20 @@ def test_a_changed_log_or_setting_is_not_taken_for_done(tmp_path: Path) -> None:
     assert [state_of(job) for job in changed] == [State.DONE, State.DONE]
 
 
-def test_a_run_folder_cut_short_is_done_again(tmp_path: Path) -> None:
+def test_incomplete_run_folder_is_processed_again(tmp_path: Path) -> None:
     jobs = made_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
-    whole = tree(jobs[0].run)
+    complete = tree(jobs[0].run)
     (jobs[0].run / "manifest.json").unlink()
     assert state_of(jobs[0]) is State.CUT_SHORT
 
     results = run_many(jobs, letters, in_turn)
 
     assert results[0].attempts == 1
-    assert tree(jobs[0].run) == whole
+    assert tree(jobs[0].run) == complete
 
 
-def test_a_run_that_was_replaced_by_hand_is_noticed(tmp_path: Path) -> None:
+def test_run_with_edited_manifest_is_not_done(tmp_path: Path) -> None:
     jobs = made_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
     manifest = jobs[0].run / "manifest.json"
@@ -128,7 +128,7 @@ def test_a_run_that_was_replaced_by_hand_is_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn", ["", "{", "[]", '{"format_version": 1}', '{"format_version": 9}'])
-def test_a_torn_journal_is_believed_in_nothing(tmp_path: Path, torn: str) -> None:
+def test_run_with_invalid_journal_entry_is_not_done(tmp_path: Path, torn: str) -> None:
     jobs = made_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
     (tmp_path / "runs" / ".drives" / "drive0.json").write_text(torn)
@@ -136,7 +136,7 @@ def test_a_torn_journal_is_believed_in_nothing(tmp_path: Path, torn: str) -> Non
     assert state_of(jobs[0]) is State.OTHER
 
 
-def test_a_log_that_is_not_there_fails_alone(tmp_path: Path) -> None:
+def test_missing_log_fails_only_its_drive(tmp_path: Path) -> None:
     jobs = made_jobs(tmp_path, ["plain", "gone"])
     Path(jobs[1].logs[0]).unlink()
 
@@ -147,7 +147,7 @@ def test_a_log_that_is_not_there_fails_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_bytes_on_one_and_on_two_workers(tmp_path: Path) -> None:
+def test_one_and_two_workers_write_equal_bytes(tmp_path: Path) -> None:
     words = ["plain", "loss", "some", "more"]
     engines: dict[str, Engine] = {"one": in_turn, "two": Processes(2, threads=1)}
     found = [
@@ -161,7 +161,7 @@ def test_the_same_bytes_on_one_and_on_two_workers(tmp_path: Path) -> None:
     assert len({one.pid for one in workers} - {os.getpid()}) in (1, 2)
 
 
-def test_two_jobs_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_duplicate_job_names_and_zero_workers_are_refused(tmp_path: Path) -> None:
     job = made_jobs(tmp_path, ["plain"])[0]
 
     with pytest.raises(UsageError, match="drive0: two drives have this name"):
@@ -170,7 +170,7 @@ def test_two_jobs_of_one_name_are_refused(tmp_path: Path) -> None:
         Processes(0)
 
 
-def test_progress_reports_what_is_left(tmp_path: Path) -> None:
+def test_progress_counts_earlier_done_and_failed_drives(tmp_path: Path) -> None:
     seen: list[Progress] = []
     jobs = made_jobs(tmp_path, ["plain", "damaged", "more"])
     run_many(jobs[:1], letters, in_turn)
@@ -181,7 +181,7 @@ def test_progress_reports_what_is_left(tmp_path: Path) -> None:
     assert (last.total, last.earlier, last.done, last.failed) == (3, 1, 2, 1)
 
 
-def test_the_exit_status_of_many() -> None:
+def test_exit_status_combines_those_of_all_drives() -> None:
     def done(status: int, error: str | None = None) -> Done[Letters]:
         return Done(Job("a", (), Path(), ""), status, error)
 
@@ -192,7 +192,7 @@ def test_the_exit_status_of_many() -> None:
     assert exit_status_of([done(4, "cut"), done(2, "wrong")]) == 1
 
 
-def test_a_fingerprint_changes_with_any_setting() -> None:
+def test_fingerprint_depends_on_settings_but_not_their_order() -> None:
     one = fingerprint_of({"a": 1, "b": [2.5, None]}, "1.0")
 
     assert one == fingerprint_of({"b": [2.5, None], "a": 1}, "1.0")
@@ -228,7 +228,9 @@ if __name__ == "__main__":
     ("number", "status"),
     [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)],
 )
-def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, status: int) -> None:
+def test_signal_to_the_parent_stops_all_workers(
+    tmp_path: Path, number: signal.Signals, status: int
+) -> None:
     script = tmp_path / "runner.py"
     script.write_text(RUNNER)
     here = os.pathsep.join(sys.path)
@@ -239,15 +241,15 @@ def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, stat
         start_new_session=True,
     )
     with parent:
-        pids = _wait_for_two(tmp_path / "drives")
+        pids = _pids_of_two_workers(tmp_path / "drives")
         parent.send_signal(number)
-        said = parent.communicate(timeout=20)[1].decode()
+        stderr_text = parent.communicate(timeout=20)[1].decode()
 
-    assert parent.returncode == status, said
+    assert parent.returncode == status, stderr_text
     _wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     assert not list(tmp_path.rglob("*.partial"))
     assert not list(tmp_path.rglob(".lock"))
-    assert "Traceback" not in said
+    assert "Traceback" not in stderr_text
 
     for log in (tmp_path / "drives").glob("*.txt"):
         log.write_text("healed")
@@ -255,13 +257,13 @@ def test_a_signal_stops_all_workers(tmp_path: Path, number: signal.Signals, stat
     assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
 
 
-def _wait_for_two(folder: Path) -> list[int]:
+def _pids_of_two_workers(folder: Path) -> list[int]:
     _wait_until(lambda: len([p for p in folder.glob("*.begun") if p.read_text()]) == 2)
     return [int(path.read_text()) for path in folder.glob("*.begun")]
 
 
-def _wait_until(holds: Callable[[], bool]) -> None:
+def _wait_until(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + 20.0
-    while not holds():
+    while not condition():
         assert time.monotonic() < end, "waited 20 s"
         time.sleep(0.02)

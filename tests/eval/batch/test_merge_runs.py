@@ -34,7 +34,7 @@ def _run(path: Path, **columns: "pa.Array") -> RunFolder:
     return run
 
 
-def test_rows_keep_their_order_and_gain_their_drive(tmp_path: Path) -> None:
+def test_merged_rows_keep_their_order_and_name_their_drive(tmp_path: Path) -> None:
     run = _merged(tmp_path, ["abc", "damaged", "de"])
 
     table = run.table("letters")
@@ -43,7 +43,7 @@ def test_rows_keep_their_order_and_gain_their_drive(tmp_path: Path) -> None:
     assert table["letter"].to_pylist() == list("abcde")
 
 
-def test_the_manifest_names_failures_and_adds_up_accounts(tmp_path: Path) -> None:
+def test_merged_manifest_lists_failures_and_sums_accounts(tmp_path: Path) -> None:
     manifest = _merged(tmp_path, ["abc", "damaged", "de"]).manifest()
     assert isinstance(manifest, MergedManifest)
 
@@ -56,7 +56,7 @@ def test_the_manifest_names_failures_and_adds_up_accounts(tmp_path: Path) -> Non
     assert [one.rows for one in manifest.drives] == [{"letters": 3}, {"letters": 2}]
 
 
-def test_merging_again_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_merging_twice_writes_equal_bytes(tmp_path: Path) -> None:
     first = tree(_merged(tmp_path, ["abc", "de"]).path)
 
     assert tree(_merged(tmp_path, ["abc", "de"]).path) == first
@@ -64,7 +64,7 @@ def test_merging_again_gives_the_same_bytes(tmp_path: Path) -> None:
     assert not is_merged(open_run(tmp_path / "runs" / "drive0"))
 
 
-def test_a_column_that_only_some_drives_have_is_null_in_the_others(tmp_path: Path) -> None:
+def test_column_missing_from_a_run_is_null_after_merging(tmp_path: Path) -> None:
     runs = {
         "plain": _run(tmp_path / "a", t_ns=pa.array([1])),
         "own": _run(tmp_path / "b", t_ns=pa.array([2]), roundabout=pa.array([0.5])),
@@ -76,7 +76,7 @@ def test_a_column_that_only_some_drives_have_is_null_in_the_others(tmp_path: Pat
     assert table["roundabout"].to_pylist() == [0.5, None]
 
 
-def test_columns_that_do_not_fit_are_reported(tmp_path: Path) -> None:
+def test_columns_of_different_types_are_refused(tmp_path: Path) -> None:
     runs = {
         "one": _run(tmp_path / "a", t_ns=pa.array([1])),
         "two": _run(tmp_path / "b", t_ns=pa.array(["noon"])),
@@ -87,7 +87,7 @@ def test_columns_that_do_not_fit_are_reported(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "manifest.json").exists()
 
 
-def test_commands_for_one_drive_refuse_many(
+def test_single_drive_commands_refuse_merged_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     merged = str(_merged(tmp_path, ["abc", "de"]).path)
@@ -97,7 +97,7 @@ def test_commands_for_one_drive_refuse_many(
         assert "holds the tables of many drives" in capsys.readouterr().err
 
 
-def test_no_drive_at_all_is_an_empty_run(tmp_path: Path) -> None:
+def test_merging_no_runs_writes_an_empty_run(tmp_path: Path) -> None:
     merged = merge_runs({}, create(tmp_path / "out", overwrite=False), {"a": "cut"})
 
     assert (merged.drives, merged.rows, merged.drive_seconds) == (0, {}, 0.0)

@@ -54,7 +54,7 @@ def cluster() -> Iterator[Any]:
 
 
 @needs_ray
-def test_a_cluster_that_is_not_there_is_one_line() -> None:
+def test_missing_cluster_is_reported_in_one_line() -> None:
     with pytest.raises(CrosscueError, match="--ray no_such: no cluster") as caught:
         joined("no_such").__enter__()
 
@@ -62,7 +62,7 @@ def test_a_cluster_that_is_not_there_is_one_line() -> None:
 
 
 @needs_ray
-def test_an_address_where_nobody_listens_is_reported_at_once() -> None:
+def test_unreachable_cluster_address_is_reported() -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -70,7 +70,7 @@ def test_an_address_where_nobody_listens_is_reported_at_once() -> None:
         joined(address).__enter__()
 
 
-def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray_package_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
 
     with pytest.raises(UsageError, match=r"pip install 'crosscue\[ray\]'"), joined(LOCAL):
@@ -79,7 +79,7 @@ def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.slow
 @needs_ray
-def test_it_does_not_report_its_use_and_is_joined_once(cluster: Any) -> None:
+def test_cluster_is_joined_once_without_usage_statistics(cluster: Any) -> None:
     from ray._common.usage import usage_lib
 
     assert not usage_lib.usage_stats_enabled()
@@ -91,7 +91,7 @@ def test_it_does_not_report_its_use_and_is_joined_once(cluster: Any) -> None:
 
 @pytest.mark.slow
 @needs_ray
-def test_drives_are_those_of_one_process_though_workers_die(
+def test_drives_on_ray_equal_one_process_despite_dead_workers(
     cluster: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     jobs = made_jobs(tmp_path, WORDS, "ray")
@@ -99,8 +99,8 @@ def test_drives_are_those_of_one_process_though_workers_die(
     results = run_many(jobs, letters, OnRay(LOCAL, workers=2, attempts=2))
 
     assert [done.job for done in results] == jobs
-    whole = [WORDS[i] for i, done in enumerate(results) if done.error is None]
-    assert whole == ["plain", "dies once", "loss", "last"]
+    complete = [WORDS[i] for i, done in enumerate(results) if done.error is None]
+    assert complete == ["plain", "dies once", "loss", "last"]
     assert "cut; copy it again" in str(results[2].error)
     assert "drive4: its worker died (WorkerCrashedError" in str(results[4].error)
     assert [done.attempts for done in results] == [1, 2, 1, 1, 2, 1]
@@ -119,7 +119,7 @@ def test_drives_are_those_of_one_process_though_workers_die(
 
 @pytest.mark.slow
 @needs_ray
-def test_a_study_has_the_bytes_of_threads_and_reports_dead_workers(
+def test_study_on_ray_equals_threads_and_reports_dead_workers(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chunks = chunks_of(STUDY.cases(), STUDY.drives, STUDY.seed)

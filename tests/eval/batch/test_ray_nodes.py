@@ -29,7 +29,7 @@ pytestmark = [
 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A head without cores and two nodes of one core; ended by the test, whatever happens."""
+    """A head without cores and two nodes of one core, shut down after the test."""
     for name, value in {
         "PYTHONPATH": os.pathsep.join(sys.path),
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -54,7 +54,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         found.shutdown()
 
 
-def test_a_lost_node_costs_its_running_drives_only(cluster: Any, tmp_path: Path) -> None:
+def test_lost_node_repeats_only_its_running_drives(cluster: Any, tmp_path: Path) -> None:
     words = ["plain", "waits once", "loss", "waits once", "last"]
     jobs = made_jobs(tmp_path, words, "ray")
     engine = OnRay(cluster.address, memory_bytes=512 * MIB)

@@ -1,4 +1,4 @@
-"""Many drives on the command line: failures are reported, a second start does what is missing."""
+"""Many drives on the command line: failures are reported, and a second start continues."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short drives, one that is not a recording, and a folder of notes."""
+    """Write two short drives and one whose log is not a recording."""
     folder = tmp_path_factory.mktemp("drives")
     for name, seed in (("monday", 1), ("tuesday", 2)):
         write_drive(folder / name, DriveSettings(seed=seed))
@@ -59,7 +59,7 @@ def test_one_failing_drive_does_not_stop_the_rest(
     assert "not an MCAP file" in Path(only["run"], "failure.log").read_text()
 
 
-def test_two_workers_give_the_bytes_of_one(drives: Path, tmp_path: Path) -> None:
+def test_two_workers_write_the_tables_of_one(drives: Path, tmp_path: Path) -> None:
     pattern = str(drives / "*day" / "drive.mcap")
     for workers in ("1", "2"):
         out = str(tmp_path / workers)
@@ -70,7 +70,7 @@ def test_two_workers_give_the_bytes_of_one(drives: Path, tmp_path: Path) -> None
     assert _tables(tmp_path / "1") == _tables(tmp_path / "2")
 
 
-def test_shards_in_any_order_and_place_merge_to_the_bytes_of_one_batch(
+def test_merged_shards_equal_one_batch(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     elsewhere = tmp_path / "elsewhere"
@@ -89,10 +89,12 @@ def test_shards_in_any_order_and_place_merge_to_the_bytes_of_one_batch(
     assert (seen["done"], seen["failed"], len(seen["drives"])) == (2, 1, 3)
     assert run(["merge", *folders, "-o", str(tmp_path / "merged"), "-q"]) == 3
 
-    found, whole = ((tmp_path / name) for name in ("merged", "all/merged"))
-    for table in whole.glob("*.parquet"):
-        assert (found / table.name).read_bytes() == table.read_bytes()
-    shards, batch = (json.loads((at / "manifest.json").read_text()) for at in (found, whole))
+    merged_folder, batch_folder = ((tmp_path / name) for name in ("merged", "all/merged"))
+    for table in batch_folder.glob("*.parquet"):
+        assert (merged_folder / table.name).read_bytes() == table.read_bytes()
+    shards, batch = (
+        json.loads((at / "manifest.json").read_text()) for at in (merged_folder, batch_folder)
+    )
     assert shards.pop("failures").keys() == batch.pop("failures").keys()
     assert shards == batch
 
@@ -107,7 +109,7 @@ def test_workers_for_a_single_drive_are_refused(
     assert "add --each" in capsys.readouterr().err
 
 
-def test_a_drive_folder_brings_its_vehicle_file(drives: Path, tmp_path: Path) -> None:
+def test_drive_folder_supplies_its_vehicle_file(drives: Path, tmp_path: Path) -> None:
     assert run(["replay", str(drives / "monday"), "-o", str(tmp_path / "run"), "-q"]) == 0
 
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
@@ -115,7 +117,7 @@ def test_a_drive_folder_brings_its_vehicle_file(drives: Path, tmp_path: Path) ->
     assert manifest["pose"]["rows"] > 1000
 
 
-def test_python_replays_many_drives_as_the_command_does(
+def test_replay_drives_function_matches_the_command(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "runs"

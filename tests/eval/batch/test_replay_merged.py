@@ -1,4 +1,4 @@
-"""Output of many drives: merged tables, and a failure for an invalid vehicle file of one drive."""
+"""Merged tables of many drives, remote logs and replaced logs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def drives(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
+def test_invalid_vehicle_file_fails_only_its_drive_and_edited_dbc_is_detected(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (drives / "tuesday" / "vehicle.toml").write_text("version = ")
@@ -56,7 +56,7 @@ def test_a_broken_vehicle_file_costs_its_own_drive_and_an_edited_dbc_is_seen(
     assert "other logs, settings or versions" in reported["monday"]["error"]
 
 
-def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
+def test_remote_log_is_replayed_and_estimated_without_local_copy(
     drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = tmp_path / "store"
@@ -69,8 +69,8 @@ def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
 
     assert run(["replay", url, "--vehicle", str(vehicle), "-o", str(run_path), "-q"]) == 0
     before = (run_path / "pose.parquet").read_bytes()
-    (said,) = open_run(run_path).drive_manifest().logs
-    assert said.path == url
+    (recorded,) = open_run(run_path).drive_manifest().logs
+    assert recorded.path == url
     # A log that is read by ranges leaves no local copy that an estimate could use.
     assert not store.exists()
     assert run(["estimate", str(run_path), "-q"]) == 0
@@ -80,7 +80,7 @@ def test_a_log_on_an_object_store_is_replayed_and_fetched_again_for_an_estimate(
     system.rm(f"/{bucket}", recursive=True)
 
 
-def test_a_log_put_in_place_of_another_is_noticed_whatever_its_time(
+def test_replaced_log_is_detected_despite_its_modification_time(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, run_path = drives / "monday" / "drive.mcap", tmp_path / "run"

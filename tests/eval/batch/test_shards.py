@@ -20,7 +20,7 @@ def test_every_drive_is_in_exactly_one_shard(identities: set[str], count: int) -
         assert sum(shard.holds(identity) for shard in shards) == 1
 
 
-def test_shards_are_about_equal() -> None:
+def test_shard_sizes_are_about_equal() -> None:
     identities = [f"{number:08x}" for number in range(4000)]
     sizes = [sum(map(Shard(number, 8).holds, identities)) for number in range(1, 9)]
 
@@ -28,7 +28,7 @@ def test_shards_are_about_equal() -> None:
     assert max(abs(size - 500) for size in sizes) < 4 * 21
 
 
-def array(number: int, first: int, last: int, step: int, count: int) -> dict[str, str]:
+def slurm_array(number: int, first: int, last: int, step: int, count: int) -> dict[str, str]:
     values = {"ID": number, "MIN": first, "MAX": last, "STEP": step, "COUNT": count}
     return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in values.items()}
 
@@ -39,19 +39,19 @@ def array(number: int, first: int, last: int, step: int, count: int) -> dict[str
         ("2/4", {}, Shard(2, 4)),
         ("1/1", {"RANK": "7", "WORLD_SIZE": "8"}, Shard(1, 1)),
         ("auto", {"RANK": "0", "WORLD_SIZE": "3"}, Shard(1, 3)),
-        ("auto", array(8, 1, 8, 1, 8), Shard(8, 8)),
-        ("auto", array(0, 0, 3, 1, 4), Shard(1, 4)),
-        ("auto", array(9, 1, 9, 4, 3), Shard(3, 3)),
-        ("auto", array(5, 5, 5, 1, 1), Shard(1, 1)),
+        ("auto", slurm_array(8, 1, 8, 1, 8), Shard(8, 8)),
+        ("auto", slurm_array(0, 0, 3, 1, 4), Shard(1, 4)),
+        ("auto", slurm_array(9, 1, 9, 4, 3), Shard(3, 3)),
+        ("auto", slurm_array(5, 5, 5, 1, 1), Shard(1, 1)),
     ],
 )
-def test_a_shard_is_read(text: str, variables: Mapping[str, str], shard: Shard) -> None:
+def test_shard_option_is_read(text: str, variables: Mapping[str, str], shard: Shard) -> None:
     assert read_shard(text, variables) == shard
     assert read_shard(str(shard), {}) == shard
 
 
 @pytest.mark.parametrize(
-    ("text", "variables", "what"),
+    ("text", "variables", "message"),
     [
         ("0/4", {}, "expected i/n with i from 1 to n"),
         ("5/4", {}, "expected i/n with i from 1 to n"),
@@ -61,11 +61,13 @@ def test_a_shard_is_read(text: str, variables: Mapping[str, str], shard: Shard) 
         ("auto", {"RANK": "1"}, "neither"),
         ("auto", {"RANK": "3", "WORLD_SIZE": "3"}, "outside its own range"),
         ("auto", {"RANK": "x", "WORLD_SIZE": "3"}, "RANK='x': expected a whole number"),
-        ("auto", array(3, 1, 7, 1, 3), "expected array tasks in equal steps"),
-        ("auto", array(1, 1, 7, 1, 3), "expected array tasks in equal steps"),
-        ("auto", {**array(1, 1, 2, 1, 2), "RANK": "0", "WORLD_SIZE": "2"}, "both"),
+        ("auto", slurm_array(3, 1, 7, 1, 3), "expected array tasks in equal steps"),
+        ("auto", slurm_array(1, 1, 7, 1, 3), "expected array tasks in equal steps"),
+        ("auto", {**slurm_array(1, 1, 2, 1, 2), "RANK": "0", "WORLD_SIZE": "2"}, "both"),
     ],
 )
-def test_what_is_no_shard_is_refused(text: str, variables: Mapping[str, str], what: str) -> None:
-    with pytest.raises(UsageError, match=what):
+def test_invalid_shard_option_is_refused(
+    text: str, variables: Mapping[str, str], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
         read_shard(text, variables)

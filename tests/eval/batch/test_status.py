@@ -37,7 +37,7 @@ def states(folder: Path) -> dict[str, str]:
     return {one.run.name: one.state.value for one in drives_of_folder(folder)}
 
 
-def test_every_planned_drive_is_in_one_state(batch: list[Job], tmp_path: Path) -> None:
+def test_each_planned_drive_has_one_state(batch: list[Job], tmp_path: Path) -> None:
     folder = tmp_path / "runs"
 
     assert states(folder) == {
@@ -54,7 +54,9 @@ def test_every_planned_drive_is_in_one_state(batch: list[Job], tmp_path: Path) -
     assert math.isnan(found.pace.left_s)
 
 
-def test_a_failure_leaves_its_log_in_the_run_folder(batch: list[Job], tmp_path: Path) -> None:
+def test_failed_drive_writes_failure_log_to_its_run_folder(
+    batch: list[Job], tmp_path: Path
+) -> None:
     text = (batch[2].run / FAILURE).read_text()
 
     assert "error     ZeroDivisionError: a bug; a bug in crosscue" in text
@@ -68,7 +70,7 @@ def test_a_failure_leaves_its_log_in_the_run_folder(batch: list[Job], tmp_path: 
     assert states(tmp_path / "runs")["drive2"] == "done"
 
 
-def test_a_worker_that_is_gone_leaves_a_stale_drive(
+def test_drive_of_a_dead_worker_is_stale(
     batch: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "runs"
@@ -94,26 +96,28 @@ def test_a_worker_that_is_gone_leaves_a_stale_drive(
     assert run(["status", str(folder), "-q"]) == 3
 
 
-def test_a_drive_whose_worker_died_on_another_machine_is_begun_again(tmp_path: Path) -> None:
+def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> None:
     (job,) = made_jobs(tmp_path, ["plain"])
     dead = "4711 another-machine boot 99"
     job.run.mkdir(parents=True)
 
-    def left_behind(entry_s: float) -> str | None:
-        """Its error, where it was begun so many seconds since 1970 and left its lock."""
+    def error_of_abandoned_drive(entry_s: float) -> str | None:
+        """Return the error of a drive that a worker began at ``entry_s`` and left locked."""
         write_entry(job.run, {"inputs": None, "worker": dead})
         os.utime(entry_path(job.run), (entry_s, entry_s))
         job.run.joinpath(LOCK).write_text(dead)
         (done,) = run_many([job], letters, in_turn)
         return done.error
 
-    assert "process 4711 on another-machine is writing it" in str(left_behind(time.time()))
+    assert "process 4711 on another-machine is writing it" in str(
+        error_of_abandoned_drive(time.time())
+    )
     assert states(tmp_path / "runs") == {"drive0": "running"}
-    assert left_behind(1.0e9) is None
+    assert error_of_abandoned_drive(1.0e9) is None
     assert states(tmp_path / "runs") == {"drive0": "done"}
 
 
-def test_a_damaged_entry_and_lock_do_not_stop_a_drive(tmp_path: Path) -> None:
+def test_damaged_entry_and_lock_do_not_block_a_drive_permanently(tmp_path: Path) -> None:
     (job,) = made_jobs(tmp_path, ["plain"])
     job.run.mkdir(parents=True)
     write_entry(job.run, {"inputs": None, "worker": "damaged"})
@@ -127,7 +131,7 @@ def test_a_damaged_entry_and_lock_do_not_stop_a_drive(tmp_path: Path) -> None:
     assert late.error is None
 
 
-def test_drives_without_a_run_are_merged_as_failures_whatever_the_order(
+def test_drives_without_a_run_are_merged_as_failures_in_any_order(
     batch: list[Job], tmp_path: Path
 ) -> None:
     other = tmp_path / "other" / "runs"
@@ -143,7 +147,7 @@ def test_drives_without_a_run_are_merged_as_failures_whatever_the_order(
     assert gathered(folders[::-1])[1] == failures
 
 
-def test_where_no_batch_is_there_is_one_line(tmp_path: Path) -> None:
+def test_status_of_a_folder_without_batch_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UnreadableRunError, match="no batch of drives; expected the folder"):
         drives_of_folder(tmp_path)
     with pytest.raises(crosscue.UsageError, match="each named once"):
@@ -151,7 +155,7 @@ def test_where_no_batch_is_there_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("torn", ["", "[]", '{"drives": 3}', "{"])
-def test_a_torn_plan_hides_no_drive_that_was_begun(
+def test_invalid_plan_does_not_hide_started_drives(
     batch: list[Job], tmp_path: Path, torn: str
 ) -> None:
     folder = tmp_path / "runs"
