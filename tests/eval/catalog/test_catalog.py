@@ -19,7 +19,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs_below(tmp_path_factory.mktemp("fleet"))
 
 
-def test_every_run_is_a_row(runs: Path) -> None:
+def test_each_run_is_one_row(runs: Path) -> None:
     found = crosscue.catalog(runs)
 
     assert found.runs == tuple(
@@ -33,7 +33,7 @@ def test_every_run_is_a_row(runs: Path) -> None:
     assert found.left_out == {}
 
 
-def test_a_row_says_what_the_manifest_says(runs: Path) -> None:
+def test_run_row_matches_its_manifest(runs: Path) -> None:
     manifest = RunFolder(runs / "a/monday").drive_manifest()
 
     [row] = crosscue.catalog(runs).query("from runs where run = 'a/monday'").to_pylist()
@@ -45,7 +45,7 @@ def test_a_row_says_what_the_manifest_says(runs: Path) -> None:
     assert "belief.parquet" in row["tables"]
 
 
-def test_settings_are_hashed_as_merge_hashes_them(runs: Path, tmp_path: Path) -> None:
+def test_settings_hash_equals_that_of_a_merged_run(runs: Path, tmp_path: Path) -> None:
     gathered_runs, failures = gathered([runs / "a"])
     merged = merge_runs(gathered_runs, create(tmp_path / "all", overwrite=False), failures)
     manifest = merged.run.manifest()
@@ -57,7 +57,7 @@ def test_settings_are_hashed_as_merge_hashes_them(runs: Path, tmp_path: Path) ->
     }
 
 
-def test_tables_of_the_runs_are_one_table(runs: Path) -> None:
+def test_query_combines_the_tables_of_all_runs(runs: Path) -> None:
     found = crosscue.catalog(runs)
 
     for table in ("belief", "cues", "range", "frames"):
@@ -69,7 +69,7 @@ def test_tables_of_the_runs_are_one_table(runs: Path) -> None:
         assert {row["run"]: row["n"] for row in counted} == parts
 
 
-def test_an_empty_table_has_its_columns(runs: Path) -> None:
+def test_empty_tables_have_the_columns_of_the_schema(runs: Path) -> None:
     found = crosscue.catalog(runs)
 
     for table in ("pose", "scores", "curves", "cue_frames", "dropped", "left_out"):
@@ -85,7 +85,7 @@ def _is(table: str) -> object:
     return pc.field("table") == table
 
 
-def test_approaches_are_those_of_every_run(tmp_path: Path) -> None:
+def test_approaches_of_all_runs_are_listed(tmp_path: Path) -> None:
     add_run(tmp_path / "one", "one", scene=scene(seen(1, 12.5), seen(2, None)))
     add_run(tmp_path / "two", "two", scene=None)
 
@@ -99,7 +99,7 @@ def test_approaches_are_those_of_every_run(tmp_path: Path) -> None:
     ]
 
 
-def test_what_was_dropped_is_counted_with_its_reason(tmp_path: Path) -> None:
+def test_dropped_rows_are_counted_by_reason(tmp_path: Path) -> None:
     lost = Line(entered=5, used=2, skipped={}, dropped={"cut": 3}, dropped_unknown=("torn",))
     account = Account(reading=(), detecting={"front": lost}, estimating={}, is_whole=False)
     add_run(tmp_path / "one", "one", account=account)
@@ -126,30 +126,30 @@ def test_what_was_dropped_is_counted_with_its_reason(tmp_path: Path) -> None:
         ("with x as (from runs) select run from x where false", []),
     ],
 )
-def test_a_condition_or_a_query_selects_runs(runs: Path, query: str, named: list[str]) -> None:
+def test_condition_or_query_selects_runs(runs: Path, query: str, named: list[str]) -> None:
     assert crosscue.catalog(runs).select(query) == tuple(runs / name for name in named)
 
 
 @pytest.mark.parametrize(
-    ("query", "said"),
+    ("query", "message"),
     [
         ("select name from runs", r"no column run in the result \(name\)"),
         ("select 'x' as run", "column run holds 'x', which is no run of"),
         ("vehcle = 'car'", r"no column vehcle; did you mean vehicle\?"),
     ],
 )
-def test_a_selection_that_selects_no_runs_is_refused(runs: Path, query: str, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_invalid_selection_is_refused(runs: Path, query: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         crosscue.catalog(runs).select(query)
 
 
-def test_a_single_run_is_a_catalog(runs: Path) -> None:
+def test_single_run_folder_is_a_catalog(runs: Path) -> None:
     found = crosscue.catalog(runs / "a/monday")
 
     assert found.select("name = 'monday'") == (runs / "a/monday",)
 
 
-def test_runs_that_were_merged_count_once(tmp_path: Path) -> None:
+def test_merged_run_is_not_counted_again(tmp_path: Path) -> None:
     run = add_run(tmp_path / "runs/one", "one")
     merge_runs({"one": run}, create(tmp_path / "runs/merged", overwrite=False), {})
 
@@ -159,7 +159,7 @@ def test_runs_that_were_merged_count_once(tmp_path: Path) -> None:
     assert found.query("select count(*) as n from belief").to_pylist() == [{"n": 50}]
 
 
-def test_what_cannot_be_read_is_left_out_and_reported(tmp_path: Path) -> None:
+def test_unreadable_runs_are_left_out_and_reported(tmp_path: Path) -> None:
     add_run(tmp_path / "good", "good")
     manifest = add_run(tmp_path / "other", "other").file(MANIFEST)
     manifest.write_text(manifest.read_text().replace('"format_version": 5', '"format_version": 4'))
@@ -177,7 +177,7 @@ def test_what_cannot_be_read_is_left_out_and_reported(tmp_path: Path) -> None:
     assert {row["run"]: row["reason"] for row in listed} == found.left_out
 
 
-def test_a_damaged_table_costs_its_run_that_table_only(tmp_path: Path) -> None:
+def test_damaged_table_is_left_out_but_its_run_is_kept(tmp_path: Path) -> None:
     for name in ("good", "gone", "torn"):
         add_run(tmp_path / name, name)
     found = crosscue.catalog(tmp_path)
@@ -192,14 +192,14 @@ def test_a_damaged_table_costs_its_run_that_table_only(tmp_path: Path) -> None:
     assert len(found.select("true")) == 3
 
 
-def test_a_folder_without_runs_is_an_error(tmp_path: Path) -> None:
+def test_folder_without_runs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UnreadableRunError, match="neither a run folder nor a folder of runs"):
         crosscue.catalog(tmp_path)
     with pytest.raises(UnreadableRunError, match="not a folder; expected a folder of runs"):
         crosscue.catalog(tmp_path / "gone")
 
 
-def test_damage_that_shows_only_while_reading_costs_that_file_only(tmp_path: Path) -> None:
+def test_table_with_damaged_data_pages_is_left_out(tmp_path: Path) -> None:
     for name in ("good", "torn"):
         add_run(tmp_path / name, name)
     path = tmp_path / "torn/belief.parquet"
@@ -215,7 +215,7 @@ def test_damage_that_shows_only_while_reading_costs_that_file_only(tmp_path: Pat
     assert "belief.parquet: damaged" in found.left_out["torn"]
 
 
-def test_drives_with_several_settings_are_noted(runs: Path) -> None:
+def test_notice_reports_drives_with_several_settings(runs: Path) -> None:
     [notice] = crosscue.catalog(runs).notices
 
     assert notice == (
@@ -225,7 +225,7 @@ def test_drives_with_several_settings_are_noted(runs: Path) -> None:
     assert crosscue.catalog(runs / "a").notices == ()
 
 
-def test_a_table_that_no_run_can_show_is_empty(tmp_path: Path) -> None:
+def test_table_unreadable_in_every_run_is_empty(tmp_path: Path) -> None:
     add_run(tmp_path / "one", "one").file("frames.parquet").write_bytes(b"PAR1")
 
     found = crosscue.catalog(tmp_path)

@@ -1,4 +1,4 @@
-"""The index of a catalog: it saves reading, and never changes the content of a catalog."""
+"""The index of a catalog: it saves reading and does not change the content."""
 
 import errno
 import os
@@ -28,8 +28,8 @@ def runs(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the runs whose manifests are read."""
+def manifests_read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Record the names of the runs whose manifests are read."""
     names: list[str] = []
     rows_of = records.rows_of
 
@@ -41,24 +41,24 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_a_second_opening_reads_no_run(runs: Path, read: list[str]) -> None:
+def test_second_opening_reads_no_manifest(runs: Path, manifests_read: list[str]) -> None:
     first = crosscue.catalog(runs).query(ALL)
-    assert len(read) == 4
-    read.clear()
+    assert len(manifests_read) == 4
+    manifests_read.clear()
 
     assert crosscue.catalog(runs).query(ALL).equals(first)
-    assert read == []
+    assert manifests_read == []
 
 
-def test_only_what_changed_is_read_again(runs: Path, read: list[str]) -> None:
+def test_only_changed_and_new_runs_are_read_again(runs: Path, manifests_read: list[str]) -> None:
     crosscue.catalog(runs)
-    read.clear()
+    manifests_read.clear()
     change(RunFolder(runs / "a/monday"), scene=scene(seen(1, 9.0), seen(2, None)))
     add_run(runs / "a/wednesday", "wednesday")
 
     rows = crosscue.catalog(runs).query("select run, approaches as n from runs order by run")
 
-    assert sorted(read) == ["a/monday", "a/wednesday"]
+    assert sorted(manifests_read) == ["a/monday", "a/wednesday"]
     assert [(row["run"], row["n"]) for row in rows.to_pylist()] == [
         ("a/monday", 2),
         ("a/tuesday", 1),
@@ -70,53 +70,53 @@ def test_only_what_changed_is_read_again(runs: Path, read: list[str]) -> None:
     assert counted.to_pylist() == [{"n": 6}]
 
 
-def test_a_deleted_run_goes(runs: Path, read: list[str]) -> None:
+def test_deleted_run_leaves_the_catalog(runs: Path, manifests_read: list[str]) -> None:
     crosscue.catalog(runs)
-    read.clear()
+    manifests_read.clear()
     for file in (runs / "b/monday").iterdir():
         file.unlink()
     (runs / "b/monday").rmdir()
 
     found = crosscue.catalog(runs)
 
-    assert read == []
+    assert manifests_read == []
     assert len(found.runs) == 3
     assert found.query("select count(*) as n from approaches").to_pylist() == [{"n": 3}]
 
 
-def fails(job: Job) -> NoReturn:
+def fail(job: Job) -> NoReturn:
     raise UnreadableRunError(f"{job.logs[0]}: no log; check the path")
 
 
-def test_a_failed_run_is_a_row_with_its_status_and_reason(runs: Path, read: list[str]) -> None:
+def test_failed_run_is_a_row_with_status_and_reason(runs: Path, manifests_read: list[str]) -> None:
     log = runs.parent / "drive.mcap"
     log.touch()
-    attempt(fails, Job("sunday", (str(log),), runs / "a/sunday", ""))
-    # A failed drive whose earlier run still exists, and a file that only looks like a failure.
-    attempt(fails, Job("monday", (str(log),), runs / "a/monday", ""))
+    attempt(fail, Job("sunday", (str(log),), runs / "a/sunday", ""))
+    # A failed drive with a complete earlier run, and a failure.log outside of any run.
+    attempt(fail, Job("monday", (str(log),), runs / "a/monday", ""))
     (runs / "b/failure.log").write_text("the coffee machine is out of order\n")
 
     found = crosscue.catalog(runs)
 
     rows = found.query("select run, outcome, exit_status, error from runs order by run").to_pylist()
     monday, sunday, *others = (tuple(row.values()) for row in rows)
-    why = f"{log}: no log; check the path"
-    assert sunday == ("a/sunday", "failed", 4, why)
-    assert monday == ("a/monday", "whole", 0, why)
+    reason = f"{log}: no log; check the path"
+    assert sunday == ("a/sunday", "failed", 4, reason)
+    assert monday == ("a/monday", "whole", 0, reason)
     assert {row[1:] for row in others} == {("whole", 0, None)}
     assert not found.left_out
     assert runs / "a/sunday" not in found.runs
     assert found.select("outcome = 'failed'") == (runs / "a/sunday",)
-    read.clear()
+    manifests_read.clear()
     assert crosscue.catalog(runs).query("select count(*) as n from runs").to_pylist() == [{"n": 5}]
-    assert read == []
+    assert manifests_read == []
     # Once complete, it is a run like the others.
     add_run(runs / "a/sunday", "sunday")
     (runs / "a/sunday/failure.log").unlink()
     assert crosscue.catalog(runs).select("outcome = 'failed'") == ()
 
 
-def test_commands_and_catalog_find_the_same_runs_equally_deep(runs: Path) -> None:
+def test_commands_and_catalog_find_runs_to_the_same_depth(runs: Path) -> None:
     deep = runs / "1/2/3/4/5"
     add_run(deep / "friday", "friday")
     add_run(deep / "6/deeper", "deeper")
@@ -125,20 +125,20 @@ def test_commands_and_catalog_find_the_same_runs_equally_deep(runs: Path) -> Non
 
     found = crosscue.catalog(runs)
 
-    there = {*found.runs, *(runs / run for run in found.left_out)}
-    assert {*runs_of([str(runs)])} == there
-    assert {deep / "friday", deep / "cut"} < there
-    assert deep / "6/deeper" not in there
+    found_by_catalog = {*found.runs, *(runs / run for run in found.left_out)}
+    assert {*runs_of([str(runs)])} == found_by_catalog
+    assert {deep / "friday", deep / "cut"} < found_by_catalog
+    assert deep / "6/deeper" not in found_by_catalog
 
 
-def test_a_run_that_cannot_be_read_is_not_read_again(runs: Path, read: list[str]) -> None:
+def test_unreadable_run_is_not_read_again(runs: Path, manifests_read: list[str]) -> None:
     (runs / "a/monday/manifest.json").write_text("{}")
     first = crosscue.catalog(runs).left_out
-    read.clear()
+    manifests_read.clear()
 
     assert crosscue.catalog(runs).left_out == first
     assert first.keys() == {"a/monday"}
-    assert read == []
+    assert manifests_read == []
 
 
 @pytest.mark.parametrize(
@@ -152,47 +152,49 @@ def test_a_run_that_cannot_be_read_is_not_read_again(runs: Path, read: list[str]
     ],
     ids=["missing", "empty", "cut", "damaged", "noise"],
 )
-def test_an_index_that_is_missing_or_broken_is_made_again(
-    runs: Path, read: list[str], damage: Callable[[Path], object]
+def test_missing_or_damaged_index_is_rebuilt(
+    runs: Path, manifests_read: list[str], damage: Callable[[Path], object]
 ) -> None:
     first = crosscue.catalog(runs).query(ALL)
     damage(runs / NAME)
-    read.clear()
+    manifests_read.clear()
 
     assert crosscue.catalog(runs).query(ALL).equals(first)
-    assert len(read) == 4
-    read.clear()
+    assert len(manifests_read) == 4
+    manifests_read.clear()
     crosscue.catalog(runs)
-    assert read == []
+    assert manifests_read == []
 
 
-def test_an_index_of_other_columns_is_made_again(
-    runs: Path, read: list[str], monkeypatch: pytest.MonkeyPatch
+def test_index_of_another_layout_is_rebuilt(
+    runs: Path, manifests_read: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     crosscue.catalog(runs)
-    read.clear()
+    manifests_read.clear()
     monkeypatch.setattr(index, "_MARK", "another")
 
     crosscue.catalog(runs)
 
-    assert len(read) == 4
+    assert len(manifests_read) == 4
 
 
-def test_a_read_only_folder_is_indexed_in_the_cache(
-    runs: Path, read: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_index_of_read_only_folder_is_written_to_the_cache(
+    runs: Path, manifests_read: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     first = crosscue.catalog(runs).query(ALL)
-    read.clear()
+    manifests_read.clear()
 
     assert crosscue.catalog(runs).query(ALL).equals(first)
-    assert read == []
+    assert manifests_read == []
     assert not (runs / NAME).exists()
     assert len(list((tmp_path / "cache/crosscue/catalogs").iterdir())) == 1
 
 
-def test_a_full_disk_costs_the_index_only(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_catalog_on_a_full_disk_works_without_index(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(self: PartialFile) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -206,7 +208,7 @@ def test_a_full_disk_costs_the_index_only(runs: Path, monkeypatch: pytest.Monkey
     assert [path.name for path in runs.iterdir() if path.is_file()] == []
 
 
-def test_a_run_alone_gets_no_index(runs: Path) -> None:
+def test_single_run_gets_no_index(runs: Path) -> None:
     crosscue.catalog(runs / "a/monday")
 
     assert not (runs / "a/monday" / NAME).exists()

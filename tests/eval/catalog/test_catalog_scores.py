@@ -13,7 +13,7 @@ from support.scoring import truth_folder
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs, one of them scored; its approach, number 7, is in the truth under rain."""
+    """Write two runs, one of them scored; the truth records rain for its approach 7."""
     folder = tmp_path_factory.mktemp("fleet")
     truth = truth_folder(folder / "truth")
     scored = add_run(folder / "runs/scored", "scored")
@@ -23,7 +23,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "runs"
 
 
-def test_an_approach_has_its_conditions_and_result(runs: Path) -> None:
+def test_scored_approach_has_conditions_and_results(runs: Path) -> None:
     rows = crosscue.catalog(runs).query(
         "select run, approach, truth, intersection, control, conditions, detected_m, "
         "detected_range_m, features_m['left'] as left_m from approaches order by run, approach"
@@ -44,7 +44,7 @@ def test_conditions_select_runs(runs: Path) -> None:
     assert found.select("not is_scored") == (runs / "plain",)
 
 
-def test_scores_are_those_of_the_metrics_file(runs: Path) -> None:
+def test_scores_equal_the_by_drive_table(runs: Path) -> None:
     table = RunFolder(runs / "scored/score").table("by_drive").to_pylist()
     rows = crosscue.catalog(runs).query("select metric, value from scores order by metric")
 
@@ -59,7 +59,7 @@ def test_scores_are_those_of_the_metrics_file(runs: Path) -> None:
             assert got[one["metric"]] ** 2 * one["rows"] == pytest.approx(one["total"])
 
 
-def test_the_first_sight_of_a_sign_is_a_question(runs: Path) -> None:
+def test_query_yields_distance_of_first_detected_sign(runs: Path) -> None:
     rows = crosscue.catalog(runs).query(
         "select run, max(distance_m) as first_m from cue_frames "
         "where cue = 'stop_sign' and count > 0 group by run"

@@ -29,7 +29,7 @@ WORSE_CUES = {**CUES, "stop_sign": {frame: int(frame >= 3) for frame in range(40
 
 
 def _settings(established: float) -> Vehicle:
-    """Values in the form of a manifest."""
+    """Return settings with the given threshold of established features."""
     return Vehicle(version=1, fusion=Fusion(established=established))
 
 
@@ -59,14 +59,16 @@ def _pair(tmp_path: Path, *, scored: bool = True, drives: int = 1) -> tuple[Path
     return tmp_path / "scores-a", tmp_path / "scores-b"
 
 
-def test_a_run_is_like_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_compared_with_itself_is_not_worse(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     good, _ = _pair(tmp_path)
 
     assert cli.run(["compare", str(good), str(good)]) == 0
     assert "nothing is worse" in capsys.readouterr().out
 
 
-def test_one_drive_shows_what_differs_and_decides_nothing(
+def test_single_drive_lists_differences_but_decides_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, worse = _pair(tmp_path)
@@ -83,7 +85,7 @@ def test_one_drive_shows_what_differs_and_decides_nothing(
 
 
 @pytest.mark.slow
-def test_what_every_drive_shows_is_decided(
+def test_difference_in_every_drive_is_decided(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, worse = _pair(tmp_path, drives=6)
@@ -107,7 +109,7 @@ def test_what_every_drive_shows_is_decided(
         assert cli.run(argv) == status
 
 
-def test_drives_that_one_run_lacks_are_counted_and_left_out(
+def test_drives_of_only_one_run_are_counted_and_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, worse = _pair(tmp_path, drives=3)
@@ -121,7 +123,7 @@ def test_drives_that_one_run_lacks_are_counted_and_left_out(
     assert worse.exists()
 
 
-def test_a_drive_whose_run_has_another_name_is_no_difference(tmp_path: Path) -> None:
+def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
     for name in ("a", "b"):
         folder = tmp_path / name
         folder.mkdir()
@@ -135,12 +137,12 @@ def test_a_drive_whose_run_has_another_name_is_no_difference(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("text", ["", "a", "-1", "nan", "1e999", "x=%", "5%%"])
-def test_a_tolerance_that_is_none_is_refused(text: str) -> None:
+def test_invalid_tolerance_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"expected 0\.01"):
         read_tolerance(text)
 
 
-def test_runs_without_a_score_are_judged_by_their_tables(
+def test_runs_without_scores_are_compared_by_their_tables(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, worse = _pair(tmp_path, scored=False)
@@ -150,7 +152,7 @@ def test_runs_without_a_score_are_judged_by_their_tables(
     assert compare_runs(open_run(good), open_run(good)).worse == ()
 
 
-def test_tables_that_cannot_be_compared_row_by_row_say_why(tmp_path: Path) -> None:
+def test_tables_of_different_rows_or_columns_report_the_difference(tmp_path: Path) -> None:
     good, worse = _pair(tmp_path, scored=False)
     pq.write_table(frame_table(49), worse / "frames.parquet")
     pq.write_table(cue_table(CUES).drop_columns(["count"]), worse / "cues.parquet")
@@ -167,7 +169,7 @@ def test_tables_that_cannot_be_compared_row_by_row_say_why(tmp_path: Path) -> No
     assert found["range"].what == "only in the first run"
 
 
-def test_damaged_scores_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_scores_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good, worse = _pair(tmp_path)
     for text in ("{", "[]", "[" * 100_000):
         (worse / "score" / "metrics.json").write_text(text)
@@ -175,7 +177,7 @@ def test_damaged_scores_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert "run crosscue score again" in capsys.readouterr().err
 
 
-def test_hostile_names_cannot_drive_the_terminal(
+def test_control_characters_in_names_are_not_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [

@@ -45,7 +45,7 @@ def _tables(path: Path, topics: Sequence[Topic], blocks: list[Block], vehicle: V
     return path
 
 
-def test_mobileye_frames_become_obstacles_from_the_rear_axle(tmp_path: Path) -> None:
+def test_mobileye_frames_decode_to_obstacles_relative_to_rear_axle(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, mobileye=Mobileye(bus="eye", x_m=2.0))
 
     folder = _tables(tmp_path / "out", [EYE], _mobileye_drive(), vehicle)
@@ -56,7 +56,7 @@ def test_mobileye_frames_become_obstacles_from_the_rear_axle(tmp_path: Path) -> 
     assert (folder / "eye_mobileye_status.parquet").exists()
 
 
-def test_what_is_not_understood_is_counted_not_dropped(tmp_path: Path) -> None:
+def test_unsupported_topics_are_counted_as_skipped(tmp_path: Path) -> None:
     odd = Topic("odd", "acme/msg/Secret", "morse")
     rows = Messages(np.zeros(8, np.uint8), np.array([0, 4]), np.array([4, 8]))
     block = Block("odd", np.array([1, 2], np.int64), rows)
@@ -75,7 +75,7 @@ def test_what_is_not_understood_is_counted_not_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("by_s", [-7.0, 0.0, 30.0])
-def test_tables_say_segment_and_stamp_and_rows_add_up(
+def test_decoded_tables_record_segment_and_log_time(
     tmp_path: Path, by_s: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
@@ -101,7 +101,7 @@ def test_tables_say_segment_and_stamp_and_rows_add_up(
     assert any(row["reason"] == "pictures are not tables" for row in skipped)
 
 
-def test_two_topics_never_share_a_file_and_none_leaves_the_folder() -> None:
+def test_file_names_of_topics_are_unique_and_stay_in_the_folder() -> None:
     taken: set[str] = set()
     for topic in (
         "/a/b",
@@ -123,7 +123,7 @@ def test_two_topics_never_share_a_file_and_none_leaves_the_folder() -> None:
         taken.add(name.lower())
 
 
-def test_the_ford_bus_decodes_from_the_command_line(
+def test_recorded_ford_bus_decodes_to_plausible_wheel_speeds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = shared("can", "ford_fusion_2017")

@@ -27,7 +27,7 @@ MODELS = ("m0", "m1", "m2", "m3")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight drives with four models, the third of which finds fewer signs; one run has no score."""
     folder = tmp_path_factory.mktemp("fleet")
-    chance = np.random.default_rng(2)
+    rng = np.random.default_rng(2)
     for at, model in enumerate(MODELS):
         for drive in range(8):
             run = create(folder / f"{9 - at}-{drive}", overwrite=False)
@@ -38,10 +38,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
             write_tags(run.path, {"model": model})
             if (model, drive) == ("m3", 7):
                 continue
-            right = 70.0 + 2.0 * drive + chance.integers(0, 3) - 15.0 * (at >= 2)
+            right = 70.0 + 2.0 * drive + rng.integers(0, 3) - 15.0 * (at >= 2)
             parts = [
                 DriveMetric(f"drive {drive}", RECALL, "mean", right, 100),
-                DriveMetric(f"drive {drive}", BRIER, "mean", 5.0 + chance.normal(), 100),
+                DriveMetric(f"drive {drive}", BRIER, "mean", 5.0 + rng.normal(), 100),
                 DriveMetric(f"drive {drive}", "cues.stop_sign.positives", "sum", 9.0, 1),
             ]
             (run.path / "score").mkdir()
@@ -49,7 +49,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Words(HTMLParser):
+class PageText(HTMLParser):
     """Parser of a page's text and of the resources that it would load."""
 
     def __init__(self) -> None:
@@ -66,18 +66,18 @@ class Words(HTMLParser):
         self.loaded += [tag] if tag in ("script", "link", "img", "iframe") else []
 
 
-def test_the_page_shows_each_metric_and_where_it_changed(
+def test_page_plots_each_metric_and_marks_its_changes(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "history.html"
 
     assert cli.run(["history", str(fleet), "--by", "model", "-o", str(page)]) == 0
 
-    said = capsys.readouterr().out
-    assert re.search(rf"WORSE +{re.escape(RECALL)}: 0\.7\d+ -> 0\.6\d+ from model m2 on", said)
-    assert "2 metrics over 4 models; 1 changed" in said
-    assert "left out   1 runs without a score" in said
-    words = Words()
+    printed = capsys.readouterr().out
+    assert re.search(rf"WORSE +{re.escape(RECALL)}: 0\.7\d+ -> 0\.6\d+ from model m2 on", printed)
+    assert "2 metrics over 4 models; 1 changed" in printed
+    assert "left out   1 runs without a score" in printed
+    words = PageText()
     words.feed(page.read_text())
     assert f"{RECALL} m2 worse" in " ".join(words.text.split())
     assert page.read_text().count("<svg") == 2
@@ -89,7 +89,7 @@ def test_the_page_shows_each_metric_and_where_it_changed(
     assert page.read_bytes() == first
 
 
-def test_points_have_intervals_and_drives(fleet: Path) -> None:
+def test_points_have_intervals_and_drive_counts(fleet: Path) -> None:
     found = crosscue.history(fleet, by="model", metrics=["*.recall"])
 
     assert found.versions == MODELS
@@ -103,9 +103,7 @@ def test_points_have_intervals_and_drives(fleet: Path) -> None:
     assert one.points[3].drives == 7
 
 
-def test_one_version_has_points_and_no_change(
-    fleet: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_single_version_has_no_changes(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["history", str(fleet), "--by", "version", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
 
@@ -116,23 +114,23 @@ def test_one_version_has_points_and_no_change(
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "what"),
+    ("words", "status", "message"),
     [
         (["--by", "no_such_tag"], 1, "no scored run of 32 has a no_such_tag"),
         (["--by", "it's"], 1, "no scored run of 32 has a it's"),
         (["--by", "model", "--metrics", "x.*"], 1, "no judged metric fits x.*"),
     ],
 )
-def test_what_has_no_history_is_one_line(
-    fleet: Path, words: list[str], status: int, what: str, capsys: pytest.CaptureFixture[str]
+def test_history_without_matching_runs_or_metrics_is_refused(
+    fleet: Path, words: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["history", str(fleet), *words]) == status
-    said = capsys.readouterr().err
-    assert what in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
 
 
-def test_names_cannot_break_out_of_the_page(fleet: Path, tmp_path: Path) -> None:
+def test_names_are_escaped_in_the_page(fleet: Path, tmp_path: Path) -> None:
     folder = tmp_path / "hostile"
     run = create(folder / "a", overwrite=False)
     write_manifest(run, estimated())

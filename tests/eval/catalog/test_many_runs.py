@@ -21,7 +21,7 @@ DUSK = "cues.stop_sign.by_condition.dusk.recall"
 
 
 def scored_runs(folder: Path, right: Sequence[int], first: int = 0) -> list[Path]:
-    """A run of each drive with the given number of 20 signs found, half of them at dusk."""
+    """Write a run of each drive that found the given number of 20 signs, half at dusk."""
     found = []
     for number, count in enumerate(right, first):
         run = create(folder / f"{folder.name}-{number}", overwrite=False)
@@ -38,7 +38,7 @@ def scored_runs(folder: Path, right: Sequence[int], first: int = 0) -> list[Path
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight drives, replayed before and after a change that costs every drive some signs."""
+    """Write runs of eight drives before and after a change that misses signs in each."""
     folder = tmp_path_factory.mktemp("fleet")
     scored_runs(folder / "before", [18, 19, 20, 18, 19, 20, 18, 19])
     scored_runs(folder / "after", [12, 14, 13, 11, 14, 15, 12, 13])
@@ -48,7 +48,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 QUERIES = ("--runs", "run like 'after/%'", "--against", "run like 'before/%'")
 
 
-def test_queries_select_what_is_compared(
+def test_queries_select_the_compared_runs(
     fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     junit = tmp_path / "junit.xml"
@@ -64,26 +64,26 @@ def test_queries_select_what_is_compared(
     assert cli.run(["compare", str(fleet), *turned, "-q"]) == 0
 
 
-def test_runs_on_a_store_are_compared_as_in_a_folder(
+def test_remote_runs_compare_like_local_runs(
     fleet: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     fsspec.filesystem("memory").put(f"{fleet}/", "/compared/", recursive=True)
-    asked = QUERIES[1], QUERIES[3]
+    queries = QUERIES[1], QUERIES[3]
 
-    there = crosscue.compare_many(*asked, "memory://compared")
-    here = crosscue.compare_many(*asked, fleet)
+    remote = crosscue.compare_many(*queries, "memory://compared")
+    local = crosscue.compare_many(*queries, fleet)
 
-    assert {one.path: one for one in there.judged} == {one.path: one for one in here.judged}
-    assert {*there.worse} == {RECALL, DUSK}
-    assert there.drives == here.drives == (8, 0, 0)
+    assert {one.path: one for one in remote.judged} == {one.path: one for one in local.judged}
+    assert {*remote.worse} == {RECALL, DUSK}
+    assert remote.drives == local.drives == (8, 0, 0)
     with pytest.raises(crosscue.UsageError, match="memory://compared: runs on a store; copy them"):
         crosscue.failures("memory://compared")
     with pytest.raises(crosscue.UsageError, match="use --runs and --against, or copy it"):
         crosscue.compare_runs("memory://compared/before", "memory://compared/after")
 
 
-def test_a_table_for_a_pull_request(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_markdown_option_prints_a_table(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["compare", str(fleet), *QUERIES, "--markdown", "--tolerance", "0.9"]) == 0
 
     text = capsys.readouterr().out
@@ -95,7 +95,7 @@ def test_a_table_for_a_pull_request(fleet: Path, capsys: pytest.CaptureFixture[s
     assert all(line.count("|") == 7 for line in lines if line.startswith("|"))
 
 
-def test_the_order_of_runs_and_their_names_change_nothing(fleet: Path) -> None:
+def test_comparison_pairs_drives_in_any_order_of_runs(fleet: Path) -> None:
     before, after = (sorted((fleet / side).iterdir()) for side in ("before", "after"))
 
     found = crosscue.compare_many(after, before)
@@ -105,9 +105,7 @@ def test_the_order_of_runs_and_their_names_change_nothing(fleet: Path) -> None:
     assert found.worse == (RECALL, DUSK)
 
 
-def test_drives_of_one_side_and_runs_without_a_score_are_reported(
-    tmp_path: Path, fleet: Path
-) -> None:
+def test_unpaired_drives_and_unscored_runs_are_reported(tmp_path: Path, fleet: Path) -> None:
     before = sorted((fleet / "before").iterdir())
     after = scored_runs(tmp_path / "after", [19] * 7, first=4)
     bare = create(tmp_path / "bare", overwrite=False)
@@ -116,7 +114,7 @@ def test_drives_of_one_side_and_runs_without_a_score_are_reported(
     found = compare_many(before, [*after, bare.path, tmp_path / "gone"])
 
     assert found.drives == (4, 4, 3)
-    assert [why.partition(";")[0] for why in found.left_out.values()] == [
+    assert [reason.partition(";")[0] for reason in found.left_out.values()] == [
         "not scored, or by an earlier version",
         f"{tmp_path / 'gone'}: no manifest.json: not a run folder, or its run was cut short",
     ]
@@ -124,7 +122,7 @@ def test_drives_of_one_side_and_runs_without_a_score_are_reported(
     assert found.is_passed
 
 
-def test_two_runs_of_one_drive_on_a_side_are_refused(tmp_path: Path, fleet: Path) -> None:
+def test_two_runs_of_one_drive_in_a_set_are_refused(tmp_path: Path, fleet: Path) -> None:
     before = sorted((fleet / "before").iterdir())
     twice = scored_runs(tmp_path / "twice", [5])
 
@@ -133,7 +131,7 @@ def test_two_runs_of_one_drive_on_a_side_are_refused(tmp_path: Path, fleet: Path
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "what"),
+    ("words", "status", "message"),
     [
         (("--runs", "true"), 2, "expected one folder with both --runs and --against"),
         (("other", *QUERIES), 2, "expected one folder with both"),
@@ -143,14 +141,14 @@ def test_two_runs_of_one_drive_on_a_side_are_refused(tmp_path: Path, fleet: Path
         (("--runs", "false", "--against", "run like 'before/%'"), 4, "selects no run"),
     ],
 )
-def test_wrong_queries_are_one_line(
+def test_invalid_queries_are_refused_in_one_line(
     fleet: Path,
     words: tuple[str, ...],
     status: int,
-    what: str,
+    message: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert cli.run(["compare", str(fleet), *words]) == status
-    said = capsys.readouterr().err
-    assert what in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

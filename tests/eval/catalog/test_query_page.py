@@ -25,12 +25,12 @@ from support.scoring import (
 )
 
 PAGE: Final = Path(__file__).parents[3] / "docs" / "howto" / "query.md"
-QUESTIONS: Final = re.findall(r"```sql\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+PAGE_QUERIES: Final = re.findall(r"```sql\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 
 
 @pytest.fixture(scope="module")
 def catalog(tmp_path_factory: pytest.TempPathFactory) -> crosscue.Catalog:
-    """Small runs with data for all queries: one approach each, in rain, at 30 m or nearer."""
+    """Small runs with data for all queries: one approach each, in rain, within 30 m."""
     folder = tmp_path_factory.mktemp("fleet")
     runs = runs_below(folder / "runs")
     signs = detected("front", {"signs": "objects"})
@@ -53,18 +53,18 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> crosscue.Catalog:
     return crosscue.catalog(runs)
 
 
-def test_there_are_ten_questions() -> None:
-    assert len(QUESTIONS) == 10
+def test_page_has_ten_queries() -> None:
+    assert len(PAGE_QUERIES) == 10
 
 
-@pytest.mark.parametrize("sql", QUESTIONS, ids=range(1, len(QUESTIONS) + 1))
-def test_a_question_has_an_answer(catalog: crosscue.Catalog, sql: str) -> None:
+@pytest.mark.parametrize("sql", PAGE_QUERIES, ids=range(1, len(PAGE_QUERIES) + 1))
+def test_query_of_the_page_returns_rows(catalog: crosscue.Catalog, sql: str) -> None:
     assert catalog.query(sql).num_rows > 0
 
 
-def test_answers_are_right(catalog: crosscue.Catalog) -> None:
+def test_queries_of_the_page_return_expected_rows(catalog: crosscue.Catalog) -> None:
     def rows(number: int) -> list[dict[str, Any]]:
-        return list(catalog.query(QUESTIONS[number - 1]).to_pylist())
+        return list(catalog.query(PAGE_QUERIES[number - 1]).to_pylist())
 
     assert rows(1) == [{"vehicle": "car", "crosscue": "0", "runs": 5, "with_losses": 1}]
     assert [row["run"] for row in rows(2)] == ["c/wednesday"]
@@ -81,7 +81,7 @@ def test_answers_are_right(catalog: crosscue.Catalog) -> None:
     assert [(row["route"], row["approaches"]) for row in rows(10)] == [("north", 2)]
 
 
-def test_every_column_is_on_the_page() -> None:
+def test_every_column_is_documented_on_the_page() -> None:
     page = PAGE.read_text(encoding="utf-8")
 
     for table, columns in {**INDEXED, **OWN}.items():

@@ -1,4 +1,4 @@
-"""A catalog of runs on an object store: its content, and how little it fetches."""
+"""A catalog of runs on an object store: its content, and the bytes that it fetches."""
 
 import io
 import os
@@ -21,7 +21,7 @@ from support.catalog_runs import add_run, runs_below
 ROWS = 200_000
 
 
-class _Counted(io.BytesIO):
+class _CountedReader(io.BytesIO):
     def read(self, size: int | None = -1, /) -> bytes:
         content = super().read(size)
         CountedStore.fetched.append(len(content))
@@ -32,7 +32,7 @@ class CountedStore(MemoryFileSystem):  # type: ignore[misc]
     """A store in memory that counts the bytes read from its objects."""
 
     protocol = "counted"
-    store: dict[str, Any] = {}  # noqa: RUF012 (as its base has it)
+    store: dict[str, Any] = {}  # noqa: RUF012 (declared as in its base class)
     fetched: list[int] = []  # noqa: RUF012
 
     @classmethod
@@ -41,7 +41,7 @@ class CountedStore(MemoryFileSystem):  # type: ignore[misc]
 
     def _open(self, path: str, mode: str = "rb", **more: Any) -> Any:
         if mode == "rb":
-            return _Counted(super()._open(path, mode, **more).getvalue())
+            return _CountedReader(super()._open(path, mode, **more).getvalue())
         return super()._open(path, mode, **more)
 
 
@@ -93,16 +93,16 @@ def url(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]
         "select * from left_out",
     ],
 )
-def test_a_store_says_what_the_folder_says(folder: Path, url: str, sql: str) -> None:
+def test_remote_catalog_equals_local_catalog(folder: Path, url: str, sql: str) -> None:
     assert crosscue.catalog(url).query(sql).equals(crosscue.catalog(folder).query(sql))
 
 
-def test_a_folder_has_a_url_too(folder: Path) -> None:
+def test_file_url_names_a_local_folder(folder: Path) -> None:
     assert crosscue.catalog(f"file://{folder}").runs == crosscue.catalog(folder).runs
 
 
-def test_only_the_columns_and_row_groups_that_a_query_needs_are_fetched(url: str) -> None:
-    whole = len(CountedStore.store["/fleet/a/monday/pose.parquet"].getvalue())
+def test_queries_fetch_only_required_columns_and_row_groups(url: str) -> None:
+    size = len(CountedStore.store["/fleet/a/monday/pose.parquet"].getvalue())
     found = crosscue.catalog(url)
 
     def fetched(sql: str) -> int:
@@ -113,15 +113,13 @@ def test_only_the_columns_and_row_groups_that_a_query_needs_are_fetched(url: str
     footer = fetched("select count(*) from pose")
     one_column = fetched("select avg(x_m) from pose")
     one_group = fetched("select avg(x_m) from pose where t_ns < 1000")
-    assert fetched("select * from pose") >= whole * 0.99
-    assert footer < one_group < footer + whole / 41
-    assert one_group < one_column < footer + whole / 5
+    assert fetched("select * from pose") >= size * 0.99
+    assert footer < one_group < footer + size / 41
+    assert one_group < one_column < footer + size / 5
     assert fetched("select avg(approaches) from runs") == 0
 
 
-def test_a_second_opening_fetches_nothing_and_a_changed_run_is_read_again(
-    url: str, folder: Path
-) -> None:
+def test_second_opening_fetches_only_changed_runs(url: str, folder: Path) -> None:
     crosscue.catalog(url)
     CountedStore.fetched.clear()
     crosscue.catalog(url)
@@ -145,18 +143,18 @@ def test_nothing_is_written_to_the_store(url: str) -> None:
     assert {*CountedStore.store} == before
 
 
-def test_runs_on_a_store_have_no_folder(url: str) -> None:
+def test_selection_of_remote_runs_is_refused(url: str) -> None:
     with pytest.raises(UsageError, match="runs on a store have no folder here"):
         crosscue.catalog(url).select("true")
 
 
 @pytest.mark.parametrize(
-    ("place", "said"),
+    ("place", "message"),
     [
         ("counted://nowhere", "nothing there|neither a run folder nor a folder of runs"),
         ("nonsense://bucket/runs", "nonsense"),
     ],
 )
-def test_a_store_that_cannot_be_read_is_one_line(url: str, place: str, said: str) -> None:
-    with pytest.raises(UnreadableRunError, match=said):
+def test_unreadable_store_is_reported(url: str, place: str, message: str) -> None:
+    with pytest.raises(UnreadableRunError, match=message):
         crosscue.catalog(place)

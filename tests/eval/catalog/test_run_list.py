@@ -1,4 +1,4 @@
-"""Runs that a command line names."""
+"""Runs named on the command line."""
 
 from pathlib import Path
 
@@ -29,15 +29,15 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path / "runs"
 
 
-def test_a_folder_stands_for_the_runs_in_it_but_not_their_merger(runs: Path) -> None:
+def test_folder_names_its_runs_but_not_their_merged_run(runs: Path) -> None:
     assert runs_of([str(runs)]) == (runs / "a", runs / "b", runs / "deep" / "c")
 
 
-def test_a_run_is_itself_even_a_merged_one(runs: Path) -> None:
+def test_run_folder_names_itself_even_if_merged(runs: Path) -> None:
     assert runs_of([str(runs / "b"), str(runs / "merged")]) == (runs / "b", runs / "merged")
 
 
-def test_a_run_cut_short_is_not_passed_over(runs: Path) -> None:
+def test_incomplete_run_is_listed(runs: Path) -> None:
     (runs / "b" / "manifest.json").unlink()
     (runs / "b" / "pose.parquet").touch()
 
@@ -49,7 +49,7 @@ def test_a_run_named_twice_is_refused(runs: Path) -> None:
         runs_of([str(runs / "b"), str(runs)])
 
 
-def test_patterns_and_lists(runs: Path) -> None:
+def test_patterns_and_list_files_are_expanded(runs: Path) -> None:
     runs.parent.joinpath("runs.txt").write_text("# two\nruns/b\n\nruns/a\n")
 
     assert runs_of([f"{runs}/[ab]"]) == (runs / "a", runs / "b")
@@ -57,7 +57,7 @@ def test_patterns_and_lists(runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("argument", "said"),
+    ("argument", "message"),
     [
         ("{}/empty", "neither a run folder nor a folder of runs"),
         ("{}/z*", "nothing matches"),
@@ -65,15 +65,17 @@ def test_patterns_and_lists(runs: Path) -> None:
         ("@{}/a/manifest.json", "neither|names no run|no run folder"),
     ],
 )
-def test_errors_are_one_line(runs: Path, argument: str, said: str) -> None:
+def test_invalid_run_arguments_are_refused_in_one_line(
+    runs: Path, argument: str, message: str
+) -> None:
     if "manifest" in argument:
         (runs / "a" / "manifest.json").write_text("# nothing\n")
 
-    with pytest.raises(CrosscueError, match=said) as caught:
+    with pytest.raises(CrosscueError, match=message) as caught:
         runs_of([argument.format(runs)])
 
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_there_is_left_to_be_reported_when_opened(tmp_path: Path) -> None:
+def test_missing_run_folder_is_kept_in_the_list(tmp_path: Path) -> None:
     assert runs_of([str(tmp_path / "gone")]) == (tmp_path / "gone",)
