@@ -31,7 +31,7 @@ CALIBRATED = Fusion(
     ),
 )
 KINDS = pytest.mark.parametrize("fusion", [SOURCE, CALIBRATED], ids=["source", "calibrated"])
-FEW = settings(max_examples=40, deadline=None)
+FEW_EXAMPLES = settings(max_examples=40, deadline=None)
 
 number = st.floats(-20.0, 20.0) | st.sampled_from([math.nan, math.inf, -math.inf, 1e300, 0.0])
 signs = st.builds(SignRange, st.sampled_from(Reference), number | st.floats(0.0, 160.0), number)
@@ -55,9 +55,9 @@ def run(drive: list[FrameEvidence], fusion: Fusion) -> tuple[list[Step], Approac
 
 
 @KINDS
-@FEW
+@FEW_EXAMPLES
 @given(drives)
-def test_probabilities_and_ranges_stay_what_they_are(
+def test_probabilities_and_ranges_are_always_valid(
     fusion: Fusion, drive: list[FrameEvidence]
 ) -> None:
     for step in run(drive, fusion)[0]:
@@ -67,9 +67,9 @@ def test_probabilities_and_ranges_stay_what_they_are(
 
 
 @KINDS
-@FEW
+@FEW_EXAMPLES
 @given(drives)
-def test_every_frame_and_every_approach_is_accounted_for(
+def test_every_frame_and_approach_is_accounted_for(
     fusion: Fusion, drive: list[FrameEvidence]
 ) -> None:
     steps, loop = run(drive, fusion)
@@ -87,9 +87,11 @@ def test_every_frame_and_every_approach_is_accounted_for(
 
 
 @KINDS
-@FEW
+@FEW_EXAMPLES
 @given(in_order)
-def test_the_hour_of_the_day_does_not_matter(fusion: Fusion, drive: list[FrameEvidence]) -> None:
+def test_shifting_all_timestamps_does_not_change_results(
+    fusion: Fusion, drive: list[FrameEvidence]
+) -> None:
     later = [replace(one, t_ns=one.t_ns + 1_700_000_000 * SECOND_NS) for one in drive]
 
     now, then = run(drive, fusion)[0], run(later, fusion)[0]
@@ -104,11 +106,9 @@ def mirrored(one: FrameEvidence) -> FrameEvidence:
 
 
 @KINDS
-@FEW
+@FEW_EXAMPLES
 @given(in_order)
-def test_in_the_mirror_a_whole_drive_changes_sides(
-    fusion: Fusion, drive: list[FrameEvidence]
-) -> None:
+def test_mirrored_drive_swaps_left_and_right(fusion: Fusion, drive: list[FrameEvidence]) -> None:
     steps = run(drive, fusion)[0]
     in_mirror = run([mirrored(one) for one in drive], fusion)[0]
 
@@ -120,18 +120,16 @@ def test_in_the_mirror_a_whole_drive_changes_sides(
 
 
 @KINDS
-@FEW
+@FEW_EXAMPLES
 @given(in_order)
-def test_a_frame_that_comes_twice_changes_nothing(
-    fusion: Fusion, drive: list[FrameEvidence]
-) -> None:
+def test_duplicate_frames_do_not_change_results(fusion: Fusion, drive: list[FrameEvidence]) -> None:
     single = list({one.t_ns: one for one in drive}.values())
     doubled = [one for one in single for _ in range(2)]
 
     assert run(doubled, fusion)[0][::2] == run(single, fusion)[0]
 
 
-def test_a_range_less_sure_than_any_range_is_long_is_refused() -> None:
+def test_range_with_overflowing_variance_is_refused() -> None:
     """The squares of these variances would overflow in the filter."""
     fusion = Fusion()
     approaches = Approaches(graph_of(fusion), fusion, RangeFilter())

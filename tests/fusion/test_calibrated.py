@@ -34,68 +34,68 @@ LEARNED = Calibrated(
 )
 
 
-def said(*observations: Situation, learned: Calibrated = LEARNED) -> list[float]:
-    """Change of the log odds of left by each observation."""
+def left_messages(*observations: Situation, learned: Calibrated = LEARNED) -> list[float]:
+    """Return the change in the log odds of left that each observation causes."""
     model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, learned))
-    return [model(look)[LEFT] for look in observations]
+    return [model(observation)[LEFT] for observation in observations]
 
 
 def road(count: int, moved_m: float = 1.0) -> Situation:
     return situation({"road_left": count}, moved_m=moved_m)
 
 
-def test_the_first_look_says_the_whole_likelihood_ratio() -> None:
-    assert said(road(1)) == [pytest.approx(math.log(P / Q))]
-    assert said(road(0)) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
+def test_first_observation_sends_full_log_likelihood_ratio() -> None:
+    assert left_messages(road(1)) == [pytest.approx(math.log(P / Q))]
+    assert left_messages(road(0)) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
 
 
-def test_a_look_that_stays_says_what_the_chain_says() -> None:
+def test_repeated_observation_sends_markov_chain_ratio() -> None:
     rho = math.exp(-1.0 / FADE)
 
-    _, stays = said(road(1), road(1))
-    _, stays_away = said(road(0), road(0))
+    _, stays = left_messages(road(1), road(1))
+    _, stays_away = left_messages(road(0), road(0))
 
     assert stays == pytest.approx(math.log((P + (1 - P) * rho) / (Q + (1 - Q) * rho)))
     assert stays_away == pytest.approx(math.log((1 - P * (1 - rho)) / (1 - Q * (1 - rho))))
 
 
-def test_a_cue_that_appears_says_the_whole_ratio_however_soon() -> None:
-    assert said(road(0), road(1, 0.1))[1] == pytest.approx(math.log(P / Q))
+def test_appearing_cue_sends_full_ratio_after_short_distance() -> None:
+    assert left_messages(road(0), road(1, 0.1))[1] == pytest.approx(math.log(P / Q))
 
 
-def test_looks_far_apart_are_independent() -> None:
-    assert said(road(1), road(1, 500.0))[1] == pytest.approx(math.log(P / Q))
+def test_observations_far_apart_are_independent() -> None:
+    assert left_messages(road(1), road(1, 500.0))[1] == pytest.approx(math.log(P / Q))
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=30))
-def test_a_car_that_stands_hears_each_change_once_and_nothing_else(counts: list[int]) -> None:
+def test_stationary_car_counts_cue_and_its_absence_once_each(counts: list[int]) -> None:
     still = [situation({"road_left": min(count, 1)}, moved_m=0.0) for count in counts]
 
-    total = sum(said(road(1), *still))
+    total = sum(left_messages(road(1), *still))
 
     gone = math.log((1 - P) / (1 - Q))
     assert total == pytest.approx(math.log(P / Q) + (gone if 0 in counts else 0.0))
 
 
-def test_a_picture_seen_before_says_nothing() -> None:
+def test_repeated_picture_sends_no_message() -> None:
     same = situation({"road_left": 1}, new_picture=False)
 
-    assert said(road(1), same, same)[1:] == [0.0, 0.0]
+    assert left_messages(road(1), same, same)[1:] == [0.0, 0.0]
 
 
-def test_a_new_thing_speaks_anew_and_one_seen_before_does_not() -> None:
+def test_only_new_objects_send_messages() -> None:
     def parked(*ids: int) -> Situation:
         return situation({"parked_left": len(ids)}, objects={"parked_left": ids}, moved_m=0.0)
 
-    first, again, other, first_again = said(parked(1), parked(1), parked(1, 2), parked(1))
+    first, again, other, first_again = left_messages(parked(1), parked(1), parked(1, 2), parked(1))
 
     assert first == other == pytest.approx(math.log(P / Q))
     assert again == first_again == 0.0
 
 
-def test_without_identities_more_things_than_ever_are_new_ones() -> None:
-    one, two, one_again, two_again = said(
+def test_without_identities_only_highest_count_adds_new_objects() -> None:
+    one, two, one_again, two_again = left_messages(
         *(situation({"parked_left": n}, moved_m=0.0) for n in (1, 2, 1, 2))
     )
 
@@ -103,17 +103,17 @@ def test_without_identities_more_things_than_ever_are_new_ones() -> None:
     assert one_again == two_again == 0.0
 
 
-def test_what_moves_by_itself_is_heard_again_after_a_time_though_the_car_stands() -> None:
+def test_cross_traffic_counts_again_after_time_while_car_stands() -> None:
     def traffic(passed_s: float) -> Situation:
         return situation({"cross_traffic_left": 1}, moved_m=0.0, passed_s=passed_s)
 
-    _, soon, late = said(traffic(0.0), traffic(0.1), traffic(60.0))
+    _, soon, late = left_messages(traffic(0.0), traffic(0.1), traffic(60.0))
 
     assert 0.0 < soon < 0.2
     assert late == pytest.approx(math.log(P / Q))
 
 
-def test_an_edge_of_which_nothing_was_learned_sends_the_published_message_discounted() -> None:
+def test_unlearned_edge_sends_discounted_published_message() -> None:
     model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, LEARNED))
     sign = situation({"stop_sign": 1}, moved_m=2.0)
     published = math.log(0.97 / 0.03)
@@ -124,22 +124,22 @@ def test_an_edge_of_which_nothing_was_learned_sends_the_published_message_discou
     assert second == pytest.approx(published * effective_sample_fraction(2.0 / 10.0))
 
 
-def test_a_features_exponent_scales_all_it_hears() -> None:
+def test_feature_exponent_scales_all_its_messages() -> None:
     half = LEARNED.model_copy(update={"exponents": {"left": 0.5}})
     observations = (road(1), road(1), situation({"one_way_right": 1}))
 
-    assert said(*observations, learned=half) == pytest.approx(
-        [0.5 * x for x in said(*observations)]
+    assert left_messages(*observations, learned=half) == pytest.approx(
+        [0.5 * x for x in left_messages(*observations)]
     )
 
 
-def test_the_gate_holds_for_learned_messages_too() -> None:
+def test_gate_applies_to_learned_messages() -> None:
     shut = situation({"parked_left": 3, "road_left": 0}, established=False)
 
-    assert said(shut) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
+    assert left_messages(shut) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
 
 
-def test_each_approach_begins_to_listen_anew() -> None:
+def test_message_memory_is_reset_for_each_approach() -> None:
     fusion = Fusion(kind="calibrated", calibrated=LEARNED)
     loop = Approaches(GRAPH, fusion, RangeFilter())
     seen = {"stop_sign": (60.0, 1), "road_left": (25.0, 1)}
@@ -151,7 +151,7 @@ def test_each_approach_begins_to_listen_anew() -> None:
     assert loop.counts["approaches opened"] == 2
 
 
-def test_probabilities_stay_inside_whatever_was_learned() -> None:
+def test_probabilities_stay_in_open_interval_with_extreme_rates() -> None:
     sure = Calibrated(
         rates=(
             Rates(cue="road_left", feature="left", near=False, if_there=1 - 1e-12, if_not=1e-12),
@@ -165,7 +165,7 @@ def test_probabilities_stay_inside_whatever_was_learned() -> None:
     assert all(0.0 < p < 1.0 for step in steps for p in step.probabilities.values())
 
 
-def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
+def test_fit_recovers_true_rates() -> None:
     fit = fit_messages(annotated(1, 150), GRAPH)
 
     for one in fit.rates:
@@ -183,7 +183,7 @@ def test_the_fit_finds_the_rates_that_the_looks_were_drawn_with() -> None:
     }
 
 
-def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:
+def test_fit_recovers_true_fade_length() -> None:
     fit = fit_messages(annotated(2, 400), GRAPH)
 
     for one in fit.fades:
@@ -194,14 +194,14 @@ def test_the_fit_finds_the_fade_that_the_looks_were_drawn_with() -> None:
     assert sum(one.is_learned for one in fit.fades) == 3
 
 
-def test_independent_cues_need_no_exponent() -> None:
+def test_exponents_of_independent_cues_are_near_one() -> None:
     exponents = fit_messages(annotated(3, 200), GRAPH).calibrated.exponents
 
     assert set(exponents) == {"left", "straight"}
     assert all(0.7 <= value <= 1.0 for value in exponents.values())
 
 
-def test_cues_that_repeat_each_other_get_an_exponent() -> None:
+def test_redundant_cues_lower_exponent() -> None:
     twins = annotated(4, 200)
     for one in twins:
         assert isinstance(one.counts, dict)
@@ -211,7 +211,7 @@ def test_cues_that_repeat_each_other_get_an_exponent() -> None:
     assert fit_messages(twins, GRAPH).calibrated.exponents["left"] < 0.6
 
 
-def test_on_simulated_approaches_not_learned_from_it_scores_better_than_the_source() -> None:
+def test_calibrated_model_beats_source_on_held_out_simulated_approaches() -> None:
     learned = fit_messages(annotated(5, 100), GRAPH).calibrated
     ours = theirs = 0.0
     for one in annotated(6, 100):
@@ -222,7 +222,8 @@ def test_on_simulated_approaches_not_learned_from_it_scores_better_than_the_sour
         frames = range(len(one.way_m))
         observations = ({cue: int(n[i]) for cue, n in one.counts.items()} for i in frames)
         messages = [
-            model(situation(look, near=bool(one.is_near[i]))) for i, look in enumerate(observations)
+            model(situation(observation, near=bool(one.is_near[i])))
+            for i, observation in enumerate(observations)
         ]
         source = np.cumsum(np.array(messages), axis=0)[:, LEFT]
         theirs += float(np.logaddexp(0.0, -source if is_left else source).mean())
@@ -230,7 +231,7 @@ def test_on_simulated_approaches_not_learned_from_it_scores_better_than_the_sour
     assert ours < 0.5 * theirs
 
 
-def test_without_approaches_that_lack_a_feature_nothing_is_learned_of_it() -> None:
+def test_feature_present_in_all_approaches_is_not_learned() -> None:
     always = [one for one in annotated(7, 60) if one.features["left"]]
 
     fit = fit_messages(always, GRAPH)
@@ -264,6 +265,6 @@ def test_without_approaches_that_lack_a_feature_nothing_is_learned_of_it() -> No
         ),
     ],
 )
-def test_what_cannot_have_been_learned_is_refused(text: str, match: str) -> None:
+def test_invalid_calibrated_settings_are_refused(text: str, match: str) -> None:
     with pytest.raises(VehicleError, match=match):
         parse(f"version = 1\n[fusion]\n{text}", "car.toml")

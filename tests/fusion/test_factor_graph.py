@@ -32,15 +32,15 @@ from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.fusion import Fusion, usual_cues
 from support.fusion import graphs, graphs_heard, other_side, situation
 
-FEW = settings(max_examples=60, deadline=None)
-USUAL = graph_of(Fusion())
+FEW_EXAMPLES = settings(max_examples=60, deadline=None)
+DEFAULT_GRAPH = graph_of(Fusion())
 DISSENT = 0.49
 
 
-def heard(
+def probabilities_after(
     graph: FactorGraph, frames: Iterable[Mapping[str, int]], *, near: bool = False
 ) -> dict[str, float]:
-    """Probabilities of an established approach after the frames."""
+    """Return the probabilities of an established approach after the frames."""
     model = published_message_model(graph, DISSENT)
     belief = begin(graph)
     for counts in frames:
@@ -49,13 +49,13 @@ def heard(
 
 
 def enumerated(graph: FactorGraph, frames: Sequence[Mapping[str, int]]) -> dict[str, float]:
-    """Marginals from the weight of every assignment of all features, in plain probabilities."""
+    """Return the marginals by weighting every assignment of all features, without log odds."""
     names = graph.feature_names
     weights: dict[tuple[bool, ...], float] = {}
     for truth in itertools.product((False, True), repeat=len(names)):
         is_there = dict(zip(names, truth, strict=True))
         weight = math.prod(f.prior if is_there[f.name] else 1.0 - f.prior for f in graph.features)
-        for cue, edge, times in sent(graph, frames):
+        for cue, edge, times in sent_messages(graph, frames):
             is_agreed = is_there[edge.feature] == edge.is_direct
             weight *= (cue.precision if is_agreed else 1.0 - cue.precision) ** times
         weights[truth] = weight
@@ -66,10 +66,10 @@ def enumerated(graph: FactorGraph, frames: Sequence[Mapping[str, int]]) -> dict[
     }
 
 
-def sent(
+def sent_messages(
     graph: FactorGraph, frames: Iterable[Mapping[str, int]]
 ) -> Iterable[tuple[CueNode, Edge, int]]:
-    """Yield every cue's detections along every edge."""
+    """Yield each edge's cue, the edge, and its number of messages in each frame."""
     cues = {cue.name: cue for cue in graph.cues}
     for counts in frames:
         for edge in graph.edges:
@@ -78,19 +78,21 @@ def sent(
                 yield cue, edge, count if cue.counted else 1
 
 
-@FEW
+@FEW_EXAMPLES
 @given(graphs_heard())
-def test_enumerating_all_cases_comes_to_the_same(
+def test_marginals_equal_enumeration_of_all_assignments(
     case: tuple[FactorGraph, list[dict[str, int]]],
 ) -> None:
     graph, frames = case
 
-    assert heard(graph, frames) == pytest.approx(enumerated(graph, frames), rel=1e-9, abs=1e-12)
+    assert probabilities_after(graph, frames) == pytest.approx(
+        enumerated(graph, frames), rel=1e-9, abs=1e-12
+    )
 
 
-@FEW
+@FEW_EXAMPLES
 @given(graphs_heard())
-def test_gtsams_discrete_factor_graph_comes_to_the_same(
+def test_marginals_equal_gtsam_discrete_factor_graph(
     case: tuple[FactorGraph, list[dict[str, int]]],
 ) -> None:
     gtsam = pytest.importorskip("gtsam", reason="this check needs the optional package gtsam")
@@ -99,19 +101,19 @@ def test_gtsams_discrete_factor_graph_comes_to_the_same(
     theirs = gtsam.DiscreteFactorGraph()
     for feature in graph.features:
         theirs.add(keys[feature.name], [1.0 - feature.prior, feature.prior])
-    for cue, edge, times in sent(graph, frames):
+    for cue, edge, times in sent_messages(graph, frames):
         yes = cue.precision if edge.is_direct else 1.0 - cue.precision
         for _ in range(times):
             theirs.add(keys[edge.feature], [1.0 - yes, yes])
     marginals = gtsam.DiscreteMarginals(theirs)
     expected = {name: marginals.marginalProbabilities(key)[1] for name, key in keys.items()}
 
-    assert heard(graph, frames) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+    assert probabilities_after(graph, frames) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-@FEW
+@FEW_EXAMPLES
 @given(graphs_heard(), st.randoms(use_true_random=False))
-def test_order_does_not_matter(
+def test_order_of_frames_does_not_matter(
     case: tuple[FactorGraph, list[dict[str, int]]],
     random: Random,
 ) -> None:
@@ -119,10 +121,12 @@ def test_order_does_not_matter(
     mixed = list(frames)
     random.shuffle(mixed)
 
-    assert heard(graph, mixed) == pytest.approx(heard(graph, frames), rel=1e-9)
+    assert probabilities_after(graph, mixed) == pytest.approx(
+        probabilities_after(graph, frames), rel=1e-9
+    )
 
 
-def test_order_does_not_matter_even_beyond_the_limit_of_what_is_shown() -> None:
+def test_order_of_frames_does_not_matter_at_saturation() -> None:
     for_it, against = [{"stop_sign": 1}] * 500, [{"do_not_enter": 1}] * 500
     graph = FactorGraph(
         (Feature("intersection"),),
@@ -130,93 +134,96 @@ def test_order_does_not_matter_even_beyond_the_limit_of_what_is_shown() -> None:
         (Edge("stop_sign", "intersection"), Edge("do_not_enter", "intersection", False)),
     )
 
-    there, back = heard(graph, for_it + against), heard(graph, against + for_it)
+    there, back = (
+        probabilities_after(graph, for_it + against),
+        probabilities_after(graph, against + for_it),
+    )
 
     assert there["intersection"] == back["intersection"] > 0.5
 
 
-@FEW
+@FEW_EXAMPLES
 @given(graphs_heard(), st.integers(0, 5))
-def test_cues_not_looked_for_or_not_found_change_nothing_far_away(
+def test_unobserved_or_absent_cues_change_nothing_far_from_intersection(
     case: tuple[FactorGraph, list[dict[str, int]]], idle: int
 ) -> None:
     graph, frames = case
     nothing: list[dict[str, int]] = [{}, {cue.name: 0 for cue in graph.cues}]
 
-    assert heard(graph, [*frames, *nothing * idle]) == heard(graph, frames)
+    assert probabilities_after(graph, [*frames, *nothing * idle]) == probabilities_after(
+        graph, frames
+    )
 
 
-@FEW
+@FEW_EXAMPLES
 @given(graphs(), st.integers(1, 100_000), st.booleans())
-def test_no_number_of_messages_makes_a_probability_leave_the_open_interval(
+def test_probabilities_stay_in_open_interval_for_any_number_of_messages(
     graph: FactorGraph, many: int, near: bool
 ) -> None:
     for counts in ({c.name: many for c in graph.cues}, {c.name: 0 for c in graph.cues}):
-        now = heard(graph, [counts] * 20, near=near)
+        now = probabilities_after(graph, [counts] * 20, near=near)
         assert all(0.0 < p < 1.0 for p in now.values())
 
 
 @given(st.floats(allow_nan=False))
-def test_log_odds_of_any_size_are_a_probability(odds: float) -> None:
+def test_probability_of_any_log_odds_lies_in_open_interval(odds: float) -> None:
     assert 0.0 < probability(odds) < 1.0
 
 
 @given(st.floats(1e-12, 1.0 - 1e-12))
-def test_log_odds_and_probability_are_each_others_inverse(p: float) -> None:
+def test_probability_inverts_log_odds(p: float) -> None:
     assert probability(log_odds(p)) == pytest.approx(p, rel=1e-9)
 
 
 @pytest.mark.parametrize("bad", [0.0, 1.0, -0.1, math.nan])
-def test_certainty_has_no_log_odds(bad: float) -> None:
+def test_log_odds_refuse_probability_outside_open_interval(bad: float) -> None:
     with pytest.raises(ValueError, match="expected inside"):
         log_odds(bad)
 
 
-@FEW
+@FEW_EXAMPLES
 @given(
     st.lists(st.dictionaries(st.sampled_from([*CUES]), st.integers(0, 3)), max_size=6),
     st.booleans(),
 )
-def test_in_the_mirror_left_and_right_change_places(
-    frames: list[dict[str, int]], near: bool
-) -> None:
+def test_mirrored_cues_swap_left_and_right(frames: list[dict[str, int]], near: bool) -> None:
     mirrored = [{other_side(cue): n for cue, n in counts.items()} for counts in frames]
 
-    seen = heard(USUAL, frames, near=near)
-    seen_in_mirror = heard(USUAL, mirrored, near=near)
+    seen = probabilities_after(DEFAULT_GRAPH, frames, near=near)
+    seen_in_mirror = probabilities_after(DEFAULT_GRAPH, mirrored, near=near)
 
     assert {other_side(name): p for name, p in seen.items()} == pytest.approx(seen_in_mirror)
 
 
-def test_eq_18_is_the_normalised_product_of_messages() -> None:
-    # two parked cars and one road: 0.83^2 * 0.77 against 0.17^2 * 0.23
+def test_eq_18_is_normalised_product_of_messages() -> None:
+    # Two parked cars and one road: 0.83^2 * 0.77 against 0.17^2 * 0.23.
     yes, no = 0.83**2 * 0.77, 0.17**2 * 0.23
 
-    now = heard(USUAL, [{"parked_left": 2, "road_left": 1}])
+    now = probabilities_after(DEFAULT_GRAPH, [{"parked_left": 2, "road_left": 1}])
 
     assert now["left"] == pytest.approx(yes / (yes + no))
     assert now["right"] == pytest.approx(0.5)
 
 
-def test_a_counted_cue_sends_one_message_for_each_detection_another_one_for_each_frame() -> None:
-    twice = heard(USUAL, [{"parked_left": 1, "stop_sign": 1}] * 2)
-    at_once = heard(USUAL, [{"parked_left": 2, "stop_sign": 2}])
+def test_counted_cue_sends_one_message_per_detection_others_one_per_frame() -> None:
+    twice = probabilities_after(DEFAULT_GRAPH, [{"parked_left": 1, "stop_sign": 1}] * 2)
+    at_once = probabilities_after(DEFAULT_GRAPH, [{"parked_left": 2, "stop_sign": 2}])
 
     assert at_once["left"] == pytest.approx(twice["left"])
     assert at_once["intersection"] == pytest.approx(0.97)
     assert twice["intersection"] > 0.99
 
 
-def test_an_exclusive_edge_sends_the_reverse() -> None:
-    now = heard(USUAL, [{"one_way_right": 1, "do_not_enter": 1}])
+def test_exclusive_edge_sends_inverted_message() -> None:
+    now = probabilities_after(DEFAULT_GRAPH, [{"one_way_right": 1, "do_not_enter": 1}])
 
     assert now["left"] == pytest.approx(0.05)
     assert now["right"] == pytest.approx(0.95)
     assert now["straight"] == pytest.approx(0.05)
 
 
-def test_near_by_absent_direct_cues_of_directions_dissent_and_signs_do_not() -> None:
-    absent = heard(USUAL, [dict.fromkeys(CUES, 0)], near=True)
+def test_absent_direction_cues_dissent_near_intersection_but_signs_do_not() -> None:
+    absent = probabilities_after(DEFAULT_GRAPH, [dict.fromkeys(CUES, 0)], near=True)
 
     three = 0.49**3 / (0.49**3 + 0.51**3)
     assert absent == pytest.approx(
@@ -224,8 +231,8 @@ def test_near_by_absent_direct_cues_of_directions_dissent_and_signs_do_not() -> 
     )
 
 
-def test_before_presence_is_established_only_four_cues_speak() -> None:
-    model = published_message_model(USUAL, DISSENT)
+def test_only_four_cues_send_messages_before_presence_is_established() -> None:
+    model = published_message_model(DEFAULT_GRAPH, DISSENT)
 
     speaking = {cue for cue in CUES if any(model(situation({cue: 1}, established=False)))}
 
@@ -239,34 +246,34 @@ def test_before_presence_is_established_only_four_cues_speak() -> None:
 def test_presence_is_established_by_intersection_left_or_right(
     odds: tuple[float, float, float, float], expected: bool
 ) -> None:
-    assert establish(Belief(odds), USUAL, 0.9).is_established is expected
+    assert establish(Belief(odds), DEFAULT_GRAPH, 0.9).is_established is expected
 
 
-def test_presence_once_established_stays_so() -> None:
-    assert establish(Belief((-5.0, -5.0, -5.0, -5.0), True), USUAL, 0.9).is_established
+def test_established_presence_is_not_withdrawn() -> None:
+    assert establish(Belief((-5.0, -5.0, -5.0, -5.0), True), DEFAULT_GRAPH, 0.9).is_established
 
 
-def test_the_usual_graph_falls_into_three_parts_as_the_source_says() -> None:
-    parts = [{name} for name in USUAL.feature_names]
-    for cue in USUAL.cues:
-        ends = {edge.feature for edge in USUAL.edges if edge.cue == cue.name}
+def test_default_graph_has_three_components_as_published() -> None:
+    parts = [{name} for name in DEFAULT_GRAPH.feature_names]
+    for cue in DEFAULT_GRAPH.cues:
+        ends = {edge.feature for edge in DEFAULT_GRAPH.edges if edge.cue == cue.name}
         touched = [part for part in parts if part & ends]
         parts = [part for part in parts if not part & ends] + [set().union(*touched)]
 
     assert sorted(map(sorted, parts)) == [["intersection"], ["left", "right"], ["straight"]]
 
 
-def test_the_usual_graph_has_every_cue_that_detectors_give() -> None:
+def test_default_graph_has_every_cue_of_cue_table() -> None:
     assert [*usual_cues()] == [*CUES]
 
 
-def test_a_cue_left_out_is_gone_and_the_rest_stays() -> None:
-    less = USUAL.without("stop_sign")
+def test_graph_without_cue_drops_only_that_cue() -> None:
+    less = DEFAULT_GRAPH.without("stop_sign")
 
-    assert {c.name for c in USUAL.cues} - {c.name for c in less.cues} == {"stop_sign"}
-    assert heard(less, [{"stop_sign": 1, "road_left": 1}])["intersection"] == 0.5
+    assert {c.name for c in DEFAULT_GRAPH.cues} - {c.name for c in less.cues} == {"stop_sign"}
+    assert probabilities_after(less, [{"stop_sign": 1, "road_left": 1}])["intersection"] == 0.5
     with pytest.raises(ValueError, match="no cue 'stop_sgn'; there are: stop_sign"):
-        USUAL.without("stop_sgn")
+        DEFAULT_GRAPH.without("stop_sgn")
 
 
 @pytest.mark.parametrize(
@@ -277,11 +284,11 @@ def test_a_cue_left_out_is_gone_and_the_rest_stays() -> None:
         ((Edge("z", "f"), Edge("z", "f", False)), "joined twice"),
     ],
 )
-def test_edges_that_lead_nowhere_are_refused(edges: tuple[Edge, ...], match: str) -> None:
+def test_invalid_edges_are_refused(edges: tuple[Edge, ...], match: str) -> None:
     with pytest.raises(ValueError, match=match):
         FactorGraph((Feature("f"),), (CueNode("z", 0.9),), edges)
 
 
-def test_a_name_that_stands_twice_is_refused() -> None:
+def test_duplicate_feature_name_is_refused() -> None:
     with pytest.raises(ValueError, match="feature 'f' appears twice"):
         FactorGraph((Feature("f"), Feature("f")), (), ())

@@ -1,4 +1,4 @@
-"""Tests of following a tracker's range over distance: without double counting and jumps."""
+"""Tests of following a tracker's range without counting it twice and without jumps."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def belief(track: RangeTrack) -> RangeBelief:
     return track.belief
 
 
-def test_the_first_is_taken_as_it_is_and_nothing_changes_while_the_car_stands() -> None:
+def test_first_range_is_adopted_and_kept_while_car_stands() -> None:
     track, began = follow(NOTHING, 50.0, 9.0, 0.0, SETTINGS)
     again, taken = follow(track, 44.0, 4.0, 0.0, SETTINGS)
 
@@ -23,7 +23,7 @@ def test_the_first_is_taken_as_it_is_and_nothing_changes_while_the_car_stands() 
     assert belief(track) == belief(again) == RangeBelief(50.0, 9.0)
 
 
-def test_with_no_way_to_take_it_up_over_it_is_the_other_s_range() -> None:
+def test_zero_take_up_distance_adopts_tracker_range_at_once() -> None:
     settings = SETTINGS.model_copy(update={"take_up_m": 0.0})
     track, _ = follow(RangeTrack(RangeBelief(50.0, 9.0)), 44.0, 4.0, 1.0, settings)
 
@@ -31,7 +31,7 @@ def test_with_no_way_to_take_it_up_over_it_is_the_other_s_range() -> None:
 
 
 @pytest.mark.parametrize("correction_m", [-9.0, 5.0, 9.9])
-def test_a_correction_below_the_way_never_makes_the_range_grow(correction_m: float) -> None:
+def test_correction_within_take_up_distance_never_increases_range(correction_m: float) -> None:
     track, _ = follow(NOTHING, 80.0, 100.0, 0.0, SETTINGS)
     ranges = [belief(track).mean_m]
     for i in range(1, 120):
@@ -45,7 +45,7 @@ def test_a_correction_below_the_way_never_makes_the_range_grow(correction_m: flo
     assert ranges[-1] == pytest.approx(80.0 + correction_m - gone_m, abs=0.1)
 
 
-def test_one_that_cannot_be_about_the_same_place_replaces_the_belief() -> None:
+def test_inconsistent_range_replaces_belief() -> None:
     track, verdict = follow(RangeTrack(RangeBelief(50.0, 1.0)), 80.0, 1.0, 0.1, SETTINGS)
 
     assert verdict is Verdict.RESTARTED
@@ -53,7 +53,7 @@ def test_one_that_cannot_be_about_the_same_place_replaces_the_belief() -> None:
 
 
 @pytest.mark.parametrize("take_up_m", [0.0, 3.0, 10.0, 40.0])
-def test_its_errors_are_as_large_as_it_says(take_up_m: float) -> None:
+def test_followed_range_errors_match_reported_variance(take_up_m: float) -> None:
     """The tracker's range is the mean of all measurements so far, so later ones are better."""
     rng = np.random.default_rng(5)
     settings = SETTINGS.model_copy(update={"take_up_m": take_up_m, "gate_nis": None})

@@ -29,39 +29,39 @@ from crosscue.replay.vehicle.fusion import RangeFilter
 
 METRES = st.floats(-200.0, 200.0)
 VARIANCES = st.floats(0.01, 400.0)
-FEW = settings(max_examples=60, deadline=None)
+FEW_EXAMPLES = settings(max_examples=60, deadline=None)
 
 
-def test_eq_8_the_way_gone_comes_off_the_range() -> None:
+def test_eq_8_subtracts_travelled_distance_from_range() -> None:
     assert predict(RangeBelief(40.0, 2.0), 1.5, 0.1).mean_m == pytest.approx(38.5)
 
 
-def test_eq_8_reversing_adds_to_the_range() -> None:
+def test_eq_8_reversing_increases_range() -> None:
     assert predict(RangeBelief(40.0, 2.0), -1.5, 0.1).mean_m == pytest.approx(41.5)
 
 
-def test_eq_9_odometry_noise_adds_to_the_variance() -> None:
+def test_eq_9_adds_odometry_variance() -> None:
     assert predict(RangeBelief(40.0, 2.0), 1.5, 0.1).var_m2 == pytest.approx(2.1)
 
 
-def test_eq_10_and_11_the_gain_shares_out_the_innovation() -> None:
+def test_eq_10_and_11_weight_innovation_by_gain() -> None:
     # K = 6 / (6 + 2) = 0.75; 20 + 0.75 * (24 - 20) = 23
     assert update(RangeBelief(20.0, 6.0), 24.0, 2.0).mean_m == pytest.approx(23.0)
 
 
-def test_eq_12_the_variance_shrinks_by_the_gain() -> None:
+def test_eq_12_reduces_variance_by_gain() -> None:
     assert update(RangeBelief(20.0, 6.0), 24.0, 2.0).var_m2 == pytest.approx(1.5)
 
 
-def test_the_first_measurement_is_the_belief() -> None:
+def test_first_measurement_initialises_belief() -> None:
     assert initialise(31.0, 2.9) == RangeBelief(31.0, 2.9)
 
 
-def test_the_innovation_is_judged_against_both_variances() -> None:
+def test_nis_uses_sum_of_both_variances() -> None:
     assert nis(RangeBelief(20.0, 6.0), 24.0, 2.0) == pytest.approx(2.0)
 
 
-@FEW
+@FEW_EXAMPLES
 @given(METRES, VARIANCES, st.lists(st.tuples(METRES, VARIANCES), min_size=1, max_size=6))
 def test_order_of_measurements_does_not_matter(
     mean_m: float, var_m2: float, seen: list[tuple[float, float]]
@@ -73,9 +73,9 @@ def test_order_of_measurements_does_not_matter(
     np.testing.assert_allclose(there, back, rtol=1e-9, atol=1e-9)
 
 
-@FEW
+@FEW_EXAMPLES
 @given(METRES, VARIANCES, METRES, VARIANCES)
-def test_a_measurement_leaves_the_belief_surer_than_either(
+def test_posterior_variance_is_below_prior_and_sensor_variance(
     mean_m: float, var_m2: float, measured_m: float, sensor_var_m2: float
 ) -> None:
     after = update(RangeBelief(mean_m, var_m2), measured_m, sensor_var_m2)
@@ -84,9 +84,9 @@ def test_a_measurement_leaves_the_belief_surer_than_either(
     assert min(mean_m, measured_m) - 1e-9 <= after.mean_m <= max(mean_m, measured_m) + 1e-9
 
 
-@FEW
+@FEW_EXAMPLES
 @given(st.lists(st.tuples(METRES, VARIANCES, st.none() | METRES, VARIANCES), max_size=20))
-def test_steps_agree_with_equations_8_to_12_as_printed(
+def test_filter_steps_match_printed_equations_8_to_12(
     steps: list[tuple[float, float, float | None, float]],
 ) -> None:
     mean_m, var_m2 = 50.0, 9.0
@@ -105,7 +105,9 @@ def test_steps_agree_with_equations_8_to_12_as_printed(
 
 
 @pytest.mark.parametrize("sensor_var_m2", [1e-9, 2.9, 1e9])
-def test_the_variance_stays_positive_whatever_the_sensor_claims(sensor_var_m2: float) -> None:
+def test_variance_matches_information_form_for_extreme_sensor_variances(
+    sensor_var_m2: float,
+) -> None:
     belief = RangeBelief(50.0, 400.0)
     for _ in range(50):
         belief = update(belief, 50.0, sensor_var_m2)
@@ -114,7 +116,7 @@ def test_the_variance_stays_positive_whatever_the_sensor_claims(sensor_var_m2: f
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan])
-def test_a_sensor_that_claims_certainty_is_refused(bad: float) -> None:
+def test_non_positive_sensor_variance_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="sensor_var_m2"):
         update(RangeBelief(30.0, 4.0), 26.0, bad)
     with pytest.raises(ValueError, match="sensor_var_m2"):
@@ -122,12 +124,12 @@ def test_a_sensor_that_claims_certainty_is_refused(bad: float) -> None:
 
 
 @pytest.mark.parametrize("bad", [-1.0, math.nan])
-def test_odometry_that_makes_surer_is_refused(bad: float) -> None:
+def test_negative_odometry_variance_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="odometry_var_m2"):
         predict(RangeBelief(30.0, 4.0), 1.0, bad)
 
 
-def test_errors_are_as_large_as_the_filter_says() -> None:
+def test_filter_errors_match_reported_variance() -> None:
     rng = np.random.default_rng(seed=11)
     runs = 2000
     nees = []
@@ -149,7 +151,7 @@ def test_errors_are_as_large_as_the_filter_says() -> None:
     assert np.mean(nees) == pytest.approx(1.0, abs=4 * math.sqrt(2 / len(nees)))
 
 
-def test_an_absurd_measurement_is_refused_and_changes_no_belief() -> None:
+def test_implausible_measurement_is_refused_and_keeps_belief() -> None:
     before = RangeTrack(RangeBelief(40.0, 2.0))
 
     after, verdict = measure(before, 90.0, 2.9, RangeFilter(), 20.0)
@@ -158,7 +160,7 @@ def test_an_absurd_measurement_is_refused_and_changes_no_belief() -> None:
     assert after.belief == before.belief
 
 
-def test_an_absurd_first_measurement_does_not_shut_out_the_good_ones() -> None:
+def test_consistent_measurements_replace_implausible_first_one() -> None:
     track, verdicts = NOTHING, []
     source = RangeFilter(begin_after=1, restart_after=5)
     for measured_m in (120.0, 60.0, 59.0, 61.0, 60.0, 60.0):
@@ -170,7 +172,7 @@ def test_an_absurd_first_measurement_does_not_shut_out_the_good_ones() -> None:
     assert track.belief.mean_m == pytest.approx(60.0, abs=0.5)
 
 
-def test_what_is_seen_once_gives_no_range_and_is_forgotten() -> None:
+def test_single_measurement_starts_no_range_and_expires() -> None:
     once, verdict = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
     gone = advance(advance(once, 4.0, 0.1, RangeFilter()), 2.0, 0.1, RangeFilter())
 
@@ -179,7 +181,7 @@ def test_what_is_seen_once_gives_no_range_and_is_forgotten() -> None:
     assert gone == NOTHING
 
 
-def test_a_second_look_that_agrees_begins_a_range_from_both() -> None:
+def test_second_consistent_measurement_starts_range_from_both() -> None:
     independent = RangeFilter(fade_m=0.0)
     once, _ = measure(NOTHING, 60.0, 2.0, independent, 20.0)
     twice, verdict = measure(advance(once, 1.0, 0.0, independent), 61.0, 2.0, independent, 20.0)
@@ -188,7 +190,7 @@ def test_a_second_look_that_agrees_begins_a_range_from_both() -> None:
     assert twice.belief == pytest.approx(RangeBelief(60.0, 1.0))
 
 
-def test_looks_that_contradict_each_other_begin_nothing() -> None:
+def test_contradictory_measurements_start_no_range() -> None:
     track = NOTHING
     for measured_m in (60.0, 20.0, 110.0, 45.0, 80.0):
         track, verdict = measure(track, measured_m, 2.9, RangeFilter(), 20.0)
@@ -197,7 +199,7 @@ def test_looks_that_contradict_each_other_begin_nothing() -> None:
     assert track.belief is None
 
 
-def test_a_first_look_waits_while_the_car_stands_and_widens_where_nobody_measured() -> None:
+def test_pending_measurement_is_kept_at_standstill_and_widens_without_odometry() -> None:
     once, _ = measure(NOTHING, 60.0, 2.9, RangeFilter(), 20.0)
     stood = advance(once, 0.0, 0.0, RangeFilter())
     blind = predict_without_odometry(once, 3.0, RangeFilter())
@@ -208,7 +210,7 @@ def test_a_first_look_waits_while_the_car_stands_and_widens_where_nobody_measure
     assert predict_without_odometry(blind, 3.0, RangeFilter()) == NOTHING
 
 
-def test_absurd_measurements_that_contradict_each_other_never_take_over() -> None:
+def test_contradictory_implausible_measurements_never_replace_belief() -> None:
     track = RangeTrack(RangeBelief(50.0, 2.0))
     for measured_m in (100.0, 20.0, 130.0, 10.0, 90.0, 140.0, 70.0):
         track, verdict = measure(track, measured_m, 2.9, RangeFilter(restart_after=2), 20.0)
@@ -217,7 +219,7 @@ def test_absurd_measurements_that_contradict_each_other_never_take_over() -> Non
     assert track.belief == RangeBelief(50.0, 2.0)
 
 
-def test_the_next_intersections_sign_does_not_pull_away_one_that_is_near() -> None:
+def test_sign_of_next_intersection_does_not_replace_near_range() -> None:
     track = RangeTrack(RangeBelief(8.0, 2.0))
     for _ in range(20):
         track, verdict = measure(track, 70.0, 2.9, RangeFilter(), 20.0)
@@ -226,11 +228,11 @@ def test_the_next_intersections_sign_does_not_pull_away_one_that_is_near() -> No
     assert track.belief == RangeBelief(8.0, 2.0)
 
 
-def test_a_range_that_has_become_too_unsure_is_dropped() -> None:
+def test_range_with_excessive_variance_is_dropped() -> None:
     assert advance(RangeTrack(RangeBelief(50.0, 399.0)), 0.0, 2.0, RangeFilter()) == NOTHING
 
 
-def test_a_look_from_the_same_place_says_nothing_new_where_errors_fade() -> None:
+def test_measurement_from_same_place_adds_no_information_with_fading_errors() -> None:
     fading = RangeFilter(fade_m=2.0, begin_after=1)
     track, _ = measure(NOTHING, 40.0, 2.9, fading, 20.0)
 
@@ -242,7 +244,7 @@ def test_a_look_from_the_same_place_says_nothing_new_where_errors_fade() -> None
     assert far.belief == pytest.approx(RangeBelief(11.0, 1.45))
 
 
-def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> None:
+def test_filter_errors_match_variance_with_distance_correlated_noise() -> None:
     rng = np.random.default_rng(3)
     fade_m, sd_m, runs = 3.0, 1.7, 600
     rho = math.exp(-1.0 / fade_m)
@@ -265,7 +267,7 @@ def test_errors_that_fade_along_the_way_are_as_large_as_the_filter_says() -> Non
     assert np.mean(nees[0.0]) > 3.0
 
 
-def test_the_smoother_is_the_least_squares_solution_over_all_measurements() -> None:
+def test_smoother_equals_least_squares_over_all_measurements() -> None:
     travelled_m, way_var_m2 = [2.0, 3.0, 1.0], [0.1, 0.2, 0.05]
     measured_m, sensor_var_m2 = [40.5, None, 34.2, 34.1], 2.0
     belief = initialise(40.5, sensor_var_m2)

@@ -24,7 +24,7 @@ CUES = [cue.name for cue in GRAPH.cues]
 STEP_NS = SECOND_NS // 10
 
 
-def believe(frames: Sequence[FrameEvidence], fusion: Fusion = FUSION) -> list[Step]:
+def fusion_steps(frames: Sequence[FrameEvidence], fusion: Fusion = FUSION) -> list[Step]:
     approaches = Approaches(graph_of(fusion), fusion, RangeFilter())
     return [approaches(frame) for frame in frames]
 
@@ -38,8 +38,8 @@ def frames_of(
     ]
 
 
-def strongest(steps: Sequence[Step]) -> float:
-    """Maximum distance of any feature's probability from 0.5."""
+def max_deviation(steps: Sequence[Step]) -> float:
+    """Return the largest deviation of any feature's probability from 0.5."""
     said = [abs(p - 0.5) for step in steps for p in step.probabilities.values()]
     return max(said, default=0.0)
 
@@ -47,7 +47,9 @@ def strongest(steps: Sequence[Step]) -> float:
 @pytest.mark.parametrize("cue", [name for name in CUES if name in NONE_SEEN])
 @settings(max_examples=15)
 @given(at=st.integers(0, 30), many=st.integers(1, 9))
-def test_one_frame_is_not_evidence(cue: str, at: int, many: int) -> None:
+def test_detection_in_single_frame_leaves_probabilities_unchanged(
+    cue: str, at: int, many: int
+) -> None:
     light = [1] * 40
     counts = [dict(one.counts) for one in frames_of("traffic_light", light)]
     without = [FrameEvidence(i * STEP_NS, 1.0, 1e-4, (), c) for i, c in enumerate(counts)]
@@ -56,12 +58,12 @@ def test_one_frame_is_not_evidence(cue: str, at: int, many: int) -> None:
     once = [*without]
     once[at] = replace(without[at], counts=false)
 
-    assert believe(once)[-1].probabilities == believe(without)[-1].probabilities
+    assert fusion_steps(once)[-1].probabilities == fusion_steps(without)[-1].probabilities
 
 
 @given(st.lists(st.integers(0, 1), min_size=8, max_size=40))
-def test_nothing_is_said_before_enough_of_the_last_frames_agree(positive: list[int]) -> None:
-    steps = believe(frames_of("traffic_light", positive))
+def test_cue_sends_no_message_until_seen_in_three_of_five_frames(positive: list[int]) -> None:
+    steps = fusion_steps(frames_of("traffic_light", positive))
 
     for i, step in enumerate(steps):
         seen = sum(positive[max(0, i - 4) : i + 1])
@@ -72,13 +74,11 @@ def test_nothing_is_said_before_enough_of_the_last_frames_agree(positive: list[i
     enough = any(
         positive[i] and sum(positive[max(0, i - 4) : i + 1]) >= 3 for i in range(len(positive))
     )
-    assert (strongest(steps) > 0.0) == enough
+    assert (max_deviation(steps) > 0.0) == enough
 
 
 @given(copies=st.integers(0, 50), seconds=st.floats(0.01, 10.0), cue=st.sampled_from(CUES))
-def test_copies_of_a_frame_are_no_more_evidence_than_the_frame(
-    copies: int, seconds: float, cue: str
-) -> None:
+def test_copies_of_frame_send_zero_messages(copies: int, seconds: float, cue: str) -> None:
     once, again = (PersistentMessageModel(GRAPH, FUSION.dissent) for _ in range(2))
     first = situation({cue: 3}, passed_s=seconds)
     copy = situation({cue: 3}, new_picture=False, passed_s=seconds)
@@ -91,7 +91,7 @@ def test_copies_of_a_frame_are_no_more_evidence_than_the_frame(
 
 
 @given(copies=st.integers(1, 20))
-def test_copies_of_a_frame_do_not_confirm_it(copies: int) -> None:
+def test_copies_of_frame_do_not_confirm_cue(copies: int) -> None:
     persistence = Persistence(GRAPH)
 
     persistence({"stop_sign": 1})
@@ -103,7 +103,9 @@ def test_copies_of_a_frame_do_not_confirm_it(copies: int) -> None:
 
 
 @given(frames=st.integers(2, 400), way_m=st.floats(0.0, 80.0))
-def test_more_frames_over_the_same_way_are_hardly_more_evidence(frames: int, way_m: float) -> None:
+def test_evidence_over_distance_is_bounded_for_any_number_of_frames(
+    frames: int, way_m: float
+) -> None:
     model = PersistentMessageModel(GRAPH, FUSION.dissent)
     place = GRAPH.feature_names.index("intersection")
     message = log_odds(FUSION.cues["traffic_light"].precision)
@@ -117,16 +119,14 @@ def test_more_frames_over_the_same_way_are_hardly_more_evidence(frames: int, way
 
 
 @given(many=st.integers(1, 20), cue=st.sampled_from(CUES))
-def test_many_things_in_a_frame_say_no_more_than_one(many: int, cue: str) -> None:
+def test_several_detections_in_frame_count_as_one(many: int, cue: str) -> None:
     one, all_of_them = (PersistentMessageModel(GRAPH, FUSION.dissent) for _ in range(2))
 
     assert one(situation({cue: 1})) == all_of_them(situation({cue: many}))
 
 
 @given(over_m=st.floats(0.1, 300.0), cue=st.sampled_from(CUES))
-def test_a_cue_says_nothing_of_an_intersection_beyond_where_it_was_validated(
-    over_m: float, cue: str
-) -> None:
+def test_cue_sends_no_message_beyond_validated_range(over_m: float, cue: str) -> None:
     model = PersistentMessageModel(GRAPH, FUSION.dissent)
     limit_m = FUSION.cues[cue].within_m
 
@@ -136,34 +136,34 @@ def test_a_cue_says_nothing_of_an_intersection_beyond_where_it_was_validated(
     assert any(model(replace(far, range_m=limit_m)))
 
 
-def test_an_unbroken_cue_far_away_says_why_it_is_not_believed() -> None:
+def test_continuous_cue_beyond_validated_range_reports_reason() -> None:
     far = RangePosterior(Reference.END, 130.0, 4.0, 130.0)
     frames = [
         replace(frame, posteriors=(far,)) for frame in frames_of("stop_sign", [1] * 8, step_m=0.0)
     ]
 
-    steps = believe(frames)
+    steps = fusion_steps(frames)
 
-    assert strongest(steps) == 0.0
+    assert max_deviation(steps) == 0.0
     assert steps[-1].not_believed == {"stop_sign": "intersection further than 100 m"}
 
 
 @pytest.mark.parametrize(
-    ("kind", "calls_it"), [("source", "source"), ("persistent", "persistent"), (None, None)]
+    ("kind", "expected"), [("source", "source"), ("persistent", "persistent"), (None, None)]
 )
-def test_the_default_is_the_source_only_for_simulated_cars(
-    kind: str | None, calls_it: str | None
+def test_default_fusion_kind_is_source_only_for_simulated_car(
+    kind: str | None, expected: str | None
 ) -> None:
     given_kind: Mapping[str, object] = {} if kind is None else {"fusion": {"kind": kind}}
 
     real = Vehicle.model_validate({"version": 1, "name": "Golf", **given_kind})
     simulated = Vehicle.model_validate({"version": 1, "name": SIMULATED_CAR, **given_kind})
 
-    assert real.fusion.kind == (calls_it or "persistent")
-    assert simulated.fusion.kind == (calls_it or "source")
+    assert real.fusion.kind == (expected or "persistent")
+    assert simulated.fusion.kind == (expected or "source")
 
 
-def test_source_multiplies_every_frame_in_as_published() -> None:
+def test_source_kind_counts_every_frame_and_detection() -> None:
     model = message_models_of(GRAPH, Fusion(kind="source"))()
     place = GRAPH.feature_names.index("left")
     counts = {"cross_traffic_left": 2}

@@ -68,13 +68,13 @@ def learned(**changes: object) -> Temporal:
 
 Frame = tuple[dict[str, int], float, list[MeasuredRange]]
 State = tuple[int, int]
-"""A cell, and outgoing roads: left, none, or no intersection."""
+"""Index of a cell, and outgoing roads: left, none, or no intersection."""
 CELLS, LEFT, NO_WAY, NOWHERE = 5, 0, 1, 2
 P_WAY: Final = (0.7, 0.3)
 
 
 def enumerated(about: Temporal, frames: list[Frame]) -> Floats:
-    """Probabilities of intersection and left by a sum over all paths of states."""
+    """Return the probabilities of intersection and left, summed over all paths of states."""
     states = list(itertools.product(range(CELLS), range(3)))
     total = np.zeros(3)
     for path in itertools.product(states, repeat=len(frames)):
@@ -92,13 +92,13 @@ def path_weight(about: Temporal, frames: list[Frame], path: tuple[State, ...]) -
         crossed = int((gone_m + moved_m) // cell_m) - int(gone_m // cell_m)
         gone_m += moved_m
         if i:
-            weight *= moves(about, path[i - 1], path[i], crossed)
+            weight *= transition_probability(about, path[i - 1], path[i], crossed)
         if weight == 0.0:
             return 0.0
         cell, way = path[i]
         center_m = (cell + 0.5) * cell_m - about.behind_m - gone_m % cell_m
         for cue, count in counts.items():
-            p = positive(about, cue, way, center_m, before.get(cue))
+            p = detection_probability(about, cue, way, center_m, before.get(cue))
             weight *= (p if count else 1.0 - p) ** about.exponent
         before = {cue: count > 0 for cue, count in counts.items()}
         for one in ranges:
@@ -116,7 +116,7 @@ def prior(about: Temporal, state: State) -> float:
     return place * (1.0 - about.ahead if way == NOWHERE else about.ahead * P_WAY[way])
 
 
-def moves(about: Temporal, old: State, new: State, cells: int) -> float:
+def transition_probability(about: Temporal, old: State, new: State, cells: int) -> float:
     assert cells in (0, 1)
     if cells == 0:
         return float(old == new)
@@ -130,7 +130,9 @@ def moves(about: Temporal, old: State, new: State, cells: int) -> float:
     return float(new == (old[0] - 1, old[1]))
 
 
-def positive(about: Temporal, cue: str, way: int, center_m: float, before: bool | None) -> float:
+def detection_probability(
+    about: Temporal, cue: str, way: int, center_m: float, before: bool | None
+) -> float:
     there = {LEFT: {"intersection", "left"}, NO_WAY: {"intersection"}, NOWHERE: set[str]()}[way]
     (one,) = (
         one
@@ -145,7 +147,7 @@ def positive(about: Temporal, cue: str, way: int, center_m: float, before: bool 
 
 
 @pytest.mark.parametrize("exponent", [1.0, 0.4])
-def test_the_filter_equals_a_sum_over_all_paths(exponent: float) -> None:
+def test_filter_equals_sum_over_all_state_paths(exponent: float) -> None:
     frames: list[Frame] = [
         ({"sign": 0, "road": 1}, 0.0, []),
         ({"sign": 1}, 1.9, [MeasuredRange(4.5, 2.0)]),
@@ -173,7 +175,7 @@ STEPS = st.lists(
 
 @given(STEPS)
 @settings(max_examples=30, deadline=None)
-def test_no_way_is_believed_more_than_the_intersection_and_mass_is_kept(
+def test_left_never_exceeds_intersection_and_mass_is_conserved(
     steps: list[tuple[dict[str, int], float, float, list[tuple[float, float]]]],
 ) -> None:
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
@@ -187,7 +189,7 @@ def test_no_way_is_believed_more_than_the_intersection_and_mass_is_kept(
         assert (belief.ahead >= 0.0).all()
 
 
-def test_ranges_that_agree_say_where_and_not_whether() -> None:
+def test_consistent_ranges_update_distance_but_not_presence() -> None:
     belief = TemporalFilter(temporal_model(GRAPH, learned(spacing_m=1e9)))
     before = belief.probabilities()[0]
 
@@ -198,7 +200,7 @@ def test_ranges_that_agree_say_where_and_not_whether() -> None:
     assert belief.distance_m() == pytest.approx(5.0, abs=0.5)
 
 
-def test_a_lapse_keeps_a_belief_from_certainty_and_the_law() -> None:
+def test_lapse_mixes_prior_into_probabilities() -> None:
     sure, careful = (
         TemporalFilter(temporal_model(GRAPH, learned(lapse=lapse))) for lapse in (0.0, 0.1)
     )
@@ -213,7 +215,7 @@ def test_a_lapse_keeps_a_belief_from_certainty_and_the_law() -> None:
     assert careful.probabilities()[1] <= careful.probabilities()[0]
 
 
-def test_a_car_that_stands_before_the_same_pictures_learns_little_more() -> None:
+def test_stationary_car_gains_no_evidence_from_repeated_pictures() -> None:
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
     belief.update({"sign": 1}, moved_m=2.0, passed_s=0.1)
     before = belief.probabilities()[0]
@@ -224,7 +226,7 @@ def test_a_car_that_stands_before_the_same_pictures_learns_little_more() -> None
     assert belief.probabilities()[0] == pytest.approx(before)
 
 
-def test_a_cue_that_stays_says_less_than_one_that_appears() -> None:
+def test_persisting_cue_is_weaker_evidence_than_appearing_cue() -> None:
     once, again = (TemporalFilter(temporal_model(GRAPH, learned())) for _ in range(2))
     once.update({"sign": 0}, moved_m=0.0)
     again.update({"sign": 1}, moved_m=0.0)
@@ -237,7 +239,7 @@ def test_a_cue_that_stays_says_less_than_one_that_appears() -> None:
     assert after[0] - odds[0] > after[1] - odds[1]
 
 
-def test_frames_between_two_steps_change_nothing() -> None:
+def test_frames_between_filter_steps_change_nothing() -> None:
     about = learned(step_m=2.0, step_s=100.0)
     coarse, fine = (TemporalFilter(temporal_model(GRAPH, about)) for _ in range(2))
     counts = {"sign": 1, "road": 0}
@@ -257,7 +259,7 @@ def frame(number: int, sign: int, range_m: float | None = None) -> FrameEvidence
     )
 
 
-def test_presence_is_established_with_hysteresis_and_withdrawn_when_nothing_comes() -> None:
+def test_presence_is_established_with_hysteresis_and_withdrawn_without_cues() -> None:
     edges_m = (0.0, 80.0)
     chains = tuple(
         one.model_copy(
@@ -292,12 +294,12 @@ SEQUENCE = st.lists(
     min_size=1,
     max_size=40,
 )
-"""Counts, distance and its variance, a sign's range, and whether the picture is new."""
+"""Counts, distance and its variance, a sign's range with its variance, and ``is_new_picture``."""
 
 
 @given(SEQUENCE, st.floats(0.0, 0.2))
 @settings(max_examples=60, deadline=None)
-def test_what_a_run_writes_keeps_the_bounds_and_the_hysteresis(
+def test_steps_respect_probability_bounds_and_hysteresis(
     frames: list[tuple[dict[str, int], float, float, tuple[float, float] | None, bool]],
     lapse: float,
 ) -> None:
@@ -322,17 +324,17 @@ def test_what_a_run_writes_keeps_the_bounds_and_the_hysteresis(
         was = step.established
 
 
-def test_the_way_before_the_first_picture_changes_nothing() -> None:
+def test_distance_before_first_picture_changes_nothing() -> None:
     settings = Fusion().model_copy(update=TEMPORAL | {"temporal": learned()})
     at_once, later = (Approaches(GRAPH, settings, FILTER) for _ in range(2))
 
     first = at_once(frame(0, 1, 5.0))
-    after_a_way = later(replace(frame(0, 1, 5.0), travelled_m=37.0, travelled_var_m2=1.0))
+    after_distance = later(replace(frame(0, 1, 5.0), travelled_m=37.0, travelled_var_m2=1.0))
 
-    assert after_a_way.probabilities == first.probabilities
+    assert after_distance.probabilities == first.probabilities
 
 
-def test_a_drive_begins_again_after_a_gap() -> None:
+def test_restart_resets_belief() -> None:
     settings = Fusion().model_copy(update=TEMPORAL | {"temporal": learned()})
     belief = Approaches(GRAPH, settings, FILTER)
     first = belief(frame(0, 1, 5.0))
@@ -352,9 +354,7 @@ def test_a_drive_begins_again_after_a_gap() -> None:
         ({"temporal": learned()}, "no cue 'sign'"),
     ],
 )
-def test_a_vehicle_file_that_cannot_be_is_refused(
-    given_settings: dict[str, object], why: str
-) -> None:
+def test_invalid_fusion_settings_are_refused(given_settings: dict[str, object], why: str) -> None:
     with pytest.raises(ValidationError, match=why):
         Fusion.model_validate(given_settings)
 
@@ -367,6 +367,6 @@ def test_a_vehicle_file_that_cannot_be_is_refused(
         ({"ways": {}}, "at least one"),
     ],
 )
-def test_what_was_learned_has_to_line_up(changes: dict[str, object], why: str) -> None:
+def test_inconsistent_temporal_model_is_refused(changes: dict[str, object], why: str) -> None:
     with pytest.raises(ValidationError, match=why):
         learned(**changes)

@@ -31,7 +31,7 @@ STAYS, APPEARS = 0.8, 0.15
 
 
 def drive(number: int, *, is_ahead: bool, left: bool) -> AnnotatedDrive:
-    """Thirty frames at intervals of two metres; one cue is a chain, another one repeats it."""
+    """Return 30 frames at intervals of 2 m; ``road`` is a Markov chain and ``again`` repeats it."""
     rng = np.random.default_rng([number, 3])
     n = 30
     road = np.zeros(n, np.int64)
@@ -73,7 +73,7 @@ def chain(learned: Temporal, cue: str, there: tuple[str, ...]) -> CueChain:
     return next(one for one in learned.chains if one.cue == cue and one.there == there)
 
 
-def test_the_rates_of_a_chain_come_back(learned: Temporal) -> None:
+def test_fit_recovers_chain_rates(learned: Temporal) -> None:
     found = chain(learned, "road", ("intersection", "left"))
 
     assert np.mean(found.stays) == pytest.approx(STAYS, abs=0.08)
@@ -81,29 +81,27 @@ def test_the_rates_of_a_chain_come_back(learned: Temporal) -> None:
     assert chain(learned, "road", ("intersection",)).appears[0] < 0.1
 
 
-def test_ways_and_presence_are_counted_once_for_each_place(learned: Temporal) -> None:
+def test_outgoing_roads_and_presence_are_counted_once_per_place(learned: Temporal) -> None:
     # 24 places: 8 with a left road, 8 without, 8 that are not an intersection.
     assert learned.ahead == pytest.approx(17.0 / 26.0, abs=1e-4)
     assert learned.ways == pytest.approx({"left": 0.5, "none": 0.5})
 
 
-def test_a_cue_that_nothing_looked_for_has_no_chain(learned: Temporal) -> None:
+def test_cue_without_observations_has_no_chain(learned: Temporal) -> None:
     assert {one.cue for one in learned.chains} == {"sign", "road", "again"}
 
 
-def test_a_cue_that_only_repeats_another_lowers_the_exponent(
-    learned: Temporal, drives: list[AnnotatedDrive]
-) -> None:
+def test_redundant_cue_lowers_exponent(learned: Temporal, drives: list[AnnotatedDrive]) -> None:
     once = fit_temporal(drives, GRAPH.without("again")).temporal
 
     assert learned.exponent < once.exponent
 
 
-def test_ranges_that_fit_are_hardly_ever_stray(learned: Temporal) -> None:
+def test_consistent_ranges_yield_low_stray_probability(learned: Temporal) -> None:
     assert learned.stray < 0.03
 
 
-def test_the_filter_finds_what_is_there_in_drives_that_were_not_counted(
+def test_filter_recovers_features_of_held_out_drives(
     learned: Temporal,
 ) -> None:
     model = temporal_model(GRAPH, learned)
@@ -115,6 +113,6 @@ def test_the_filter_finds_what_is_there_in_drives_that_were_not_counted(
         assert np.mean([abs(p - left) for _, p in ends]) < 0.25
 
 
-def test_one_place_teaches_nothing_about_others(drives: list[AnnotatedDrive]) -> None:
+def test_fit_from_single_place_is_refused(drives: list[AnnotatedDrive]) -> None:
     with pytest.raises(ValueError, match="two places"):
         fit_temporal(drives[:2], GRAPH)
