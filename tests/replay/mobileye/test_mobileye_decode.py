@@ -1,4 +1,4 @@
-"""Frames of a bus are decoded to tables: frames that belong together are joined, no others."""
+"""Frames of a bus are decoded to tables; only frames of one image are joined."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from crosscue.replay.mobileye.layout import VARIANTS
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import MS, frames, join, random_drive, status, triple, values
 
-HERE = Mounting()
-AS_IT_COMES = MobileyeSettings(mounting=HERE)
+ORIGIN_MOUNTING = Mounting()
+DEVICE_FRAME = MobileyeSettings(mounting=ORIGIN_MOUNTING)
 
 
 def decode(
-    blocks: Block | list[Block], how: MobileyeSettings = AS_IT_COMES
+    blocks: Block | list[Block], how: MobileyeSettings = DEVICE_FRAME
 ) -> tuple[dict[str, Table], Ledger]:
-    """All tables of a log, and its account, which must add up."""
+    """Return all tables of a log and its ledger, after checking that the ledger adds up."""
     blocks = [blocks] if isinstance(blocks, Block) else blocks
     ledger = Ledger("log")
     decoder = MobileyeDecoder("can1", ledger, how)
-    given_blocks: list[Block] = []
+    decoded_blocks: list[Block] = []
     for block in blocks:
         ledger.find("can1", len(block))
-        given_blocks += decoder(block)
-    given_blocks += decoder.flush()
+        decoded_blocks += decoder(block)
+    decoded_blocks += decoder.flush()
     tables: dict[str, list[Table]] = {}
-    for block in given_blocks:
+    for block in decoded_blocks:
         assert isinstance(block.rows, Table)
         tables.setdefault(block.topic.removeprefix("can1/mobileye/"), []).append(block.rows)
     whole = {name: stack(parts) for name, parts in tables.items()}
@@ -50,7 +50,7 @@ def stack(parts: list[Table]) -> Table:
 
 
 def frames_in(tables: dict[str, Table]) -> int:
-    """Number of frames that yielded the rows."""
+    """Return the number of frames from which the rows were decoded."""
     weight = {"obstacles": 3, "lanes": 2, "next_lanes": 2}
     return sum(weight.get(name, 1) * len(table) for name, table in tables.items())
 
@@ -59,7 +59,7 @@ def skipped(ledger: Ledger) -> Counter[str]:
     return ledger.topic("can1").skipped
 
 
-def test_a_whole_burst_gives_a_row_per_obstacle() -> None:
+def test_complete_burst_yields_one_row_per_obstacle() -> None:
     sent = [status(2, 40), *triple(0, 7), *triple(1, 9)]
     tables, ledger = decode(frames(sent))
 
@@ -83,7 +83,7 @@ def test_order_of_frames_within_a_burst_does_not_matter() -> None:
     assert not skipped(ledger)
 
 
-def test_parts_of_different_slots_are_never_one_obstacle() -> None:
+def test_parts_of_different_slots_are_not_joined() -> None:
     sent = [status(2, 0), triple(0, 7)[0], triple(1, 9)[1], triple(0, 7)[2], status(0, 66)]
     tables, ledger = decode(frames(sent, [0, MS, 2 * MS, 3 * MS, 66 * MS]))
 
@@ -92,7 +92,7 @@ def test_parts_of_different_slots_are_never_one_obstacle() -> None:
     assert ledger.topic("can1").dropped.total() == 3
 
 
-def test_a_triple_across_two_status_frames_is_not_joined() -> None:
+def test_obstacle_split_by_status_frame_is_not_joined() -> None:
     a, b, c = triple(0, 7)
     sent = [status(1, 0), a, status(1, 66), b, c, status(0, 132)]
     tables, ledger = decode(frames(sent, [0, MS, 66 * MS, 67 * MS, 68 * MS, 132 * MS]))
@@ -103,18 +103,18 @@ def test_a_triple_across_two_status_frames_is_not_joined() -> None:
     assert ledger.topic("can1").dropped.total() == 3
 
 
-def test_a_cut_burst_keeps_its_whole_obstacles_and_reports_the_rest() -> None:
+def test_truncated_burst_keeps_complete_obstacles_and_reports_others() -> None:
     sent = [status(3, 0), *triple(0, 7), *triple(1, 9)[:2], status(0, 66)]
     times = [0, *range(MS, 6 * MS, MS), 66 * MS]
     tables, ledger = decode(frames(sent, times))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
     assert skipped(ledger)["incomplete obstacle: A, B or C is missing"] == 2
-    lost = list(ledger.drops())
-    assert [(d.count, d.t_ns, d.detail) for d in lost] == [(4, 0, "burst 0")]
+    drops = list(ledger.drops())
+    assert [(d.count, d.t_ns, d.detail) for d in drops] == [(4, 0, "burst 0")]
 
 
-def test_a_log_that_ends_within_a_burst_is_not_called_damaged() -> None:
+def test_log_that_ends_within_a_burst_is_not_damaged() -> None:
     tables, ledger = decode(frames([status(2, 0), *triple(0, 7), triple(1, 9)[0]]))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
@@ -123,7 +123,7 @@ def test_a_log_that_ends_within_a_burst_is_not_called_damaged() -> None:
     assert any("ends within an image's burst" in n for n in ledger.notices)
 
 
-def test_a_lost_status_frame_does_not_mix_two_images() -> None:
+def test_missing_status_frame_does_not_mix_two_images() -> None:
     """Slot 0 is repeated with other content: frames from there on belong to another image."""
     sent = [status(2, 0), *triple(0, 7), *triple(0, 8), *triple(1, 9), status(0, 99)]
     tables, ledger = decode(frames(sent, [*range(0, 10 * MS, MS), 99 * MS]))
@@ -132,7 +132,7 @@ def test_a_lost_status_frame_does_not_mix_two_images() -> None:
     assert skipped(ledger)["slot sent twice: the status frame in between is missing"] == 6
 
 
-def test_frames_long_after_their_status_frame_belong_to_another_image() -> None:
+def test_frames_long_after_status_frame_are_skipped() -> None:
     """One complete slot, the next status frame and the A of the next image are lost."""
     a, b, c = triple(0, 7)
     sent = [status(1, 0), a, b, c]
@@ -142,7 +142,7 @@ def test_frames_long_after_their_status_frame_belong_to_another_image() -> None:
     assert skipped(ledger)["too long after its status frame"] == 2
 
 
-def test_a_repeated_burst_is_used_once() -> None:
+def test_repeated_burst_is_used_once() -> None:
     burst = [status(1, 10), *triple(0, 7)]
     tables, ledger = decode(frames([*burst, *burst]))
 
@@ -151,28 +151,28 @@ def test_a_repeated_burst_is_used_once() -> None:
     assert skipped(ledger) == {"repeated status frame": 1, "repeated frame": 3}
 
 
-def test_the_same_counter_a_wrap_later_is_a_new_image() -> None:
+def test_same_counter_after_a_wrap_is_a_new_image() -> None:
     tables, ledger = decode(frames([status(0, 10), status(0, 10)], [0, 256 * MS]))
 
     assert len(tables["status"]) == 2
     assert not skipped(ledger)
 
 
-def test_slots_beyond_the_count_are_reported_not_used() -> None:
+def test_slots_beyond_the_count_are_skipped() -> None:
     tables, ledger = decode(frames([status(1, 0), *triple(0, 7), *triple(1, 9)]))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [7]
     assert skipped(ledger)["slot beyond the count of its status frame"] == 3
 
 
-def test_obstacles_before_the_first_status_frame_have_no_burst() -> None:
+def test_obstacles_before_first_status_frame_are_skipped() -> None:
     tables, ledger = decode(frames([*triple(0, 7), status(1, 0), *triple(0, 8)]))
 
     assert tables["obstacles"]["obstacle_id"].tolist() == [8]
     assert skipped(ledger)["obstacle before the first status frame"] == 3
 
 
-def test_thirteen_slots_end_before_the_vehicle_signals() -> None:
+def test_thirteen_slots_do_not_overlap_vehicle_signals() -> None:
     sent = [status(13, 0), *(f for slot in range(13) for f in triple(slot, slot + 1))]
     sent.append((0x760, "0100480000000000"))
     tables, ledger = decode(frames(sent))
@@ -182,8 +182,8 @@ def test_thirteen_slots_end_before_the_vehicle_signals() -> None:
     assert not skipped(ledger)
 
 
-def test_with_ten_slots_the_ids_above_are_foreign() -> None:
-    how = MobileyeSettings(slots=10, mounting=HERE)
+def test_ids_above_ten_slots_are_not_obstacles() -> None:
+    how = MobileyeSettings(slots=10, mounting=ORIGIN_MOUNTING)
     sent = [status(11, 0), *(f for slot in range(11) for f in triple(slot, slot + 1))]
     tables, ledger = decode(frames([*sent, status(0, 66)], [0] * 34 + [66 * MS]), how)
 
@@ -193,7 +193,7 @@ def test_with_ten_slots_the_ids_above_are_foreign() -> None:
     assert any("announces 11 obstacles; there are 10 slots" in n for n in ledger.notices)
 
 
-def test_frames_that_are_no_mobileyes_are_reported_by_reason() -> None:
+def test_frames_without_mobileye_data_are_skipped_by_reason() -> None:
     good = frames([status(0, 0)])
     odd = [
         frames([status(0, 0)], kind=REMOTE),
@@ -218,7 +218,7 @@ def test_frames_that_are_no_mobileyes_are_reported_by_reason() -> None:
     assert ledger.details[-1].detail == "0x766 (1)"
 
 
-def test_on_a_shared_bus_foreign_frames_are_another_decoders_business() -> None:
+def test_unknown_ids_are_not_counted_on_shared_bus() -> None:
     ledger = Ledger("log")
     decoder = MobileyeDecoder("can1", ledger, MobileyeSettings(is_shared_bus=True))
     decoder(frames([(0x123, "00"), (0x739, "00")]))
@@ -226,19 +226,19 @@ def test_on_a_shared_bus_foreign_frames_are_another_decoders_business() -> None:
     assert skipped(ledger) == {"length that its Mobileye message does not have": 1}
 
 
-def test_a_table_is_no_bus() -> None:
+def test_rows_that_are_not_can_frames_are_refused() -> None:
     decoder = MobileyeDecoder("can1", Ledger("log"))
     with pytest.raises(ValueError, match="can1: expected CanFrames, got Table"):
         decoder(Block("can1", np.zeros(0, dtype=np.int64), Table({})))
 
 
-def test_without_a_calibrated_mounting_a_notice_says_so() -> None:
+def test_missing_mounting_calibration_is_a_notice() -> None:
     ledger = Ledger("log")
     MobileyeDecoder("can1", ledger)
     assert any("calibrate x_m and y_m" in n for n in ledger.notices)
 
 
-def test_distances_count_from_the_rear_axle() -> None:
+def test_obstacle_positions_are_relative_to_rear_axle() -> None:
     """An obstacle 24 m ahead and 28 m right of a device 3 m ahead, rotated by 90 degrees left."""
     sent = [status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]]
     turned = MobileyeSettings(mounting=Mounting(3.0, 0.5, radians(90)))
@@ -253,7 +253,7 @@ RIGHT_LANE = [(0x768, "A13801FF7FFF7F0A"), (0x769, "0D80801E")]
 
 
 def test_lanes_are_left_positive_after_decoding() -> None:
-    """On the wire both C0 are positive to the right: -1.758 m left, +1.219 m right."""
+    """On the bus, both C0 are positive to the right: -1.758 m left, +1.219 m right."""
     tables, ledger = decode(frames([status(0, 0), *LEFT_LANE, *RIGHT_LANE]))
 
     lanes = tables["lanes"]
@@ -266,18 +266,20 @@ def test_lanes_are_left_positive_after_decoding() -> None:
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.03])
-def test_a_lane_is_the_same_curve_in_the_vehicle_frame(yaw_rad: float) -> None:
+def test_lane_is_transformed_to_vehicle_frame(yaw_rad: float) -> None:
     mounting = Mounting(1.7, -0.2, yaw_rad)
-    here, _ = decode(frames([status(0, 0), *LEFT_LANE]))
-    there, _ = decode(frames([status(0, 0), *LEFT_LANE]), MobileyeSettings(mounting=mounting))
+    in_device_frame, _ = decode(frames([status(0, 0), *LEFT_LANE]))
+    in_vehicle_frame, _ = decode(
+        frames([status(0, 0), *LEFT_LANE]), MobileyeSettings(mounting=mounting)
+    )
 
     for x_m in (0.0, 10.0, 30.0):
-        y_m = cubic(here["lanes"], x_m)
-        x_there_m = 1.7 + cos(yaw_rad) * x_m - sin(yaw_rad) * y_m
-        y_there_m = -0.2 + sin(yaw_rad) * x_m + cos(yaw_rad) * y_m
-        assert cubic(there["lanes"], x_there_m) == pytest.approx(y_there_m, abs=1e-5)
-    end_m = values(there["lanes"], "x_end_m")[0]
-    range_m = values(here["lanes"], "view_range_m")[0]
+        y_m = cubic(in_device_frame["lanes"], x_m)
+        x_vehicle_m = 1.7 + cos(yaw_rad) * x_m - sin(yaw_rad) * y_m
+        y_vehicle_m = -0.2 + sin(yaw_rad) * x_m + cos(yaw_rad) * y_m
+        assert cubic(in_vehicle_frame["lanes"], x_vehicle_m) == pytest.approx(y_vehicle_m, abs=1e-5)
+    end_m = values(in_vehicle_frame["lanes"], "x_end_m")[0]
+    range_m = values(in_device_frame["lanes"], "view_range_m")[0]
     assert end_m == pytest.approx(1.7 + range_m, abs=0.2)
 
 
@@ -286,7 +288,7 @@ def cubic(lanes: Table, x_m: float) -> float:
     return c[0] + c[1] * x_m + c[2] * x_m**2 + c[3] * x_m**3
 
 
-def test_a_side_without_a_marking_has_no_curve() -> None:
+def test_lane_without_marking_has_nan_coefficients() -> None:
     default = [(0x766, "0220FEFF7FFF7F00"), (0x767, "FF7F0080")]
     tables, _ = decode(frames([status(0, 0), *default]))
 
@@ -295,7 +297,7 @@ def test_a_side_without_a_marking_has_no_curve() -> None:
     assert np.isnan(values(tables["lanes"], "x_end_m")).all()
 
 
-def test_further_lanes_alternate_left_and_right_outwards() -> None:
+def test_next_lanes_alternate_left_and_right_outwards() -> None:
     sent = [
         frame
         for k in range(8)
@@ -316,7 +318,7 @@ def test_halves_of_different_lanes_or_images_are_not_joined() -> None:
     assert skipped(ledger) == {"lane A without its B": 2, "lane B without its A": 2}
 
 
-def test_the_layout_of_lane_details_follows_the_status_frame() -> None:
+def test_lane_details_layout_follows_status_frame() -> None:
     details = (0x737, "0040200C00000000")
     classic, _ = decode(frames([status(0, 0), details]))
     newer, _ = decode(frames([status(0, 0, length=7), details]))
@@ -331,15 +333,15 @@ def test_the_layout_of_lane_details_follows_the_status_frame() -> None:
     assert any("before the first status frame" in n for n in ledger.notices)
 
 
-def test_a_revision_that_is_set_refuses_status_frames_of_the_other() -> None:
-    how = MobileyeSettings(revision="classic", mounting=HERE)
+def test_configured_revision_skips_status_frames_of_other_revision() -> None:
+    how = MobileyeSettings(revision="classic", mounting=ORIGIN_MOUNTING)
     tables, ledger = decode(frames([status(0, 0, length=7)]), how)
 
     assert tables == {}
     assert skipped(ledger) == {"length that its Mobileye message does not have": 1}
 
 
-def test_both_revisions_on_one_bus_are_noticed() -> None:
+def test_both_revisions_on_one_bus_are_a_notice() -> None:
     blocks = [frames([status(0, 0)]), frames([status(0, 66, length=7)], [66 * MS])]
     tables, ledger = decode(blocks)
 
@@ -347,55 +349,55 @@ def test_both_revisions_on_one_bus_are_noticed() -> None:
     assert any("status frames of both revisions" in n for n in ledger.notices)
 
 
-def test_an_unknown_protocol_version_is_noticed() -> None:
+def test_unknown_protocol_version_is_a_notice() -> None:
     _, ledger = decode(frames([status(0, 0, tail="00F209")]))
     assert any("protocol version 9" in n for n in ledger.notices)
 
 
-def test_a_log_without_lengths_leaves_missing_what_hangs_on_them() -> None:
+def test_fields_that_depend_on_unknown_length_are_missing() -> None:
     block = frames([status(1, 0), *triple(0, 7)])
     assert isinstance(block.rows, CanFrames)
     block.rows.length[:] = LENGTH_UNKNOWN
     unknown, _ = decode(block)
-    reported, _ = decode(block, MobileyeSettings(revision="2.32", mounting=HERE))
+    reported, _ = decode(block, MobileyeSettings(revision="2.32", mounting=ORIGIN_MOUNTING))
 
     assert len(unknown["obstacles"]) == 1
     assert unknown["status"]["failsafe"].tolist() == [-1]
     assert reported["status"]["failsafe"].tolist() == [0]
 
 
-LDW_BIT = "0000000001000000"
-TSR_SHOWS = "0000000101000000"
-EXTENDED_SHOWS = "0000000011000000"
+LDW_PAYLOAD = "0000000001000000"
+TSR_PAYLOAD = "0000000101000000"
+EXTENDED_PAYLOAD = "0000000011000000"
 
 
 @pytest.mark.parametrize(
-    ("sent", "want"),
+    ("sent", "expected"),
     [
-        ([LDW_BIT], [-1]),
-        ([LDW_BIT, TSR_SHOWS, LDW_BIT], [-1, 0, 0]),
-        ([EXTENDED_SHOWS, LDW_BIT], [1, 1]),
-        ([TSR_SHOWS, EXTENDED_SHOWS, LDW_BIT], [0, -1, -1]),
+        ([LDW_PAYLOAD], [-1]),
+        ([LDW_PAYLOAD, TSR_PAYLOAD, LDW_PAYLOAD], [-1, 0, 0]),
+        ([EXTENDED_PAYLOAD, LDW_PAYLOAD], [1, 1]),
+        ([TSR_PAYLOAD, EXTENDED_PAYLOAD, LDW_PAYLOAD], [0, -1, -1]),
     ],
 )
-def test_the_warning_family_is_decided_by_bits_of_one_family_only(
-    sent: list[str], want: list[int]
+def test_warning_family_is_inferred_from_unambiguous_bits(
+    sent: list[str], expected: list[int]
 ) -> None:
     tables, ledger = decode(frames([(0x700, text) for text in sent]))
 
-    assert tables["warnings"]["ldw_on"].tolist() == want
-    assert any("0x700" in n for n in ledger.notices) == (-1 in want)
+    assert tables["warnings"]["ldw_on"].tolist() == expected
+    assert any("0x700" in n for n in ledger.notices) == (-1 in expected)
 
 
-def test_a_family_that_is_set_is_believed() -> None:
-    how = MobileyeSettings(family="tsr", mounting=HERE)
-    tables, ledger = decode(frames([(0x700, LDW_BIT)]), how)
+def test_configured_warning_family_is_used() -> None:
+    how = MobileyeSettings(family="tsr", mounting=ORIGIN_MOUNTING)
+    tables, ledger = decode(frames([(0x700, LDW_PAYLOAD)]), how)
 
     assert tables["warnings"]["ldw_on"].tolist() == [0]
     assert ledger.notices == []
 
 
-def test_image_time_is_the_time_of_obstacles_and_status() -> None:
+def test_obstacles_and_status_have_image_time() -> None:
     sent = [status(1, 0), *triple(0, 7), status(1, 66), *triple(0, 8)]
     times = [1000 * MS, *(1000 * MS + k * MS for k in (1, 2, 3)), 1071 * MS]
     tables, _ = decode(frames(sent, [*times, *(1071 * MS + k * MS for k in (1, 2, 3))]))
@@ -410,8 +412,8 @@ def test_image_time_is_the_time_of_obstacles_and_status() -> None:
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 400), max_size=6))
 @settings(max_examples=25, deadline=None)
-def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[int]) -> None:
-    """The law also holds for a damaged log with frames dropped, duplicated and swapped."""
+def test_tables_do_not_depend_on_block_division(seed: int, cuts: list[int]) -> None:
+    """This also holds for a damaged log, in which frames are missing or repeated."""
     rng = np.random.default_rng(seed)
     drive = random_drive(8, rng)
     index = np.sort(rng.choice(len(drive), size=len(drive), replace=True))
@@ -419,35 +421,35 @@ def test_how_the_log_is_cut_into_blocks_changes_nothing(seed: int, cuts: list[in
     whole, ledger = decode(drive)
     places = sorted({min(c, len(drive)) for c in cuts})
     parts = [drive.take(np.s_[a:b]) for a, b in pairwise([0, *places, len(drive)])]
-    pieces, ledger_of_pieces = decode(parts)
+    from_parts, ledger_of_parts = decode(parts)
 
-    assert whole.keys() == pieces.keys()
+    assert whole.keys() == from_parts.keys()
     for name, table in whole.items():
         for column in table.columns:
-            np.testing.assert_array_equal(table[column], pieces[name][column])
-    assert skipped(ledger) == skipped(ledger_of_pieces)
-    assert ledger.topic("can1").dropped == ledger_of_pieces.topic("can1").dropped
+            np.testing.assert_array_equal(table[column], from_parts[name][column])
+    assert skipped(ledger) == skipped(ledger_of_parts)
+    assert ledger.topic("can1").dropped == ledger_of_parts.topic("can1").dropped
 
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=25, deadline=None)
-def test_losing_frames_never_makes_a_row_that_was_not_there(seed: int) -> None:
+def test_lost_frames_never_add_a_row(seed: int) -> None:
     rng = np.random.default_rng(seed)
     drive = random_drive(10, rng)
     whole, _ = decode(drive)
-    left, ledger = decode(drive.take(rng.random(len(drive)) > 0.2))
+    remaining, ledger = decode(drive.take(rng.random(len(drive)) > 0.2))
 
-    known = rows_of(whole.get("obstacles"))
-    assert rows_of(left.get("obstacles")) <= known
-    assert rows_of(left.get("lanes")) <= rows_of(whole.get("lanes"))
-    if len(rows_of(left.get("obstacles"))) < len(known):
+    all_obstacles = rows_of(whole.get("obstacles"))
+    assert rows_of(remaining.get("obstacles")) <= all_obstacles
+    assert rows_of(remaining.get("lanes")) <= rows_of(whole.get("lanes"))
+    if len(rows_of(remaining.get("obstacles"))) < len(all_obstacles):
         assert skipped(ledger) or ledger.topic("can1").dropped
 
 
 @given(seed=st.integers(0, 100_000))
 @settings(max_examples=40, deadline=None)
-def test_any_bytes_at_any_time_are_accounted_for(seed: int) -> None:
+def test_arbitrary_frames_are_accounted_for(seed: int) -> None:
     """Random payloads, lengths, kinds and times with ids of the table and others."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 400))
@@ -465,11 +467,11 @@ def test_any_bytes_at_any_time_are_accounted_for(seed: int) -> None:
     )
     cut = n // 2
     block = Block("can1", 10**18 + np.cumsum(steps), rows)
-    decode([block.take(np.s_[:cut]), block.take(np.s_[cut:])])  # which checks the account
+    decode([block.take(np.s_[:cut]), block.take(np.s_[cut:])])  # checks that the ledger adds up
 
 
 def rows_of(table: Table | None) -> set[tuple[str, ...]]:
-    """Rows without burst numbers."""
+    """Return the rows as text, without burst numbers and image times."""
     if table is None:
         return set()
     skip = ("burst", "t_ns")
@@ -477,7 +479,7 @@ def rows_of(table: Table | None) -> set[tuple[str, ...]]:
     return set(zip(*([str(v) for v in table[name]] for name in names), strict=True))
 
 
-def test_all_blocks_may_be_empty() -> None:
+def test_empty_blocks_yield_no_tables() -> None:
     tables, ledger = decode([frames([]), join([frames([]), frames([])])])
     assert tables == {}
     assert ledger.notices == []

@@ -1,4 +1,4 @@
-"""Tables encoded as frames and decoded again are equal, and vice versa."""
+"""Encoding and decoding of Mobileye tables are inverse to each other."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block
 from support.mobileye_frames import MS, block_of, random_drive, random_words, values
 
-MOUNTED = MobileyeSettings(mounting=Mounting(1.85, -0.1, 0.02))
-STRAIGHT = MobileyeSettings(mounting=Mounting(1.85, -0.1))
+ROTATED = MobileyeSettings(mounting=Mounting(1.85, -0.1, 0.02))
+UNROTATED = MobileyeSettings(mounting=Mounting(1.85, -0.1))
 
 
 def encode_burst(
@@ -29,7 +29,7 @@ def encode_burst(
     *,
     latency_ns: int = LATENCY_NS,
 ) -> Block:
-    """The frames of one image: a status frame, then A, B and C of each obstacle that is sent."""
+    """Return the frames of one image: a status frame, then A, B and C of each sent obstacle."""
     times = np.array([image_ns], dtype=np.int64)
     objects = Table({**objects.columns, "t_ns": np.full(len(objects), image_ns, dtype=np.int64)})
     return encode_tables(bursts_of(times, objects, settings, latency_ns=latency_ns), settings)
@@ -49,30 +49,30 @@ def table(blocks: list[Block], name: str) -> Table:
     return Table({n: np.concatenate([t[n] for t in tables]) for n in tables[0].columns})
 
 
-def assert_same_frames(got: Block, want: Block) -> None:
-    assert isinstance(got.rows, CanFrames)
-    assert isinstance(want.rows, CanFrames)
-    np.testing.assert_array_equal(got.log_ns, want.log_ns)
-    np.testing.assert_array_equal(got.rows.arbitration_id, want.rows.arbitration_id)
-    np.testing.assert_array_equal(got.rows.length, want.rows.length)
-    np.testing.assert_array_equal(got.rows.data, want.rows.data)
+def assert_same_frames(actual: Block, expected: Block) -> None:
+    assert isinstance(actual.rows, CanFrames)
+    assert isinstance(expected.rows, CanFrames)
+    np.testing.assert_array_equal(actual.log_ns, expected.log_ns)
+    np.testing.assert_array_equal(actual.rows.arbitration_id, expected.rows.arbitration_id)
+    np.testing.assert_array_equal(actual.rows.length, expected.rows.length)
+    np.testing.assert_array_equal(actual.rows.data, expected.rows.data)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("revision", ["classic", "2.32"])
-@pytest.mark.parametrize("how", [MOUNTED, STRAIGHT])
+@pytest.mark.parametrize("how", [ROTATED, UNROTATED])
 @given(seed=st.integers(0, 100_000))
 @settings(max_examples=12, deadline=None)
-def test_encoding_what_was_decoded_gives_the_same_frames(
+def test_encoding_decoded_tables_restores_frames(
     revision: str, how: MobileyeSettings, seed: int
 ) -> None:
     """Complete bursts with lanes; random lanes cannot be rotated exactly and are only moved."""
-    drive = random_drive(5, np.random.default_rng(seed), revision, has_lanes=how is STRAIGHT)
+    drive = random_drive(5, np.random.default_rng(seed), revision, has_lanes=how is UNROTATED)
     assert_same_frames(encode_tables(decode(drive, how), how, "can1"), drive)
 
 
-def plain_messages() -> list[tuple[Message, str]]:
-    """Every message that belongs to no burst, in each of its variants."""
+def standalone_messages() -> list[tuple[Message, str]]:
+    """Return every message that is not joined with others, in each of its variants."""
     joined = ("status", "obstacles", "lanes", "next_lanes")
     return [
         (message, variant)
@@ -86,9 +86,9 @@ def plain_messages() -> list[tuple[Message, str]]:
 
 
 @pytest.mark.parametrize(
-    ("message", "variant"), plain_messages(), ids=lambda x: getattr(x, "name", x)
+    ("message", "variant"), standalone_messages(), ids=lambda x: getattr(x, "name", x)
 )
-def test_every_message_comes_back_byte_for_byte(message: Message, variant: str) -> None:
+def test_standalone_messages_round_trip_byte_for_byte(message: Message, variant: str) -> None:
     n = 40
     words = random_words(message, n, np.random.default_rng(3), variant)
     ids = np.array(message.ids)[np.arange(n) % len(message.ids)]
@@ -100,17 +100,17 @@ def test_every_message_comes_back_byte_for_byte(message: Message, variant: str) 
 
 
 def settings_for(variant: str) -> MobileyeSettings:
-    here = Mounting(1.85, -0.1)
+    unrotated_mounting = Mounting(1.85, -0.1)
     return {
-        "classic": MobileyeSettings(revision="classic", mounting=here),
-        "2.32": MobileyeSettings(revision="2.32", mounting=here),
-        "extended": MobileyeSettings(family="extended", mounting=here),
-        "tsr": MobileyeSettings(family="tsr", mounting=here),
-    }.get(variant, MobileyeSettings(mounting=here))
+        "classic": MobileyeSettings(revision="classic", mounting=unrotated_mounting),
+        "2.32": MobileyeSettings(revision="2.32", mounting=unrotated_mounting),
+        "extended": MobileyeSettings(family="extended", mounting=unrotated_mounting),
+        "tsr": MobileyeSettings(family="tsr", mounting=unrotated_mounting),
+    }.get(variant, MobileyeSettings(mounting=unrotated_mounting))
 
 
 def scene(seed: int, n: int) -> tuple[Columns, list[int]]:
-    """Objects as the table ``obstacles``, within the range of the device."""
+    """Return columns of the table ``obstacles`` within the device's range, and image times."""
     rng = np.random.default_rng(seed)
     image_ns = [10**18 + k * 66 * MS for k in range(10)]
     t_ns = np.array([image_ns[k] for k in np.sort(rng.integers(0, 10, n))], dtype=np.int64)
@@ -135,7 +135,7 @@ def scene(seed: int, n: int) -> tuple[Columns, list[int]]:
     }, image_ns
 
 
-HALF_STEP = {
+MAX_ERROR = {
     "x_m": 1 / 32,
     "y_m": 1 / 32,
     "vx_mps": 1 / 32,
@@ -150,31 +150,35 @@ HALF_STEP = {
 
 @given(seed=st.integers(0, 100_000), n=st.integers(1, 60))
 @settings(max_examples=25, deadline=None)
-def test_decoding_what_was_encoded_is_within_half_a_step(seed: int, n: int) -> None:
+def test_decoded_obstacles_are_within_half_a_step(seed: int, n: int) -> None:
     columns, image_ns = scene(seed, n)
-    blocks = bursts_of(np.array(image_ns, dtype=np.int64), Table(columns), STRAIGHT)
+    blocks = bursts_of(np.array(image_ns, dtype=np.int64), Table(columns), UNROTATED)
     sent = table(blocks, "obstacles")
-    back = table(decode(encode_tables(blocks, STRAIGHT, "can1"), STRAIGHT), "obstacles")
+    decoded_table = table(decode(encode_tables(blocks, UNROTATED, "can1"), UNROTATED), "obstacles")
 
-    assert len(sent) == len(back)
-    for name, half in HALF_STEP.items():
-        np.testing.assert_allclose(values(back, name), values(sent, name), atol=half + 1e-9)
+    assert len(sent) == len(decoded_table)
+    for name, max_error in MAX_ERROR.items():
+        np.testing.assert_allclose(
+            values(decoded_table, name), values(sent, name), atol=max_error + 1e-9
+        )
     for name in ("obstacle_id", "type", "status", "age_frames", "cipv", "brake_lights", "slot"):
-        np.testing.assert_array_equal(back[name], sent[name])
+        np.testing.assert_array_equal(decoded_table[name], sent[name])
     is_matched = ~np.isnan(values(sent, "radar_x_m"))
-    radar = values(back, "radar_vx_mps")
+    radar = values(decoded_table, "radar_vx_mps")
     np.testing.assert_allclose(
         radar[is_matched], values(sent, "radar_vx_mps")[is_matched], atol=1 / 32
     )
     assert np.isnan(radar[~is_matched]).all()
 
 
-def test_the_simulated_angle_is_the_bearing_from_the_device() -> None:
+def test_simulated_angle_is_bearing_from_device() -> None:
     objects = Table({"x_m": np.array([21.85]), "y_m": np.array([4.9])})
-    back = table(decode(encode_burst(10**18, objects, STRAIGHT), STRAIGHT), "obstacles")
-    on_wire = frame_words(encode_burst(10**18, objects, STRAIGHT), 0x73B)
+    decoded_table = table(decode(encode_burst(10**18, objects, UNROTATED), UNROTATED), "obstacles")
+    on_wire = frame_words(encode_burst(10**18, objects, UNROTATED), 0x73B)
 
-    assert values(back, "angle_rad")[0] == pytest.approx(atan2(5.0, 20.0), abs=0.005 * pi / 180)
+    assert values(decoded_table, "angle_rad")[0] == pytest.approx(
+        atan2(5.0, 20.0), abs=0.005 * pi / 180
+    )
     assert (on_wire >> 48) - (1 << 16) == round(-atan2(5.0, 20.0) * 180 / pi * 100)
 
 
@@ -184,32 +188,32 @@ def frame_words(block: Block, identifier: int) -> int:
     return int.from_bytes(block.rows.data[row].tobytes(), "little")
 
 
-def test_what_is_not_given_is_sent_as_missing() -> None:
+def test_absent_columns_are_sent_as_missing() -> None:
     objects = Table({"x_m": np.array([30.0]), "y_m": np.array([0.0])})
-    back = table(decode(encode_burst(10**18, objects, STRAIGHT), STRAIGHT), "obstacles")
+    decoded_table = table(decode(encode_burst(10**18, objects, UNROTATED), UNROTATED), "obstacles")
 
     for name in ("length_m", "radar_x_m", "radar_vx_mps", "accel_x_mps2"):
-        assert np.isnan(values(back, name)).all(), name
-    assert back["radar_id"].tolist() == [-1]
-    assert back["valid"].tolist() == [1]
+        assert np.isnan(values(decoded_table, name)).all(), name
+    assert decoded_table["radar_id"].tolist() == [-1]
+    assert decoded_table["valid"].tolist() == [1]
 
 
-def test_the_nearest_objects_get_the_slots_and_far_ones_none() -> None:
+def test_slots_are_assigned_to_nearest_objects_in_range() -> None:
     x_m = np.append(np.linspace(240.0, 20.0, 16), [252.0, 1.0, 50.0])
     y_m = np.append(np.zeros(18), [35.0])
-    back = table(
-        decode(encode_burst(10**18, Table({"x_m": x_m, "y_m": y_m}), STRAIGHT), STRAIGHT),
+    decoded_table = table(
+        decode(encode_burst(10**18, Table({"x_m": x_m, "y_m": y_m}), UNROTATED), UNROTATED),
         "obstacles",
     )
 
-    assert len(back) == 13
-    assert (np.diff(values(back, "x_m")) > 0).all()
-    assert values(back, "x_m")[0] == pytest.approx(20.0, abs=1 / 32)
+    assert len(decoded_table) == 13
+    assert (np.diff(values(decoded_table, "x_m")) > 0).all()
+    assert values(decoded_table, "x_m")[0] == pytest.approx(20.0, abs=1 / 32)
 
 
-def test_frames_of_a_burst_follow_one_another() -> None:
+def test_frames_of_burst_are_evenly_spaced() -> None:
     objects = Table({"x_m": np.array([30.0, 40.0]), "y_m": np.array([0.0, 1.0])})
-    block = encode_burst(10**18, objects, STRAIGHT, latency_ns=70 * MS)
+    block = encode_burst(10**18, objects, UNROTATED, latency_ns=70 * MS)
 
     assert isinstance(block.rows, CanFrames)
     assert block.rows.arbitration_id.tolist() == [0x738, *range(0x739, 0x73F)]
@@ -217,13 +221,13 @@ def test_frames_of_a_burst_follow_one_another() -> None:
     assert np.diff(block.log_ns).tolist() == [FRAME_NS] * 6
 
 
-def test_an_image_without_objects_is_a_burst_of_none() -> None:
+def test_image_without_objects_is_one_status_frame() -> None:
     empty = Table({"x_m": np.zeros(0), "y_m": np.zeros(0)})
-    assert len(encode_burst(10**18, empty, STRAIGHT)) == 1
+    assert len(encode_burst(10**18, empty, UNROTATED)) == 1
 
 
-@pytest.mark.parametrize("how", [STRAIGHT, MOUNTED])
-def test_lanes_come_back_within_half_a_step_of_the_wire(how: MobileyeSettings) -> None:
+@pytest.mark.parametrize("how", [UNROTATED, ROTATED])
+def test_lanes_round_trip_within_quantization_steps(how: MobileyeSettings) -> None:
     n = 30
     rng = np.random.default_rng(5)
     side = np.where(np.arange(n) % 2 == 0, LEFT, RIGHT).astype(np.int8)
@@ -238,14 +242,14 @@ def test_lanes_come_back_within_half_a_step_of_the_wire(how: MobileyeSettings) -
         "quality": np.full(n, 3, dtype=np.int16),
     }
     sent = table_block("can1", "lanes", np.arange(n) * 100 * MS, columns)
-    back = table(decode(encode_tables([sent], how, "can1"), how), "lanes")
+    decoded_table = table(decode(encode_tables([sent], how, "can1"), how), "lanes")
 
-    np.testing.assert_array_equal(back["side"], side)
+    np.testing.assert_array_equal(decoded_table["side"], side)
     for x_m in (2.0, 20.0):
-        want = cubic(columns, x_m)
-        got = cubic(dict(back.columns), x_m)
+        expected = cubic(columns, x_m)
+        actual = cubic(dict(decoded_table.columns), x_m)
         steps_m = 1 / 512 + x_m / 2048 + x_m**2 / 2048000 + x_m**3 / 2**29
-        assert np.abs(want - got).max() <= steps_m + 1e-5
+        assert np.abs(expected - actual).max() <= steps_m + 1e-5
 
 
 def cubic(columns: Columns, x_m: float) -> Floats:
@@ -254,16 +258,16 @@ def cubic(columns: Columns, x_m: float) -> Floats:
     return y_m
 
 
-def test_a_side_without_a_marking_is_sent_as_such() -> None:
+def test_lane_without_marking_is_sent_as_missing() -> None:
     nothing = np.full(2, np.nan)
     columns: Columns = {"side": np.array([LEFT, RIGHT], dtype=np.int8)}
     columns |= dict.fromkeys(("c0_m", "c1", "c2_per_m", "c3_per_m2", "view_range_m"), nothing)
     sent = table_block("can1", "lanes", np.array([0, MS]), columns)
-    frames = encode_tables([sent], MOUNTED, "can1")
+    frames = encode_tables([sent], ROTATED, "can1")
 
     assert frame_words(frames, 0x766) & 0xFFFFFF == (-480 & 0xFFFF) << 8 | 2
     assert frame_words(frames, 0x768) & 0xFFFFFF == 480 << 8 | 2
-    assert table(decode(frames, MOUNTED), "lanes")["has_marking"].tolist() == [False, False]
+    assert table(decode(frames, ROTATED), "lanes")["has_marking"].tolist() == [False, False]
 
 
 @pytest.mark.parametrize(
@@ -275,25 +279,30 @@ def test_a_side_without_a_marking_is_sent_as_such() -> None:
         ("radar_x_m", 400.0, r"obstacles radar_x_m, row 0: cannot encode"),
     ],
 )
-def test_what_the_wire_cannot_carry_is_refused(column: str, value: float, message: str) -> None:
+def test_value_out_of_message_range_is_refused(column: str, value: float, message: str) -> None:
     objects = Table({"x_m": np.array([30.0]), "y_m": np.array([0.0]), column: np.array([value])})
     with pytest.raises(ValueError, match=message):
-        encode_burst(10**18, objects, STRAIGHT)
+        encode_burst(10**18, objects, UNROTATED)
 
 
-def test_speeds_beyond_the_wire_are_clipped_as_the_table_declares() -> None:
+def test_speed_out_of_message_range_is_clipped() -> None:
     objects = Table({"x_m": np.array([30.0]), "y_m": np.zeros(1), "vx_mps": np.array([-200.0])})
-    back = table(decode(encode_burst(10**18, objects, STRAIGHT), STRAIGHT), "obstacles")
-    assert values(back, "vx_mps").tolist() == [-127.9375]
+    decoded_table = table(decode(encode_burst(10**18, objects, UNROTATED), UNROTATED), "obstacles")
+    assert values(decoded_table, "vx_mps").tolist() == [-127.9375]
 
 
-def test_tables_and_bursts_that_do_not_fit_are_refused() -> None:
+def test_invalid_tables_and_bursts_are_refused() -> None:
     times = np.zeros(1, dtype=np.int64)
     with pytest.raises(ValueError, match="no such table: lidar; there are: status"):
         encode_tables([Block("can1/lidar", times, Table({"t_ns": times}))])
-    lonely: Columns = {"burst": times + 4, "slot": times, "x_m": times + 9.0, "y_m": times + 0.0}
+    without_status: Columns = {
+        "burst": times + 4,
+        "slot": times,
+        "x_m": times + 9.0,
+        "y_m": times + 0.0,
+    }
     with pytest.raises(ValueError, match="obstacles of burst 4: expected a status row"):
-        encode_tables([table_block("can1", "obstacles", times, lonely)])
+        encode_tables([table_block("can1", "obstacles", times, without_status)])
     with pytest.raises(ValueError, match="expected increasing times"):
         bursts_of(np.array([1, 1]), Table({"t_ns": times, "x_m": times, "y_m": times}))
     with pytest.raises(ValueError, match="expected times from image_ns"):

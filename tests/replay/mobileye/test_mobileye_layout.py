@@ -17,7 +17,7 @@ from crosscue.replay.mobileye.wire import columns_of, from_given, from_raw, valu
 from support.mobileye_frames import random_words
 
 
-def value_in(name: str, field: str, text: str, variant: str = "") -> float:
+def decoded_value(name: str, field: str, text: str, variant: str = "") -> float:
     message = layout()[name]
     payload = np.zeros((1, 8), dtype=np.uint8)
     raw = bytes.fromhex(text)
@@ -28,7 +28,7 @@ def value_in(name: str, field: str, text: str, variant: str = "") -> float:
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "field", "want"),
+    ("name", "text", "field", "expected"),
     [
         ("obstacle_a", "0180014002003003", "obstacle_id", 1),
         ("obstacle_a", "0180014002003003", "x_m", 24.0),
@@ -51,14 +51,14 @@ def value_in(name: str, field: str, text: str, variant: str = "") -> float:
         ("lane_details", "0040200200000000", "c1", 0.272),
     ],
 )
-def test_published_frames_give_the_published_values(
-    name: str, text: str, field: str, want: float
+def test_published_frames_decode_to_published_values(
+    name: str, text: str, field: str, expected: float
 ) -> None:
-    assert value_in(name, field, text, "classic") == pytest.approx(want, rel=1e-12)
+    assert decoded_value(name, field, text, "classic") == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("name", "field", "text", "variant", "want"),
+    ("name", "field", "text", "variant", "expected"),
     [
         (
             "lane_a",
@@ -95,10 +95,10 @@ def test_published_frames_give_the_published_values(
         ("gyro", "rate_radps", "80FF00", "", 256 * 0.00875),
     ],
 )
-def test_what_the_sources_agree_on(
-    name: str, field: str, text: str, variant: str, want: float
+def test_known_payloads_decode_to_known_values(
+    name: str, field: str, text: str, variant: str, expected: float
 ) -> None:
-    assert value_in(name, field, text, variant) == pytest.approx(want, abs=1e-12)
+    assert decoded_value(name, field, text, variant) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -117,25 +117,23 @@ def test_what_the_sources_agree_on(
         ("warnings", "headway_s", "0000320000000000"),
     ],
 )
-def test_codes_for_no_value_are_missing(name: str, field: str, text: str) -> None:
-    assert np.isnan(value_in(name, field, text, "classic" if name == "lane_details" else ""))
+def test_codes_for_missing_values_are_nan(name: str, field: str, text: str) -> None:
+    assert np.isnan(decoded_value(name, field, text, "classic" if name == "lane_details" else ""))
 
 
-def test_a_matched_radar_speed_may_be_minus_one_step() -> None:
-    assert value_in("obstacle_b", "radar_vx_mps", "0000000001FF0F00") == -0.0625
+def test_radar_speed_of_minus_one_step_is_not_missing() -> None:
+    assert decoded_value("obstacle_b", "radar_vx_mps", "0000000001FF0F00") == -0.0625
 
 
-def test_what_hangs_on_the_variant_is_missing_where_that_is_unknown() -> None:
-    assert np.isnan(value_in("warnings", "ldw_on", "0000000001000000"))
-    assert np.isnan(value_in("lane_details", "c1", "0000200200000000"))
-    assert value_in("warnings", "fcw", "0000000008000000") == 1
+def test_fields_that_depend_on_unknown_variant_are_missing() -> None:
+    assert np.isnan(decoded_value("warnings", "ldw_on", "0000000001000000"))
+    assert np.isnan(decoded_value("lane_details", "c1", "0000200200000000"))
+    assert decoded_value("warnings", "fcw", "0000000008000000") == 1
 
 
 @pytest.mark.parametrize(("angle_raw", "bearing_deg"), [(-109, 1.07), (33, -0.25), (-778, 7.74)])
-def test_real_angles_are_the_bearing_with_the_opposite_sign(
-    angle_raw: int, bearing_deg: float
-) -> None:
-    """From three real recordings: the angle sent, and the bearing of the position sent with it."""
+def test_angle_on_the_bus_is_negated_bearing(angle_raw: int, bearing_deg: float) -> None:
+    """The sent angle and the bearing of the sent position are from three real recordings."""
     f = next(f for f in layout()["obstacle_c"].fields if f.name == "angle_rad")
     words = place(np.array([angle_raw]), f.start, f.bits, False)
     values = values_of(layout()["obstacle_c"], words, np.array([-1], dtype=np.int8))
@@ -143,19 +141,21 @@ def test_real_angles_are_the_bearing_with_the_opposite_sign(
     assert degrees(angle_rad[0]) == pytest.approx(bearing_deg, abs=0.1)
 
 
-def test_the_two_ends_of_one_lane_have_opposite_signs_on_the_wire() -> None:
+def test_lane_heading_sign_is_unified_across_messages() -> None:
     """Real messages: 0x737 is left-positive, the LKA lane right-positive; columns agree."""
     c1_lka = np.array([0.01367])
-    lka = columns_of(layout()["lane_b"], {"c1": c1_lka, **_rest("lane_b", "c1")})
-    details = columns_of(layout()["lane_details"], {"c1": -c1_lka, **_rest("lane_details", "c1")})
+    lka = columns_of(layout()["lane_b"], {"c1": c1_lka, **_other_fields("lane_b", "c1")})
+    details = columns_of(
+        layout()["lane_details"], {"c1": -c1_lka, **_other_fields("lane_details", "c1")}
+    )
     assert lka["c1"].tolist() == details["c1"].tolist() == [-0.01367]
 
 
-def _rest(name: str, but: str) -> dict[str, np.ndarray[tuple[int], np.dtype[np.float64]]]:
+def _other_fields(name: str, but: str) -> dict[str, np.ndarray[tuple[int], np.dtype[np.float64]]]:
     return {f.name: np.zeros(1) for f in layout()[name].fields if f.name != but}
 
 
-def test_every_message_of_the_facts_has_its_identifiers() -> None:
+def test_messages_have_documented_identifiers() -> None:
     ids = {m.name: m.ids for m in layout().messages}
     assert ids["obstacle_a"] == tuple(range(0x739, 0x760, 3))
     assert ids["obstacle_c"][-1] == 0x75F
@@ -181,13 +181,13 @@ def test_describe_lists_every_field_once() -> None:
         ('fields = [{name = "a", start = 24, bits = 9}]', "m.a: does not fit the payload"),
     ],
 )
-def test_a_table_that_cannot_be_is_refused(text: str, message: str) -> None:
+def test_invalid_layout_is_refused(text: str, message: str) -> None:
     head = '[[message]]\nname = "m"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\n'
     with pytest.raises(SchemaError, match=re.escape(message)):
         parse(head + text)
 
 
-def test_two_messages_with_one_identifier_are_refused() -> None:
+def test_messages_with_same_identifier_are_refused() -> None:
     one = '[[message]]\nname = "{}"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\nfields = []\n'
     with pytest.raises(SchemaError, match="two messages have the same identifier"):
         parse(one.format("a") + one.format("b"))
@@ -197,7 +197,7 @@ def test_two_messages_with_one_identifier_are_refused() -> None:
     start=st.integers(0, 63), bits=st.integers(1, 32), signed=st.booleans(), seed=st.integers(0, 99)
 )
 @settings(max_examples=60, deadline=None)
-def test_bits_placed_are_the_bits_extracted(start: int, bits: int, signed: bool, seed: int) -> None:
+def test_extract_inverts_place(start: int, bits: int, signed: bool, seed: int) -> None:
     bits = min(bits, 64 - start)
     low = -(1 << (bits - 1)) if signed else 0
     raw = np.random.default_rng(seed).integers(low, low + (1 << bits), 20)
@@ -206,25 +206,25 @@ def test_bits_placed_are_the_bits_extracted(start: int, bits: int, signed: bool,
     np.testing.assert_array_equal(words_of(payloads_of(words)), words)
 
 
-def test_big_endian_numbers_are_read_byte_by_byte() -> None:
+def test_big_endian_numbers_are_extracted_and_placed() -> None:
     word = words_of(np.array([[0, 0x12, 0x34, 0, 0, 0, 0, 0]], dtype=np.uint8))
     assert extract(word, 8, 16, False, True)[0] == 0x1234
     np.testing.assert_array_equal(place(np.array([0x1234]), 8, 16, True), word)
 
 
 @pytest.mark.parametrize("message", layout().messages, ids=lambda m: m.name)
-def test_float32_values_from_another_program_are_the_same_values(message: Message) -> None:
-    """A driver that passes values through float32 loses no step and no missing code."""
+def test_float32_values_restore_raw_values(message: Message) -> None:
+    """A driver that converts values to float32 loses no step and no code for missing values."""
     rng = np.random.default_rng(1)
     for f in message.fields:
         lowest, highest = f.raw_range
         raw = np.append(rng.integers(lowest, highest + 1, 50), list(f.missing)).astype(np.int64)
-        through = (raw - f.zero) * f.scale / f.per
-        given_values = through.astype(np.float32).astype(np.float64)
-        np.testing.assert_array_equal(from_given(f, given_values), from_raw(f, raw))
+        physical = (raw - f.zero) * f.scale / f.per
+        as_float32 = physical.astype(np.float32).astype(np.float64)
+        np.testing.assert_array_equal(from_given(f, as_float32), from_raw(f, raw))
 
 
-def test_a_random_payload_is_within_the_declared_ranges() -> None:
+def test_random_words_are_within_declared_ranges() -> None:
     words = random_words(layout()["obstacle_a"], 500, np.random.default_rng(0))
     x_m = values_of(layout()["obstacle_a"], words, np.full(500, -1, dtype=np.int8))["x_m"]
     assert x_m.max() <= 250.0

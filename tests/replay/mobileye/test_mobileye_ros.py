@@ -31,7 +31,9 @@ from support.mobileye_frames import (
 )
 from support.mobileye_ros import TOPIC_TYPES, as_cdr, messages_of
 
-AS_ON_WIRE = MobileyeSettings(mounting=Mounting(1.9, 0.1), family="extended", ros_lane_sign="right")
+BUS_SETTINGS = MobileyeSettings(
+    mounting=Mounting(1.9, 0.1), family="extended", ros_lane_sign="right"
+)
 
 
 def tables_of(blocks: Sequence[Block]) -> dict[str, Table]:
@@ -45,13 +47,13 @@ def tables_of(blocks: Sequence[Block]) -> dict[str, Table]:
     }
 
 
-def from_can(block: Block, how: MobileyeSettings = AS_ON_WIRE) -> dict[str, Table]:
+def tables_from_can(block: Block, how: MobileyeSettings = BUS_SETTINGS) -> dict[str, Table]:
     decoder = MobileyeDecoder("can1", Ledger("log"), how)
     return tables_of([*decoder(block), *decoder.flush()])
 
 
-def from_bag(
-    blocks: Sequence[Block], how: MobileyeSettings = AS_ON_WIRE
+def tables_from_bag(
+    blocks: Sequence[Block], how: MobileyeSettings = BUS_SETTINGS
 ) -> tuple[dict[str, Table], Ledger]:
     ledger = Ledger("log")
     reader = RosMobileye("ros", TOPIC_TYPES, ledger, how)
@@ -59,7 +61,7 @@ def from_bag(
     return tables_of([*tables, *reader.flush()]), ledger
 
 
-def by_time(table: Table) -> Table:
+def sorted_by_time(table: Table) -> Table:
     keys = [table[n] for n in ("slot", "index", "side", "t_ns") if n in table.columns]
     return table.take(np.lexsort(keys))
 
@@ -67,27 +69,29 @@ def by_time(table: Table) -> Table:
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=15, deadline=None)
-def test_messages_give_the_very_same_columns_as_frames(seed: int) -> None:
+def test_messages_decode_to_same_columns_as_frames(seed: int) -> None:
     drive = random_drive(6, np.random.default_rng(seed))
-    can = from_can(drive)
-    bag, ledger = from_bag(messages_of(drive))
+    can = tables_from_can(drive)
+    bag, ledger = tables_from_bag(messages_of(drive))
 
     assert can.keys() == bag.keys()
     for name, table in can.items():
         assert list(table.columns) == list(bag[name].columns)
         if name == "next_lanes":
             continue  # a message does not identify its lane
-        one, other = by_time(table), by_time(bag[name])
+        from_frames, from_messages = sorted_by_time(table), sorted_by_time(bag[name])
         for column in table.columns:
-            assert one[column].dtype == other[column].dtype, column
+            assert from_frames[column].dtype == from_messages[column].dtype, column
             if name != "lanes" or column != "burst":
-                np.testing.assert_array_equal(one[column], other[column], err_msg=column)
+                np.testing.assert_array_equal(
+                    from_frames[column], from_messages[column], err_msg=column
+                )
     assert ledger.is_whole
     assert not any(account.skipped for account in ledger.accounts.values())
 
 
-def test_bytes_of_a_bag_give_the_same_columns_as_frames() -> None:
-    """End to end: messages as written by rosbags, decoded by crosscue's decoder of messages."""
+def test_serialized_messages_decode_to_same_columns_as_frames() -> None:
+    """Messages are serialized by rosbags and decoded by crosscue's message decoder."""
     drive = random_drive(6, np.random.default_rng(8))
     ledger = Ledger("log")
     decoded = []
@@ -95,13 +99,15 @@ def test_bytes_of_a_bag_give_the_same_columns_as_frames() -> None:
         decode = decoder_for(topic)
         assert decode is not None
         decoded.append(decode(block, ledger))
-    bag, _ = from_bag(decoded)
-    can = from_can(drive)
+    bag, _ = tables_from_bag(decoded)
+    can = tables_from_can(drive)
 
     for name in ("status", "obstacles", "lanes"):
-        one, other = by_time(can[name]), by_time(bag[name])
-        for column in set(one.columns) - {"burst"}:
-            np.testing.assert_array_equal(one[column], other[column], err_msg=column)
+        from_frames, from_messages = sorted_by_time(can[name]), sorted_by_time(bag[name])
+        for column in set(from_frames.columns) - {"burst"}:
+            np.testing.assert_array_equal(
+                from_frames[column], from_messages[column], err_msg=column
+            )
     assert not any(account.skipped for account in ledger.accounts.values())
 
 
@@ -114,23 +120,23 @@ def test_bytes_of_a_bag_give_the_same_columns_as_frames() -> None:
         ("sign", "basic"),
     ],
 )
-def test_single_messages_give_the_same_columns_too(name: str, variant: str) -> None:
+def test_standalone_messages_decode_to_same_columns_as_frames(name: str, variant: str) -> None:
     message = layout()[name]
     words = random_words(message, 30, np.random.default_rng(4), variant)
     payloads = [(message.ids[0], int(w).to_bytes(8, "little").hex()) for w in words.tolist()]
     sent = frames(payloads, range(MS, 31 * MS, MS))
-    how = replace(AS_ON_WIRE, revision="classic")
-    can, (bag, _) = from_can(sent, how), from_bag(messages_of(sent), how)
+    how = replace(BUS_SETTINGS, revision="classic")
+    can, (bag, _) = tables_from_can(sent, how), tables_from_bag(messages_of(sent), how)
 
     for column in can[message.table].columns:
         if column != "sign":
             np.testing.assert_array_equal(can[message.table][column], bag[message.table][column])
 
 
-def test_high_beam_comes_in_one_message_for_two_frames() -> None:
+def test_high_beam_message_combines_two_frames() -> None:
     sent = frames([(0x729, "64C8800C320000"), (0x730, "1B05")])
-    bag, _ = from_bag(messages_of(sent))
-    can = from_can(sent)
+    bag, _ = tables_from_bag(messages_of(sent))
+    can = tables_from_can(sent)
 
     assert values(bag["high_beam_area"], "distance_m").tolist() == [100.0]
     for column in can["high_beam_state"].columns:
@@ -141,20 +147,22 @@ def test_high_beam_comes_in_one_message_for_two_frames() -> None:
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000), cut=st.integers(0, 60), order=st.permutations(range(5)))
 @settings(max_examples=20, deadline=None)
-def test_how_topics_interleave_changes_nothing(seed: int, cut: int, order: list[int]) -> None:
+def test_tables_do_not_depend_on_topic_interleaving(seed: int, cut: int, order: list[int]) -> None:
     """A reader may yield a block of one topic long before the others."""
     messages = messages_of(random_drive(12, np.random.default_rng(seed)))
     pieces = [piece for m in messages for piece in (m.take(np.s_[:cut]), m.take(np.s_[cut:]))]
     firsts, seconds = pieces[0::2], pieces[1::2]
     mixed = [firsts[k] for k in order if k < len(firsts)]
     mixed += [seconds[k] for k in order[::-1] if k < len(seconds)]
-    straight, _ = from_bag(messages)
-    shuffled, ledger = from_bag(mixed)
+    straight, _ = tables_from_bag(messages)
+    shuffled, ledger = tables_from_bag(mixed)
 
     for name, table in straight.items():
-        one, other = by_time(table), by_time(shuffled[name])
+        from_frames, from_messages = sorted_by_time(table), sorted_by_time(shuffled[name])
         for column in table.columns:
-            np.testing.assert_array_equal(one[column], other[column], err_msg=f"{name} {column}")
+            np.testing.assert_array_equal(
+                from_frames[column], from_messages[column], err_msg=f"{name} {column}"
+            )
     assert ledger.is_whole
 
 
@@ -164,42 +172,42 @@ def obstacle_drive() -> list[Block]:
     return messages_of(frames(sent, times))
 
 
-def test_obstacle_messages_that_did_not_come_are_reported() -> None:
+def test_missing_obstacle_message_is_dropped() -> None:
     statuses, obstacles = obstacle_drive()
-    _, ledger = from_bag([statuses, obstacles.take(np.arange(8) != 3)])
+    _, ledger = tables_from_bag([statuses, obstacles.take(np.arange(8) != 3)])
 
     account = ledger.topic("/parsed_tx/obstacle_data")
     assert account.dropped.total() == 1
     assert [(d.t_ns, d.detail) for d in ledger.drops()] == [(1066 * MS, "burst 1")]
 
 
-def test_no_obstacle_messages_at_all_are_reported_too() -> None:
+def test_obstacles_missing_in_every_burst_are_dropped() -> None:
     statuses, obstacles = obstacle_drive()
-    _, ledger = from_bag([statuses, obstacles.take(np.s_[:0])])
+    _, ledger = tables_from_bag([statuses, obstacles.take(np.s_[:0])])
     assert (
         ledger.topic("/parsed_tx/obstacle_data").dropped.total() == 6
     )  # the last burst may be incomplete
 
 
-def test_whole_obstacles_without_their_status_keep_their_own_time() -> None:
+def test_obstacles_without_status_keep_their_own_time() -> None:
     statuses, obstacles = obstacle_drive()
-    bag, ledger = from_bag([statuses.take(np.arange(4) != 2), obstacles])
+    bag, ledger = tables_from_bag([statuses.take(np.arange(4) != 2), obstacles])
 
     assert bag["obstacles"]["burst"].tolist() == [0, 0, 1, 1, -1, -1, 2, 2]
     assert bag["obstacles"]["slot"].tolist() == [0, 1, 0, 1, -1, -1, 0, 1]
     assert any("keep their own time" in n for n in ledger.notices)
 
 
-def test_without_a_status_topic_obstacles_are_given_at_once() -> None:
+def test_obstacles_without_status_topic_are_returned_immediately() -> None:
     obstacles = obstacle_drive()[1]
     types = {obstacles.topic: "mobileye_560_660_msgs/ObstacleData"}
-    reader = RosMobileye("ros", types, Ledger("log"), AS_ON_WIRE)
+    reader = RosMobileye("ros", types, Ledger("log"), BUS_SETTINGS)
     assert [len(b) for b in reader(obstacles)] == [8]
     assert reader.flush() == []
 
 
 def lane_drive(seconds: int, mirrored: bool) -> list[Block]:
-    """Left lane 1.75 m to the left, right lane 1.25 m to the right, as on the wire or mirrored."""
+    """Return a left lane at 1.75 m and a right lane at -1.25 m, with bus signs or mirrored."""
     left, right = ("40FE", "4001") if not mirrored else ("C001", "C0FE")
     burst = [
         (0x766, f"A1{left}FF7FFF7F0A"),
@@ -214,14 +222,10 @@ def lane_drive(seconds: int, mirrored: bool) -> list[Block]:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("seconds", [1, 10])
-def test_the_left_lane_lies_on_the_left_whatever_the_messages_mean(
-    mirrored: bool, seconds: int
-) -> None:
-    assert (
-        4 * VOTES_WANTED > 15 * 4
-    )  # one second is not enough to decide, but the end of the log decides
-    how = replace(AS_ON_WIRE, ros_lane_sign="auto")
-    bag, ledger = from_bag(lane_drive(seconds, mirrored), how)
+def test_lane_sign_is_inferred_from_messages(mirrored: bool, seconds: int) -> None:
+    assert 4 * VOTES_WANTED > 15 * 4  # one second has too few votes, so the end of the log decides
+    how = replace(BUS_SETTINGS, ros_lane_sign="auto")
+    bag, ledger = tables_from_bag(lane_drive(seconds, mirrored), how)
 
     lanes = bag["lanes"]
     assert (values(lanes, "c0_m") * values(lanes, "side") > 0).all()
@@ -230,31 +234,31 @@ def test_the_left_lane_lies_on_the_left_whatever_the_messages_mean(
 
 
 @pytest.mark.parametrize("sign", [s for s in get_args(LaneSign) if s != "auto"])
-def test_a_sign_that_is_set_is_kept_but_a_wrong_one_noticed(sign: LaneSign) -> None:
-    how = replace(AS_ON_WIRE, ros_lane_sign=sign)
-    bag, ledger = from_bag(lane_drive(2, mirrored=sign == "right"), how)
+def test_wrong_configured_lane_sign_is_kept_with_notice(sign: LaneSign) -> None:
+    how = replace(BUS_SETTINGS, ros_lane_sign=sign)
+    bag, ledger = tables_from_bag(lane_drive(2, mirrored=sign == "right"), how)
 
     assert (values(bag["lanes"], "c0_m") * values(bag["lanes"], "side") < 0).all()
     assert any("wrong side" in n for n in ledger.notices)
 
 
-def test_a_mirrored_obstacle_is_noticed() -> None:
+def test_mirrored_obstacle_is_a_notice() -> None:
     sent = frames([status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]])
     statuses, obstacles = messages_of(sent)
     assert isinstance(obstacles.rows, Table)
     mirrored = {**obstacles.rows.columns, "obstacle_angle": np.array([-49.4])}
-    _, ledger = from_bag([statuses, replace(obstacles, rows=Table(mirrored))])
+    _, ledger = tables_from_bag([statuses, replace(obstacles, rows=Table(mirrored))])
     assert any("compare the obstacles' sides with a picture" in n for n in ledger.notices)
 
 
-def test_messages_not_used_are_reported_under_their_topic() -> None:
+def test_unused_messages_are_skipped_by_topic_and_reason() -> None:
     statuses, obstacles = obstacle_drive()
     assert isinstance(obstacles.rows, Table)
     fewer = {n: c for n, c in obstacles.rows.columns.items() if n != "obstacle_pos_x"}
     foe = Block("/parsed_tx/fixed_foe", np.zeros(2, dtype=np.int64), Table({"a": np.zeros(2)}))
     raw = replace(frames([status(0, 0)]), topic="/parsed_tx/lane")
     assert isinstance(raw.rows, CanFrames)
-    _, ledger = from_bag([statuses, replace(obstacles, rows=Table(fewer)), foe, raw])
+    _, ledger = tables_from_bag([statuses, replace(obstacles, rows=Table(fewer)), foe, raw])
 
     reasons = {topic: dict(a.skipped) for topic, a in ledger.accounts.items() if a.skipped}
     assert reasons == {
@@ -265,6 +269,6 @@ def test_messages_not_used_are_reported_under_their_topic() -> None:
     assert ledger.details[0].detail == "obstacle_pos_x"
 
 
-def test_topics_of_other_types_are_left_alone() -> None:
-    reader = RosMobileye("ros", {"/imu": "sensor_msgs/msg/Imu"}, Ledger("log"), AS_ON_WIRE)
+def test_topics_of_other_types_are_ignored() -> None:
+    reader = RosMobileye("ros", {"/imu": "sensor_msgs/msg/Imu"}, Ledger("log"), BUS_SETTINGS)
     assert reader(join([replace(frames([status(0, 0)]), topic="/imu")])) == []
