@@ -40,15 +40,15 @@ from support.ros_messages import (
 SCHEMA = b"float64 data\n"
 
 
-def stretch(channel: int, log_ns: list[int], payloads: list[bytes]) -> Stretch:
+def stretch_of(channel: int, log_ns: list[int], payloads: list[bytes]) -> Stretch:
     n = len(log_ns)
     times = np.array(log_ns, np.int64)
     sequence = np.arange(n, dtype=np.uint32) + channel * 1000
     return Stretch(channel, times, times + channel, sequence, messages_of(payloads, 2))
 
 
-def peers_messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:
-    """Messages in stored order as the mcap package reads them, checksums on."""
+def messages_in_file_order(path: Path) -> list[tuple[str, int, int, int, bytes]]:
+    """Return the messages that the mcap package reads, in stored order, with checksums verified."""
     with path.open("rb") as stream:
         reader = NonSeekingReader(stream, validate_crcs=True)
         return [
@@ -57,7 +57,7 @@ def peers_messages(path: Path) -> list[tuple[str, int, int, int, bytes]]:
         ]
 
 
-def indexed_messages(path: Path) -> list[tuple[str, int, bytes]]:
+def messages_by_index(path: Path) -> list[tuple[str, int, bytes]]:
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         return [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
@@ -65,12 +65,12 @@ def indexed_messages(path: Path) -> list[tuple[str, int, bytes]]:
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
-def test_every_message_is_stored_once_and_each_topic_keeps_its_order(
+def test_each_message_is_stored_once_in_topic_order(
     seed: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     rng = np.random.default_rng(seed)
     path = tmp_path_factory.mktemp("mcap") / "o.mcap"
-    want: dict[str, list[tuple[int, bytes]]] = {}
+    written: dict[str, list[tuple[int, bytes]]] = {}
     compression: Compression = ("zstd", "lz4", "none")[int(rng.integers(0, 3))]
     with McapWriter(path, compression=compression, chunk_bytes=int(rng.integers(1, 900))) as writer:
         for _ in range(int(rng.integers(1, 6))):
@@ -79,14 +79,14 @@ def test_every_message_is_stored_once_and_each_topic_keeps_its_order(
             n = int(rng.integers(0, 60))
             times = rng.integers(0, 1000, n).tolist()
             payloads = [rng.bytes(int(rng.integers(0, 80))) for _ in range(n)]
-            writer.write(stretch(channel, times, payloads))
-            want.setdefault(topic, []).extend(zip(times, payloads, strict=True))
+            writer.write(stretch_of(channel, times, payloads))
+            written.setdefault(topic, []).extend(zip(times, payloads, strict=True))
 
-    stored = peers_messages(path)
-    for topic, messages in want.items():
+    stored = messages_in_file_order(path)
+    for topic, messages in written.items():
         assert [(t, data) for name, t, _, _, data in stored if name == topic] == messages
-    assert len(stored) == sum(map(len, want.values()))
-    assert sorted(indexed_messages(path)) == sorted((n, t, d) for n, t, _, _, d in stored)
+    assert len(stored) == sum(map(len, written.values()))
+    assert sorted(messages_by_index(path)) == sorted((n, t, d) for n, t, _, _, d in stored)
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -102,9 +102,9 @@ def test_topics_are_merged_by_log_time(tmp_path: Path) -> None:
     with McapWriter(path) as writer:
         for name, times in (("/a", [1, 4, 9]), ("/b", [2, 3, 8]), ("/c", [5, 0, 6])):
             channel = writer.add_channel(name, "std_msgs/msg/Float64", SCHEMA)
-            writer.write(stretch(channel, times, [b"x"] * 3))
+            writer.write(stretch_of(channel, times, [b"x"] * 3))
 
-    assert [(name, t) for name, t, *_ in peers_messages(path)] == [
+    assert [(name, t) for name, t, *_ in messages_in_file_order(path)] == [
         ("/a", 1),
         ("/b", 2),
         ("/b", 3),
@@ -122,22 +122,22 @@ def test_publish_time_and_sequence_are_kept(tmp_path: Path) -> None:
     with McapWriter(path) as writer:
         writer.add_channel("/none", "std_msgs/msg/Float64", SCHEMA)
         channel = writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
-        writer.write(stretch(channel, [5, 6], [b"x", b"yy"]))
+        writer.write(stretch_of(channel, [5, 6], [b"x", b"yy"]))
 
-    assert peers_messages(path) == [("/a", 5, 7, 2000, b"x"), ("/a", 6, 8, 2001, b"yy")]
+    assert messages_in_file_order(path) == [("/a", 5, 7, 2000, b"x"), ("/a", 6, 8, 2001, b"yy")]
 
 
-def test_an_empty_file_is_a_valid_one(tmp_path: Path) -> None:
+def test_file_without_messages_is_valid(tmp_path: Path) -> None:
     path = tmp_path / "o.mcap"
     with McapWriter(path) as writer:
         writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
 
-    assert peers_messages(path) == []
-    assert indexed_messages(path) == []
+    assert messages_in_file_order(path) == []
+    assert messages_by_index(path) == []
 
 
 class FailingFile:
-    """A file on a disk that is full from the nth write on."""
+    """File whose writes fail with a full disk from the nth one on."""
 
     def __init__(self, inner: Any, nth: int) -> None:
         self.inner, self.left = inner, nth
@@ -157,16 +157,16 @@ def _write_with_failure(path: Path, nth: int, monkeypatch: pytest.MonkeyPatch) -
     opened = PartialFile.open
     with monkeypatch.context() as patch:
         patch.setattr(PartialFile, "open", lambda self: FailingFile(opened(self), nth))
-        _write_twenty(path)
+        _write_messages(path)
 
 
-def _write_twenty(path: Path) -> None:
+def _write_messages(path: Path) -> None:
     with McapWriter(path, chunk_bytes=100) as writer:
         channel = writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
-        writer.write(stretch(channel, list(range(20)), [b"payload"] * 20))
+        writer.write(stretch_of(channel, list(range(20)), [b"payload"] * 20))
 
 
-def test_a_disk_that_fills_up_at_any_write_leaves_no_file_and_one_line(
+def test_full_disk_leaves_no_file_and_one_line_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, nth = tmp_path / "o.mcap", 0
@@ -177,26 +177,26 @@ def test_a_disk_that_fills_up_at_any_write_leaves_no_file_and_one_line(
         nth += 1
 
     assert nth > 10
-    assert len(peers_messages(path)) == 20
+    assert len(messages_in_file_order(path)) == 20
     with pytest.raises(OutputError, match=r"^[^\n]*disk is full[^\n]*$"):
         _write_with_failure(tmp_path / "other.mcap", 3, monkeypatch)
 
 
-def _write_and_stop(path: Path) -> None:
+def _write_and_raise(path: Path) -> None:
     with McapWriter(path) as writer:
         channel = writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
-        writer.write(stretch(channel, [1], [b"x"]))
+        writer.write(stretch_of(channel, [1], [b"x"]))
         raise RuntimeError("stop")
 
 
-def test_an_error_while_writing_leaves_nothing(tmp_path: Path) -> None:
+def test_error_while_writing_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="stop"):
-        _write_and_stop(tmp_path / "o.mcap")
+        _write_and_raise(tmp_path / "o.mcap")
 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_and_folders_in_the_way_are_not_touched(tmp_path: Path) -> None:
+def test_existing_files_and_folders_are_not_changed(tmp_path: Path) -> None:
     (tmp_path / "there.mcap").write_bytes(b"mine")
     (tmp_path / "folder.mcap").mkdir()
 
@@ -210,7 +210,7 @@ def test_files_and_folders_in_the_way_are_not_touched(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lengths", [[3] * 9, [0, 1, 2, 0, 5], list(range(90)), [5000, 0, 9000]])
-def test_ranges_are_copied_exactly(lengths: list[int]) -> None:
+def test_copy_ranges_copies_each_range(lengths: list[int]) -> None:
     rng = np.random.default_rng(0)
     source = rng.integers(0, 256, sum(lengths) + 64, dtype=np.uint8)
     length = np.array(lengths, np.int64)
@@ -228,8 +228,8 @@ def test_ranges_are_copied_exactly(lengths: list[int]) -> None:
         )
 
 
-def made_source(path: Path, compression: CompressionType = CompressionType.ZSTD) -> None:
-    """A file by the mcap package: two ROS 2 topics, one broken definition, one unsupported type."""
+def write_source(path: Path, compression: CompressionType = CompressionType.ZSTD) -> None:
+    """Write two ROS 2 topics, one invalid definition and one unsupported encoding with mcap."""
     rng = np.random.default_rng(0)
     store = ros2_store()
     with path.open("wb") as stream:
@@ -242,43 +242,43 @@ def made_source(path: Path, compression: CompressionType = CompressionType.ZSTD)
             channels.append((writer.register_channel(name, "cdr", schema), type_name))
         broken = writer.register_schema("made_msgs/msg/Bad", "ros2msg", b"not a definition ~~\n")
         bad = writer.register_channel("/bad", "cdr", broken)
-        foreign = writer.register_channel("/foreign", "flatbuffer", 0)
+        unsupported = writer.register_channel("/foreign", "flatbuffer", 0)
         for i in range(60):
             for channel, type_name in channels:
                 raw = bytes(store.serialize_cdr(random_message(rng, store, type_name), type_name))
                 writer.add_message(channel, 10**9 * i + channel, raw, 10**9 * i, sequence=7 * i)
         for i in range(3):
             writer.add_message(bad, i, b"\x00\x01\x00\x00", i)
-            writer.add_message(foreign, i, b"abc", i)
+            writer.add_message(unsupported, i, b"abc", i)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def test_ros2_messages_come_out_byte_for_byte_and_the_rest_is_counted(
+def test_ros2_messages_are_copied_exactly_and_others_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
-    made_source(source)
+    write_source(source)
 
     status = crosscue(["convert", str(source), "-o", str(out), "--json"])
 
-    said = json.loads(capsys.readouterr().out)
-    kept = [row for row in peers_messages(source) if row[0] in ("/imu", "/s")]
-    assert sorted(peers_messages(out)) == sorted(kept)
+    report = json.loads(capsys.readouterr().out)
+    kept = [row for row in messages_in_file_order(source) if row[0] in ("/imu", "/s")]
+    assert sorted(messages_in_file_order(out)) == sorted(kept)
     assert status == 3
-    assert said["is_whole"] is False
-    assert said["topics"]["/bad"]["skipped"] == {BAD_SCHEMA: 3}
-    assert said["topics"]["/foreign"]["skipped"] == {NO_TYPE: 3}
+    assert report["is_whole"] is False
+    assert report["topics"]["/bad"]["skipped"] == {BAD_SCHEMA: 3}
+    assert report["topics"]["/foreign"]["skipped"] == {NO_TYPE: 3}
     for name in ("/imu", "/s"):
-        assert said["topics"][name]["found"] == said["topics"][name]["written"] == 60
+        assert report["topics"][name]["found"] == report["topics"][name]["written"] == 60
     with AnyReader([out]) as reader:
         assert (
             sum(1 for c, _, raw in reader.messages() if reader.deserialize(raw, c.msgtype)) == 120
         )
 
 
-def test_the_same_log_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_convert_is_deterministic_and_idempotent(tmp_path: Path) -> None:
     source = tmp_path / "in.mcap"
-    made_source(source)
+    write_source(source)
     outs = [tmp_path / f"{k}.mcap" for k in range(3)]
     for out in outs:
         assert crosscue(["convert", str(source), "-o", str(out), "-q"]) == 3
@@ -290,27 +290,29 @@ def test_the_same_log_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-def test_every_compression_reads_back(tmp_path: Path, compression: str) -> None:
+def test_every_compression_round_trips(tmp_path: Path, compression: str) -> None:
     source, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
-    made_source(source, CompressionType.LZ4)
+    write_source(source, CompressionType.LZ4)
 
     crosscue(["convert", str(source), "-o", str(out), "--compression", compression, "-q"])
 
-    kept = [row for row in peers_messages(source) if row[0] in ("/imu", "/s")]
-    assert sorted(peers_messages(out)) == sorted(kept)
+    kept = [row for row in messages_in_file_order(source) if row[0] in ("/imu", "/s")]
+    assert sorted(messages_in_file_order(out)) == sorted(kept)
 
 
-def test_from_to_and_topics_choose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_to_and_topics_select_messages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
-    made_source(source)
+    write_source(source)
     part = ["--topics", "/imu", "--from", "10000000000ns", "--to", "20000000000ns"]
 
     status = crosscue(["convert", str(source), "-o", str(out), *part, "--json"])
 
-    said = json.loads(capsys.readouterr().out)
+    report = json.loads(capsys.readouterr().out)
     assert status == 0
-    assert {name: row["messages"] for name, row in said["written"].items()} == {"/imu": 10}
-    for account in said["topics"].values():
+    assert {name: row["messages"] for name, row in report["written"].items()} == {"/imu": 10}
+    for account in report["topics"].values():
         skipped, lost = sum(account["skipped"].values()), sum(account["dropped"].values())
         assert account["found"] == account["written"] + skipped
         if account["declared"] is not None:
@@ -328,7 +330,7 @@ def test_from_to_and_topics_choose(tmp_path: Path, capsys: pytest.CaptureFixture
         (["in.mcap", "-o", "out.mcap", "--from", "soon"], 2, "--from soon"),
     ],
 )
-def test_misuse_is_one_line_and_leaves_everything_as_it_was(
+def test_invalid_arguments_are_refused_and_change_no_file(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -337,19 +339,19 @@ def test_misuse_is_one_line_and_leaves_everything_as_it_was(
     complaint: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    made_source(tmp_path / "in.mcap")
+    write_source(tmp_path / "in.mcap")
     (tmp_path / "there.mcap").write_bytes(b"mine")
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
 
     assert crosscue(["convert", *arguments]) == status
 
-    said = capsys.readouterr().err
-    assert complaint in said
-    assert len(said.splitlines()) == 1
+    printed = capsys.readouterr().err
+    assert complaint in printed
+    assert len(printed.splitlines()) == 1
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
-def test_rows_before_1970_are_counted_not_wrapped(tmp_path: Path) -> None:
+def test_rows_before_1970_are_skipped_and_counted(tmp_path: Path) -> None:
     ledger = Ledger("made")
     block = Block("can0", np.array([-5, 5], np.int64), _frames(2))
     with LogWriter(tmp_path / "o.mcap", ledger) as writer:
@@ -357,7 +359,7 @@ def test_rows_before_1970_are_counted_not_wrapped(tmp_path: Path) -> None:
         assert writer.write(block) == 1
 
     assert ledger.topic("can0").skipped == {TOO_EARLY: 1}
-    assert [t for _, t, *_ in peers_messages(tmp_path / "o.mcap")] == [5]
+    assert [t for _, t, *_ in messages_in_file_order(tmp_path / "o.mcap")] == [5]
 
 
 def _frames(n: int) -> CanFrames:
@@ -366,7 +368,7 @@ def _frames(n: int) -> CanFrames:
     return CanFrames(np.zeros(n, np.uint32), no, zeros, zeros, np.zeros((n, 8), np.uint8), no)
 
 
-def test_a_ros1_topic_whose_definition_lies_is_skipped_by_reason(tmp_path: Path) -> None:
+def test_ros1_topic_with_invalid_definition_is_skipped(tmp_path: Path) -> None:
     ledger = Ledger("made")
     topic = ros1_topic("/t", "made_msgs/Thing", "Missing m\n")
     rows = Messages(np.zeros(4, np.uint8), np.array([0], np.int64), np.array([4], np.int64))
@@ -389,7 +391,7 @@ def test_a_ros1_topic_whose_definition_lies_is_skipped_by_reason(tmp_path: Path)
     ],
     ids=lambda parts: parts[-1],
 )
-def test_real_bags_hold_the_same_messages_afterwards(
+def test_real_bags_keep_their_messages(
     tmp_path: Path, parts: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, out = shared(*parts), tmp_path / "out.mcap"
@@ -405,28 +407,28 @@ def test_real_bags_hold_the_same_messages_afterwards(
 
 
 def _rosbags_values(path: Path) -> dict[str, list[tuple[int, str]]]:
-    """All messages as strings, without the header counter of ROS 1."""
+    """Return all messages as strings, without the header counter of ROS 1."""
     found: dict[str, list[tuple[int, str]]] = {}
     with AnyReader([path]) as reader:
         for connection, t_ns, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
-            found.setdefault(connection.topic, []).append((t_ns, _values_of(message)))
+            found.setdefault(connection.topic, []).append((t_ns, _as_text(message)))
     return {topic: sorted(rows) for topic, rows in found.items()}
 
 
-def _values_of(value: Any) -> str:
+def _as_text(value: Any) -> str:
     if hasattr(value, "__msgtype__"):
         # Constants belong to the definition; only ROS 1 has the header's counter.
         hidden = ("__msgtype__", "seq")
         names = [f.name for f in fields(value) if f.name not in hidden and not f.name.isupper()]
-        return "{" + ", ".join(_values_of(getattr(value, name)) for name in names) + "}"
+        return "{" + ", ".join(_as_text(getattr(value, name)) for name in names) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_values_of, value)) + "]"
+        return "[" + ", ".join(map(_as_text, value)) + "]"
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)
 
 
 @pytest.mark.slow
-def test_the_real_comma2k19_minute_keeps_every_row(tmp_path: Path) -> None:
+def test_real_comma2k19_segment_keeps_every_row(tmp_path: Path) -> None:
     segment = shared("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")
     out = tmp_path / "out.mcap"
 
@@ -443,9 +445,9 @@ def test_the_real_comma2k19_minute_keeps_every_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_rerun_imports_what_we_write(tmp_path: Path) -> None:
+def test_rerun_imports_converted_file(tmp_path: Path) -> None:
     source, out, rrd = tmp_path / "in.mcap", tmp_path / "out.mcap", tmp_path / "x.rrd"
-    made_source(source)
+    write_source(source)
     crosscue(["convert", str(source), "-o", str(out), "-q"])
     code = (
         "import sys, rerun as rr; rr.init('made', spawn=False); rr.save(sys.argv[2]); "

@@ -51,24 +51,24 @@ def columns_block(topic: str, rows: Rows) -> Block:
     return Block(topic, log_ns, rows, header_ns=log_ns - 7)
 
 
-def there_and_back(topic: str, rows: Rows, ledger: Ledger | None = None) -> list[Block]:
+def round_trip(topic: str, rows: Rows, ledger: Ledger | None = None) -> list[Block]:
     block = columns_block(topic, rows)
-    back: list[Block] = []
+    decoded: list[Block] = []
     for outgoing in encoded(Topic(topic, "crosscue/Any", "columns"), block, ledger):
         stored = Topic(
             outgoing.block.topic, outgoing.type.name, "cdr", outgoing.type.schema, "ros2msg"
         )
         decoder = decoder_for(stored)
         assert decoder is not None
-        reported = Ledger("back")
-        back.append(decoder(outgoing.block, reported))
+        reported = Ledger("decoded")
+        decoded.append(decoder(outgoing.block, reported))
         assert not reported.details
-        _rosbags_reads(outgoing)
-    return back
+        _read_with_rosbags(outgoing)
+    return decoded
 
 
-def _rosbags_reads(outgoing: Outgoing) -> list[Any]:
-    """All messages as rosbags reads them with the stored definition."""
+def _read_with_rosbags(outgoing: Outgoing) -> list[Any]:
+    """Return all messages, read by rosbags with the stored definition."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(outgoing.type.schema.decode(), outgoing.type.name))
     rows = outgoing.block.rows
@@ -79,7 +79,7 @@ def _rosbags_reads(outgoing: Outgoing) -> list[Any]:
 @pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 @QUICK
-def test_ros1_messages_of_made_up_types_become_what_rosbags_makes_of_them(seed: int) -> None:
+def test_ros1_messages_of_random_types_convert_like_rosbags(seed: int) -> None:
     rng = np.random.default_rng(seed)
     name = "made_msgs/msg/Root"
     text = random_definition(rng, "made_msgs/Root")
@@ -93,13 +93,13 @@ def test_ros1_messages_of_made_up_types_become_what_rosbags_makes_of_them(seed: 
 
     rows = out[0].block.rows
     assert isinstance(rows, Messages)
-    want = [bytes(store.ros1_to_cdr(each, name)) for each in payloads]
-    assert [bytes(rows.payload(i)) for i in range(len(rows))] == want
-    _rosbags_reads(out[0])
+    expected = [bytes(store.ros1_to_cdr(each, name)) for each in payloads]
+    assert [bytes(rows.payload(i)) for i in range(len(rows))] == expected
+    _read_with_rosbags(out[0])
 
 
 @pytest.mark.slow
-def test_ros1_messages_of_standard_types_become_what_rosbags_makes_of_them() -> None:
+def test_ros1_messages_of_standard_types_convert_like_rosbags() -> None:
     rng = np.random.default_rng(8)
     ours, theirs = ros1_store(), ros2_store()
     compared = 0
@@ -114,13 +114,13 @@ def test_ros1_messages_of_standard_types_become_what_rosbags_makes_of_them() -> 
         out = encoded(ros1_topic("/t", name), block_of("/t", payloads))
         rows = out[0].block.rows
         assert isinstance(rows, Messages)
-        want = [bytes(theirs.ros1_to_cdr(each, name)) for each in payloads]
-        assert [bytes(rows.payload(i)) for i in range(len(rows))] == want, name
+        expected = [bytes(theirs.ros1_to_cdr(each, name)) for each in payloads]
+        assert [bytes(rows.payload(i)) for i in range(len(rows))] == expected, name
         compared += 1
     assert compared > 60
 
 
-def test_ros1_types_that_ros2_kept_take_its_field_names() -> None:
+def test_ros1_message_gets_ros2_field_names() -> None:
     topic = ros1_topic("/cam", "sensor_msgs/msg/CameraInfo")
     store = ros1_store()
     message = random_message(np.random.default_rng(0), store, "sensor_msgs/msg/CameraInfo")
@@ -128,14 +128,14 @@ def test_ros1_types_that_ros2_kept_take_its_field_names() -> None:
 
     (out,) = encoded(topic, block_of("/cam", [raw]))
 
-    (read,) = _rosbags_reads(out)
+    (read,) = _read_with_rosbags(out)
     np.testing.assert_array_equal(read.k, message.K)  # type: ignore[attr-defined]
     assert not hasattr(read.header, "seq")
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 @QUICK
-def test_damaged_ros1_messages_are_dropped_and_the_rest_transcribed(seed: int) -> None:
+def test_only_damaged_ros1_messages_are_dropped(seed: int) -> None:
     rng = np.random.default_rng(seed)
     store, name = ros1_store(), "diagnostic_msgs/msg/DiagnosticArray"
     good = [bytes(store.serialize_ros1(random_message(rng, store, name), name)) for _ in range(8)]
@@ -146,12 +146,12 @@ def test_damaged_ros1_messages_are_dropped_and_the_rest_transcribed(seed: int) -
 
     out = encoded(ros1_topic("/d", name), block_of("/d", payloads), ledger)
 
-    got = []
+    converted = []
     if out:
         rows = out[0].block.rows
         assert isinstance(rows, Messages)
-        got = [bytes(rows.payload(i)) for i in range(len(rows))]
-    assert got == [bytes(ros2_store().ros1_to_cdr(each, name)) for each in kept]
+        converted = [bytes(rows.payload(i)) for i in range(len(rows))]
+    assert converted == [bytes(ros2_store().ros1_to_cdr(each, name)) for each in kept]
     assert ledger.topic("/d").dropped.total() == len(payloads) - len(kept)
     assert set(ledger.topic("/d").dropped) <= {MISFIT}
     assert not ledger.topic("/d").skipped
@@ -170,28 +170,28 @@ def can_frames(n: int, width: int, seed: int = 0) -> CanFrames:
     return CanFrames(identifier.astype(np.uint32), extended, kind, length, data, fd)
 
 
-def test_can_frames_come_back_as_they_were() -> None:
+def test_can_frames_round_trip() -> None:
     frames = can_frames(500, 8)
 
-    (back,) = there_and_back("can0", frames)
+    (decoded,) = round_trip("can0", frames)
 
-    assert isinstance(back.rows, CanFrames)
+    assert isinstance(decoded.rows, CanFrames)
     for name in ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd"):
-        np.testing.assert_array_equal(getattr(back.rows, name), getattr(frames, name))
-    assert back.header_ns is not None
-    np.testing.assert_array_equal(back.header_ns, back.log_ns - 7)
+        np.testing.assert_array_equal(getattr(decoded.rows, name), getattr(frames, name))
+    assert decoded.header_ns is not None
+    np.testing.assert_array_equal(decoded.header_ns, decoded.log_ns - 7)
 
 
 @pytest.mark.slow
-def test_can_fd_frames_go_to_a_topic_of_their_own_and_it_is_said() -> None:
+def test_can_fd_frames_get_separate_topic_and_notice() -> None:
     frames, ledger = can_frames(300, 64), Ledger("made")
 
-    back = there_and_back("can0", frames, ledger)
+    decoded = round_trip("can0", frames, ledger)
 
-    classic, fd = back[0], [each for each in back if each.topic == "can0/fd"]
+    classic, fd = decoded[0], [each for each in decoded if each.topic == "can0/fd"]
     assert isinstance(classic.rows, CanFrames)
     np.testing.assert_array_equal(classic.rows.arbitration_id, frames.arbitration_id[~frames.is_fd])
-    assert sum(map(len, back)) == len(frames)
+    assert sum(map(len, decoded)) == len(frames)
     log_ns = columns_block("can0", frames).log_ns
     for block in fd:
         assert isinstance(block.rows, CanFrames)
@@ -202,7 +202,7 @@ def test_can_fd_frames_go_to_a_topic_of_their_own_and_it_is_said() -> None:
     assert any("CAN FD" in notice for notice in ledger.notices)
 
 
-def test_frames_of_unknown_length_are_written_as_padded_and_it_is_said() -> None:
+def test_frames_of_unknown_length_are_written_padded_with_notice() -> None:
     frames, ledger = can_frames(5, 8), Ledger("made")
     unknown = CanFrames(
         frames.arbitration_id,
@@ -213,10 +213,10 @@ def test_frames_of_unknown_length_are_written_as_padded_and_it_is_said() -> None
         frames.is_fd,
     )
 
-    (back,) = there_and_back("can0", unknown, ledger)
+    (decoded,) = round_trip("can0", unknown, ledger)
 
-    assert isinstance(back.rows, CanFrames)
-    assert back.rows.length.tolist() == [8] * 5
+    assert isinstance(decoded.rows, CanFrames)
+    assert decoded.rows.length.tolist() == [8] * 5
     assert "does not record the lengths of frames" in ledger.notices[0]
 
 
@@ -246,75 +246,75 @@ def images(codings: tuple[str, ...], raw: bool = False) -> Images:
     ],
     ids=["compressed", "video", "raw"],
 )
-def test_pictures_come_back_byte_for_byte(pictures: Images, type_name: str) -> None:
+def test_images_round_trip_byte_for_byte(pictures: Images, type_name: str) -> None:
     topic = Topic("/front", "crosscue/Images", "columns")
     (out,) = encoded(topic, columns_block("/front", pictures))
 
-    (back,) = there_and_back("/front", pictures)
+    (decoded,) = round_trip("/front", pictures)
 
     assert out.type.name == type_name
-    assert isinstance(back.rows, Images)
-    assert back.rows.coding == pictures.coding
+    assert isinstance(decoded.rows, Images)
+    assert decoded.rows.coding == pictures.coding
     for i in range(len(pictures)):
-        assert back.rows.bytes_.payload(i) == pictures.bytes_.payload(i)
+        assert decoded.rows.bytes_.payload(i) == pictures.bytes_.payload(i)
     if type_name == "sensor_msgs/msg/Image":
-        assert back.rows.pixel_format == pictures.pixel_format
+        assert decoded.rows.pixel_format == pictures.pixel_format
 
 
-def column(n: int, *names: str) -> dict[str, NDArray[np.generic]]:
+def random_columns(n: int, *names: str) -> dict[str, NDArray[np.generic]]:
     rng = np.random.default_rng(2)
     return {name: rng.normal(size=n) for name in names}
 
 
 QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
 TABLES: Mapping[str, dict[str, NDArray[np.generic]]] = {
-    "sensor_msgs/msg/Imu": column(
+    "sensor_msgs/msg/Imu": random_columns(
         4, *(f"accel_{a}_mps2" for a in "xyz"), *(f"gyro_{a}_radps" for a in "xyz"), *QUAT
     ),
-    "sensor_msgs/msg/MagneticField": column(4, "mag_x_t", "mag_y_t", "mag_z_t"),
-    "sensor_msgs/msg/NavSatFix": column(4, "latitude_deg", "longitude_deg", "altitude_m")
+    "sensor_msgs/msg/MagneticField": random_columns(4, "mag_x_t", "mag_y_t", "mag_z_t"),
+    "sensor_msgs/msg/NavSatFix": random_columns(4, "latitude_deg", "longitude_deg", "altitude_m")
     | {
         "status": np.array([0, -1, 2, 0], np.int8),
         "covariance_m2": np.arange(36.0).reshape(4, 9),
         "covariance_type": np.array([2, 0, 1, 3], np.uint8),
     },
-    "nav_msgs/msg/Odometry": column(
+    "nav_msgs/msg/Odometry": random_columns(
         4, "x_m", "y_m", "z_m", *QUAT, "speed_x_mps", "speed_y_mps", "yaw_rate_radps"
     ),
-    "geometry_msgs/msg/PoseStamped": column(4, "x_m", "y_m", "z_m", *QUAT),
+    "geometry_msgs/msg/PoseStamped": random_columns(4, "x_m", "y_m", "z_m", *QUAT),
 }
 
 
 @pytest.mark.parametrize("type_name", sorted(TABLES))
-def test_standard_columns_use_the_standard_type_and_come_back(type_name: str) -> None:
+def test_standard_columns_round_trip_in_standard_type(type_name: str) -> None:
     table = Table(TABLES[type_name])
     (out,) = encoded(Topic("/t", "crosscue/Table", "columns"), columns_block("/t", table))
 
-    (back,) = there_and_back("/t", table)
+    (decoded,) = round_trip("/t", table)
 
     assert out.type.name == type_name
-    assert isinstance(back.rows, Table)
-    assert back.rows.columns.keys() == table.columns.keys()
+    assert isinstance(decoded.rows, Table)
+    assert decoded.rows.columns.keys() == table.columns.keys()
     for name, values in table.columns.items():
-        np.testing.assert_array_equal(back.rows[name], values)
+        np.testing.assert_array_equal(decoded.rows[name], values)
 
 
-def test_an_imu_without_gyro_says_so_instead_of_standing_still() -> None:
-    table = Table(column(3, *(f"accel_{a}_mps2" for a in "xyz")))
+def test_imu_without_gyro_is_marked_missing() -> None:
+    table = Table(random_columns(3, *(f"accel_{a}_mps2" for a in "xyz")))
     (out,) = encoded(Topic("/imu", "crosscue/Table", "columns"), columns_block("/imu", table))
 
-    read = _rosbags_reads(out)
-    (back,) = there_and_back("/imu", table)
+    read = _read_with_rosbags(out)
+    (decoded,) = round_trip("/imu", table)
 
     assert out.type.name == "sensor_msgs/msg/Imu"
     assert read[0].angular_velocity_covariance[0] == -1
     assert read[0].linear_acceleration_covariance[0] == 0
-    assert isinstance(back.rows, Table)
-    assert np.isnan(back.rows["gyro_z_radps"].astype(np.float64)).all()
-    np.testing.assert_array_equal(back.rows["accel_x_mps2"], table["accel_x_mps2"])
+    assert isinstance(decoded.rows, Table)
+    assert np.isnan(decoded.rows["gyro_z_radps"].astype(np.float64)).all()
+    np.testing.assert_array_equal(decoded.rows["accel_x_mps2"], table["accel_x_mps2"])
 
 
-def test_other_tables_get_a_type_of_their_own_and_come_back() -> None:
+def test_other_tables_round_trip_in_generated_type() -> None:
     table = Table(
         {
             "speed_mps": np.array([1.5, np.nan]),
@@ -329,10 +329,10 @@ def test_other_tables_get_a_type_of_their_own_and_come_back() -> None:
     )
     ledger = Ledger("made")
 
-    (back,) = there_and_back("/car/wheel speeds", table, ledger)
+    (decoded,) = round_trip("/car/wheel speeds", table, ledger)
 
-    assert isinstance(back.rows, Table)
-    assert list(back.rows.columns) == [
+    assert isinstance(decoded.rows, Table)
+    assert list(decoded.rows.columns) == [
         "speed_mps",
         "count",
         "wheel_fl",
@@ -341,14 +341,16 @@ def test_other_tables_get_a_type_of_their_own_and_come_back() -> None:
         "is_on",
         "c_0x1f",
     ]
-    for ours, theirs in zip(list(table.columns)[:-1], back.rows.columns, strict=True):
-        np.testing.assert_array_equal(back.rows[theirs], table[ours])
+    for ours, theirs in zip(list(table.columns)[:-1], decoded.rows.columns, strict=True):
+        np.testing.assert_array_equal(decoded.rows[theirs], table[ours])
     assert "words" in ledger.notices[0]
 
 
-def test_stamps_that_ros2_cannot_hold_are_skipped_not_wrapped() -> None:
-    far = np.array([0, 2**31 * 1_000_000_000, -(2**31) * 1_000_000_000 - 1], np.int64)
-    block = Block("/t", np.arange(3, dtype=np.int64), Table({"a": np.zeros(3)}), header_ns=far)
+def test_stamps_out_of_ros2_range_are_skipped() -> None:
+    out_of_range = np.array([0, 2**31 * 1_000_000_000, -(2**31) * 1_000_000_000 - 1], np.int64)
+    block = Block(
+        "/t", np.arange(3, dtype=np.int64), Table({"a": np.zeros(3)}), header_ns=out_of_range
+    )
     ledger = Ledger("made")
 
     (out,) = encoded(Topic("/t", "crosscue/Table", "columns"), block, ledger)
@@ -357,7 +359,7 @@ def test_stamps_that_ros2_cannot_hold_are_skipped_not_wrapped() -> None:
     assert ledger.topic("/t").skipped == {TIME_MISFIT: 2}
 
 
-def test_definitions_without_a_type_are_not_guessed() -> None:
+def test_unknown_types_have_no_encoder() -> None:
     encoders = Encoders()
 
     assert encoders.encoder_for(Topic("/t", "unknown_msgs/msg/T", "cdr")) is None

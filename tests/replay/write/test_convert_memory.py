@@ -15,8 +15,8 @@ PAYLOAD = b"\0\1\0\0" + bytes(24)
 DATA_END, FOOTER, MESSAGE = 0x0F, 0x02, 0x05
 
 
-def _unchunked() -> bytes:
-    """Vectors one after another without a chunk or an index."""
+def _unchunked_log() -> bytes:
+    """Return an MCAP file of consecutive vectors without chunks and index."""
     rows = np.zeros(
         RECORDS,
         dtype=[
@@ -40,15 +40,15 @@ def _unchunked() -> bytes:
 
 
 @pytest.mark.slow
-def test_an_unchunked_log_of_many_small_records_is_converted_in_little_memory(
+def test_unchunked_log_is_converted_within_memory_limit(
     tmp_path: Path,
 ) -> None:
     log = tmp_path / "log.mcap"
-    log.write_bytes(_unchunked())
+    log.write_bytes(_unchunked_log())
 
     out = str(tmp_path / "out.mcap")
-    status, said, peak_mb = measured(["convert", str(log), "-o", out, "--json"])
+    status, output, peak_mb = measured(["convert", str(log), "-o", out, "--json"])
 
-    assert status == 0, said
-    assert str(RECORDS) in said
+    assert status == 0, output
+    assert str(RECORDS) in output
     assert peak_mb < 200

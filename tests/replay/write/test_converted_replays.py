@@ -1,4 +1,4 @@
-"""A converted log plays the roles of its original, and replays to the same tables."""
+"""A converted log has the same roles as its original, and replays to the same tables."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ COLUMNS = {
 """Streams of a comma2k19 segment and their columns."""
 
 
-def segment(folder: Path) -> Path:
-    """Ten seconds in a circle at 10 m/s."""
+def circular_segment(folder: Path) -> Path:
+    """Write a comma2k19 segment of ten seconds in a circle at 10 m/s."""
     t_s = np.arange(1000) * 0.01
     for name, count in COLUMNS.items():
         place = folder / "segment" / "processed_log" / name
@@ -42,17 +42,17 @@ def segment(folder: Path) -> Path:
     return folder / "segment"
 
 
-def converted(log: Path, out: Path) -> Path:
+def convert(log: Path, out: Path) -> Path:
     assert cli.run(["convert", str(log), "-o", str(out)]) in (0, 3)
     return out
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_every_topic_keeps_its_role(name: str, tmp_path: Path) -> None:
-    log = segment(tmp_path) if name == "comma2k19" else EVERY_FORMAT[name](tmp_path)
-    again = converted(converted(log, tmp_path / "once.mcap"), tmp_path / "twice.mcap")
+def test_converted_topics_keep_their_roles(name: str, tmp_path: Path) -> None:
+    log = circular_segment(tmp_path) if name == "comma2k19" else EVERY_FORMAT[name](tmp_path)
+    converted_twice = convert(convert(log, tmp_path / "once.mcap"), tmp_path / "twice.mcap")
 
-    with open_log(log) as first, open_log(again) as second:
+    with open_log(log) as first, open_log(converted_twice) as second:
         roles = {topic.name: role_of(topic) for topic in first.topics}
         found = {topic.name: role_of(topic) for topic in second.topics}
 
@@ -66,20 +66,20 @@ def _tables(log: Path, run: Path) -> dict[str, object]:
     return {name: pq.read_table(run / f"{name}.parquet").to_pydict() for name in names}
 
 
-def test_a_converted_segment_replays_as_its_original_does(tmp_path: Path) -> None:
-    log = segment(tmp_path)
+def test_converted_segment_replays_like_original(tmp_path: Path) -> None:
+    log = circular_segment(tmp_path)
     first = _tables(log, tmp_path / "first")
     pose = first["pose"]
     assert isinstance(pose, dict)
     assert max(pose["travelled_m"]) == pytest.approx(100.0, rel=0.05)
 
-    assert _tables(converted(log, tmp_path / "log.mcap"), tmp_path / "second") == first
+    assert _tables(convert(log, tmp_path / "log.mcap"), tmp_path / "second") == first
 
 
 @pytest.mark.slow
-def test_a_real_segment_replays_as_its_original_does(tmp_path: Path) -> None:
+def test_converted_real_segment_replays_like_original(tmp_path: Path) -> None:
     (log,) = shared("comma2k19/Example_1").glob("*/40")
 
-    assert _tables(converted(log, tmp_path / "log.mcap"), tmp_path / "b") == _tables(
+    assert _tables(convert(log, tmp_path / "log.mcap"), tmp_path / "b") == _tables(
         log, tmp_path / "a"
     )

@@ -16,13 +16,13 @@ from support.rosbag_files import read_rows, rows_of, write_bag
 
 
 def cdr(i: int) -> bytes:
-    """A message that fits the definition ``int32 x``."""
+    """Return a CDR message of the definition ``int32 x``."""
     return b"\x00\x01\x00\x00" + struct.pack("<i", i)
 
 
 @pytest.fixture
 def damaged(tmp_path: Path) -> tuple[Path, int]:
-    """A recording without chunks in which one of 600 records begins with zeros; its position."""
+    """Return an unchunked log with one of 600 records damaged, and that record's position."""
     records = [schema(1), channel(1, 1, "/a")]
     records += [message(1, 10**18 + i * 10**6, cdr(i)) for i in range(600)]
     coded = bytearray(McapFile(records, data_crc=True).coded())
@@ -34,24 +34,24 @@ def damaged(tmp_path: Path) -> tuple[Path, int]:
 
 
 @pytest.mark.parametrize("flags", [[], ["--salvage"]])
-def test_convert_writes_what_can_be_read_and_exits_3(
+def test_convert_writes_readable_messages_and_exits_with_3(
     damaged: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
 ) -> None:
     path, at = damaged
 
     status = crosscue(["convert", str(path), "-o", str(tmp_path / "out.mcap"), *flags])
 
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert status == 3
-    spans = re.findall(r"bytes (\d+) to (\d+)", " ".join(said.err.split()))
+    spans = re.findall(r"bytes (\d+) to (\d+)", " ".join(printed.err.split()))
     assert any(at - 39 <= int(a) <= at and int(b) == at + 39 for a, b in spans)
-    assert ("--salvage" in said.err) == (not flags)
+    assert ("--salvage" in printed.err) == (not flags)
     read = read_back(path)
     assert read_back(tmp_path / "out.mcap").messages == read.messages
     assert read.count() == 598
 
 
-def test_salvage_lists_every_damaged_place(
+def test_salvage_reports_damaged_byte_ranges(
     damaged: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, _ = damaged
@@ -64,7 +64,7 @@ def test_salvage_lists_every_damaged_place(
     assert account["written"]["/a"]["messages"] == 598
 
 
-def test_a_damaged_bag_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_rosbag1_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_bag(tmp_path / "a.bag", rows_of(600), "bz2")
     content = bytearray(path.read_bytes())
     middle = len(content) // 2
@@ -79,7 +79,7 @@ def test_a_damaged_bag_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture
     account = json.loads(capsys.readouterr().out)
     assert status == 3
     assert 0 < readable < 600
-    # The made-up bytes of these messages fit no schema: each one read is found and then dropped.
+    # The random payloads fit no schema, so each message read is found and then dropped.
     assert (
         sum(
             one["found"] + one["dropped"].get("does not fit its schema", 0)
@@ -89,7 +89,7 @@ def test_a_damaged_bag_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture
     )
 
 
-def test_info_of_a_damaged_log_names_salvage(
+def test_info_of_damaged_log_suggests_salvage(
     damaged: tuple[Path, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert crosscue(["info", str(damaged[0])]) == 3
@@ -97,7 +97,7 @@ def test_info_of_a_damaged_log_names_salvage(
 
 
 @pytest.mark.parametrize("command", ["info", "convert"])
-def test_a_chunk_over_max_chunk_is_refused_with_both_numbers(
+def test_chunk_over_max_chunk_is_refused_with_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     path = tmp_path / "log.mcap"
@@ -110,13 +110,13 @@ def test_a_chunk_over_max_chunk_is_refused_with_both_numbers(
 
     status = crosscue([command, str(path), "--max-chunk", "0.001", *out[command]])
 
-    said = capsys.readouterr()
-    text = " ".join((said.out + said.err).split())
+    printed = capsys.readouterr()
+    text = " ".join((printed.out + printed.err).split())
     # A log with no chunk below the limit has nothing to convert.
     assert status == (3 if command == "info" else 4)
     assert "the limit is 1048" in text
 
 
-def test_max_chunk_wants_a_size(capsys: pytest.CaptureFixture[str]) -> None:
+def test_negative_max_chunk_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert crosscue(["info", "x.mcap", "--max-chunk", "-1"]) == 2
     assert "expected MiB" in capsys.readouterr().err
