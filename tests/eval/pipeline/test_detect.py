@@ -1,4 +1,4 @@
-"""From a camera log to a run folder of detections and cues, on the command line."""
+"""``crosscue detect``: from a camera log to a run folder with detections and cues."""
 
 import json
 from pathlib import Path
@@ -84,7 +84,7 @@ def _folder(tmp_path: Path, count: int = 5) -> Path:
     return folder
 
 
-def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
+def test_custom_detector_writes_detections_table(tmp_path: Path) -> None:
     log, out = _folder(tmp_path), tmp_path / "run"
 
     status = run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"])
@@ -108,10 +108,10 @@ def test_a_detector_of_ones_own_writes_tables(tmp_path: Path) -> None:
     ],
     ids=("cars", "lights", "not counted"),
 )
-def test_rules_that_used_boxes_for_masks_are_named(
+def test_notice_names_rules_that_use_boxes_instead_of_masks(
     tmp_path: Path, counted: str, said: str | None
 ) -> None:
-    """With a detector of boxes alone, eq. 15 uses boxes and eq. 16 is not evaluated."""
+    """If a detector returns boxes only, eq. 15 uses boxes and eq. 16 is not evaluated."""
     log, out, vehicle = _folder(tmp_path, 1), tmp_path / "run", tmp_path / "car.toml"
     vehicle.write_text(f"version = 1\n{counted}\n")
 
@@ -123,7 +123,7 @@ def test_rules_that_used_boxes_for_masks_are_named(
     assert len(notices) == (said is not None)
 
 
-def test_a_detector_of_an_installed_package_is_asked_for_by_its_entry_points_name(
+def test_detector_of_installed_package_is_selected_by_entry_point_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     info = tmp_path / "packages" / "own_pack-1.0.dist-info"
@@ -141,7 +141,7 @@ def test_a_detector_of_an_installed_package_is_asked_for_by_its_entry_points_nam
     assert "detector 'owm': no such name; did you mean own?" in capsys.readouterr().err
 
 
-def test_a_second_run_takes_all_from_the_cache_and_gives_the_same(
+def test_second_run_reads_cache_and_writes_same_detections(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, cache = _folder(tmp_path), str(tmp_path / "cache.sqlite")
@@ -158,7 +158,7 @@ def test_a_second_run_takes_all_from_the_cache_and_gives_the_same(
     assert first.table("detections").equals(second.table("detections"))
 
 
-def test_broken_empty_and_huge_pictures_are_skipped_and_reported(tmp_path: Path) -> None:
+def test_empty_and_oversized_pictures_are_accounted_for(tmp_path: Path) -> None:
     log = _folder(tmp_path)
     ok, png = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
     assert ok
@@ -181,7 +181,7 @@ def test_broken_empty_and_huge_pictures_are_skipped_and_reported(tmp_path: Path)
     assert account.dropped["picture not decoded"] == 1
 
 
-def test_a_camera_that_changes_size_is_followed_and_reported(tmp_path: Path) -> None:
+def test_change_of_picture_size_is_handled_and_reported(tmp_path: Path) -> None:
     log = _folder(tmp_path)
     wide = np.zeros((96, 128), np.uint8)
     wide[50:60, 10:20] = 255
@@ -209,7 +209,7 @@ OTHER_SIZES = {
 
 
 @pytest.mark.parametrize("camera", OTHER_SIZES)
-def test_intrinsics_of_images_of_another_size_are_refused(
+def test_intrinsics_for_another_image_size_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str
 ) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
@@ -225,7 +225,7 @@ def test_intrinsics_of_images_of_another_size_are_refused(
         assert not out.exists()
 
 
-def test_unusual_intrinsics_are_used_where_their_size_is_stated(tmp_path: Path) -> None:
+def test_unusual_intrinsics_are_accepted_with_stated_image_size(tmp_path: Path) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
     camera = "focal_px = 600.0\ncenter_px = [44.0, 24.0]\nsize_px = [64, 48]"
     vehicle.write_text(f"version = 1\n[camera]\n{camera}\n")
@@ -234,7 +234,7 @@ def test_unusual_intrinsics_are_used_where_their_size_is_stated(tmp_path: Path) 
     assert run([*command, "--detectors", BRIGHT]) == 0
 
 
-def test_an_estimate_with_intrinsics_of_another_size_leaves_the_run_as_it_was(
+def test_estimate_with_intrinsics_for_another_size_leaves_run_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
@@ -249,7 +249,7 @@ def test_an_estimate_with_intrinsics_of_another_size_leaves_the_run_as_it_was(
     assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
 
 
-def test_a_later_picture_of_another_size_than_the_intrinsics_is_dropped(tmp_path: Path) -> None:
+def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
     ok, encoded = cv2.imencode(".png", np.zeros((96, 128), np.uint8))
     assert ok
@@ -274,7 +274,7 @@ def test_a_later_picture_of_another_size_than_the_intrinsics_is_dropped(tmp_path
         ("", "none named; expected some of"),
     ],
 )
-def test_a_detector_that_cannot_be_is_reported_in_one_line(
+def test_invalid_detector_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], detector: str, said: str
 ) -> None:
     log = _folder(tmp_path)
@@ -287,7 +287,7 @@ def test_a_detector_that_cannot_be_is_reported_in_one_line(
     assert reported.count("\n") == 1
 
 
-def test_an_unknown_setting_is_refused_with_a_suggestion(
+def test_unknown_detector_setting_is_refused_with_suggestion(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle = tmp_path / "v.toml"
@@ -313,7 +313,7 @@ def test_an_unknown_setting_is_refused_with_a_suggestion(
         ({"weights": '"gone.onnx"'}, "put the weights next to the card"),
     ],
 )
-def test_a_card_that_does_not_fit_is_reported_in_one_line(
+def test_card_not_matching_weights_is_reported_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], said: str
 ) -> None:
     card = yolox_card(tmp_path, **changes)
@@ -326,7 +326,7 @@ def test_a_card_that_does_not_fit_is_reported_in_one_line(
     assert reported.count("\n") == 1
 
 
-def test_yolox_finds_the_cars_and_lights_of_a_real_approach(tmp_path: Path) -> None:
+def test_yolox_detects_cars_and_lights_of_real_approach(tmp_path: Path) -> None:
     source = shared("sequences", "us_signalized_intersection_dashcam")
     log = tmp_path / "us"
     log.mkdir()
@@ -345,7 +345,7 @@ def test_yolox_finds_the_cars_and_lights_of_a_real_approach(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", sorted(ROAD_CARDS))
-def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
+def test_real_segmentation_network_finds_road_ahead_but_not_in_sky(
     name: str, tmp_path: Path
 ) -> None:
     folder, package, text = ROAD_CARDS[name]
@@ -377,12 +377,12 @@ def test_each_real_segmentation_sees_the_road_ahead_and_none_in_the_sky(
 
 
 @pytest.mark.slow
-def test_networks_of_simulated_scenes_warn_on_any_other_log(tmp_path: Path) -> None:
+def test_networks_trained_on_simulation_warn_on_other_logs(tmp_path: Path) -> None:
     log, vehicle = _folder(tmp_path), tmp_path / "car.toml"
     arguments = ["detect", str(log), "--detectors", "road", "--no-cache", "-q"]
     vehicle.write_text(f'version = 1\nname = "{SIMULATED_CAR}"\n')
 
-    # A vehicle file may be copied or left out; the file next to the log belongs to it.
+    # The file next to the log decides, because a vehicle file can be copied or omitted.
     assert run([*arguments, "-o", str(tmp_path / "real"), "--vehicle", str(vehicle)]) == 0
     (tmp_path / SIMULATED).write_text("{}")
     assert run([*arguments, "-o", str(tmp_path / "simulated")]) == 0

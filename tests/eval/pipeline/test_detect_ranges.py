@@ -1,4 +1,4 @@
-"""From heights in pixels to ranges: the fit recovers the curve of the pairs and its scatter."""
+"""``crosscue fit ranges``: curves from heights in pixels to ranges, and their residuals."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ from crosscue.replay.vehicle.vehicle import RangeCurve, parse
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_curve_that_made_the_pairs_comes_back(family: str) -> None:
+def test_fit_recovers_curve_and_residual_of_generated_pairs(family: str) -> None:
     parameters = {"pinhole": (750.0,), "pinhole-offset": (700.0, 2.5), "power": (600.0, -0.9)}
     curve = RangeCurve(
         family=family,  # type: ignore[arg-type]
@@ -39,14 +39,12 @@ def test_the_curve_that_made_the_pairs_comes_back(family: str) -> None:
     ("heights", "ranges", "said"),
     [([10.0, 20.0, -1.0], [5.0, 4.0, 3.0], "row 3"), ([10.0] * 3, [5.0] * 3, "different heights")],
 )
-def test_pairs_that_cannot_be_fitted_are_refused(
-    heights: list[float], ranges: list[float], said: str
-) -> None:
+def test_degenerate_pairs_are_refused(heights: list[float], ranges: list[float], said: str) -> None:
     with pytest.raises(CrosscueError, match=said):
         fit_range(np.array(heights), np.array(ranges), "pinhole")
 
 
-def test_fit_ranges_writes_a_section_that_the_vehicle_file_takes(
+def test_fit_ranges_prints_valid_vehicle_file_section(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "pairs.csv"
@@ -62,7 +60,7 @@ def test_fit_ranges_writes_a_section_that_the_vehicle_file_takes(
     assert curve.residual_sd_m == pytest.approx(0.5, rel=0.05)
 
 
-def test_a_table_without_its_columns_is_reported(
+def test_table_without_required_columns_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "pairs.csv"
@@ -73,7 +71,7 @@ def test_a_table_without_its_columns_is_reported(
     assert "expected the columns height_px and range_m" in capsys.readouterr().err
 
 
-def test_a_table_that_is_none_is_reported_with_its_path_once(
+def test_missing_or_binary_table_is_reported_with_path_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
@@ -90,7 +88,7 @@ HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
 
 
 def drive(folder: Path, noise_m: float = 0.0) -> Path:
-    """A drive with a stop sign at the start and a light at the end of its intersection."""
+    """Write the truth of an approach with a stop sign at the start and a light at the end."""
     folder.mkdir()
     rng = np.random.default_rng(2)
     images, objects, ranges = [], [], ["t_ns,approach,start_m,end_m"]
@@ -129,7 +127,7 @@ def drive(folder: Path, noise_m: float = 0.0) -> Path:
 
 
 @pytest.mark.parametrize("cue", HEIGHTS)
-def test_a_sign_measures_the_start_and_a_light_the_end_and_hidden_ones_nothing(
+def test_signs_pair_with_start_lights_with_end_and_hidden_boxes_are_omitted(
     cue: str, tmp_path: Path
 ) -> None:
     pairs = pairs_of_truth(drive(tmp_path / "a"), cue)
@@ -138,7 +136,7 @@ def test_a_sign_measures_the_start_and_a_light_the_end_and_hidden_ones_nothing(
     np.testing.assert_allclose(pairs.height_px * pairs.range_m, HEIGHTS[cue])
 
 
-def test_a_curve_is_measured_on_drives_it_was_not_fitted_to(
+def test_fitted_curve_is_evaluated_on_other_drives(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fitted, other = drive(tmp_path / "a"), drive(tmp_path / "b", noise_m=1.0)
@@ -165,12 +163,12 @@ def test_a_curve_is_measured_on_drives_it_was_not_fitted_to(
     assert reported["tested"]["residual_sd_m"] == pytest.approx(1.0, rel=0.3)
     assert reported["tested"]["pairs"] == 60
     assert figure.read_bytes().startswith(b"\x89PNG")
-    assert run(argv) == 1  # the figure is there already
+    assert run(argv) == 1  # the figure already exists
     assert run([*argv, "--overwrite"]) == 0
     assert "on other drives, 60 pairs" in capsys.readouterr().out
 
 
-def test_a_runs_detections_are_paired_with_the_truth_of_its_drive(tmp_path: Path) -> None:
+def test_confident_detections_of_run_are_paired_with_truth_ranges(tmp_path: Path) -> None:
     truth = drive(tmp_path / "a")
     t_ns = [1_700_000_000_000_000_000 + k * 100_000_000 for k in (3, 4, 5)] + [9]
     table = pa.table(
@@ -188,7 +186,7 @@ def test_a_runs_detections_are_paired_with_the_truth_of_its_drive(tmp_path: Path
     assert pairs.range_m.tolist() == [67.0]
 
 
-def test_truth_without_objects_or_ranges_is_reported(tmp_path: Path) -> None:
+def test_missing_or_malformed_truth_is_reported(tmp_path: Path) -> None:
     save(Truth(version=1, start_ns=0, end_ns=9), tmp_path)
 
     with pytest.raises(SchemaError, match="has no ranges"):
@@ -201,7 +199,9 @@ def test_truth_without_objects_or_ranges_is_reported(tmp_path: Path) -> None:
         pairs_of_run(tmp_path, whole, "stop_sign", 0.9)
 
 
-def test_runs_and_drives_come_in_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unequal_numbers_of_runs_and_drives_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     here = str(drive(tmp_path / "a"))
 
     assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--runs", here]) == 2

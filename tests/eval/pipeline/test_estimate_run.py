@@ -1,4 +1,4 @@
-"""The second stage: from stored detections to cues, ranges and beliefs, without a picture."""
+"""``crosscue estimate``: from stored detections to cues, ranges and beliefs, without pictures."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _manifest(run_path: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_drive_up_to_an_intersection_is_believed_in(drive: Path) -> None:
+def test_intersection_probability_is_high_at_end_of_approach(drive: Path) -> None:
     folder = open_run(drive / "run")
 
     belief = folder.table("belief")
@@ -83,7 +83,7 @@ def test_a_drive_up_to_an_intersection_is_believed_in(drive: Path) -> None:
     assert all(v > 0 for v in ranges["var_m2"].to_pylist())
 
 
-def test_every_frame_has_every_cue_that_was_looked_for(drive: Path) -> None:
+def test_cues_table_has_row_for_each_frame_and_evaluated_cue(drive: Path) -> None:
     folder = open_run(drive / "run")
 
     frames = folder.table("frames").num_rows
@@ -95,7 +95,7 @@ def test_every_frame_has_every_cue_that_was_looked_for(drive: Path) -> None:
     assert "road_left" not in by_cue
 
 
-def test_the_manifest_accounts_for_the_camera_and_the_rest(drive: Path) -> None:
+def test_manifest_accounts_for_messages_of_every_topic(drive: Path) -> None:
     manifest = _manifest(drive / "run")
 
     topics = manifest["account"]["reading"][0]["topics"]
@@ -109,7 +109,7 @@ def test_the_manifest_accounts_for_the_camera_and_the_rest(drive: Path) -> None:
     assert manifest["scene"]["frames"] == manifest["detect"]["counts"]["frames"]
 
 
-def test_every_candidate_is_explained_in_manifest_and_summary(
+def test_rejected_candidates_are_explained_in_manifest_and_summary(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree(drive / "run", tmp_path / "run")
@@ -133,11 +133,11 @@ def test_every_candidate_is_explained_in_manifest_and_summary(
     assert f"range: {signs:,} stop signs measured, no curve" in printed
 
 
-def _never(self: Oracle, frames: Sequence[object]) -> Sequence[object]:
+def _fail_if_called(self: Oracle, frames: Sequence[object]) -> Sequence[object]:
     raise AssertionError("a detector ran")
 
 
-def test_another_setting_is_tried_without_opening_a_picture(
+def test_estimate_applies_new_settings_without_decoding_pictures(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(drive / "run", tmp_path / "run")
@@ -145,9 +145,9 @@ def test_another_setting_is_tried_without_opening_a_picture(
     settings = (drive / "vehicle.toml").read_text() + "\n[fusion]\nestablished = 0.99\n"
     (tmp_path / "v.toml").write_text(settings)
     shutil.copy(drive / "simulated_car.dbc", tmp_path)
-    monkeypatch.setattr("crosscue.detectors.runner.decode", _never)
-    monkeypatch.setattr("crosscue.detectors.images.decode", _never)
-    monkeypatch.setattr(Oracle, "__call__", _never)
+    monkeypatch.setattr("crosscue.detectors.runner.decode", _fail_if_called)
+    monkeypatch.setattr("crosscue.detectors.images.decode", _fail_if_called)
+    monkeypatch.setattr(Oracle, "__call__", _fail_if_called)
 
     assert run(["estimate", str(tmp_path / "run"), "--logs", str(drive), "-q"]) == 0
     assert _tables(tmp_path / "run") == before
@@ -162,7 +162,7 @@ def test_another_setting_is_tried_without_opening_a_picture(
     assert after["detections.parquet"] == before["detections.parquet"]
 
 
-def test_only_a_changed_detector_runs_again(
+def test_only_detector_with_changed_settings_runs_again(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (drive / "vehicle.toml").read_text()
@@ -187,7 +187,7 @@ def test_only_a_changed_detector_runs_again(
     assert reported["ran"] == {"oracle": 0, "signs": reported["frames"]}
 
 
-def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(
+def test_resumed_run_writes_same_bytes_as_uninterrupted_run(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def killed(*_args: object, **_more: object) -> None:
@@ -213,7 +213,7 @@ def test_a_resumed_run_gives_the_bytes_of_an_uninterrupted_one(
     assert _tables(tmp_path / "run") == _tables(drive / "run")
 
 
-def test_a_log_that_is_gone_or_has_changed_is_refused(
+def test_estimate_refuses_missing_or_changed_log(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy = tmp_path / "drive"
@@ -229,7 +229,7 @@ def test_a_log_that_is_gone_or_has_changed_is_refused(
     assert "is gone; say where it is with --logs DIR" in capsys.readouterr().err
 
 
-def test_a_car_without_a_camera_goes_on_and_says_so(
+def test_replay_without_detectors_succeeds_and_reports_it(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, vehicle = str(drive / "drive.mcap"), str(drive / "vehicle.toml")
@@ -240,9 +240,7 @@ def test_a_car_without_a_camera_goes_on_and_says_so(
     assert not RunFolder(tmp_path / "run").file("belief.parquet").exists()
 
 
-def test_a_cue_and_a_feature_of_ones_own_are_lines_of_configuration(
-    drive: Path, tmp_path: Path
-) -> None:
+def test_custom_cue_and_feature_are_configured_in_vehicle_file(drive: Path, tmp_path: Path) -> None:
     shutil.copytree(drive / "run", tmp_path / "run")
     shutil.copy(drive / "simulated_car.dbc", tmp_path)
     (tmp_path / "v.toml").write_text(
@@ -274,7 +272,7 @@ def test_a_cue_and_a_feature_of_ones_own_are_lines_of_configuration(
     assert folder.table("belief")["busy"].to_pylist()[-1] > 0.9
 
 
-def test_a_cue_of_ones_own_may_not_take_a_name_that_is_there(
+def test_custom_cue_with_existing_name_is_refused(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = (drive / "vehicle.toml").read_text() + "\n[cues.own.stop_sign]\nlabels = ['x']\n"

@@ -1,7 +1,7 @@
-"""From pictures to a better pose, through the command line: simulated drive, simulated walls.
+"""Landmarks correct the pose of a simulated drive, through the command line.
 
-The car drives past textured walls. A survey at another time of day gives the database; the replay
-starts metres off and meets the walls again.
+The simulated car drives past textured walls. A survey with other image noise fills the database.
+The replay starts with a wrong pose and passes the same walls.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ WALL_M = 40.0
 
 
 def view(way_m: float, noise: float, seed: int) -> Bytes:
-    """Picture of the next wall after a distance; it is larger when the wall is nearer."""
+    """Render the next wall after a distance; a nearer wall appears larger."""
     number, into_m = divmod(way_m, WALL_M)
     scale = 0.6 * (WALL_M + 15.0) / (WALL_M + 15.0 - into_m)
     return seen_from(_wall(int(number) + 100), 0.0, scale, noise, seed)
@@ -50,7 +50,7 @@ def _wall(seed: int) -> Bytes:
 
 
 def frames(folder: Path, drive: DriveFiles, every_ns: int, noise: float, seed: int) -> Path:
-    """A folder of the camera's pictures."""
+    """Write a folder of camera pictures along the true path of a drive."""
     track = read_tum(drive.truth.parent / "pose.tum")
     way_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track.xyz_m[:, :2], axis=0).T))])
     folder.mkdir()
@@ -109,7 +109,7 @@ def found(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 @pytest.fixture(scope="module")
 def without(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """The drive replayed without any."""
+    """The drive replayed without landmarks."""
     return replay(town, tmp_path_factory.mktemp("without") / "run")
 
 
@@ -137,7 +137,7 @@ def test_landmarks_correct_a_drifting_pose(
     assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
 
 
-def test_rows_name_the_landmark_and_the_manifest_accounts_for_every_frame(
+def test_pose_rows_name_landmarks_and_manifest_counts_every_frame(
     town: Town, found: RunFolder
 ) -> None:
     manifest = estimate_manifest(found)
@@ -155,14 +155,16 @@ def test_rows_name_the_landmark_and_the_manifest_accounts_for_every_frame(
     assert (np.diff(times) > 0).all()
 
 
-def test_the_same_drive_gives_the_same_bytes(town: Town, found: RunFolder, tmp_path: Path) -> None:
+def test_repeated_landmark_replay_writes_same_bytes(
+    town: Town, found: RunFolder, tmp_path: Path
+) -> None:
     again = replay(town, tmp_path / "again", "--landmarks", str(town.database))
 
     for name in ("pose.parquet", "measurements.parquet"):
         assert again.file(name).read_bytes() == found.file(name).read_bytes()
 
 
-def test_zero_landmarks_leave_the_pose_as_it_was(
+def test_empty_landmark_database_leaves_pose_unchanged(
     town: Town, without: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     empty = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
@@ -173,7 +175,7 @@ def test_zero_landmarks_leave_the_pose_as_it_was(
     assert "0 landmarks used, 0 rejected by the gate" in capsys.readouterr().out
 
 
-def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
+def test_landmarks_without_camera_are_reported(town: Town, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = ["replay", str(town.drive.log), "--vehicle", str(town.vehicle), "-o", str(run)]
     assert cli.run([*command, "--landmarks", str(town.database)]) == 0
@@ -182,7 +184,7 @@ def test_a_log_without_a_camera_says_so(town: Town, tmp_path: Path) -> None:
     assert "landmarks were given, but the logs have no camera: none is searched for" in notices
 
 
-def refused(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
+def _refusal(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
     status = cli.run(list(command))
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -190,7 +192,7 @@ def refused(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str
     return status, captured.err
 
 
-def test_bad_databases_are_refused_in_one_line(
+def test_bad_landmark_databases_are_refused_in_one_line(
     town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut = tmp_path / "cut.sqlite"
@@ -198,16 +200,16 @@ def test_bad_databases_are_refused_in_one_line(
     other = database_of(tmp_path / "other.sqlite", np.zeros((1, 2)), kind="learned")
     replaying = ["replay", str(town.drive.log), "-o", str(tmp_path / "run"), "--landmarks"]
 
-    status, text = refused(capsys, *replaying, str(cut))
+    status, text = _refusal(capsys, *replaying, str(cut))
     assert (status, "cut short" in text) == (4, True)
-    status, text = refused(capsys, *replaying, str(other))
+    status, text = _refusal(capsys, *replaying, str(other))
     assert (status, "matcher 'learned', not 'orb'" in text) == (2, True)
-    status, text = refused(capsys, "landmarks", "list", str(tmp_path / "missing.sqlite"))
+    status, text = _refusal(capsys, "landmarks", "list", str(tmp_path / "missing.sqlite"))
     assert (status, "crosscue landmarks add" in text) == (4, True)
     assert not (tmp_path / "run" / "manifest.json").exists()
 
 
-def test_list_and_match_show_what_is_there(
+def test_landmarks_list_and_match_report_stored_landmarks(
     town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
@@ -232,19 +234,21 @@ def test_list_and_match_show_what_is_there(
     assert "1 landmarks compared" in capsys.readouterr().out
 
 
-def test_a_near_that_is_none_is_refused(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_near_option_is_refused(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     for text in ("1,2", "1,2,-3", "nan,0,1", "a,b,c"):
-        status, err = refused(capsys, "landmarks", "list", str(town.database), f"--near={text}")
+        status, err = _refusal(capsys, "landmarks", "list", str(town.database), f"--near={text}")
         assert (status, "expected x,y,radius in metres" in err) == (2, True)
 
 
-def test_fewer_than_none_cannot_be_shown(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_limit_and_best_options_are_refused(
+    town: Town, capsys: pytest.CaptureFixture[str]
+) -> None:
     capsys.readouterr()
     database = str(town.database)
 
     for command in (("list", database, "--limit=-1"), ("match", database, "x.png", "--best=0")):
-        status, err = refused(capsys, "landmarks", *command)
+        status, err = _refusal(capsys, "landmarks", *command)
         assert (status, "expected" in err) == (2, True)
 
 
@@ -295,18 +299,18 @@ def test_bad_coordinates_are_refused_and_nothing_is_written(
 ) -> None:
     folder, csv = photos(tmp_path / "photos", table)
     add = ["landmarks", "add", str(tmp_path / "lm.sqlite"), "--images", str(folder)]
-    got, text = refused(capsys, *add, "--coordinates", str(csv))
+    got, text = _refusal(capsys, *add, "--coordinates", str(csv))
 
     assert got == status
     assert why in text
     assert not (tmp_path / "lm.sqlite").exists()
 
 
-def test_add_wants_a_log_with_poses_or_pictures_with_coordinates(
+def test_landmarks_add_requires_log_with_poses_or_images_with_coordinates(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for more in ([], ["--images", "x"], ["log"], ["log", "--poses", "p", "--images", "x"]):
-        status, text = refused(capsys, "landmarks", "add", str(tmp_path / "lm.sqlite"), *more)
+        status, text = _refusal(capsys, "landmarks", "add", str(tmp_path / "lm.sqlite"), *more)
         assert (status, "expected LOG... with --poses" in text) == (2, True)
 
 
@@ -327,7 +331,7 @@ def belief_at(t_ns: int) -> PoseBelief:
     return PoseBelief(t_ns, np.zeros(4), np.eye(4))
 
 
-def test_a_picture_that_does_not_decode_is_dropped_in_the_account(tmp_path: Path) -> None:
+def test_undecodable_picture_is_counted_as_dropped(tmp_path: Path) -> None:
     ledger = Ledger("cam")
     stage = stage_at(database_of(tmp_path / "lm.sqlite", np.zeros((1, 2))), ledger)
     ledger.find("cam", 2)
@@ -342,7 +346,7 @@ def test_a_picture_that_does_not_decode_is_dropped_in_the_account(tmp_path: Path
     assert stage.counts()["candidates"] == 1
 
 
-def test_frames_too_close_or_without_odometry_are_counted_and_let_go(tmp_path: Path) -> None:
+def test_thinned_and_late_frames_are_counted(tmp_path: Path) -> None:
     stage = stage_at(database_of(tmp_path / "lm.sqlite", np.zeros((1, 2))), Ledger("cam"))
     stage.see(block([b"x"] * 10, step_ns=50_000_000))
     assert len(stage.times_ns()) == 5
@@ -355,8 +359,8 @@ def test_frames_too_close_or_without_odometry_are_counted_and_let_go(tmp_path: P
     assert stage.counts()["late"] == 5
 
 
-def test_real_frames_find_the_landmarks_of_their_own_street(tmp_path: Path) -> None:
-    """KITTI: every fourth metre of a turn as landmarks; the frames between find the nearest."""
+def test_real_frames_match_nearest_landmarks_of_kitti_turn(tmp_path: Path) -> None:
+    """Every fourth frame of a turn is a landmark; frames between match one within 4.5 m."""
     folder = shared("sequences", "kitti_seq2_right_turn_98deg")
     pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
     east_north = np.column_stack([pose[:, 2, 3], -pose[:, 0, 3]])
@@ -380,13 +384,13 @@ def test_real_frames_find_the_landmarks_of_their_own_street(tmp_path: Path) -> N
     assert max(apart) < 4.5
 
 
-def test_a_vehicle_file_with_a_landmark_section_is_checked(tmp_path: Path) -> None:
+def test_vehicle_file_accepts_landmarks_section(tmp_path: Path) -> None:
     path = tmp_path / "car.toml"
     path.write_text("version = 1\n[landmarks]\nmin_score = 33\nmatcher = 'orb'\n")
     assert load(path).landmarks.min_score == 33.0
 
 
-def test_the_score_shows_filter_and_batch_smoother_side_by_side(
+def test_score_compares_filter_with_batch_smoother(
     town: Town, found: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
@@ -403,7 +407,7 @@ def test_the_score_shows_filter_and_batch_smoother_side_by_side(
     assert "filter against batch smoother" in capsys.readouterr().out
 
 
-def test_the_measurements_are_those_that_the_filter_used(found: RunFolder) -> None:
+def test_measurements_table_holds_those_used_by_filter(found: RunFolder) -> None:
     counts = estimate_manifest(found).counts
     kinds = found.table("measurements")["kind"].to_pylist()
 
@@ -417,7 +421,7 @@ def test_the_measurements_are_those_that_the_filter_used(found: RunFolder) -> No
     assert ends.mean() > 0.99
 
 
-def test_a_matcher_of_ones_own_makes_and_asks_a_database(
+def test_custom_matcher_writes_and_queries_database(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "photos"
@@ -437,11 +441,11 @@ def test_a_matcher_of_ones_own_makes_and_asks_a_database(
         ("photos/50.png", 90.0),
         ("photos/150.png", 10.0),
     ]
-    status, text = refused(capsys, "landmarks", "match", database, str(picture))
+    status, text = _refusal(capsys, "landmarks", "match", database, str(picture))
     assert (status, "matcher 'shade', not 'orb'" in text) == (2, True)
 
 
-def test_a_picture_bomb_is_refused_in_one_line(
+def test_decompression_bomb_is_refused_in_one_line(
     town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     jpeg = bytearray(encoded(wall(1, 64, 64), ".jpg"))
@@ -451,5 +455,5 @@ def test_a_picture_bomb_is_refused_in_one_line(
     capsys.readouterr()
 
     match = ["landmarks", "match", str(town.database), str(tmp_path / "bomb.jpg")]
-    status, text = refused(capsys, *match)
+    status, text = _refusal(capsys, *match)
     assert (status, "65000 x 65000 pixels: more than" in text) == (4, True)

@@ -1,4 +1,4 @@
-"""Choice of the light or sign that yields the range, and frames in which none can."""
+"""Ranges from motion: which light or sign yields the range, and frames without a range."""
 
 from collections.abc import Sequence
 
@@ -62,7 +62,7 @@ def drive(
     return rows
 
 
-def test_the_far_lights_mark_the_end_and_groups_are_never_averaged() -> None:
+def test_far_lights_mark_end_and_groups_are_not_averaged() -> None:
     beside: Thing = ("traffic light", 57.0, -9.0, 1.3)
     rows = drive(MotionRanges(vehicle()), [NEAR, beside, FAR], 45, ("red", "red", "red"))
 
@@ -75,7 +75,7 @@ def test_the_far_lights_mark_the_end_and_groups_are_never_averaged() -> None:
     assert rows[0] == ()
 
 
-def test_a_light_that_does_not_face_the_car_never_marks_the_end() -> None:
+def test_light_facing_away_never_marks_end() -> None:
     behind: Thing = ("traffic light", 95.0, -9.0, 1.3)
     ranges = MotionRanges(vehicle())
 
@@ -91,7 +91,7 @@ def test_a_light_that_does_not_face_the_car_never_marks_the_end() -> None:
     assert [one.reference for one in ranges.objects] == [Reference.START, Reference.END, None]
 
 
-def test_a_cue_that_is_left_out_gives_no_range_to_either_end() -> None:
+def test_excluded_cue_yields_no_range() -> None:
     ranges = MotionRanges(vehicle())
     drive(ranges, [NEAR, FAR], 30)
     seen = found([NEAR, FAR], 30.0)
@@ -101,7 +101,7 @@ def test_a_cue_that_is_left_out_gives_no_range_to_either_end() -> None:
     assert ranges(AHEAD, 0.1, [seen], spans, frozenset({"traffic_light"})) == ()
 
 
-def test_lights_seen_from_behind_alone_mark_the_start_and_the_run_says_so() -> None:
+def test_lights_facing_away_alone_mark_start_and_are_counted() -> None:
     ranges = MotionRanges(vehicle())
 
     rows = drive(ranges, [NEAR], 40, ("dark",))
@@ -110,7 +110,7 @@ def test_lights_seen_from_behind_alone_mark_the_start_and_the_run_says_so() -> N
     assert ranges.counts[ONLY_AWAY] >= 25
 
 
-def test_one_group_of_lights_is_the_end_and_the_run_says_so() -> None:
+def test_single_group_of_lights_marks_end_and_is_counted() -> None:
     ranges = MotionRanges(vehicle())
 
     rows = drive(ranges, [FAR], 40, ("green",))
@@ -119,7 +119,7 @@ def test_one_group_of_lights_is_the_end_and_the_run_says_so() -> None:
     assert ranges.counts[ONE_GROUP] == sum(bool(row) for row in rows)
 
 
-def test_a_larger_light_that_comes_into_view_does_not_take_over() -> None:
+def test_new_larger_light_does_not_replace_tracked_light() -> None:
     ranges = MotionRanges(vehicle())
     drive(ranges, [FAR], 30)
     seen = found([NEAR, FAR], 30.0)
@@ -129,7 +129,7 @@ def test_a_larger_light_that_comes_into_view_does_not_take_over() -> None:
     assert one.range_m == pytest.approx(84.0 - 30.0 + 1.5 - SETBACK_M, rel=0.06)
 
 
-def test_the_nearest_stop_sign_marks_the_start() -> None:
+def test_nearest_stop_sign_marks_start() -> None:
     near: Thing = ("stop sign", 40.0, 4.0, 0.75)
     far: Thing = ("stop sign", 65.0, -4.0, 0.75)
 
@@ -150,7 +150,7 @@ def test_the_nearest_stop_sign_marks_the_start() -> None:
         (CAMERA + "[ranges]\nkind = 'motion'\n" + CURVE, "motion"),
     ],
 )
-def test_one_source_of_ranges_at_a_time(text: str, source: str | None) -> None:
+def test_settings_select_one_source_of_ranges(text: str, source: str | None) -> None:
     given = vehicle(text)
     ranges = MotionRanges(given)
     rows = drive(ranges, [FAR], 5)
@@ -167,7 +167,7 @@ def test_one_source_of_ranges_at_a_time(text: str, source: str | None) -> None:
     assert by_curve.by_cue["traffic_light"].skipped == skipped
 
 
-def test_boxes_cut_by_the_edge_give_no_range_and_are_counted() -> None:
+def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:
     aside: Thing = ("traffic light", 20.0, -12.75, 1.3)
     given = vehicle()
     seen = found([aside], 0.0)
@@ -178,7 +178,7 @@ def test_boxes_cut_by_the_edge_give_no_range_and_are_counted() -> None:
     assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
 
 
-def test_a_posterior_begins_a_range_and_is_taken_up_along_the_way() -> None:
+def test_posterior_starts_range_that_is_predicted_and_updated() -> None:
     settings = vehicle()
     loop = Approaches(graph_of(settings.fusion), settings.fusion, settings.range_filter)
     known = RangePosterior(Reference.END, 50.0, 9.0, 51.0)

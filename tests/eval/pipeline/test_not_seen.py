@@ -8,9 +8,9 @@ from crosscue.eval.runs.folder import EstimateManifest, RunFolder, SceneSummary
 from support.gap_drive import Clock, GreyNumber, replayed, write_drive
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["signs alone", "anything"])
+@pytest.fixture(scope="module", params=[True, False], ids=["declared labels", "undeclared labels"])
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A drive to a single stop sign, with a detector that states its labels or does not."""
+    """A drive to a single stop sign, with a detector that declares its labels or does not."""
     folder = tmp_path_factory.mktemp("drive")
     with pytest.MonkeyPatch.context() as patch:
         if request.param:
@@ -25,7 +25,7 @@ def scene_of(run: RunFolder) -> SceneSummary:
     return manifest.scene
 
 
-def test_roads_are_not_seen_unless_cars_were_looked_for_and_were_not_there(run: RunFolder) -> None:
+def test_side_roads_are_not_seen_if_detector_cannot_find_cars(run: RunFolder) -> None:
     scene = scene_of(run)
     (approach,) = scene.approaches
 
@@ -36,7 +36,7 @@ def test_roads_are_not_seen_unless_cars_were_looked_for_and_were_not_there(run: 
     assert approach.probabilities["intersection"] > 0.9
 
 
-def test_what_was_not_seen_has_its_prior_in_every_row_and_all_else_has_not(run: RunFolder) -> None:
+def test_only_features_not_seen_keep_prior_in_every_row(run: RunFolder) -> None:
     rows = run.table("belief").to_pydict()
     (approach,) = scene_of(run).approaches
 

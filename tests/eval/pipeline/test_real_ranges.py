@@ -20,7 +20,7 @@ traffic_light_score = 0.5
 """
 CAMERA_M = 1.8
 TRUTH_M = {"end": 79.0, "start": 59.0}
-"""From the first frame's camera to the far kerb and the crosswalk, each to 2.5 m."""
+"""Distance from the first frame's camera to the far kerb and the crosswalk, each within 2.5 m."""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def columns(drive: RunFolder, reference: str) -> tuple[Floats, Floats, Floats]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reference", ["end", "start"])
-def test_the_range_falls_and_holds_the_truth(drive: RunFolder, reference: str) -> None:
+def test_range_decreases_and_interval_contains_truth(drive: RunFolder, reference: str) -> None:
     range_m, sd_m, gone_m = columns(drive, reference)
     true_m = TRUTH_M[reference] + CAMERA_M - gone_m
 
@@ -67,7 +67,7 @@ def test_the_range_falls_and_holds_the_truth(drive: RunFolder, reference: str) -
 
 
 @pytest.mark.slow
-def test_the_far_group_faces_the_car_and_the_near_one_does_not(drive: RunFolder) -> None:
+def test_far_group_faces_ego_vehicle_and_near_group_faces_away(drive: RunFolder) -> None:
     rows = drive.table("ranged_objects").to_pylist()
     marks = {
         reference: {row["facing"] for row in rows if row["reference"] == reference}

@@ -41,7 +41,7 @@ def _replay(path: Path, blocks: list[Block], vehicle: Vehicle | None = None) -> 
     return replay_drive([log], vehicle, create(path, overwrite=True), EVERYTHING)
 
 
-def test_a_straight_drive_ends_straight_ahead(tmp_path: Path) -> None:
+def test_straight_drive_ends_straight_ahead_of_start(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, start=Start(x_m=5.0, y_m=-3.0, heading_rad=math.pi / 3))
 
     outcome = _replay(tmp_path / "run", _drive(0.0), vehicle)
@@ -54,7 +54,7 @@ def test_a_straight_drive_ends_straight_ahead(tmp_path: Path) -> None:
     assert outcome.exit_status == 0
 
 
-def test_a_circle_closes(tmp_path: Path) -> None:
+def test_full_circle_ends_at_start(tmp_path: Path) -> None:
     yaw_rate = 2.0 * math.pi / 19.9
 
     table = _replay(tmp_path / "run", _drive(yaw_rate)).run.table("pose")
@@ -63,7 +63,7 @@ def test_a_circle_closes(tmp_path: Path) -> None:
     assert np.linalg.norm(end) < 1e-6
 
 
-def test_the_speed_is_that_of_the_first_row_measured(tmp_path: Path) -> None:
+def test_speed_starts_at_first_measured_wheel_speed(tmp_path: Path) -> None:
     blocks = _drive(0.0, speed_mps=17.0)
 
     speeds = _replay(tmp_path / "run", blocks).run.table("pose")["speed_mps"].to_numpy()
@@ -71,7 +71,7 @@ def test_the_speed_is_that_of_the_first_row_measured(tmp_path: Path) -> None:
     np.testing.assert_allclose(speeds, 17.0, atol=1e-9)
 
 
-def test_a_car_is_nowhere_until_a_speed_is_a_number(tmp_path: Path) -> None:
+def test_pose_starts_with_first_finite_wheel_speed(tmp_path: Path) -> None:
     unknown = wheel_block([-SECOND, -SECOND // 2], [math.nan, math.nan])
 
     outcome = _replay(tmp_path / "run", [unknown, *_drive(0.0, speed_mps=17.0)])
@@ -83,9 +83,7 @@ def test_a_car_is_nowhere_until_a_speed_is_a_number(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 3.0, 17.0])
-def test_no_row_of_any_table_has_a_speed_that_was_not_driven(
-    tmp_path: Path, speed_mps: float
-) -> None:
+def test_all_tables_hold_only_driven_speed(tmp_path: Path, speed_mps: float) -> None:
     unknown = wheel_block([-SECOND, -SECOND // 2], [math.nan, math.nan])
     drive = _drive(0.05, speed_mps=speed_mps)
     with_a_gap = [unknown, *drive[:10], *drive[30:]]
@@ -103,7 +101,7 @@ def test_no_row_of_any_table_has_a_speed_that_was_not_driven(
         np.testing.assert_allclose(speeds, speed_mps, atol=1e-6, err_msg=name)
 
 
-def test_the_mirror_image_drives_the_mirror_image(tmp_path: Path) -> None:
+def test_mirrored_input_yields_mirrored_path(tmp_path: Path) -> None:
     left, right = (
         _replay(tmp_path / f"{sign}", _drive(sign * 0.1)).run.table("pose") for sign in (1, -1)
     )
@@ -112,7 +110,7 @@ def test_the_mirror_image_drives_the_mirror_image(tmp_path: Path) -> None:
     np.testing.assert_allclose(left["y_m"].to_numpy(), -right["y_m"].to_numpy(), atol=1e-9)
 
 
-def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_repeated_replay_writes_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         _replay(tmp_path / name, _drive(0.05))
 
@@ -120,7 +118,7 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
         assert (tmp_path / "a" / table).read_bytes() == (tmp_path / "b" / table).read_bytes()
 
 
-def test_rows_that_are_not_numbers_are_counted_and_left_out(tmp_path: Path) -> None:
+def test_wheel_rows_that_are_not_finite_are_counted_and_skipped(tmp_path: Path) -> None:
     blocks = _drive(0.0)
     blocks[5] = wheel_block([2 * SECOND + 1], [math.nan])
 
@@ -134,7 +132,7 @@ def test_rows_that_are_not_numbers_are_counted_and_left_out(tmp_path: Path) -> N
     assert np.isfinite(outcome.run.table("pose")["x_m"].to_numpy()).all()
 
 
-def test_the_manifest_accounts_for_every_row_and_setting(tmp_path: Path) -> None:
+def test_manifest_records_rows_settings_and_sources(tmp_path: Path) -> None:
     manifest = estimate_manifest(_replay(tmp_path / "run", _drive(0.0)).run)
 
     wheels = manifest.account.reading[0].topics["wheels"]
@@ -144,7 +142,7 @@ def test_the_manifest_accounts_for_every_row_and_setting(tmp_path: Path) -> None
     assert manifest.versions["crosscue"]
 
 
-def test_without_wheels_and_camera_there_is_no_run(tmp_path: Path) -> None:
+def test_log_without_wheels_and_camera_is_refused(tmp_path: Path) -> None:
     log = MemoryLog((GYRO,), [gyro_block([1, 2], [0.0, 0.0])], path=Path(__file__))
     run = create(tmp_path / "run", overwrite=False)
 
@@ -153,7 +151,7 @@ def test_without_wheels_and_camera_there_is_no_run(tmp_path: Path) -> None:
     assert not list(run.path.iterdir())
 
 
-def test_signals_without_a_dbc_are_refused(tmp_path: Path) -> None:
+def test_can_signals_without_dbc_are_refused(tmp_path: Path) -> None:
     vehicle = parse(
         'version = 1\n[can.wheel_speeds]\nrear_left = "A.L"\nrear_right = "A.R"', "car.toml"
     )
@@ -162,14 +160,14 @@ def test_signals_without_a_dbc_are_refused(tmp_path: Path) -> None:
         _replay(tmp_path / "run", _drive(0.0), vehicle)
 
 
-def test_an_existing_run_is_not_overwritten_unasked(tmp_path: Path) -> None:
+def test_existing_run_is_not_overwritten_by_default(tmp_path: Path) -> None:
     _replay(tmp_path / "run", _drive(0.0))
 
     with pytest.raises(RunError, match="--overwrite"):
         create(tmp_path / "run", overwrite=False)
 
 
-def test_the_real_minute_from_the_command_line(
+def test_real_comma2k19_segment_replays_from_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     segment, dbc = shared(*SEGMENT), shared("comma2k19", "toyota_2017.dbc")

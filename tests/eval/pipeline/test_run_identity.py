@@ -1,4 +1,4 @@
-"""Runs record their inputs: no other run overwrites them, and merging loses none of them."""
+"""Runs record their inputs: no other run overwrites them, and merging keeps all of them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _replay(place: Path | str, out: Path, *more: str) -> int:
     return run(["replay", str(place), "-o", str(out), "-q", *more])
 
 
-def test_resume_of_another_log_or_setting_is_refused_and_touches_nothing(
+def test_resume_with_another_log_or_setting_is_refused_and_changes_nothing(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     keep = tmp_path / "keep"
@@ -73,7 +73,7 @@ def test_resume_of_another_log_or_setting_is_refused_and_touches_nothing(
     assert "without input.json" in capsys.readouterr().err
 
 
-def test_a_run_cut_short_is_known_by_its_input(
+def test_incomplete_run_is_identified_by_input_file(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cut = tmp_path / "cut"
@@ -89,7 +89,7 @@ def test_a_run_cut_short_is_known_by_its_input(
     assert tree(cut) != whole
 
 
-def test_a_run_of_the_old_format_is_refused(
+def test_run_of_older_format_is_refused(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     manifest = tmp_path / "old" / "manifest.json"
@@ -109,7 +109,7 @@ def test_a_run_of_the_old_format_is_refused(
     assert REFUSAL in capsys.readouterr().err
 
 
-def test_a_run_is_the_same_bytes_from_wherever_it_is_made(
+def test_run_has_same_bytes_from_any_working_directory(
     drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(drives.parent)
@@ -127,7 +127,7 @@ def test_a_run_is_the_same_bytes_from_wherever_it_is_made(
     shutil.rmtree(drives.parent / "out")
 
 
-def test_logs_are_found_again_only_as_what_they_were(
+def test_moved_logs_are_accepted_and_changed_logs_refused(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = tmp_path / "one"
@@ -160,11 +160,9 @@ def _merged(argv: list[str], out: Path, status: int) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_shards_merged_in_any_way_are_the_single_batch(
-    drives: Path, tmp_path: Path, seed: int
-) -> None:
+def test_merged_shards_equal_single_batch(drives: Path, tmp_path: Path, seed: int) -> None:
     """Check a property over random splits, orders, overlaps and numbers of workers."""
-    chance = random.Random(seed)
+    rng = random.Random(seed)
     logs = [str(path) for path in sorted(drives.glob("*/drive.mcap"))]
     single = tmp_path / "single"
     assert run(["replay", *logs, "--each", "-o", str(single), *PART]) == 3
@@ -172,24 +170,24 @@ def test_shards_merged_in_any_way_are_the_single_batch(
 
     shards: list[list[str]] = [[], [], []]
     for log in logs:
-        for shard in chance.sample(shards, chance.choice([1, 1, 2])):
+        for shard in rng.sample(shards, rng.choice([1, 1, 2])):
             shard.append(log)
     folders = []
     for number, shard in enumerate(shards):
-        chance.shuffle(shard)
+        rng.shuffle(shard)
         folder = tmp_path / "deep" / "er" / str(number)
         if shard:
-            workers = ["--workers", chance.choice(["1", "2"])]
+            workers = ["--workers", rng.choice(["1", "2"])]
             run(["replay", *shard, "--each", "-o", str(folder), *PART, *workers])
             folders.append(str(folder))
     folders = [folder for folder in folders if Path(folder, "merged").exists()]
-    chance.shuffle(folders)
+    rng.shuffle(folders)
 
     assert _merged(["merge", *folders], tmp_path / "all", 3) == whole
     assert _merged(["merge", *folders, *folders[:1]], tmp_path / "twice", 3) == whole
 
 
-def test_a_folder_used_again_keeps_the_drives_of_both_batches(drives: Path, tmp_path: Path) -> None:
+def test_reused_folder_keeps_drives_of_both_batches(drives: Path, tmp_path: Path) -> None:
     first, second = (str(drives / name / "drive.mcap") for name in ("D-0", "D-1"))
     for log in (first, second):
         assert run(["replay", log, "--each", "-o", str(tmp_path / "again"), *PART]) == 0
@@ -200,7 +198,7 @@ def test_a_folder_used_again_keeps_the_drives_of_both_batches(drives: Path, tmp_
     assert {name[:-9] for name in names} == {"D-0", "D-1"}
 
 
-def test_two_different_runs_of_one_name_are_refused(
+def test_merge_refuses_different_runs_with_same_name(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = str(drives / "D-0" / "drive.mcap")
@@ -217,7 +215,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_relative_run_below_a_link_finds_its_logs(
+def test_estimate_finds_logs_of_relative_run_below_symlink(
     drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = tmp_path / "disk" / "deep"

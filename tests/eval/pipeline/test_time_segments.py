@@ -1,4 +1,4 @@
-"""A drive whose clock jumps, pauses or is set back is a list of time segments."""
+"""A drive whose clock jumps, pauses or is set back is divided into time segments."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _distance(outcome: Outcome, segment: int = 0) -> float:
 
 
 @pytest.mark.parametrize("by_s", [1200, 3600, -10, -3600, -1])
-def test_a_clock_that_is_set_makes_no_distance_and_loses_none(tmp_path: Path, by_s: int) -> None:
+def test_clock_jump_neither_adds_nor_removes_distance(tmp_path: Path, by_s: int) -> None:
     blocks = _drive()
     cut_ns = BEGIN + 8 * SECOND
     first, second = (
@@ -110,7 +110,7 @@ def test_a_clock_that_is_set_makes_no_distance_and_loses_none(tmp_path: Path, by
     by_ms=st.one_of(st.integers(-4_000_000, -350), st.integers(1_100, 4_000_000)),
     rows_a_block=st.sampled_from([3, 7, 50, 200]),
 )
-def test_both_sides_of_a_cut_are_the_two_halves_alone(
+def test_distance_around_any_clock_jump_is_sum_of_halves(
     tmp_path: Path, cut: int, offset_ns: int, by_ms: int, rows_a_block: int
 ) -> None:
     blocks = _drive(rows_a_block=rows_a_block)
@@ -127,7 +127,7 @@ def test_both_sides_of_a_cut_are_the_two_halves_alone(
     assert whole.travelled_m == pytest.approx(sum(alone), abs=1e-9)
 
 
-def test_a_pause_is_a_gap_with_its_length(tmp_path: Path) -> None:
+def test_pause_is_reported_as_gap_with_its_length(tmp_path: Path) -> None:
     blocks = _drive()
     paused = _part(blocks, last=BEGIN + 5 * SECOND) + _part(blocks, first=BEGIN + 9 * SECOND)
 
@@ -140,7 +140,7 @@ def test_a_pause_is_a_gap_with_its_length(tmp_path: Path) -> None:
     assert [one.cause for one in reported] == ["start", "odometry silent"]
 
 
-def test_a_gap_shorter_than_the_limit_changes_nothing(tmp_path: Path) -> None:
+def test_pause_below_silence_limit_changes_nothing(tmp_path: Path) -> None:
     blocks = _drive()
     paused = _part(blocks, last=BEGIN + 5 * SECOND) + _part(
         blocks, first=BEGIN + 5 * SECOND + 9 * ROW
@@ -160,7 +160,7 @@ def test_a_gap_shorter_than_the_limit_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("by_s", [1000, -900])
-def test_one_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -> None:
+def test_single_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -> None:
     blocks = _drive(rows_a_block=50)
     stray = blocks[2].log_ns.copy()
     stray[20] += by_s * SECOND
@@ -177,7 +177,7 @@ def test_one_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -> N
     assert any("is far" in sentence for sentence in outcome.ledgers[0].notices)
 
 
-def test_late_rows_are_no_set_back() -> None:
+def test_late_rows_are_not_taken_for_clock_set_back() -> None:
     stamps = np.arange(1000) * ROW
     stamps[[500, 501, 502]] -= 4 * SECOND
     watch = StampWatch()
@@ -190,7 +190,7 @@ def test_late_rows_are_no_set_back() -> None:
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 100, 700])
-def test_a_watch_finds_the_same_in_any_pieces(pieces: int) -> None:
+def test_stamp_watch_result_does_not_depend_on_block_size(pieces: int) -> None:
     stamps: Int64s = np.arange(700) * ROW
     stamps[300:] -= 20 * SECOND
     stamps[450] += 5000 * SECOND
@@ -213,7 +213,7 @@ def _belief(speed_mps: float) -> PoseBelief:
 
 
 @pytest.mark.parametrize("gap_s", [1.5, 4.0, 20.0, 1200.0])
-def test_whatever_a_car_may_do_in_a_gap_is_within_three_sigma(gap_s: float) -> None:
+def test_any_motion_in_gap_is_within_three_sigma(gap_s: float) -> None:
     limits = GapSettings()
     rng = np.random.default_rng(3)
     crossed = cross_gap(_belief(15.0), round(gap_s * 1e9), limits).belief
@@ -229,7 +229,7 @@ def test_whatever_a_car_may_do_in_a_gap_is_within_three_sigma(gap_s: float) -> N
 
 
 @pytest.mark.parametrize("by_ms", [-120, -150, -200, -250, -300])
-def test_a_clock_set_back_by_hardly_a_row_invents_no_distance(tmp_path: Path, by_ms: int) -> None:
+def test_clock_set_back_by_few_rows_adds_no_distance(tmp_path: Path, by_ms: int) -> None:
     blocks = _drive()
     straight = _replay(tmp_path / "straight", blocks).travelled_m
 
@@ -240,7 +240,7 @@ def test_a_clock_set_back_by_hardly_a_row_invents_no_distance(tmp_path: Path, by
     assert straight - 3.0 < set_back.travelled_m <= straight
 
 
-def test_a_longer_gap_is_never_surer() -> None:
+def test_longer_gap_increases_covariance() -> None:
     spread = [
         float(np.trace(cross_gap(_belief(15.0), round(s * 1e9), GapSettings()).belief.cov))
         for s in np.linspace(0.0, 60.0, 121)

@@ -1,4 +1,4 @@
-"""Cues, ranges and beliefs of a drive whose clock is set are those of its halves replayed alone."""
+"""Cues, ranges and beliefs of a drive with a clock jump equal those of its separate halves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ONE_ROW_MS: Final = ROW // 1_000_000
 def _columns(
     outcome: Outcome, name: str, segment: int = 0, by_ms: int = 0
 ) -> dict[str, list[object]]:
-    """A table's rows in one segment: stamps as before the clock was set, counters from 0."""
+    """Rows of a table in one segment, with the clock jump removed and counters starting at 0."""
     table = outcome.run.table(name)
     table = table.filter([number == segment for number in table["segment"].to_pylist()])
     columns: dict[str, list[object]] = table.to_pydict()
@@ -38,7 +38,7 @@ def _columns(
     return {key: rows for key, rows in columns.items() if key not in ("segment", "log_t_ns")}
 
 
-def _are_the_same(one: dict[str, list[object]], other: dict[str, list[object]]) -> None:
+def _assert_equal(one: dict[str, list[object]], other: dict[str, list[object]]) -> None:
     assert one.keys() == other.keys()
     for name, mine in one.items():
         if any(isinstance(value, float) for value in mine):
@@ -62,7 +62,7 @@ def _are_the_same(one: dict[str, list[object]], other: dict[str, list[object]]) 
 )
 @example(cut=60, by_ms=3_000, rows_a_block=7)
 @example(cut=60, by_ms=-3_000, rows_a_block=7)
-def test_what_is_seen_on_both_sides_of_a_cut_is_that_of_the_halves(
+def test_tables_around_clock_jump_equal_those_of_halves(
     tmp_path: Path, cut: int, by_ms: int, rows_a_block: int
 ) -> None:
     cut_s = cut * ROW / SECOND
@@ -83,14 +83,14 @@ def test_what_is_seen_on_both_sides_of_a_cut_is_that_of_the_halves(
     assert all(_columns(half, "range")["t_ns"] for half in (first, second))
     assert all(half.scene and half.scene.positive["stop_sign"] for half in (first, second))
     for name in ("frames", "detections", "cues", "range", "belief"):
-        _are_the_same(_columns(whole, name, 0), _columns(first, name))
-    begins_anew = by_ms < 0 or by_ms + ONE_ROW_MS > RESTART_MS
-    for name in ("cues", "range", "belief") if begins_anew else ("detections",):
-        _are_the_same(_columns(whole, name, 1, by_ms), _columns(second, name))
+        _assert_equal(_columns(whole, name, 0), _columns(first, name))
+    restarts = by_ms < 0 or by_ms + ONE_ROW_MS > RESTART_MS
+    for name in ("cues", "range", "belief") if restarts else ("detections",):
+        _assert_equal(_columns(whole, name, 1, by_ms), _columns(second, name))
 
 
 @pytest.mark.parametrize("by_s", [-3600.0, -7.0, 1200.0])
-def test_every_table_says_its_segment_and_its_stamp(tmp_path: Path, by_s: float) -> None:
+def test_every_table_records_segment_and_original_stamp(tmp_path: Path, by_s: float) -> None:
     whole = replay(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s)))
 
     for name in LABELLED:
@@ -101,7 +101,7 @@ def test_every_table_says_its_segment_and_its_stamp(tmp_path: Path, by_s: float)
 
 
 @pytest.mark.parametrize("pause_s", [1.5, 3.0])
-def test_a_short_gap_keeps_the_approach_and_its_range(tmp_path: Path, pause_s: float) -> None:
+def test_short_gap_keeps_approach_and_range(tmp_path: Path, pause_s: float) -> None:
     begin_s = 5.0
     log = write_drive(tmp_path, Clock(pause_s=(begin_s, begin_s + pause_s)))
 
@@ -120,7 +120,7 @@ def test_a_short_gap_keeps_the_approach_and_its_range(tmp_path: Path, pause_s: f
     assert after[0]["range_m"] == pytest.approx(left_m, abs=1.0)
 
 
-def test_a_long_gap_begins_anew(tmp_path: Path) -> None:
+def test_long_gap_starts_new_approach(tmp_path: Path) -> None:
     outcome = replay(tmp_path, write_drive(tmp_path, Clock(pause_s=(4.0, 9.2))))
 
     assert outcome.scene is not None
@@ -129,7 +129,7 @@ def test_a_long_gap_begins_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["max_silence_s = 9.0", "restart_after_s = 2.0"])
-def test_estimate_refuses_another_split_than_the_frames_carry(
+def test_estimate_refuses_settings_that_split_frames_differently(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
     run = replay(tmp_path, write_drive(tmp_path, Clock(pause_s=(5.0, 8.0)))).run
@@ -148,7 +148,7 @@ def test_estimate_refuses_another_split_than_the_frames_carry(
 
 
 def _detected_without_odometry(folder: Path, clock: Clock) -> Path:
-    """Frames labelled with a vehicle file whose wheel speeds are not on the bus."""
+    """Run ``detect`` with a vehicle file whose wheel speed signals are not on the bus."""
     log = write_drive(folder, clock)
     wrong = folder / "wrong.toml"
     wrong.write_text((folder / "car.toml").read_text().replace('"WHEEL_SPEEDS.', '"WHEELS.'))
@@ -157,7 +157,7 @@ def _detected_without_odometry(folder: Path, clock: Clock) -> Path:
     return folder / "run"
 
 
-def test_estimate_refuses_frames_that_were_split_without_odometry(
+def test_estimate_refuses_frames_segmented_without_odometry(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = _detected_without_odometry(tmp_path, Clock(pause_s=(5.0, 8.0)))
@@ -174,14 +174,14 @@ def test_estimate_refuses_frames_that_were_split_without_odometry(
     assert tree(run) == before
 
 
-def test_estimate_takes_frames_of_a_drive_without_gaps(tmp_path: Path) -> None:
+def test_estimate_accepts_frames_of_drive_without_gaps(tmp_path: Path) -> None:
     run = _detected_without_odometry(tmp_path, Clock())
 
     assert cli.run(["estimate", str(run), "--vehicle", str(tmp_path / "car.toml")]) == 0
 
 
 @pytest.mark.parametrize("by_s", [3.0, -3.0])
-def test_estimate_keeps_the_segments_of_frames_detected_alone(tmp_path: Path, by_s: float) -> None:
+def test_estimate_keeps_segments_of_detect(tmp_path: Path, by_s: float) -> None:
     log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
     car, run = str(tmp_path / "car.toml"), tmp_path / "run"
 

@@ -58,7 +58,7 @@ def _column(run: RunFolder, name: str, column: str) -> np.typing.NDArray[np.floa
     return np.asarray(run.table(name)[column].to_numpy())
 
 
-def test_a_camera_log_set_back_alone_leaves_the_wheels_as_they_are(tmp_path: Path) -> None:
+def test_clock_set_back_in_camera_log_leaves_odometry_unchanged(tmp_path: Path) -> None:
     straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
     camera = Clock(set_at_s=6.0, by_s=-3.0)
 
@@ -78,7 +78,7 @@ def test_a_camera_log_set_back_alone_leaves_the_wheels_as_they_are(tmp_path: Pat
     assert frames["segment"].to_pylist() == [0] * 60 + [1] * 80
 
 
-def test_a_wheel_log_that_jumps_alone_is_a_gap_and_no_distance(tmp_path: Path) -> None:
+def test_clock_jump_in_wheel_log_is_gap_without_distance(tmp_path: Path) -> None:
     straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
 
     whole = _two_logs(tmp_path, Clock(set_at_s=6.0, by_s=3.0), Clock(), "whole")
@@ -106,7 +106,7 @@ def _replayed_part(folder: Path, log: Path, run: str, *part: str) -> tuple[int, 
         (("--from", "6"), 0, [60], 59 * STEP_M),
     ],
 )
-def test_a_part_of_a_log_has_the_gaps_within_it(
+def test_selected_part_of_log_has_only_its_gaps(
     tmp_path: Path, part: tuple[str, ...], status: int, rows: list[int], way_m: float
 ) -> None:
     log = write_drive(tmp_path, Clock(pause_s=(5.0, 8.0)))
@@ -119,10 +119,10 @@ def test_a_part_of_a_log_has_the_gaps_within_it(
     assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(way_m, abs=0.01)
 
 
-def test_a_moment_that_comes_twice_is_read_twice(tmp_path: Path) -> None:
+def test_repeated_time_range_is_read_twice(tmp_path: Path) -> None:
     log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0))
 
-    # From the log's first message; 3 s to 6 s occur twice.
+    # Times are relative to the log's first message; 3 s to 6 s occur twice.
     ended, run = _replayed_part(tmp_path, log, "run", "--from", "4", "--to", "5")
 
     assert ended == 3
@@ -134,7 +134,9 @@ def test_a_moment_that_comes_twice_is_read_twice(tmp_path: Path) -> None:
     assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(18 * STEP_M, abs=0.01)
 
 
-def test_detect_alone_says_segments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_detect_records_segments_in_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log, out = write_drive(tmp_path, Clock(pause_s=(5.0, 8.0))), tmp_path / "run"
     argv = ["detect", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(out)]
 
@@ -148,7 +150,7 @@ def test_detect_alone_says_segments(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert 0 < is_after.sum() < len(is_after)
 
 
-def test_merge_keeps_the_segments_of_each_drive(tmp_path: Path) -> None:
+def test_merge_keeps_segments_of_each_drive(tmp_path: Path) -> None:
     runs = []
     for name, clock in (("gap", Clock(pause_s=(5.0, 8.0))), ("whole", Clock())):
         log = write_drive(tmp_path, clock, name=f"{name}.mcap")
@@ -166,7 +168,7 @@ def test_merge_keeps_the_segments_of_each_drive(tmp_path: Path) -> None:
     assert {row["segment"] for row in merged} == {0, 1}
 
 
-def test_compare_names_the_rows_whose_segment_differs(
+def test_compare_reports_segment_column_as_changed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     jumped = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=3.0))
@@ -212,7 +214,7 @@ def marked(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     return _with_landmarks(tmp_path_factory.mktemp("marked"), PAUSE)
 
 
-def test_landmarks_find_the_car_again_after_a_gap(marked: Outcome, tmp_path: Path) -> None:
+def test_landmarks_correct_pose_after_long_gap(marked: Outcome, tmp_path: Path) -> None:
     without = replayed(tmp_path, write_drive(tmp_path, PAUSE))
 
     after = _column(marked.run, "pose", "segment") == 1
@@ -230,7 +232,7 @@ def test_landmarks_find_the_car_again_after_a_gap(marked: Outcome, tmp_path: Pat
     )
 
 
-def test_the_pose_filter_grows_by_what_a_car_could_have_done(tmp_path: Path) -> None:
+def test_pose_covariance_grows_by_possible_motion_in_gap(tmp_path: Path) -> None:
     run = replayed(tmp_path, write_drive(tmp_path, Clock(pause_s=(4.0, 7.0))))
     last, first = (
         int(np.flatnonzero(_column(run, "pose", "segment") == n)[-1 + n]) for n in (0, 1)
@@ -250,7 +252,7 @@ def test_the_pose_filter_grows_by_what_a_car_could_have_done(tmp_path: Path) -> 
     assert float(np.diff(pose["travelled_m"])[0]) <= STEP_M + 1e-6
 
 
-def test_the_smoother_crosses_a_gap(marked: Outcome) -> None:
+def test_batch_smoother_corrects_pose_across_gap(marked: Outcome) -> None:
     pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
 
     score = score_smoother(marked.run, marked.run.path.parent / "truth.json", {})

@@ -11,7 +11,7 @@ SECOND = 1_000_000_000
 
 
 def _odometer() -> Odometer:
-    """10 m/s for two seconds, a gap of two seconds crossed at that speed, and two more seconds."""
+    """Odometry at 10 m/s: two seconds, an assumed gap of two seconds, and two more seconds."""
     start = np.array([0, 1, 2, 4, 5]) * SECOND
     stop = np.array([1, 2, 4, 5, 6]) * SECOND
     way = np.array([10.0, 10.0, 20.0, 10.0, 10.0])
@@ -19,7 +19,7 @@ def _odometer() -> Odometer:
     return Odometer(iter([(start, stop, way, 0.1 * way, 0.01 * way, is_gap)]))
 
 
-def test_a_way_says_how_much_of_it_was_assumed() -> None:
+def test_distance_across_gap_is_reported_as_assumed() -> None:
     odometer = _odometer()
 
     assert odometer.until(SECOND) == Way(10.0, 0.1, 1.0, SECOND)
@@ -28,7 +28,7 @@ def test_a_way_says_how_much_of_it_was_assumed() -> None:
     assert (rest.distance_m, rest.assumed_m) == pytest.approx((30.0, 10.0))
 
 
-def test_after_a_skip_nothing_of_the_gap_counts() -> None:
+def test_distance_before_skip_is_not_counted() -> None:
     odometer = _odometer()
 
     odometer.skip_to(3 * SECOND)
