@@ -1,4 +1,4 @@
-"""Directions of metrics are right; the amount scored has none."""
+"""Metrics compared by drive: the direction of each, and those that are no longer scored."""
 
 import json
 from collections.abc import Mapping
@@ -39,14 +39,14 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def fleet(tree: Mapping[str, Any]) -> list[DriveMetric]:
-    """The same scores in each of several drives."""
+    """Return metrics of several drives that all have the same scores."""
     return [one for i in range(DRIVES) for one in parts_of(f"drive {i}", tree, None, is_lost=False)]
 
 
-def of_twice_as_many(tree: Any, name: str = "") -> Any:
-    """The same rates over twice as many rows: only counts are doubled."""
+def with_doubled_counts(tree: Any, name: str = "") -> Any:
+    """Double every count and keep every rate."""
     if isinstance(tree, Mapping):
-        return {key: of_twice_as_many(value, key) for key, value in tree.items()}
+        return {key: with_doubled_counts(value, key) for key, value in tree.items()}
     is_count = isinstance(tree, int) and not isinstance(tree, bool)
     return 2 * tree if is_count else tree
 
@@ -55,8 +55,10 @@ def verdicts(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, s
     return {one.path: one.verdict for one in compare_drives(fleet(before), fleet(after))}
 
 
-def test_how_much_was_scored_is_neither_better_nor_worse(scores: dict[str, Any]) -> None:
-    more = scores | {name: of_twice_as_many(scores[name]) for name in ("cues", "belief", "range")}
+def test_number_of_scored_rows_has_no_direction(scores: dict[str, Any]) -> None:
+    more = scores | {
+        name: with_doubled_counts(scores[name]) for name in ("cues", "belief", "range")
+    }
     changed = {one.metric for one in set(fleet(more)) - set(fleet(scores))}
     assert {"cues.stop_sign.scored", "range.start.scored", "belief.left.scored"} <= changed
 
@@ -65,7 +67,7 @@ def test_how_much_was_scored_is_neither_better_nor_worse(scores: dict[str, Any])
         assert set(found.values()) == {"undecided"}
 
 
-def test_an_approach_more_that_is_detected_late_is_not_worse(scores: dict[str, Any]) -> None:
+def test_additional_late_detection_is_not_worse(scores: dict[str, Any]) -> None:
     def found(detected: int, mean_m: float) -> dict[str, Any]:
         counts = {"approaches": 4, "detected": detected, "full": 0, "full_m": None}
         group = counts | {"detected_m": mean_m}
@@ -76,7 +78,7 @@ def test_an_approach_more_that_is_detected_late_is_not_worse(scores: dict[str, A
             | {"detected": {"value": detected / 4, "of": 4}, "by_condition": {"rain": group}}
         }
 
-    # Two approaches at 40 m; then a third at 10 m, so that the mean of those detected is 30 m.
+    # Two approaches at 40 m; then a third at 10 m, so that the mean over detected ones is 30 m.
     got = verdicts(found(2, 40.0), found(3, 30.0))
 
     for path in ("approaches", "approaches.by_condition.rain"):
@@ -85,7 +87,7 @@ def test_an_approach_more_that_is_detected_late_is_not_worse(scores: dict[str, A
     assert "worse" not in got.values()
 
 
-def test_what_is_not_scored_at_all_any_more_is_reported(scores: dict[str, Any]) -> None:
+def test_metrics_no_longer_scored_are_reported(scores: dict[str, Any]) -> None:
     nothing = {"value": None, "of": 0}
     unseen = scores["cues"]["stop_sign"] | {"scored": 0, "precision": nothing, "recall": nothing}
     off = scores | {"cues": scores["cues"] | {"stop_sign": unseen}}
@@ -95,7 +97,7 @@ def test_what_is_not_scored_at_all_any_more_is_reported(scores: dict[str, Any]) 
     assert no_longer_scored(fleet(scores), fleet(scores)) == ()
 
 
-def test_what_only_a_drive_of_one_side_has_is_not_lost() -> None:
+def test_metrics_of_drives_on_one_side_only_are_not_reported_as_lost() -> None:
     """A fleet with one more drive has conditions that the other lacks."""
 
     def of(log: str, metric: str) -> DriveMetric:

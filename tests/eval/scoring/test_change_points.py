@@ -1,4 +1,4 @@
-"""Change points are found at the right versions, with the stated rate of false ones."""
+"""Change points are found at the right versions, with the stated rate of false alarms."""
 
 import math
 
@@ -13,11 +13,11 @@ DRIVES, VERSIONS = 8, 6
 
 
 def history(
-    chance: np.random.Generator, steps: dict[int, float], drives: int = DRIVES
+    rng: np.random.Generator, steps: dict[int, float], drives: int = DRIVES
 ) -> NDArray[np.float64]:
-    """Values of very different drives, with noise, and steps at some versions."""
-    level = chance.normal(0.0, 1.0, (drives, 1))
-    values = level + chance.normal(0.0, 0.1, (drives, VERSIONS))
+    """Generate values of drives with different levels, noise, and steps at some versions."""
+    level = rng.normal(0.0, 1.0, (drives, 1))
+    values = level + rng.normal(0.0, 0.1, (drives, VERSIONS))
     for at, step in steps.items():
         values[:, at:] += step
     return values
@@ -31,34 +31,32 @@ def places(found: dict[str, Results]) -> list[list[int]]:
     return [[point.at for point in points] for points in change_points(found).values()]
 
 
-def test_steps_are_found_where_they_are() -> None:
+def test_steps_are_found_at_their_versions() -> None:
     right = 0
     for seed in range(20):
-        chance = np.random.default_rng(seed)
+        rng = np.random.default_rng(seed)
         steps: tuple[dict[int, float], ...] = ({3: 0.5}, {1: 0.5, 4: -0.5}, {})
-        found = places(results(*(history(chance, one) for one in steps)))
+        found = places(results(*(history(rng, one) for one in steps)))
         assert {*found[0]} >= {3}
         assert {*found[1]} >= {1, 4}
         right += found == [[3], [1, 4], []]
 
-    # Each of two further rounds finds one change too many in 5 % of cases: 18 right on average.
+    # Each of two further rounds finds a false change in 5 % of cases: 18 are right on average.
     assert right >= 15
 
 
-def test_a_history_without_a_change_shows_one_as_rarely_as_stated(
+def test_false_alarm_rate_is_as_stated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "SHUFFLES", 100)
-    chance = np.random.default_rng(2)
+    rng = np.random.default_rng(2)
     times = 300
-    alarms = sum(
-        any(places(results(*(history(chance, {}) for _ in range(3))))) for _ in range(times)
-    )
+    alarms = sum(any(places(results(*(history(rng, {}) for _ in range(3))))) for _ in range(times))
 
     assert alarms / times <= FALSE_ALARMS + 2.0 * math.sqrt(FALSE_ALARMS / times)
 
 
-def test_order_of_drives_and_scale_change_nothing() -> None:
+def test_change_points_do_not_depend_on_order_of_drives_or_scale() -> None:
     values = history(np.random.default_rng(3), {2: 0.3})
     points = change_points(results(values))["0"]
 
@@ -71,9 +69,9 @@ def test_order_of_drives_and_scale_change_nothing() -> None:
     assert places(results(values[:, ::-1])) == [[VERSIONS - 2]]
 
 
-def test_drives_that_come_and_go_are_no_change() -> None:
-    chance = np.random.default_rng(4)
-    values = history(chance, {}, drives=24)
+def test_added_drives_are_not_reported_as_change() -> None:
+    rng = np.random.default_rng(4)
+    values = history(rng, {}, drives=24)
     # Hard drives join from version 3 on: the mean over drives falls, no drive does.
     values[12:] -= 5.0
     values[12:, :3] = np.nan
@@ -84,11 +82,11 @@ def test_drives_that_come_and_go_are_no_change() -> None:
 
 
 @pytest.mark.parametrize("drives", [1, MIN_DRIVES - 1])
-def test_too_few_drives_decide_nothing(drives: int) -> None:
+def test_too_few_drives_yield_no_change_points(drives: int) -> None:
     assert places(results(history(np.random.default_rng(5), {3: 9.0}, drives))) == [[]]
 
 
-def test_equal_results_and_a_single_version_have_no_change() -> None:
+def test_constant_missing_and_single_version_results_have_no_change() -> None:
     assert places(results(np.ones((DRIVES, VERSIONS)))) == [[]]
     assert places(results(np.ones((DRIVES, 1)))) == [[]]
     assert places(results(np.full((DRIVES, VERSIONS), np.nan))) == [[]]

@@ -9,22 +9,22 @@ from crosscue.replay.columns import Int64s
 
 TIMES = 800
 SLACK = 0.023
-"""Three standard deviations of a coverage of 95 % in this number of trials."""
+"""Three standard deviations of a coverage of 95 % in ``TIMES`` trials."""
 
 
-def sizes(chance: np.random.Generator, clusters: int, *, equal: bool) -> Int64s:
-    return np.full(clusters, 20) if equal else chance.integers(5, 60, clusters)
+def sizes(rng: np.random.Generator, clusters: int, *, equal: bool) -> Int64s:
+    return np.full(clusters, 20) if equal else rng.integers(5, 60, clusters)
 
 
 @pytest.mark.parametrize("equal", [True, False])
 @pytest.mark.parametrize("clusters", [4, 5, 8, 30])
-def test_intervals_of_means_cover_what_they_state(clusters: int, equal: bool) -> None:
-    chance = np.random.default_rng(clusters)
+def test_intervals_of_means_have_stated_coverage(clusters: int, equal: bool) -> None:
+    rng = np.random.default_rng(clusters)
     held = 0
     for _ in range(TIMES):
-        rows = sizes(chance, clusters, equal=equal)
+        rows = sizes(rng, clusters, equal=equal)
         which = np.repeat(np.arange(clusters), rows)
-        values = chance.normal(0.0, 1.0, clusters)[which] + chance.normal(0.0, 1.0, len(which))
+        values = rng.normal(0.0, 1.0, clusters)[which] + rng.normal(0.0, 1.0, len(which))
         low, high = mean_by_cluster(values, which)
         held += low <= 0.0 <= high
 
@@ -34,18 +34,18 @@ def test_intervals_of_means_cover_what_they_state(clusters: int, equal: bool) ->
 @pytest.mark.parametrize("alike", [0.05, 0.2])
 @pytest.mark.parametrize("fraction", [0.5, 0.8, 0.95])
 @pytest.mark.parametrize("clusters", [4, 5, 8, 30])
-def test_intervals_of_shares_cover_nearly_what_they_state(
+def test_intervals_of_fractions_have_nearly_stated_coverage(
     clusters: int, fraction: float, alike: float
 ) -> None:
-    chance = np.random.default_rng(clusters)
+    rng = np.random.default_rng(clusters)
     held = 0
     for _ in range(TIMES):
-        rows = sizes(chance, clusters, equal=False)
+        rows = sizes(rng, clusters, equal=False)
         rest = 1.0 / alike - 1.0
         which = np.repeat(np.arange(clusters), rows)
         is_right = (
-            chance.random(len(which))
-            < chance.beta(fraction * rest, (1.0 - fraction) * rest, clusters)[which]
+            rng.random(len(which))
+            < rng.beta(fraction * rest, (1.0 - fraction) * rest, clusters)[which]
         )
         low, high = fraction_by_cluster(is_right, which)
         held += low <= fraction <= high
@@ -53,19 +53,19 @@ def test_intervals_of_shares_cover_nearly_what_they_state(
     assert held / TIMES > 0.89
 
 
-def test_drawing_clusters_with_replacement_would_cover_too_little() -> None:
-    chance = np.random.default_rng(5)
+def test_cluster_bootstrap_would_cover_too_little() -> None:
+    rng = np.random.default_rng(5)
     held = 0
     for _ in range(TIMES):
-        means = chance.normal(0.0, 1.0, 5)
-        drawn = chance.choice(means, (400, 5)).mean(axis=1)
+        means = rng.normal(0.0, 1.0, 5)
+        drawn = rng.choice(means, (400, 5)).mean(axis=1)
         low, high = np.percentile(drawn, [2.5, 97.5])
         held += low <= 0.0 <= high
 
     assert 0.78 < held / TIMES < 0.88
 
 
-def test_one_row_a_cluster_is_students_t() -> None:
+def test_interval_with_one_row_per_cluster_is_students_t() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 9)
     low, high = mean_by_cluster(values, np.arange(9))
     of_study = mean_of(values)
@@ -74,7 +74,7 @@ def test_one_row_a_cluster_is_students_t() -> None:
     assert (of_study.low, of_study.high) == pytest.approx((low, high), rel=1e-12)
 
 
-def test_intervals_stay_possible_and_need_four_clusters() -> None:
+def test_intervals_stay_within_bounds_and_need_four_clusters() -> None:
     right, drives = np.ones(400, np.bool_), np.repeat(np.arange(4), 100)
 
     low, high = fraction_by_cluster(right, drives)
@@ -87,7 +87,7 @@ def test_intervals_stay_possible_and_need_four_clusters() -> None:
     assert np.isnan(range_at(np.arange(3.0), np.ones(3), 0.8).low)
 
 
-def test_one_cluster_that_holds_nearly_all_rows_leaves_the_mean_open() -> None:
+def test_dominant_cluster_widens_interval_of_mean() -> None:
     values = np.random.default_rng(0).normal(0.0, 1.0, 1003)
     even = mean_by_cluster(values, np.arange(1003) % 4)
     uneven = mean_by_cluster(values, np.r_[np.zeros(1000, np.int64), [1, 2, 3]])
@@ -95,12 +95,12 @@ def test_one_cluster_that_holds_nearly_all_rows_leaves_the_mean_open() -> None:
     assert uneven.high - uneven.low > even.high - even.low
 
 
-def test_a_ratios_interval_covers_and_is_that_of_all_drives_where_all_are_chosen() -> None:
-    chance = np.random.default_rng(2)
+def test_ratio_interval_covers_and_equals_ratio_of_means_over_all_drives() -> None:
+    rng = np.random.default_rng(2)
     held = 0
     for _ in range(TIMES):
-        bottom = chance.gamma(5.0, 1.0, 20)
-        top = bottom * chance.gamma(20.0, 1.3 / 20.0, 20)
+        bottom = rng.gamma(5.0, 1.0, 20)
+        top = bottom * rng.gamma(20.0, 1.3 / 20.0, 20)
         found = ratio_of(top, bottom)
         held += found.low <= 1.3 <= found.high
         every = np.ones(20)

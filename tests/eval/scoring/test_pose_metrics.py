@@ -1,4 +1,4 @@
-"""Pose metrics satisfy laws, and equal those of evo."""
+"""Pose metrics satisfy invariants, and equal those of evo."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ with warnings.catch_warnings():
 SEEDS = st.integers(0, 10_000)
 
 
-def walk(seed: int, n: int = 60, flat: bool = False) -> Trajectory:
-    """A random trajectory, ten poses a second."""
+def random_walk(seed: int, n: int = 60, flat: bool = False) -> Trajectory:
+    """Generate a random trajectory with ten poses per second."""
     rng = np.random.default_rng(seed)
     xyz = np.cumsum(rng.normal(0.4, 1.0, (n, 3)), axis=0)
     t_ns = np.arange(n, dtype=np.int64) * 100_000_000
@@ -54,8 +54,8 @@ def walk(seed: int, n: int = 60, flat: bool = False) -> Trajectory:
     return Trajectory(t_ns, xyz, quat / np.linalg.norm(quat, axis=1, keepdims=True))
 
 
-def near(truth: Trajectory, seed: int, sd_m: float = 0.5, sd_rad: float = 0.1) -> Trajectory:
-    """The same poses with small errors, moved together."""
+def with_errors(truth: Trajectory, seed: int, sd_m: float = 0.5, sd_rad: float = 0.1) -> Trajectory:
+    """Add small errors to each pose, and one rigid transform to all."""
     rng = np.random.default_rng(seed)
     n = len(truth)
     half = rng.normal(0.0, sd_rad / 2, (n, 3))
@@ -67,7 +67,7 @@ def near(truth: Trajectory, seed: int, sd_m: float = 0.5, sd_rad: float = 0.1) -
     return Trajectory(truth.t_ns, xyz, product(turn, product(truth.quat_wxyz, wobble)))
 
 
-def evos(trajectory: Trajectory) -> Any:
+def to_evo(trajectory: Trajectory) -> Any:
     return PoseTrajectory3D(
         trajectory.xyz_m.copy(), trajectory.quat_wxyz.copy(), trajectory.t_ns * 1e-9
     )
@@ -80,15 +80,15 @@ def evo_errors(metric: Any, truth: Any, estimate: Any) -> tuple[Floats, dict[str
 
 @given(seed=SEEDS)
 @settings(max_examples=25, deadline=None)
-def test_ape_is_evos(seed: int) -> None:
-    truth = walk(seed)
-    estimate = near(truth, seed + 1)
+def test_ape_equals_evo(seed: int) -> None:
+    truth = random_walk(seed)
+    estimate = with_errors(truth, seed + 1)
     ours = ape(truth, estimate)
     for relation, errors in (
         (metrics.PoseRelation.translation_part, ours.translation_m),
         (metrics.PoseRelation.rotation_angle_rad, ours.rotation_rad),
     ):
-        theirs, numbers = evo_errors(metrics.APE(relation), evos(truth), evos(estimate))
+        theirs, numbers = evo_errors(metrics.APE(relation), to_evo(truth), to_evo(estimate))
         np.testing.assert_allclose(errors, theirs, rtol=0, atol=1e-9)
         stats = statistics(errors)
         for name, number in numbers.items():
@@ -101,16 +101,16 @@ def test_ape_is_evos(seed: int) -> None:
 )
 @given(seed=SEEDS)
 @settings(max_examples=10, deadline=None)
-def test_rpe_is_evos(
+def test_rpe_equals_evo(
     size: float, unit: Literal["frames", "metres"], all_pairs: bool, seed: int
 ) -> None:
-    truth = walk(seed)
-    estimate = near(truth, seed + 1)
+    truth = random_walk(seed)
+    estimate = with_errors(truth, seed + 1)
     delta = RpeDelta(size, unit, all_pairs)
     evo_unit = Unit.frames if unit == "frames" else Unit.meters
     if len(rpe_pairs(estimate.xyz_m, delta)[0]) == 0:
         with pytest.raises(filters.FilterException):
-            metrics.id_pairs_from_delta(evos(estimate).poses_se3, size, evo_unit, 0.1, all_pairs)
+            metrics.id_pairs_from_delta(to_evo(estimate).poses_se3, size, evo_unit, 0.1, all_pairs)
         return
     ours = rpe(truth, estimate, delta)
     for relation, errors in (
@@ -118,18 +118,18 @@ def test_rpe_is_evos(
         (metrics.PoseRelation.rotation_angle_rad, ours.rotation_rad),
     ):
         metric = metrics.RPE(relation, size, evo_unit, all_pairs=all_pairs)
-        theirs, numbers = evo_errors(metric, evos(truth), evos(estimate))
+        theirs, numbers = evo_errors(metric, to_evo(truth), to_evo(estimate))
         np.testing.assert_allclose(errors, theirs, rtol=0, atol=1e-9)
         assert statistics(errors).rmse == pytest.approx(numbers["rmse"], abs=1e-9)
 
 
-@given(seed=SEEDS, size=st.floats(0.1, 30.0), stands=st.booleans())
+@given(seed=SEEDS, size=st.floats(0.1, 30.0), is_stationary=st.booleans())
 @settings(max_examples=40, deadline=None)
-def test_all_pairs_by_metres_are_evos_even_when_the_car_stands(
-    seed: int, size: float, stands: bool
+def test_pairs_by_metres_equal_evo_also_for_stationary_car(
+    seed: int, size: float, is_stationary: bool
 ) -> None:
-    truth = walk(seed, 40)
-    xyz = np.repeat(truth.xyz_m, 3, axis=0) if stands else truth.xyz_m
+    truth = random_walk(seed, 40)
+    xyz = np.repeat(truth.xyz_m, 3, axis=0) if is_stationary else truth.xyz_m
     first, second = rpe_pairs(xyz, RpeDelta(size, "metres", True, 0.1))
     poses = [np.block([[np.eye(3), p[:, None]], [np.zeros(3), 1.0]]) for p in xyz]
     theirs = filters.filter_pairs_by_path(poses, size, size * 0.1, all_pairs=True)
@@ -137,7 +137,7 @@ def test_all_pairs_by_metres_are_evos_even_when_the_car_stands(
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == theirs
 
 
-def test_no_pose_is_paired_with_itself() -> None:
+def test_rpe_never_pairs_pose_with_itself() -> None:
     far_apart = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
     first, second = rpe_pairs(far_apart, RpeDelta(1.0, "metres", True, 100.0))
 
@@ -146,12 +146,12 @@ def test_no_pose_is_paired_with_itself() -> None:
 
 @given(seed=SEEDS)
 @settings(max_examples=25, deadline=None)
-def test_alignment_is_evos(seed: int) -> None:
-    truth = walk(seed)
-    estimate = near(truth, seed + 1)
-    by_umeyama, by_origin = evos(estimate), evos(estimate)
-    by_umeyama.align(evos(truth))
-    by_origin.align_origin(evos(truth))
+def test_alignment_equals_evo(seed: int) -> None:
+    truth = random_walk(seed)
+    estimate = with_errors(truth, seed + 1)
+    by_umeyama, by_origin = to_evo(estimate), to_evo(estimate)
+    by_umeyama.align(to_evo(truth))
+    by_origin.align_origin(to_evo(truth))
     for how, theirs in (("se3", by_umeyama), ("origin", by_origin)):
         ours = align(truth, estimate, "se3" if how == "se3" else "origin")
         np.testing.assert_allclose(ours.xyz_m, theirs.positions_xyz, rtol=0, atol=1e-9)
@@ -159,16 +159,16 @@ def test_alignment_is_evos(seed: int) -> None:
             metrics.PoseRelation.translation_part,
             metrics.PoseRelation.rotation_angle_rad,
         ):
-            errors, _ = evo_errors(metrics.APE(relation), evos(truth), theirs)
+            errors, _ = evo_errors(metrics.APE(relation), to_evo(truth), theirs)
             made = ape(truth, ours)
             is_length = relation is metrics.PoseRelation.translation_part
             found = made.translation_m if is_length else made.rotation_rad
             np.testing.assert_allclose(found, errors, rtol=0, atol=1e-9)
 
 
-def test_through_tum_files_evo_gives_the_same_numbers(tmp_path: Path) -> None:
-    truth = walk(4, flat=True)
-    estimate = near(truth, 5)
+def test_evo_computes_same_ape_from_tum_files(tmp_path: Path) -> None:
+    truth = random_walk(4, flat=True)
+    estimate = with_errors(truth, 5)
     for name, trajectory in (("truth", truth), ("estimate", estimate)):
         write_tum(tmp_path / name, trajectory)
     reads = file_interface.read_tum_trajectory_file
@@ -185,14 +185,14 @@ def test_through_tum_files_evo_gives_the_same_numbers(tmp_path: Path) -> None:
 
 @given(seed=SEEDS, shift=st.integers(-60, 60))
 @settings(max_examples=25, deadline=None)
-def test_nearest_pairs_are_evos(seed: int, shift: int) -> None:
+def test_nearest_pairs_equal_evo(seed: int, shift: int) -> None:
     rng = np.random.default_rng(seed)
-    truth = walk(seed, 50)
-    long = walk(seed + 1, 400)
+    truth = random_walk(seed, 50)
+    long = random_walk(seed + 1, 400)
     t_ns = np.cumsum(rng.integers(1, 40_000_000, 400)) + shift * 1_000_000
     estimate = Trajectory(t_ns, long.xyz_m, long.quat_wxyz)
     ours = pair(truth, estimate, 10_000_000, how="nearest")
-    theirs, found = sync.associate_trajectories(evos(truth), evos(estimate), max_diff=0.01)
+    theirs, found = sync.associate_trajectories(to_evo(truth), to_evo(estimate), max_diff=0.01)
 
     np.testing.assert_allclose(ours.truth.xyz_m, theirs.positions_xyz)
     np.testing.assert_allclose(ours.estimate.xyz_m, found.positions_xyz)
@@ -200,8 +200,8 @@ def test_nearest_pairs_are_evos(seed: int, shift: int) -> None:
 
 
 @pytest.mark.parametrize("how", ["none", "origin", "yaw", "se3"])
-def test_a_trajectory_against_itself_has_no_error(how: Alignment) -> None:
-    truth = walk(3)
+def test_trajectory_compared_with_itself_has_no_error(how: Alignment) -> None:
+    truth = random_walk(3)
     same = align(truth, truth, how)
 
     assert ape(truth, same).translation_m.max() < 1e-12
@@ -211,10 +211,10 @@ def test_a_trajectory_against_itself_has_no_error(how: Alignment) -> None:
 
 @given(seed=SEEDS, yaw=st.floats(-3.1, 3.1), x=st.floats(-50, 50), z=st.floats(-5, 5))
 @settings(max_examples=25, deadline=None)
-def test_yaw_alignment_finds_a_turn_about_the_vertical(
+def test_yaw_alignment_recovers_rotation_about_vertical(
     seed: int, yaw: float, x: float, z: float
 ) -> None:
-    truth = walk(seed)
+    truth = random_walk(seed)
     turn = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
     xyz = rotate(turn, truth.xyz_m) + np.array([x, 1.0, z])
     moved = Trajectory(truth.t_ns, xyz, product(turn, truth.quat_wxyz))
@@ -224,9 +224,9 @@ def test_yaw_alignment_finds_a_turn_about_the_vertical(
     assert ape(truth, back).rotation_rad.max() < 1e-7
 
 
-def test_no_turn_about_the_vertical_does_better() -> None:
-    truth = walk(8, flat=True)
-    estimate = near(truth, 9, sd_m=2.0)
+def test_yaw_alignment_minimises_translation_error() -> None:
+    truth = random_walk(8, flat=True)
+    estimate = with_errors(truth, 9, sd_m=2.0)
     best = align(truth, estimate, "yaw")
     rmse = statistics(ape(truth, best).translation_m).rmse
     center = best.xyz_m.mean(axis=0)
@@ -239,10 +239,10 @@ def test_no_turn_about_the_vertical_does_better() -> None:
 
 @given(seed=SEEDS, turn_seed=SEEDS)
 @settings(max_examples=20, deadline=None)
-def test_rpe_does_not_see_where_the_map_lies(seed: int, turn_seed: int) -> None:
-    truth = walk(seed)
-    estimate = near(truth, seed + 1)
-    moved = near(estimate, turn_seed, sd_m=0.0, sd_rad=0.0)
+def test_rpe_is_invariant_under_rigid_transform(seed: int, turn_seed: int) -> None:
+    truth = random_walk(seed)
+    estimate = with_errors(truth, seed + 1)
+    moved = with_errors(estimate, turn_seed, sd_m=0.0, sd_rad=0.0)
     delta = RpeDelta(3, "frames")
 
     ours, theirs = rpe(truth, estimate, delta), rpe(truth, moved, delta)
@@ -250,8 +250,8 @@ def test_rpe_does_not_see_where_the_map_lies(seed: int, turn_seed: int) -> None:
     np.testing.assert_allclose(ours.rotation_rad, theirs.rotation_rad, atol=1e-9)
 
 
-def test_every_true_pose_is_accounted_for() -> None:
-    truth = walk(1, 100)
+def test_coverage_accounts_for_every_true_pose() -> None:
+    truth = random_walk(1, 100)
     keep = np.ones(100, np.bool_)
     keep[:10] = keep[40:50] = keep[95:] = False
     estimate = Trajectory(truth.t_ns[keep], truth.xyz_m[keep], truth.quat_wxyz[keep])
@@ -267,8 +267,8 @@ def test_every_true_pose_is_accounted_for() -> None:
 
 @given(seed=SEEDS, fraction=st.floats(0.0, 1.0))
 @settings(max_examples=40, deadline=None)
-def test_interpolation_moves_evenly(seed: int, fraction: float) -> None:
-    two = walk(seed, 2)
+def test_interpolation_is_linear_in_time(seed: int, fraction: float) -> None:
+    two = random_walk(seed, 2)
     middle = np.array([round(fraction * 100_000_000)], np.int64)
     truth = Trajectory(middle, np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     cov = np.array([[0.0] * 6, [1.0] * 6])
@@ -285,13 +285,13 @@ def test_interpolation_moves_evenly(seed: int, fraction: float) -> None:
     assert gone == pytest.approx(part * whole, abs=1e-7)
 
 
-def test_turning_not_at_all_is_fine() -> None:
+def test_interpolation_between_equal_rotations_is_constant() -> None:
     same = np.array([[0.5, 0.5, -0.5, 0.5]])
 
     np.testing.assert_allclose(between(same, -same, np.array([0.3])), same)
 
 
-def pairs_with(error: Floats, cov_xyh: Floats) -> Paired:
+def paired_with(error: Floats, cov_xyh: Floats) -> Paired:
     n = len(error)
     t_ns = np.arange(n, dtype=np.int64)
     zero = np.zeros(n)
@@ -300,14 +300,14 @@ def pairs_with(error: Floats, cov_xyh: Floats) -> Paired:
     return Paired(truth, estimate, cov_xyh, Coverage(n, n, 0, 0, 0))
 
 
-def test_nees_of_drawn_errors_lies_in_its_band() -> None:
+def test_nees_of_consistent_errors_lies_in_band() -> None:
     rng = np.random.default_rng(11)
     root = np.array([[3.0, 0.0, 0.0], [1.0, 2.0, 0.0], [0.02, -0.03, 0.05]])
     cov = root @ root.T
     error = rng.normal(size=(2000, 3)) @ root.T
     upper = np.tile(cov[np.triu_indices(3)], (2000, 1))
     for dimensions in (2, 3):
-        values = nees(pairs_with(error, upper), 2 if dimensions == 2 else 3)
+        values = nees(paired_with(error, upper), 2 if dimensions == 2 else 3)
         summary = summarise_nees(values, dimensions, independent=2000)
         assert summary.band_low < summary.mean < summary.band_high
         assert summary.fraction_inside_95 == pytest.approx(0.95, abs=0.02)
@@ -315,15 +315,15 @@ def test_nees_of_drawn_errors_lies_in_its_band() -> None:
         assert overconfident.mean > overconfident.band_high
 
 
-def test_nees_by_hand_and_across_the_seam() -> None:
+def test_nees_computed_by_hand_with_heading_wrap() -> None:
     upper = np.array([[4.0, 0.0, 0.0, 1.0, 0.0, 0.25]])
-    paired = pairs_with(np.array([[2.0, 3.0, 1.0]]), upper)
+    paired = paired_with(np.array([[2.0, 3.0, 1.0]]), upper)
 
     assert nees(paired, 2)[0] == pytest.approx(1.0 + 9.0)
     assert nees(paired, 3)[0] == pytest.approx(1.0 + 9.0 + 4.0)
 
 
-def test_rows_without_a_usable_claim_are_counted_not_scored() -> None:
+def test_rows_with_singular_covariance_are_counted_not_scored() -> None:
     upper = np.array(
         [
             [1.0, 0.0, 0.0, 1.0, 0.0, 1.0],
@@ -333,20 +333,20 @@ def test_rows_without_a_usable_claim_are_counted_not_scored() -> None:
             [1.0, 0.0, 0.0, -1.0, 0.0, 1.0],
         ]
     )
-    summary = summarise_nees(nees(pairs_with(np.ones((5, 3)), upper), 3), 3)
+    summary = summarise_nees(nees(paired_with(np.ones((5, 3)), upper), 3), 3)
 
     assert (summary.rows, summary.rows_singular) == (1, 4)
     assert summary.mean == pytest.approx(3.0)
     assert summarise_nees(np.full(3, np.nan), 3).rows == 0
 
 
-def test_one_drive_counts_as_one_draw() -> None:
+def test_nees_band_of_one_drive_uses_one_sample() -> None:
     summary = summarise_nees(np.full(1000, 2.0), 2)
 
     assert (summary.band_low, summary.band_high) == pytest.approx((0.0506, 7.378), abs=1e-3)
 
 
-def test_the_mean_band_holds_its_share_of_simulated_means() -> None:
+def test_mean_band_covers_95_percent_of_simulated_means() -> None:
     rng = np.random.default_rng(11)
     means = rng.chisquare(3, (20_000, 5)).mean(axis=1)
 
@@ -356,58 +356,86 @@ def test_the_mean_band_holds_its_share_of_simulated_means() -> None:
     assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.006)
 
 
-def test_chi_square_refuses_what_means_nothing() -> None:
+def test_chi_square_refuses_invalid_arguments() -> None:
     with pytest.raises(ValueError, match="dimensions: expected >= 1, got 0"):
         chi_square.quantile(0.5, 0)
     with pytest.raises(ValueError, match=r"probability: expected in \(0, 1\), got 1.0"):
         chi_square.quantile(1.0, 2)
 
 
-def standing() -> Trajectory:
+def stationary_track() -> Trajectory:
     return planar(np.arange(5, dtype=np.int64), np.ones(5), np.ones(5), np.zeros(5))
 
 
-def later() -> Trajectory:
-    moved = walk(1)
+def later_track() -> Trajectory:
+    moved = random_walk(1)
     return Trajectory(moved.t_ns + 10, moved.xyz_m, moved.quat_wxyz)
 
 
-def straight() -> Trajectory:
+def straight_track() -> Trajectory:
     return planar(np.arange(5, dtype=np.int64), np.arange(5.0), np.zeros(5), np.zeros(5))
 
 
 @pytest.mark.parametrize(
-    ("call", "error", "says"),
+    ("call", "error", "message"),
     [
-        (lambda: align(standing(), standing(), "yaw"), UsageError, "do not determine yaw"),
-        (lambda: align(straight(), straight(), "se3"), UsageError, "align by yaw or origin"),
-        (lambda: rpe(straight(), straight(), RpeDelta(9, "frames")), UsageError, "no two of 5"),
-        (lambda: rpe(straight(), straight(), RpeDelta(9.0, "metres")), UsageError, "9 metres"),
+        (
+            lambda: align(stationary_track(), stationary_track(), "yaw"),
+            UsageError,
+            "do not determine yaw",
+        ),
+        (
+            lambda: align(straight_track(), straight_track(), "se3"),
+            UsageError,
+            "align by yaw or origin",
+        ),
+        (
+            lambda: rpe(straight_track(), straight_track(), RpeDelta(9, "frames")),
+            UsageError,
+            "no two of 5",
+        ),
+        (
+            lambda: rpe(straight_track(), straight_track(), RpeDelta(9.0, "metres")),
+            UsageError,
+            "9 metres",
+        ),
         (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(0, "frames")), ValueError, "expected > 0"),
         (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(1.5, "frames")), ValueError, "whole number"),
-        (lambda: pair(later(), standing(), 1), UsageError, "no true pose has an estimate"),
-        (lambda: pair(walk(1, 0), standing(), 1), UsageError, "0 true and 5 estimated"),
-        (lambda: pair(walk(1), walk(2), 1, np.zeros((3, 6))), ValueError, r"expected \(60, 6\)"),
         (
-            lambda: nees(Paired(walk(1), walk(1), None, Coverage(0, 0, 0, 0, 0)), 2),
+            lambda: pair(later_track(), stationary_track(), 1),
+            UsageError,
+            "no true pose has an estimate",
+        ),
+        (
+            lambda: pair(random_walk(1, 0), stationary_track(), 1),
+            UsageError,
+            "0 true and 5 estimated",
+        ),
+        (
+            lambda: pair(random_walk(1), random_walk(2), 1, np.zeros((3, 6))),
+            ValueError,
+            r"expected \(60, 6\)",
+        ),
+        (
+            lambda: nees(Paired(random_walk(1), random_walk(1), None, Coverage(0, 0, 0, 0, 0)), 2),
             ValueError,
             "cov_xyh: needed for NEES",
         ),
     ],
 )
-def test_what_cannot_be_scored_is_refused(
-    call: Callable[[], object], error: type[Exception], says: str
+def test_trajectories_that_cannot_be_scored_are_refused(
+    call: Callable[[], object], error: type[Exception], message: str
 ) -> None:
-    with pytest.raises(error, match=says):
+    with pytest.raises(error, match=message):
         call()
 
 
-def test_statistics_of_nothing_are_nan() -> None:
+def test_statistics_of_empty_array_are_nan() -> None:
     assert math.isnan(statistics(np.empty(0)).rmse)
 
 
-def test_heading_of_a_planar_pose_survives_alignment() -> None:
-    truth = walk(2, flat=True)
+def test_yaw_alignment_preserves_heading_of_identical_track() -> None:
+    truth = random_walk(2, flat=True)
 
     np.testing.assert_allclose(
         np.cos(heading_rad(align(truth, truth, "yaw")) - heading_rad(truth)), 1.0

@@ -37,7 +37,7 @@ from support.scoring import (
 )
 
 
-def test_distances_are_those_at_the_first_step_above_the_threshold() -> None:
+def test_detection_distance_is_at_first_step_above_threshold() -> None:
     judged = judge_approaches(good_tables(), good_truth())
     assert judged is not None
     (one,) = judged.results
@@ -52,7 +52,7 @@ def test_distances_are_those_at_the_first_step_above_the_threshold() -> None:
     assert len(judged.curves[0].t_ns) == 40
 
 
-def test_a_feature_that_nothing_spoke_of_is_not_seen_rather_than_improbable() -> None:
+def test_feature_without_evidence_is_not_seen_rather_than_improbable() -> None:
     steps = {**BELIEF, "left": dict.fromkeys(range(45), 0.5)}
     steps["right"] = {frame: 0.5 + 0.001 * frame for frame in range(45)}
     judged = judge_approaches(tables(belief=belief_table(steps)), truth())
@@ -71,7 +71,7 @@ def test_a_feature_that_nothing_spoke_of_is_not_seen_rather_than_improbable() ->
         (None, "never probable enough", "not seen: intersection, right"),
     ],
 )
-def test_what_no_cue_looked_for_is_neither_improbable_nor_unseen(
+def test_feature_without_evaluated_cue_is_reported_as_not_looked_for(
     cues: dict[str, dict[int, int]] | None, detected: str, full: str
 ) -> None:
     steps = {**BELIEF, "intersection": {}, "right": {}}
@@ -82,7 +82,7 @@ def test_what_no_cue_looked_for_is_neither_improbable_nor_unseen(
     assert judged.results[0].why_not_full.startswith(full)
 
 
-def test_a_probable_intersection_is_not_detected_before_it_has_a_range() -> None:
+def test_intersection_is_not_detected_before_it_has_range() -> None:
     late = tables(belief=belief_table(BELIEF), ranges=range_table(22, 45))
     never = tables(belief=belief_table(BELIEF))
 
@@ -100,7 +100,7 @@ CHANGES = st.dictionaries(st.integers(0, 44), st.sampled_from([0.05, 0.6, 0.95])
 
 @given(st.fixed_dictionaries(dict.fromkeys(BELIEF, CHANGES)), st.integers(0, 44))
 @settings(max_examples=60, deadline=None)
-def test_nothing_is_in_full_before_it_is_detected(
+def test_full_detection_never_precedes_detection(
     changes: dict[str, dict[int, float]], ranged_from: int
 ) -> None:
     run = tables(belief=belief_table(changes), ranges=range_table(ranged_from, 45))
@@ -112,7 +112,7 @@ def test_nothing_is_in_full_before_it_is_detected(
             assert one.full_m <= one.detected_m
 
 
-def test_full_waits_for_the_range_that_makes_it_a_detection_but_not_as_published() -> None:
+def test_full_detection_waits_for_range_unless_scored_as_published() -> None:
     run = tables(belief=belief_table(BELIEF), ranges=range_table(30, 45))
 
     cases: list[tuple[Definition, float]] = [("confirmed", 10.0), ("published", 15.0)]
@@ -123,17 +123,19 @@ def test_full_waits_for_the_range_that_makes_it_a_detection_but_not_as_published
 
 
 @pytest.mark.parametrize(("control", "full_m"), [("none", 15.0), ("stop_sign", None)])
-def test_only_without_sign_or_light_established_presence_stands_for_the_intersection(
+def test_full_detection_requires_intersection_feature_only_with_sign_or_light(
     control: Literal["none", "stop_sign"], full_m: float | None
 ) -> None:
     roads_only = {name: changes for name, changes in BELIEF.items() if name != "intersection"}
-    unsaid = belief_table({"intersection": {}, **roads_only})
+    without_intersection = belief_table({"intersection": {}, **roads_only})
     reported = truth()
     (one,) = reported.truth.approaches
     approaches = (one.model_copy(update={"control": control}),)
     reported = replace(reported, truth=reported.truth.model_copy(update={"approaches": approaches}))
 
-    judged = judge_approaches(tables(belief=unsaid, ranges=range_table(8, 45)), reported)
+    judged = judge_approaches(
+        tables(belief=without_intersection, ranges=range_table(8, 45)), reported
+    )
 
     assert judged is not None
     (result,) = judged.results
@@ -141,7 +143,7 @@ def test_only_without_sign_or_light_established_presence_stands_for_the_intersec
     assert result.full_m == full_m
 
 
-def test_exactly_the_threshold_is_not_above_it() -> None:
+def test_probability_equal_to_threshold_is_no_detection() -> None:
     run = tables(belief=belief_table({"intersection": {0: 0.9}}), ranges=range_table(0, 40))
     judged = judge_approaches(run, truth())
 
@@ -150,7 +152,7 @@ def test_exactly_the_threshold_is_not_above_it() -> None:
     assert judged.results[0].why_not_detected == "never probable enough"
 
 
-def test_absent_features_that_were_believed_are_counted() -> None:
+def test_falsely_believed_features_are_counted() -> None:
     features = {**BELIEF, "straight": {12: 0.95, 14: 0.1}}
     judged = judge_approaches(tables(belief=belief_table(features)), truth())
     assert judged is not None
@@ -161,7 +163,7 @@ def test_absent_features_that_were_believed_are_counted() -> None:
     assert score.false_features.value == 1.0
 
 
-def test_a_spike_of_one_frame_is_spurious_and_published_by_name() -> None:
+def test_spike_of_one_frame_is_spurious_unless_scored_as_published() -> None:
     spike = {**BELIEF, "intersection": {4: 0.95, 5: 0.5, 20: 0.95}}
     run = tables(belief=belief_table(spike), ranges=range_table(0, 45))
 
@@ -177,7 +179,7 @@ def test_a_spike_of_one_frame_is_spurious_and_published_by_name() -> None:
         assert one.why_spurious == ("for fewer than 3 frames" if spurious_m else "")
 
 
-def test_a_spike_alone_is_no_detection_and_no_full_one() -> None:
+def test_single_spike_is_no_detection() -> None:
     only = {name: {35: 0.95, 37: 0.5} for name in ("intersection", "left", "right")}
     judged = judge_approaches(tables(belief=belief_table(only), ranges=range_table(0, 45)), truth())
     assert judged is not None
@@ -190,7 +192,7 @@ def test_a_spike_alone_is_no_detection_and_no_full_one() -> None:
     assert score.spurious == 1
 
 
-def test_a_range_100_m_off_is_no_detection_unless_it_says_how_unsure_it_is() -> None:
+def test_range_outside_its_interval_is_no_detection() -> None:
     for error_m, var_m2, detected_m in (
         (100.0, 1.0, None),
         (1.9, 1.0, 30.0),
@@ -206,7 +208,7 @@ def test_a_range_100_m_off_is_no_detection_unless_it_says_how_unsure_it_is() -> 
         assert one.why_not_detected == ("" if detected_m else "range outside its 95 % interval")
 
 
-def test_a_range_to_the_end_confirms_as_well_as_one_to_the_start() -> None:
+def test_range_to_end_confirms_detection() -> None:
     ranges = range_table(8, 45, 0.5, reference="end")
     judged = judge_approaches(tables(belief=belief_table(BELIEF), ranges=ranges), truth())
 
@@ -214,7 +216,7 @@ def test_a_range_to_the_end_confirms_as_well_as_one_to_the_start() -> None:
     assert judged.results[0].detected_m == pytest.approx(30.0)
 
 
-def test_failures_have_no_part_in_means_but_are_named() -> None:
+def test_failures_are_excluded_from_means_and_named() -> None:
     good = judge_approaches(good_tables(), good_truth())
     bad = judge_approaches(tables(belief=belief_table({"intersection": {5: 0.95}})), truth())
     assert good is not None
@@ -232,7 +234,7 @@ def test_failures_have_no_part_in_means_but_are_named() -> None:
     assert score.by_condition["rain"].full == 1
 
 
-def test_every_approach_belongs_to_one_at_most_by_largest_shared_time() -> None:
+def test_approaches_are_associated_one_to_one_by_overlap() -> None:
     first = approach(id=1, start_ns=at(0), enter_ns=at(10))
     second = approach(id=2, start_ns=at(10), enter_ns=at(30))
     spans = {5: (at(2), at(25)), 6: (at(8), at(12)), 9: (at(40), at(50))}
@@ -242,7 +244,7 @@ def test_every_approach_belongs_to_one_at_most_by_largest_shared_time() -> None:
     assert associate([first, second], {}) == {}
 
 
-def test_shifting_all_times_changes_no_association() -> None:
+def test_association_is_invariant_under_time_shift() -> None:
     ones = [approach(id=i, start_ns=at(20 * i), enter_ns=at(20 * i + 15)) for i in range(3)]
     spans = {i: (at(20 * i + 3), at(20 * i + 17)) for i in range(3)}
     later = [
@@ -254,7 +256,7 @@ def test_shifting_all_times_changes_no_association() -> None:
     assert associate(ones, spans) == associate(later, moved) == {0: 0, 1: 1, 2: 2}
 
 
-def test_approaches_where_there_is_none_are_counted_and_pieces_too() -> None:
+def test_extra_and_split_approaches_are_counted() -> None:
     import pyarrow as pa
 
     far = approach(start_ns=at(20), enter_ns=at(40))
@@ -272,7 +274,7 @@ def test_approaches_where_there_is_none_are_counted_and_pieces_too() -> None:
     assert judged.results[0].splits == 1
 
 
-def test_without_true_ranges_detection_counts_but_no_distance_is_made_up() -> None:
+def test_without_true_ranges_detection_counts_without_distance() -> None:
     drive = good_truth()
     blind = type(drive)(drive.drive, drive.truth, None)
     judged = judge_approaches(good_tables(), blind)
@@ -286,7 +288,7 @@ def test_without_true_ranges_detection_counts_but_no_distance_is_made_up() -> No
     assert score.full_from_8_m.of == 0
 
 
-def test_brier_and_log_score_by_hand() -> None:
+def test_brier_and_log_score_computed_by_hand() -> None:
     p, there = np.array([0.5, 0.9, 1.0, 0.0]), np.array([True, True, True, True])
 
     assert brier(p, there) == pytest.approx([0.25, 0.01, 0.0, 1.0])
@@ -296,7 +298,7 @@ def test_brier_and_log_score_by_hand() -> None:
     assert log_score(1.0 - p, ~there) == pytest.approx(log_score(p, there), rel=1e-6)
 
 
-def test_a_perfectly_calibrated_belief_lies_on_the_diagonal() -> None:
+def test_reliability_of_calibrated_belief_is_on_diagonal() -> None:
     rng = np.random.default_rng(5)
     p = rng.uniform(0.0, 1.0, 20000)
     bins = reliability(p, rng.uniform(0.0, 1.0, 20000) < p, np.arange(20000) % 20)
@@ -307,7 +309,7 @@ def test_a_perfectly_calibrated_belief_lies_on_the_diagonal() -> None:
     assert sum(inside) >= 8
 
 
-def test_belief_is_judged_until_the_car_enters_and_the_rest_is_reported() -> None:
+def test_belief_is_scored_until_car_enters_intersection() -> None:
     scores = score_belief(judge_belief(good_tables(), good_truth()))
 
     # Ten steps at 0.5, thirty at 0.95; the last ten are in the intersection.
@@ -318,7 +320,7 @@ def test_belief_is_judged_until_the_car_enters_and_the_rest_is_reported() -> Non
     assert scores["straight"].brier.value == pytest.approx((30 * 0.25 + 10 * 0.04) / 40)
 
 
-def test_frames_for_which_the_run_believes_nothing_are_reported() -> None:
+def test_frames_without_belief_are_reported() -> None:
     run = tables(belief=belief_table(BELIEF, frames=range(15, 50)), frames=50)
     score = score_belief(judge_belief(run, truth()))["left"]
 
@@ -327,7 +329,7 @@ def test_frames_for_which_the_run_believes_nothing_are_reported() -> None:
     assert (score.steps, score.scored) == (50, 25)
 
 
-def test_where_no_intersection_is_ahead_only_its_absence_is_judged() -> None:
+def test_only_intersection_is_scored_where_none_is_ahead() -> None:
     far = approach(start_ns=at(20), enter_ns=at(40))
     scores = score_belief(judge_belief(good_tables(), truth([], [far])))
 
@@ -335,7 +337,7 @@ def test_where_no_intersection_is_ahead_only_its_absence_is_judged() -> None:
     assert scores["left"].left_out == {"in the intersection": 10, "no intersection ahead": 20}
 
 
-def test_a_feature_of_the_users_own_is_not_judged_and_reported() -> None:
+def test_custom_feature_without_truth_is_reported_as_not_scored() -> None:
     run = tables(belief=belief_table({"intersection": {}, "roundabout": {3: 0.99}}))
     score = score_belief(judge_belief(run, truth()))["roundabout"]
 
@@ -344,7 +346,7 @@ def test_a_feature_of_the_users_own_is_not_judged_and_reported() -> None:
     assert math.isnan(score.brier.value)
 
 
-def test_missing_numbers_are_left_out_and_counted_everywhere() -> None:
+def test_nan_values_are_excluded_and_counted() -> None:
     broken = tables(
         belief=belief_table({"intersection": {10: 0.95, 12: math.nan, 13: 0.95}, "left": {}}),
         ranges=range_table(8, 45, math.nan),
@@ -359,7 +361,7 @@ def test_missing_numbers_are_left_out_and_counted_everywhere() -> None:
     assert judged.results[0].why_not_detected == "no range"
 
 
-def test_the_better_of_two_beliefs_is_named_only_where_drives_agree() -> None:
+def test_belief_comparison_is_decided_only_over_enough_drives() -> None:
     good, poor = {"intersection": {5: 0.95}}, {"intersection": {5: 0.6}}
     drives = [truth(drive=f"drive {i}") for i in range(8)]
     first = [
@@ -376,7 +378,7 @@ def test_the_better_of_two_beliefs_is_named_only_where_drives_agree() -> None:
     assert compare_belief(first[:1], second[:1])["intersection"].verdict == "undecided"
 
 
-def test_range_errors_by_reference_and_what_the_filter_claims() -> None:
+def test_range_errors_and_nees_are_scored_by_reference() -> None:
     import pyarrow as pa
 
     both = pa.concat_tables(
@@ -392,7 +394,7 @@ def test_range_errors_by_reference_and_what_the_filter_claims() -> None:
     assert scores["start"].by_distance["0-10"].rows == 9
 
 
-def test_ranges_are_told_apart_by_what_stands_at_the_intersection() -> None:
+def test_ranges_are_scored_by_control_of_intersection() -> None:
     lit = truth([], [approach(control="traffic_light")], drive="lit")
     found = tables(ranges=range_table(0, 40, 1.0, reference="end"))
     phantom = tables(ranges=range_table(0, 20, 9.0, reference="end"))
@@ -406,7 +408,7 @@ def test_ranges_are_told_apart_by_what_stands_at_the_intersection() -> None:
     assert score.by_control["stop_sign"].bias_m == pytest.approx(9.0)
 
 
-def test_true_ranges_hold_between_rows_but_not_far_from_any() -> None:
+def test_true_ranges_are_interpolated_only_near_rows() -> None:
     ranges = true_ranges([approach()])
     times = np.array([at(10) + 50_000_000, at(39) + 50_000_000, at(39) + 600_000_000], np.int64)
     start, end = ranges.at(times, np.zeros(3, np.int64))
@@ -416,7 +418,7 @@ def test_true_ranges_hold_between_rows_but_not_far_from_any() -> None:
     assert math.isnan(start[2])
 
 
-def test_a_road_that_nobody_knows_is_neither_believed_rightly_nor_falsely() -> None:
+def test_road_with_unknown_truth_is_not_scored() -> None:
     known = truth(approaches=[approach(features={"left": None, "right": True, "straight": False})])
 
     judged = judge_approaches(good_tables(), known)

@@ -23,7 +23,7 @@ from support.scoring import (
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 400), st.integers(1, 400), st.sampled_from([0.8, 0.95, 0.99]))
-def test_wilson_is_scipys(right: int, more: int, confidence: float) -> None:
+def test_wilson_interval_equals_scipy(right: int, more: int, confidence: float) -> None:
     from scipy.stats import binomtest
 
     theirs = binomtest(right, right + more).proportion_ci(confidence, "wilson")
@@ -33,13 +33,13 @@ def test_wilson_is_scipys(right: int, more: int, confidence: float) -> None:
     assert ours.high == pytest.approx(theirs.high, abs=1e-12)
 
 
-def test_wilson_of_nothing_is_unknown_and_of_impossible_counts_refused() -> None:
+def test_wilson_interval_is_nan_without_data_and_refuses_impossible_counts() -> None:
     assert np.isnan(wilson(0, 0)).all()
     with pytest.raises(ValueError, match="expected 0 to 3, got 4"):
         wilson(4, 3)
 
 
-def test_frames_of_one_drive_say_nothing_about_the_next() -> None:
+def test_mean_over_one_drive_has_no_interval() -> None:
     one = mean(np.array([0.2, 0.4]), np.array([5, 5]))
 
     assert one.value == pytest.approx(0.3)
@@ -47,7 +47,7 @@ def test_frames_of_one_drive_say_nothing_about_the_next() -> None:
     assert np.isnan(one.high)
 
 
-def test_repeated_frames_narrow_wilsons_interval_but_not_that_over_drives() -> None:
+def test_repeated_frames_narrow_wilson_interval_but_not_interval_over_drives() -> None:
     right = np.array([True, True, False, True, False])
     drives = np.arange(5)
     few = fraction(right, drives)
@@ -57,7 +57,7 @@ def test_repeated_frames_narrow_wilsons_interval_but_not_that_over_drives() -> N
     assert many.clusters_high - many.clusters_low == few.clusters_high - few.clusters_low > 0.3
 
 
-def test_a_hand_counted_drive() -> None:
+def test_cue_scores_equal_those_counted_by_hand() -> None:
     score = score_cues(match_cues(good_tables(), good_truth()))["stop_sign"]
     objects = score.readings["object"]
 
@@ -75,7 +75,7 @@ def test_a_hand_counted_drive() -> None:
     assert score.is_sources_reading
 
 
-def test_frames_sum_up_to_scored_and_reasons_in_every_reading() -> None:
+def test_frames_are_scored_or_excluded_with_reason() -> None:
     found = {"stop_sign": {3: 1, 7: 0, 45: 1, 80: 2}, "do_not_enter": {0: 1}}
     scores = score_cues(match_cues(tables(found, frames=50), good_truth()))
 
@@ -88,7 +88,7 @@ def test_frames_sum_up_to_scored_and_reasons_in_every_reading() -> None:
     assert scores["stop_sign"].readings["object"].left_out["outside the truth's time"] == 1
 
 
-def test_the_two_readings_differ_where_a_way_is_there_but_closed() -> None:
+def test_object_and_feature_readings_differ_for_closed_road() -> None:
     one = approach(features={"left": False, "right": True, "straight": False}, one_way="right")
     drive = truth([span("road_left", 0, 40), span("one_way_right", 0, 40, present=False)], [one])
     scores = score_cues(
@@ -103,7 +103,7 @@ def test_the_two_readings_differ_where_a_way_is_there_but_closed() -> None:
     assert sign["feature"].precision.value == 1.0
 
 
-def test_a_cue_of_an_intersection_where_none_is_ahead_is_wrong() -> None:
+def test_cue_without_intersection_ahead_is_false() -> None:
     far = approach(start_ns=at(20), enter_ns=at(40))
     judged = match_cues(tables({"traffic_light": {5: 1, 25: 1}}), truth([], [far]))
     score = score_cues(judged)["traffic_light"]
@@ -114,7 +114,7 @@ def test_a_cue_of_an_intersection_where_none_is_ahead_is_wrong() -> None:
     assert (score.precision.right, score.precision.of) == (1, 2)
 
 
-def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
+def test_hidden_objects_do_not_count_in_visible_recall() -> None:
     drive = truth(
         [
             span("parked_left", 0, 10, visible=0.2, count=2),
@@ -129,7 +129,7 @@ def test_things_hidden_do_not_count_in_the_recall_of_what_can_be_seen() -> None:
     assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
 
 
-def test_what_a_truth_of_things_leaves_open_is_not_judged_by_features() -> None:
+def test_object_truth_is_not_completed_with_features() -> None:
     found = {"parked_left": {3: 1}, "cross_traffic_left": {3: 1}}
     of_things = score_cues(match_cues(tables(found), truth([span("parked_left", 0, 20)])))
     of_features = score_cues(match_cues(tables(found), truth([])))
@@ -142,7 +142,7 @@ def test_what_a_truth_of_things_leaves_open_is_not_judged_by_features() -> None:
     assert of_features["cross_traffic_left"].reading == "feature"
 
 
-def test_a_cue_of_ones_own_is_scored_and_reported_where_nothing_looked_for_it() -> None:
+def test_custom_cue_is_scored_and_reported_if_not_evaluated() -> None:
     drive = truth([span("zebra", 0, 10), span("zebra", 10, 40, present=False), span("gate", 0, 40)])
     scores = score_cues(match_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
 
@@ -153,7 +153,7 @@ def test_a_cue_of_ones_own_is_scored_and_reported_where_nothing_looked_for_it() 
     assert gate.readings["object"].left_out["not looked for"] == 10
 
 
-def test_moments_without_a_frame_are_reported() -> None:
+def test_moment_annotations_without_frame_are_counted() -> None:
     moment = span("stop_sign", 0, 1).model_copy(
         update={"start_ns": None, "end_ns": None, "t_ns": at(3) + 1}
     )
@@ -162,7 +162,7 @@ def test_moments_without_a_frame_are_reported() -> None:
     assert score_cues(judged)["stop_sign"].moments_unmatched == 1
 
 
-def test_merged_drives_count_as_the_sum_and_know_their_clusters() -> None:
+def test_merged_drives_sum_counts_and_clusters() -> None:
     judged = [one for name in ("a", "b") for one in match_cues(good_tables(), good_truth(name))]
     score = score_cues(judged)["stop_sign"]
 
@@ -172,7 +172,7 @@ def test_merged_drives_count_as_the_sum_and_know_their_clusters() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(st.integers(0, 55), st.integers(0, 3), min_size=1))
-def test_the_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
+def test_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
     from crosscue.eval.scoring.run_tables import run_tables
 
     table = cue_table({"stop_sign": frames, "road_left": frames})
@@ -191,7 +191,7 @@ SPANS = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(SPANS, st.dictionaries(st.integers(0, 59), st.integers(0, 2), min_size=1))
-def test_counting_frame_by_frame_gives_the_same(
+def test_cue_scores_equal_count_frame_by_frame(
     spans: list[tuple[int, int, bool]], found: dict[int, int]
 ) -> None:
     stated = [span("stop_sign", first, first + length, there) for first, length, there in spans]
@@ -214,7 +214,7 @@ def test_counting_frame_by_frame_gives_the_same(
     assert features.precision.of == features.precision.right
 
 
-def test_parts_by_distance_sum_up_and_tags_belong_to_their_approach() -> None:
+def test_scores_by_distance_sum_up_and_conditions_follow_approach() -> None:
     wet = approach(id=1, conditions=("rain", "dusk"), start_ns=at(0), enter_ns=at(20))
     dry = approach(id=2, conditions=(), start_ns=at(130), enter_ns=at(150))
     drive = truth(
@@ -230,7 +230,7 @@ def test_parts_by_distance_sum_up_and_tags_belong_to_their_approach() -> None:
     assert set(score.by_distance) == {"0-10", "10-20", "20-30"}
 
 
-def test_a_road_that_nobody_knows_is_not_scored() -> None:
+def test_cue_of_road_with_unknown_truth_is_not_scored() -> None:
     unknown = approach(features={"left": True, "right": True, "straight": None})
     found = {"vehicles_past": dict.fromkeys(range(10), 1)}
 

@@ -1,4 +1,4 @@
-"""Scores of a run's pose: a perfect run, and refused truth."""
+"""Scores of a run's pose, the files and pages written from them, and refused truth."""
 
 import json
 import warnings
@@ -80,7 +80,7 @@ def _scored(tmp_path: Path) -> tuple[RunFolder, Path, PoseScore]:
     return run, path, score_pose(run, path)
 
 
-def test_a_perfect_run_has_no_error_and_says_what_was_left_out(tmp_path: Path) -> None:
+def test_perfect_run_has_no_error_and_full_accounting(tmp_path: Path) -> None:
     _, _, result = _scored(tmp_path)
 
     assert result.ape["none"].translation_m.max < 1e-2
@@ -93,7 +93,7 @@ def test_a_perfect_run_has_no_error_and_says_what_was_left_out(tmp_path: Path) -
     assert covered.scored + covered.before_estimate + covered.after_estimate == covered.truth_poses
 
 
-def test_a_shifted_truth_is_an_error_that_alignment_takes_away(tmp_path: Path) -> None:
+def test_alignment_removes_constant_offset(tmp_path: Path) -> None:
     track = _circle(np.arange(0.5, 29.0, 0.05))
     moved = Trajectory(track.t_ns, track.xyz_m + np.array([3.0, 4.0, 7.0]), track.quat_wxyz)
 
@@ -105,7 +105,7 @@ def test_a_shifted_truth_is_an_error_that_alignment_takes_away(tmp_path: Path) -
     assert result.ape["yaw"].translation_m.rmse < 1e-2
 
 
-def test_truth_of_the_camera_is_compared_at_the_camera(tmp_path: Path) -> None:
+def test_camera_truth_is_compared_at_camera(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), camera=Camera(x_m=2.0))
     path = _truth(tmp_path / "truth", _circle(np.arange(0.5, 29.0, 0.05), 2.0), pose_point="camera")
 
@@ -113,18 +113,18 @@ def test_truth_of_the_camera_is_compared_at_the_camera(tmp_path: Path) -> None:
 
 
 def _turned(track: Trajectory, yaw_rad: float) -> Trajectory:
-    """The same track, of a body that is mounted rotated to the left."""
+    """The same track of a body mounted with a yaw offset to the left."""
     heading = heading_rad(track) + yaw_rad
     return planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading)
 
 
-@pytest.mark.parametrize("says", ["truth", "vehicle"])
-def test_a_camera_that_looks_aside_is_no_heading_error(tmp_path: Path, says: str) -> None:
+@pytest.mark.parametrize("source", ["truth", "vehicle"])
+def test_camera_yaw_offset_is_not_heading_error(tmp_path: Path, source: str) -> None:
     start = Start(heading_rad=0.0)
     at_s = np.arange(0.5, 29.0, 0.05)
     track = _turned(_circle(at_s, 2.0), 0.016)
-    camera = Camera(x_m=2.0, yaw_rad=0.016) if says == "vehicle" else Camera(x_m=9.0)
-    mounting = {"x_m": 2.0, "yaw_rad": 0.016} if says == "truth" else None
+    camera = Camera(x_m=2.0, yaw_rad=0.016) if source == "vehicle" else Camera(x_m=9.0)
+    mounting = {"x_m": 2.0, "yaw_rad": 0.016} if source == "truth" else None
     path = _truth(tmp_path / "truth", track, pose_point="camera", mounting=mounting)
     result = score_pose(
         _run(tmp_path / "run", Vehicle(version=1, start=start, camera=camera)), path
@@ -134,7 +134,7 @@ def test_a_camera_that_looks_aside_is_no_heading_error(tmp_path: Path, says: str
     assert result.ape["none"].translation_m.max < 0.1
 
 
-def test_nees_counts_what_the_truth_itself_is_uncertain_by(tmp_path: Path) -> None:
+def test_nees_includes_uncertainty_of_truth(tmp_path: Path) -> None:
     run = _run(tmp_path / "run")
     shifted = _circle(np.arange(0.5, 29.0, 0.05))
     shifted = replace(shifted, xyz_m=shifted.xyz_m + np.array([30.0, 0.0, 0.0]))
@@ -145,7 +145,7 @@ def test_nees_counts_what_the_truth_itself_is_uncertain_by(tmp_path: Path) -> No
     assert rough.nees_xy.mean < 0.01
 
 
-def test_evo_gives_the_same_numbers_from_the_files_written(tmp_path: Path) -> None:
+def test_evo_computes_same_ape_from_written_files(tmp_path: Path) -> None:
     run, _, result = _scored(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -181,7 +181,7 @@ def test_truth_on_another_clock_is_refused(tmp_path: Path) -> None:
         ('{"version": 1, "start_ns": 5, "end_ns": 9}', "pose: missing"),
     ],
 )
-def test_truth_that_does_not_fit_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_malformed_truth_is_refused(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "truth.json").write_text(text)
 
     with pytest.raises(SchemaError, match=said):
@@ -208,7 +208,7 @@ def _reported(run: RunFolder, path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path) -> None:
+def test_report_is_self_contained_and_escapes_names(tmp_path: Path) -> None:
     run, path, _ = _scored(tmp_path)
     manifest = json.loads(run.file("manifest.json").read_text())
     manifest["logs"][0]["name"] = "</td><script>alert(1)</script>"
@@ -226,7 +226,7 @@ def test_the_report_needs_no_network_and_hostile_names_stay_text(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_the_same_run_gives_the_same_report_and_figures(tmp_path: Path) -> None:
+def test_repeated_scoring_writes_same_report_and_figures(tmp_path: Path) -> None:
     pages = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -238,7 +238,7 @@ def test_the_same_run_gives_the_same_report_and_figures(tmp_path: Path) -> None:
     assert pages[0][1] == pages[1][1]
 
 
-def test_a_recording_is_written_with_and_without_truth(tmp_path: Path) -> None:
+def test_recording_with_truth_is_larger_than_without(tmp_path: Path) -> None:
     run, path, _ = _scored(tmp_path)
     save_recording(run, tmp_path / "plain.rrd")
     save_recording(run, tmp_path / "truth.rrd", truth_track(path, run))
@@ -248,7 +248,7 @@ def test_a_recording_is_written_with_and_without_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
+def test_score_prints_json_and_refuses_folder_that_is_not_a_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, path, _ = _scored(tmp_path)
@@ -261,7 +261,7 @@ def test_the_score_command_prints_json_and_refuses_a_foreign_folder(
     assert "neither a run folder" in capsys.readouterr().err
 
 
-def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
+def test_recording_stores_encoded_pictures_unchanged(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     noise = rng.integers(0, 255, (3, 240, 320, 3), np.uint8)
     jpegs = [cv2.imencode(".jpg", picture)[1].ravel() for picture in noise]
@@ -290,7 +290,7 @@ def test_pictures_pass_into_the_recording_as_stored(tmp_path: Path) -> None:
     assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 20_000
 
 
-def test_no_nees_where_the_runs_frame_is_its_own(tmp_path: Path) -> None:
+def test_nees_is_not_computed_without_common_frame(tmp_path: Path) -> None:
     run = _run(tmp_path / "run", Vehicle(version=1))
     path = _truth(tmp_path / "truth", _circle(np.arange(-1.0, 33.0, 0.05)))
     result = score_pose(run, path)
@@ -303,7 +303,7 @@ def test_no_nees_where_the_runs_frame_is_its_own(tmp_path: Path) -> None:
     assert result.ape["yaw"].translation_m.max < 1e-2
 
 
-def test_a_score_says_which_body_it_compares_and_what_is_only_assumed(tmp_path: Path) -> None:
+def test_score_reports_compared_body_and_assumed_mounting(tmp_path: Path) -> None:
     track = _turned(_circle(np.arange(0.5, 29.0, 0.05), 2.0), 0.016)
     mounting = {"x_m": None, "y_m": 0.0, "yaw_rad": 0.016}
     path = _truth(

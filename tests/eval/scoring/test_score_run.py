@@ -41,7 +41,7 @@ from support.scoring import (
 
 
 def _one(tmp_path: Path, name: str = "one") -> Path:
-    """A run whose truth is next to its log."""
+    """Write a run whose truth is next to its log."""
     truth_folder(tmp_path / name)
     run_folder(tmp_path / name / "run")
     return tmp_path / name / "run"
@@ -57,7 +57,7 @@ def _fails(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
     return line
 
 
-def test_a_run_finds_the_truth_beside_its_log_and_leaves_its_scores(
+def test_score_finds_truth_next_to_log_and_writes_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = _one(tmp_path)
@@ -75,9 +75,7 @@ def test_a_run_finds_the_truth_beside_its_log_and_leaves_its_scores(
     assert frames.filter(frames["cue"].to_numpy(zero_copy_only=False) == "road_left").num_rows == 50
 
 
-def test_a_score_repeats_what_the_run_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_score_repeats_notices_of_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth_folder(tmp_path)
     run_folder(tmp_path / "run", notices=("284 of 411 compass readings were rejected",))
 
@@ -85,7 +83,7 @@ def test_a_score_repeats_what_the_run_warned_of(
     assert "\nnote       284 of 411 compass readings" in capsys.readouterr().out
 
 
-def test_the_summary_reports_coverage_first_and_fits_a_terminal(
+def test_summary_reports_coverage_first_and_fits_80_columns(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [str(_one(tmp_path, name)) for name in ("one", "two")]
@@ -98,7 +96,7 @@ def test_the_summary_reports_coverage_first_and_fits_a_terminal(
     assert "2 of 2, 15.0 m away on average" in text
 
 
-def test_several_runs_pool_into_the_folder_asked_for(tmp_path: Path) -> None:
+def test_several_runs_are_pooled_into_output_folder(tmp_path: Path) -> None:
     runs = [str(_one(tmp_path, name)) for name in ("one", "two")]
 
     assert cli.run(["score", *runs, "-o", str(tmp_path / "all"), "-q"]) == 0
@@ -109,7 +107,7 @@ def test_several_runs_pool_into_the_folder_asked_for(tmp_path: Path) -> None:
     assert pooled["approaches"]["approaches"] == 2
 
 
-def test_the_same_runs_give_the_same_bytes(tmp_path: Path) -> None:
+def test_repeated_score_writes_same_bytes(tmp_path: Path) -> None:
     run = _one(tmp_path)
     seen = []
     for _ in range(2):
@@ -124,7 +122,7 @@ def _gates(tmp_path: Path, *gates: str) -> str:
     return str(path)
 
 
-def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> None:
+def test_gates_set_exit_status_and_write_junit_file(tmp_path: Path) -> None:
     run = _one(tmp_path)
     passing = 'metric = "cues.stop_sign.precision"\nmin = 0.99'
     failing = 'metric = "cues.stop_sign.precision"\nmin = 0.99\nuse = "low"'
@@ -134,7 +132,7 @@ def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> 
     suite = ET.parse(run / "score" / "junit.xml").getroot()
     assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
     (failure,) = suite.iter("failure")
-    # 30 of 30 right: Wilson's lower end is 0.886.
+    # 30 of 30 are right: the lower end of Wilson's interval is 0.886.
     assert "0.88" in str(failure.get("message"))
 
 
@@ -156,7 +154,7 @@ def test_gates_decide_the_exit_status_and_leave_a_junit_file(tmp_path: Path) -> 
         ("metric = [", "not readable as TOML"),
     ],
 )
-def test_a_gate_that_means_nothing_is_refused(
+def test_invalid_gate_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], gate: str, said: str
 ) -> None:
     line = _fails(capsys, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
@@ -164,7 +162,7 @@ def test_a_gate_that_means_nothing_is_refused(
     assert said in line
 
 
-def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
+def test_gate_fails_for_metric_that_was_not_scored(tmp_path: Path) -> None:
     run = _one(tmp_path)
     gates = [
         'metric = "pose.ape.none.translation_m.rmse"\nmax = 1.0',
@@ -183,7 +181,7 @@ def test_a_gate_on_what_was_not_scored_fails(tmp_path: Path) -> None:
     assert "based on 30 rows" in messages[2]
 
 
-def test_gates_over_several_runs_need_a_place_for_their_results(
+def test_gates_over_several_runs_require_output_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [_one(tmp_path, name) for name in ("one", "two")]
@@ -197,7 +195,7 @@ def test_gates_over_several_runs_need_a_place_for_their_results(
 
 @settings(max_examples=60, deadline=None)
 @given(st.text(min_size=1), st.text())
-def test_hostile_names_stay_names_in_junit(metric: str, suite: str) -> None:
+def test_arbitrary_names_yield_valid_junit(metric: str, suite: str) -> None:
     gate = Gate.model_construct(metric=metric, min=0.5, max=None, use="value", min_count=1)
     results = check_gates([gate], {metric: MetricValue(0.1)}, {})
     root = ET.fromstring(junit_text(results, suite))
@@ -206,7 +204,7 @@ def test_hostile_names_stay_names_in_junit(metric: str, suite: str) -> None:
     assert root[0].get("tests") == root.get("failures") == "1"
 
 
-def test_control_characters_and_markup_are_shown_in_junit() -> None:
+def test_control_characters_and_markup_are_escaped_in_junit() -> None:
     name = 'a"]]><x>\x1b[31m\x00\ud800\n'
     gate = Gate.model_construct(metric=name, min=0.5, max=None, use="value", min_count=1)
     text = junit_text(check_gates([gate], {name: MetricValue(0.9)}, {}), "suite")
@@ -218,7 +216,7 @@ def test_control_characters_and_markup_are_shown_in_junit() -> None:
     assert case.get("name") == 'a"]]><x>\\x1b[31m\\x00\\ud800\\n >= 0.5'
 
 
-def test_the_wider_of_two_intervals_is_the_one_that_gates_use() -> None:
+def test_metric_values_use_wider_interval() -> None:
     tree = {
         "precision": {
             "value": 0.9,
@@ -236,7 +234,7 @@ def test_the_wider_of_two_intervals_is_the_one_that_gates_use() -> None:
     assert list(metric_values(tree, parts=False)) == ["precision"]
 
 
-def test_a_gate_file_is_bounded(tmp_path: Path) -> None:
+def test_gate_file_over_size_limit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "gates.toml"
     path.write_text("#" * (1 << 20) + "\n")
 
@@ -244,7 +242,7 @@ def test_a_gate_file_is_bounded(tmp_path: Path) -> None:
         load_gates(path)
 
 
-def test_truth_of_another_log_is_refused_by_time_and_by_hash(
+def test_truth_of_another_log_is_refused_by_time_or_hash(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = _one(tmp_path)
@@ -264,15 +262,15 @@ def test_truth_of_another_log_is_refused_by_time_and_by_hash(
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q"]) == 0
 
 
-def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
+def test_approach_outside_log_is_refused_unless_run_is_partial(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     late = approach(id=1, start_ns=at(1000), enter_ns=at(1040))
     truth_folder(tmp_path, truth([], [approach(), late], end=2000))
-    whole = run_folder(tmp_path / "whole", selection=WHOLE_LOG)
+    whole_log = run_folder(tmp_path / "whole", selection=WHOLE_LOG)
     part = run_folder(tmp_path / "part", selection=Part(start_ns=None, end_ns=at(50), topics=None))
 
-    assert "approach 1 from" in _fails(capsys, "score", whole.path)
+    assert "approach 1 from" in _fails(capsys, "score", whole_log.path)
     assert cli.run(["score", str(part.path), "-q"]) == 0
 
 
@@ -292,7 +290,7 @@ def test_an_approach_outside_the_log_is_refused_unless_only_a_part_was_replayed(
         ({"ranges": "../run/manifest.json"}, "manifest.json"),
     ],
 )
-def test_truth_that_does_not_fit_is_refused(
+def test_invalid_truth_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], said: str
 ) -> None:
     run = _one(tmp_path)
@@ -308,7 +306,7 @@ def test_truth_that_does_not_fit_is_refused(
 @pytest.mark.parametrize(
     "line", ["x,0,1,2", "5,9,1,2", "5,0,nan,2", "5,0,inf,2", "99999999999999999999,0,1,2", "5"]
 )
-def test_a_range_that_is_none_is_refused_with_its_line(
+def test_invalid_range_row_is_refused_with_line_number(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
     run = _one(tmp_path)
@@ -317,35 +315,35 @@ def test_a_range_that_is_none_is_refused_with_its_line(
     assert "ranges.csv:2" in _fails(capsys, "score", run)
 
 
-def test_runs_that_cannot_be_scored_are_named(
+def test_damaged_or_incomplete_run_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = _one(tmp_path)
     manifest = run / "manifest.json"
-    whole = manifest.read_text()
+    intact = manifest.read_text()
 
     this = f'"format_version": {FORMAT_VERSION}'
-    manifest.write_text(whole.replace(this, '"format_version": 99'))
+    manifest.write_text(intact.replace(this, '"format_version": 99'))
     assert "format 99" in _fails(capsys, "score", run)
-    manifest.write_text(whole[:50])
+    manifest.write_text(intact[:50])
     assert "manifest.json: unreadable" in _fails(capsys, "score", run)
     manifest.unlink()
     assert "was cut short" in _fails(capsys, "score", run)
-    manifest.write_text(whole)
+    manifest.write_text(intact)
     (run / "cues.parquet").write_bytes((run / "cues.parquet").read_bytes()[:-9])
     assert "cues.parquet: damaged" in _fails(capsys, "score", run)
 
 
-def test_a_place_that_cannot_be_written_is_named(
+def test_unwritable_score_folder_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = _one(tmp_path)
-    (run / "score").write_text("a file where a folder must be")
+    (run / "score").write_text("a file in place of a folder")
 
     assert "score" in _fails(capsys, "score", run)
 
 
-def test_tables_of_another_version_are_refused_by_column(
+def test_invalid_tables_are_refused_with_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth_folder(tmp_path)
@@ -362,7 +360,7 @@ def test_tables_of_another_version_are_refused_by_column(
         assert said in _fails(capsys, "score", run.path)
 
 
-def test_a_run_without_anything_to_score_says_why(
+def test_run_with_nothing_to_score_reports_reasons(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth_folder(tmp_path)
@@ -375,7 +373,7 @@ def test_a_run_without_anything_to_score_says_why(
     assert "not scored belief: the run has no belief" in capsys.readouterr().out
 
 
-def test_no_truth_anywhere_is_reported_with_the_places_looked_at(
+def test_missing_truth_is_reported_with_truth_option(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = run_folder(tmp_path / "run")
@@ -383,7 +381,7 @@ def test_no_truth_anywhere_is_reported_with_the_places_looked_at(
     assert "name it with --truth" in _fails(capsys, "score", run.path)
 
 
-def test_merged_drives_are_not_scored_as_one(
+def test_merged_run_is_not_scored_as_one_drive(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth_folder(tmp_path)
@@ -400,7 +398,7 @@ def _log_of(folder: Path, run: Path) -> tuple[LogRow, ...]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
+def test_run_that_cannot_be_scored_does_not_stop_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], workers: str
 ) -> None:
     for name in ("a", "b", "c"):
@@ -419,7 +417,7 @@ def test_a_run_that_cannot_be_scored_does_not_stop_the_rest(
     assert list(pooled["coverage"]["failed"]) == [str(tmp_path / "runs" / "b")]
 
 
-def test_two_runs_of_one_log_are_reported(
+def test_several_runs_of_same_log_are_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth_folder(tmp_path)
@@ -430,7 +428,7 @@ def test_two_runs_of_one_log_are_reported(
 
 
 @pytest.mark.slow
-def test_neither_hash_seed_nor_zone_nor_locale_changes_a_byte(tmp_path: Path) -> None:
+def test_scores_do_not_depend_on_hash_seed_time_zone_or_locale(tmp_path: Path) -> None:
     run = _one(tmp_path)
     seen = []
     for seed, zone, locale in (("0", "UTC", "C"), ("7", "Asia/Tokyo", "C.UTF-8")):
@@ -441,12 +439,12 @@ def test_neither_hash_seed_nor_zone_nor_locale_changes_a_byte(tmp_path: Path) ->
     assert seen[0] == seen[1]
 
 
-def test_a_disk_that_fills_up_at_any_place_leaves_no_half_file(
+def test_full_disk_leaves_no_partial_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = _one(tmp_path)
     gate = _gates(tmp_path, 'metric = "approaches.full"\nmin = 1.0')
-    whole = os.fsync
+    real_fsync = os.fsync
     for fails_at in range(1, 60):
         calls = 0
 
@@ -455,7 +453,7 @@ def test_a_disk_that_fills_up_at_any_place_leaves_no_half_file(
             calls += 1
             if calls == fails_at:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            whole(handle)
+            real_fsync(handle)
 
         monkeypatch.setattr(os, "fsync", fsync)
         status = cli.run(["score", str(run), "-q", "--gate", gate])
@@ -469,7 +467,7 @@ def test_a_disk_that_fills_up_at_any_place_leaves_no_half_file(
     assert calls == fails_at - 1 >= 8
 
 
-def test_one_run_is_written_to_the_folder_asked_for_as_well(
+def test_score_of_one_run_is_also_written_to_output_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, out = _one(tmp_path), tmp_path / "scored"

@@ -23,14 +23,14 @@ def _replayed(folder: Path, clock: Clock) -> RunFolder:
 
 
 def _ambiguous_rows(run: RunFolder, name: str) -> int:
-    """Return the rows whose stamp is also in the other segment's time."""
+    """Return the number of rows whose stamp also occurs in the other segment."""
     timeline = run.drive_manifest().timeline
     table = run.table(name)
     log_ns, numbers = table["log_t_ns"].to_numpy(), table["segment"].to_numpy().astype(np.int64)
     return int(ambiguous(timeline, log_ns, numbers).sum())
 
 
-def test_what_a_set_back_makes_ambiguous_is_counted_everywhere(tmp_path: Path) -> None:
+def test_rows_with_repeated_log_time_are_counted_in_all_scores(tmp_path: Path) -> None:
     run = _replayed(tmp_path, Clock(set_at_s=6, by_s=-3))
     frames, belief, ranges = (_ambiguous_rows(run, name) for name in ("frames", "belief", "range"))
     assert min(frames, belief, ranges) > 0
@@ -69,7 +69,7 @@ def test_what_a_set_back_makes_ambiguous_is_counted_everywhere(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("clock", [Clock(), Clock(pause_s=(5.0, 9.1))])
-def test_nothing_is_ambiguous_without_a_set_back(tmp_path: Path, clock: Clock) -> None:
+def test_no_row_is_ambiguous_without_clock_set_back(tmp_path: Path, clock: Clock) -> None:
     run = _replayed(tmp_path, clock)
 
     scored = ScoreWork(tmp_path / "truth.json", ScoreSettings(), (10.0,))(run.path)

@@ -1,4 +1,4 @@
-"""With the simulator's noise settings, the pose's errors are consistent."""
+"""The pose filter is consistent with the noise settings of the simulator."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from crosscue.replay.vehicle.vehicle import load
 DRIVES = 4
 
 
-def test_simulated_drives_are_as_wrong_as_their_vehicle_files_say(tmp_path: Path) -> None:
+def test_nees_of_simulated_drives_is_in_band(tmp_path: Path) -> None:
     poses = []
     for seed in range(DRIVES):
         files = write_drive(tmp_path / str(seed), DriveSettings(seed=seed, blocks=1, block_m=70.0))

@@ -1,4 +1,4 @@
-"""The range smoother and the range filter on generated approaches."""
+"""The range smoother and the range filter on simulated approaches."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rows(beliefs: list[RangeBelief]) -> RangeRows:
     return RangeRows(t_ns, np.ones(n, np.int64), np.full(n, "start"), mean_m, var_m2)
 
 
-def test_the_smoother_knows_at_the_first_row_what_the_filter_knows_at_the_last() -> None:
+def test_range_smoother_is_more_accurate_than_filter() -> None:
     rng = np.random.default_rng(seed=3)
     true_m = 60.0 - STEP_M * np.arange(50)
     filter_m2, smoother_m2 = [], []
@@ -48,7 +48,7 @@ def test_the_smoother_knows_at_the_first_row_what_the_filter_knows_at_the_last()
     assert np.mean(smoother_m2) < 0.8 * np.mean(filter_m2)
 
 
-def test_a_range_that_restarts_says_nothing_of_the_one_before() -> None:
+def test_restarted_range_does_not_change_previous_range() -> None:
     rng = np.random.default_rng(seed=4)
     first = filtered(60.0 - STEP_M * np.arange(10) + rng.normal(0.0, 2.0, 10))
     second = filtered(90.0 - STEP_M * np.arange(10) + rng.normal(0.0, 2.0, 10))
@@ -59,7 +59,7 @@ def test_a_range_that_restarts_says_nothing_of_the_one_before() -> None:
     np.testing.assert_allclose(together.range_m[:10], alone.range_m, rtol=1e-12)
 
 
-def test_where_odometry_is_missing_the_rows_behind_say_nothing_of_those_before() -> None:
+def test_rows_without_odometry_are_not_smoothed() -> None:
     beliefs = filtered(60.0 - STEP_M * np.arange(10.0))
 
     after = smoothed_rows(rows(beliefs), odometer(5))

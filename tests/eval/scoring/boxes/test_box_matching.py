@@ -28,7 +28,7 @@ def boxes(
     ignored: tuple[int, ...] = (),
     range_m: list[float] | None = None,
 ) -> Boxes:
-    """Picture, class and box of each."""
+    """Build boxes from rows of picture, class and corners."""
     n = len(rows)
     is_ignored = np.zeros(n, np.bool_)
     is_ignored[list(ignored)] = True
@@ -42,8 +42,8 @@ def boxes(
     )
 
 
-def made_up(seed: int) -> tuple[Boxes, Boxes]:
-    """Labels and detections of 12 pictures and 3 classes; many overlap, some scores are equal."""
+def random_boxes(seed: int) -> tuple[Boxes, Boxes]:
+    """Random labels and detections of 12 pictures and 3 classes, with overlaps and equal scores."""
     rng = np.random.default_rng(seed)
     labels, found, scores = [], [], []
     for picture in range(12):
@@ -62,7 +62,7 @@ def made_up(seed: int) -> tuple[Boxes, Boxes]:
     return boxes(*labels, ignored=ignored), boxes(*found, scores=scores)
 
 
-def judged(truth: Boxes, found: Boxes) -> np.ndarray:
+def pycocotools_precision(truth: Boxes, found: Boxes) -> np.ndarray:
     """Precision from pycocotools: overlap, recall, class, size, max detections."""
     coco = COCO()
     coco.dataset = {
@@ -105,16 +105,16 @@ def _xywh(box: np.ndarray) -> list[float]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_average_precision_is_that_of_pycocotools(seed: int) -> None:
-    truth, found = made_up(seed)
-    wanted = judged(truth, found)
+def test_average_precision_equals_pycocotools(seed: int) -> None:
+    truth, found = random_boxes(seed)
+    expected = pycocotools_precision(truth, found)
 
     for label in range(3):
         for i, part in enumerate((ALL, *SIZES)):
             matched = match(truth, found, label, part)
             for step in range(len(OVERLAPS)):
                 mine = float(average_precision(matched, step)[0])
-                theirs = wanted[step, :, label, i]
+                theirs = expected[step, :, label, i]
                 if (theirs == -1).all():
                     assert math.isnan(mine)
                 else:
@@ -125,8 +125,8 @@ UNIT = (0.0, 0.0, 100.0, 100.0)
 AWAY = (200.0, 200.0, 300.0, 300.0)
 
 
-def test_a_hand_can_count_this() -> None:
-    """Two labels, found with 0.9 and 0.3; a false one with 0.6 between them."""
+def test_precision_recall_and_ap50_computed_by_hand() -> None:
+    """Two labels are found with scores 0.9 and 0.3; a false detection has score 0.6."""
     truth = boxes((0, 0, UNIT), (1, 0, UNIT))
     found = boxes((0, 0, UNIT), (0, 0, AWAY), (1, 0, UNIT), scores=[0.9, 0.6, 0.3])
 
@@ -139,7 +139,7 @@ def test_a_hand_can_count_this() -> None:
     assert (all_.precision.value, all_.recall.value) == (0.5, 0.5)
 
 
-def test_what_is_ignored_is_neither_asked_for_nor_wrong() -> None:
+def test_ignored_labels_count_neither_as_missed_nor_as_false() -> None:
     truth = boxes((0, 0, UNIT), (0, NOBODY, AWAY), ignored=(1,))
     inside = (210.0, 210.0, 230.0, 230.0)
     found = boxes((0, 0, UNIT), (0, 0, inside), (0, 0, AWAY), scores=[0.9, 0.8, 0.7])
@@ -149,7 +149,7 @@ def test_what_is_ignored_is_neither_asked_for_nor_wrong() -> None:
     assert (all_.labels, all_.right, all_.wrong) == (1, 1, 0)
 
 
-def test_one_label_is_found_once() -> None:
+def test_duplicate_detection_of_label_is_false() -> None:
     truth = boxes((0, 0, UNIT))
     found = boxes((0, 0, UNIT), (0, 0, UNIT), scores=[0.9, 0.8])
 
@@ -159,7 +159,7 @@ def test_one_label_is_found_once() -> None:
     assert matched.is_wrong[0].tolist() == [False, True]
 
 
-def test_by_range_a_label_counts_where_it_is_and_a_false_one_where_it_is_believed() -> None:
+def test_labels_are_binned_by_true_range_and_false_detections_by_estimated_range() -> None:
     truth = boxes((0, 0, UNIT), (0, 0, AWAY), range_m=[10.0, 50.0])
     low = (400.0, 0.0, 440.0, 40.0)
     found = boxes((0, 0, UNIT), (0, 0, low), scores=[0.9, 0.8], range_m=[30.0, 45.0])
@@ -172,7 +172,7 @@ def test_by_range_a_label_counts_where_it_is_and_a_false_one_where_it_is_believe
     assert "20 to 40 m" not in by_part
 
 
-def test_intervals_need_blocks_and_the_same_seed_gives_the_same() -> None:
+def test_bootstrap_requires_enough_blocks_and_is_reproducible() -> None:
     assert drawn(np.array([0, 0, 1, 1]), 0) is None
     first, again = (drawn(np.repeat(np.arange(6), 2), 3) for _ in range(2))
     assert first is not None
@@ -182,7 +182,7 @@ def test_intervals_need_blocks_and_the_same_seed_gives_the_same() -> None:
 
 
 def _blocks_of_pictures(rng: np.random.Generator, blocks: int) -> tuple[Boxes, Boxes]:
-    """Blocks of four pictures with four labels; in some, most are found, in others, few."""
+    """Blocks of four pictures with four labels each and a random recall per block."""
     found_at = np.repeat(rng.beta(4.0, 1.0, blocks), 16)
     rows = [
         (p, 0, (200.0 * i, 0.0, 200.0 * i + 100, 100.0))
@@ -197,7 +197,7 @@ def _blocks_of_pictures(rng: np.random.Generator, blocks: int) -> tuple[Boxes, B
     return boxes(*rows), found
 
 
-def test_intervals_of_six_blocks_hold_what_many_show() -> None:
+def test_intervals_of_six_blocks_cover_value_of_many() -> None:
     """In 150 simulations, 93 % of intervals cover AP50; bootstrap percentiles cover 77 %."""
     rng = np.random.default_rng(5)
 
@@ -214,7 +214,7 @@ def test_intervals_of_six_blocks_hold_what_many_show() -> None:
     assert held >= 42
 
 
-def test_scores_that_are_true_have_no_calibration_error_and_others_do() -> None:
+def test_calibration_error_is_zero_for_calibrated_scores_only() -> None:
     rng = np.random.default_rng(0)
     scores = rng.random(20_000)
     is_right = rng.random(20_000) < scores
