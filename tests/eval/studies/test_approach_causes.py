@@ -1,4 +1,4 @@
-"""Causes of failed approaches from their frames, and effects of conditions at the same place."""
+"""Causes of failed approaches, and effects of conditions at the same intersection."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _result(**changes: object) -> ApproachResult:
 def _cue(
     cue: str, *, found: int = 0, there: int = 0, visible: float = 1.0, approach: int = 0
 ) -> CueFrames:
-    """Objects, and positives, in the first frames."""
+    """Build frames of a cue: objects in the first ``there``, positives in the first ``found``."""
     first = np.arange(FRAMES)
     return CueFrames(
         drive="runs/X-01",
@@ -73,31 +73,31 @@ def _found(result: ApproachResult, *cues: CueFrames) -> list[Finding]:
 NO_LEFT = _result(features_m={"intersection": 40.0, "left": None}, full_m=None)
 
 
-def test_an_approach_believed_in_time_has_no_finding() -> None:
+def test_approach_established_in_time_has_no_finding() -> None:
     assert _found(_result(), _cue("road_left", there=40)) == []
 
 
-def test_believed_only_at_the_intersection_is_late() -> None:
+def test_feature_established_only_at_intersection_is_late() -> None:
     (one,) = _found(_result(features_m={"intersection": 40.0, "left": 5.0}), _cue("road_left"))
 
     assert (one.failing, one.at_m, one.feature) == ("late", 5.0, "left")
     assert one.conditions == ("dusk",)
 
 
-def test_what_no_cue_could_show() -> None:
+def test_feature_without_visible_cue_is_reported_as_not_shown() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left"), _cue("parked_left"))
 
     assert one.cause == "nothing shows it"
 
 
-def test_what_is_covered_is_hidden_whatever_detectors_did() -> None:
+def test_occluded_cue_is_reported_as_hidden() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, visible=0.4))
 
     assert one.cause == "hidden"
     assert "30 frames" in one.reported
 
 
-def test_what_is_in_plain_view_and_missed_is_laid_to_the_detectors() -> None:
+def test_visible_cue_without_detections_is_reported_as_not_found() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("parked_left", there=10))
 
     assert one.cause == "not found"
@@ -106,7 +106,7 @@ def test_what_is_in_plain_view_and_missed_is_laid_to_the_detectors() -> None:
     assert "parked left 0/10" in one.reported
 
 
-def test_a_positive_where_nothing_is_does_not_count_as_finding_it() -> None:
+def test_positives_on_hidden_cue_do_not_count_as_found() -> None:
     (one,) = _found(
         NO_LEFT, _cue("road_left", there=30, visible=0.4, found=30), _cue("parked_left", there=8)
     )
@@ -115,14 +115,14 @@ def test_a_positive_where_nothing_is_does_not_count_as_finding_it() -> None:
     assert "0 of 8" in one.reported
 
 
-def test_a_louder_cue_that_rules_it_out_denies_it() -> None:
+def test_more_frequent_contradicting_cue_is_reported_as_denial() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("one_way_right", found=9))
 
     assert one.cause == "denied"
     assert "one way right" in one.reported
 
 
-def test_found_but_never_counted_waits_for_presence() -> None:
+def test_road_found_before_presence_is_established_waits_for_presence() -> None:
     result = _result(features_m={"intersection": None, "left": None}, detected_m=None)
     cues = _cue("road_left", there=30, found=25), _cue("stop_sign", there=30, found=2)
     one, other = _found(result, *cues)
@@ -131,13 +131,13 @@ def test_found_but_never_counted_waits_for_presence() -> None:
     assert (other.feature, other.cause) == ("left", "waited for presence")
 
 
-def test_found_and_counted_but_not_believed_was_too_little() -> None:
+def test_counted_cue_below_threshold_is_reported_as_too_little() -> None:
     (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=25))
 
     assert one.cause == "too little"
 
 
-def test_an_invented_feature_names_who_claimed_it() -> None:
+def test_invented_feature_names_cues_that_support_it() -> None:
     result = _result(false_features=("straight",))
     (one,) = _found(result, _cue("road_straight", found=12), _cue("lanes_past", found=1))
 
@@ -146,7 +146,7 @@ def test_an_invented_feature_names_who_claimed_it() -> None:
     assert one.at_m == pytest.approx(90.0)
 
 
-def test_frames_of_another_approach_or_at_the_intersection_itself_say_nothing() -> None:
+def test_frames_of_other_approaches_or_at_intersection_are_ignored() -> None:
     other = _cue("road_left", there=40, found=40, approach=1)
     near = replace(_cue("parked_left", there=40), distance_m=np.full(FRAMES, 5.0))
     (one,) = _found(NO_LEFT, other, near)
@@ -154,7 +154,7 @@ def test_frames_of_another_approach_or_at_the_intersection_itself_say_nothing() 
     assert one.cause == "nothing shows it"
 
 
-def test_causes_count_drives_not_features() -> None:
+def test_causes_are_counted_per_drive_not_per_feature() -> None:
     result = _result(features_m={"intersection": None, "left": None}, detected_m=None)
     found = _found(result, _cue("road_left"), _cue("stop_sign"))
 
@@ -163,7 +163,7 @@ def test_causes_count_drives_not_features() -> None:
     }
 
 
-def test_a_condition_costs_what_good_runs_at_the_same_place_had_more() -> None:
+def test_condition_cost_is_difference_from_good_runs_at_same_intersection() -> None:
     good = [_result(drive=f"{i}", conditions=("clear",), detected_m=40.0 + i) for i in range(2)]
     bad = [
         _result(conditions=("glare",), detected_m=30.0),
@@ -177,7 +177,7 @@ def test_a_condition_costs_what_good_runs_at_the_same_place_had_more() -> None:
     assert cost.full_m.value == pytest.approx(0.0)
 
 
-def test_what_always_holds_somewhere_does_not_hide_its_good_runs() -> None:
+def test_permanent_condition_of_intersection_does_not_exclude_good_runs() -> None:
     runs = [
         _result(conditions=("clear", "occluded"), detected_m=30.0),
         _result(conditions=("dusk", "occluded"), detected_m=20.0),
@@ -188,7 +188,7 @@ def test_what_always_holds_somewhere_does_not_hide_its_good_runs() -> None:
     assert cost.detected_m.value == pytest.approx(-10.0)
 
 
-def test_with_nothing_to_compare_nothing_is_claimed() -> None:
+def test_condition_cost_is_nan_without_runs_to_compare() -> None:
     here = _result(conditions=("clear",))
     there = _result(intersection="Y", conditions=("clear",))
     lost = _result(intersection="Y", conditions=("rain",), detected_m=None)

@@ -1,4 +1,4 @@
-"""Effect of a cue: none if it has no evidence, everything if all evidence is its own."""
+"""Effect of leaving out a cue on the scores of drives."""
 
 import math
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ def _tables(belief: Beliefs) -> RunTables:
 
 
 def _drive(name: str, by_cue: Mapping[str, Beliefs]) -> Drive:
-    """A drive whose belief changes when the cues named are left out."""
+    """A drive whose belief changes if one of the given cues is left out."""
     truth = good_truth(name)
 
     def estimate(cues: frozenset[str], /) -> RunTables:
@@ -38,11 +38,11 @@ GROUPS = {
 }
 
 
-def test_a_cue_is_worth_the_metres_that_are_lost_without_it() -> None:
+def test_cue_effect_is_distance_lost_without_it() -> None:
     drives = [_drive(f"d{i}", {"parked_right": LATE, "stop_sign": NEVER}) for i in range(6)]
     found = attribute(drives, GROUPS)
 
-    # Right comes in frame 25 (15 m) with parked cars, in frame 33 (7 m) without.
+    # The right road is established in frame 25 (15 m) with parked cars, in frame 33 (7 m) without.
     assert found["parked"].full_m.value == pytest.approx(8.0)
     assert found["parked"].full_m.low == pytest.approx(8.0)
     assert found["parked"].measures["approaches.full_m"].without == pytest.approx(7.0)
@@ -52,7 +52,7 @@ def test_a_cue_is_worth_the_metres_that_are_lost_without_it() -> None:
     assert math.isnan(found["stop_sign"].full_m.value)
 
 
-def test_a_cue_that_says_nothing_changes_nothing() -> None:
+def test_cue_without_influence_has_no_effect() -> None:
     found = attribute([_drive("d", {})], GROUPS)
 
     for one in found.values():
@@ -61,7 +61,7 @@ def test_a_cue_that_says_nothing_changes_nothing() -> None:
         assert one.belief["left"].log_score.value == 0.0
 
 
-def test_attribution_is_reported_in_metrics_and_in_a_terminal() -> None:
+def test_attribution_is_serialised_and_summary_fits_80_columns() -> None:
     drive = _drive("d", {"stop_sign": NEVER})
     found = attribute([drive], GROUPS)
     metrics = as_metrics(score([drive.judged])) | {"attribution": attribution_tree(found)}

@@ -1,4 +1,4 @@
-"""The published experiment on simulated drives, small: flow, resumption, tables, bad input."""
+"""The intersections study on few, small simulated drives: tables, resumption and bad input."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ARGUMENTS = ("--layouts", "A,E", "--runs", "1", "--width", "192", "--detectors",
 
 
 def _with_oracle(path: Path) -> Vehicle:
-    """The drive's vehicle file with detectors that know its truth: no network is needed."""
+    """Load the drive's vehicle file with a detector that returns the truth, without a network."""
     vehicle = load_vehicle(path)
     oracle = DetectorSection(
         kind="support.oracle:build", settings={"objects": str(path.parent / "objects.json")}
@@ -37,8 +37,8 @@ def _with_oracle(path: Path) -> Vehicle:
     return vehicle.model_copy(update={"detectors": {"oracle": oracle}, "ranges": ranges})
 
 
-def _stay_here(patch: pytest.MonkeyPatch) -> None:
-    """Run drives in this process, because another would not have the patched detectors."""
+def _run_in_this_process(patch: pytest.MonkeyPatch) -> None:
+    """Run drives in this process, because a worker process would not have the patched detectors."""
     patch.setattr(simulated_drives, "load", _with_oracle)
     patch.setattr(study_intersections, "engine_of", lambda *_args: in_turn)
 
@@ -47,7 +47,7 @@ def _stay_here(patch: pytest.MonkeyPatch) -> None:
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("study")
     with pytest.MonkeyPatch.context() as patch:
-        _stay_here(patch)
+        _run_in_this_process(patch)
         assert run(["study", "intersections", "-o", str(out), *ARGUMENTS, "-q"]) == 0
     return out
 
@@ -57,7 +57,7 @@ def _tables(out: Path) -> dict[str, Any]:
     return found
 
 
-def test_the_tables_say_that_they_are_simulated_and_stand_beside_the_published(study: Path) -> None:
+def test_tables_are_marked_as_simulated_and_include_published_values(study: Path) -> None:
     tables = _tables(study)
 
     assert tables["is_simulated"] is True
@@ -71,7 +71,7 @@ def test_the_tables_say_that_they_are_simulated_and_stand_beside_the_published(s
     assert (study / "detections.jpg").stat().st_size > 10_000
 
 
-def test_truth_reported_as_detections_gives_right_cues(study: Path) -> None:
+def test_true_objects_as_detections_yield_right_cues(study: Path) -> None:
     rows = {row["cue"]: row for row in _tables(study)["cues"]}
 
     assert rows["stop sign"]["precision"] == rows["traffic light"]["precision"] == 1.0
@@ -79,16 +79,18 @@ def test_truth_reported_as_detections_gives_right_cues(study: Path) -> None:
     assert rows["road"]["positives"] == 0
 
 
-def test_without_stop_signs_an_intersection_with_one_is_lost(study: Path) -> None:
+def test_attribution_shows_intersection_lost_without_stop_signs(study: Path) -> None:
     rows = {row["cue"]: row for row in _tables(study)["attribution"]}
 
     assert rows["stop_sign"]["detected_lost"] == 1
     assert rows["lanes_past"]["detected_lost"] == 0
 
 
-def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_second_start_of_study_replays_nothing(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = (study / "study.json").read_bytes()
-    _stay_here(monkeypatch)
+    _run_in_this_process(monkeypatch)
     monkeypatch.setattr(
         simulated_drives, "replay_drive", lambda *_args, **_more: pytest.fail("ran again")
     )
@@ -98,7 +100,7 @@ def test_a_second_start_does_nothing_again(study: Path, monkeypatch: pytest.Monk
     assert (study / "study.json").read_bytes() == before
 
 
-def test_every_published_cue_has_a_row_even_without_a_single_detection() -> None:
+def test_every_published_cue_has_row_without_detections() -> None:
     assert [row["positives"] for row in cue_rows({})] == [0] * len(groups())
 
 
@@ -112,7 +114,7 @@ def test_every_published_cue_has_a_row_even_without_a_single_detection() -> None
         (["--workers", "0"], "expected 1 or more"),
     ],
 )
-def test_wrong_settings_are_refused_in_one_line(
+def test_invalid_study_arguments_are_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert run(["study", "intersections", "-o", str(tmp_path), *arguments]) == 2

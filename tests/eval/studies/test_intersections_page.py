@@ -1,4 +1,4 @@
-"""The page of the intersections study uses only existing fields of its records."""
+"""The template of the intersections study uses only existing fields of its records."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ PAGE: Final = Path(__file__).parents[3] / "eval" / "report" / "templates" / "int
 
 
 @pytest.mark.parametrize(("rows", "kind"), [("findings", Finding), ("conditions", ConditionCost)])
-def test_every_field_of_a_row_exists(rows: str, kind: type[Finding] | type[ConditionCost]) -> None:
+def test_template_uses_only_existing_fields(
+    rows: str, kind: type[Finding] | type[ConditionCost]
+) -> None:
     text = PAGE.read_text(encoding="utf-8")
     loop = text.partition(f"{{% for one in {rows} %}}")[2].partition("{% endfor %}")[0]
-    asked = {*re.findall(r"\bone\.(\w+)", loop)}
+    used = {*re.findall(r"\bone\.(\w+)", loop)}
 
-    assert asked
-    assert asked <= {field.name for field in fields(kind)}
+    assert used
+    assert used <= {field.name for field in fields(kind)}

@@ -50,7 +50,7 @@ def scores() -> LayoutScores:
     )
 
 
-def test_every_table_has_as_many_entries_in_each_row_as_columns() -> None:
+def test_every_table_row_has_one_entry_per_column() -> None:
     for table in tables_of(scores()):
         assert {len(row) for row in table.rows} == {len(table.head)}
         assert table.as_text().startswith(table.heading)
@@ -65,13 +65,11 @@ def test_every_table_has_as_many_entries_in_each_row_as_columns() -> None:
         (math.nan, math.nan, "undecided"),
     ],
 )
-def test_a_difference_is_decided_only_by_an_interval_without_zero(
-    low: float, high: float, said: str
-) -> None:
+def test_verdict_requires_interval_without_zero(low: float, high: float, said: str) -> None:
     assert verdict(Mean((low + high) / 2.0, low, high, 10, 5)) == said
 
 
-def test_files_say_that_all_is_simulated_and_how_to_do_it_again(tmp_path: Path) -> None:
+def test_files_state_that_study_is_simulated_and_command_to_repeat_it(tmp_path: Path) -> None:
     files = write_layout_study(tmp_path, LayoutStudy(), scores(), {"M3-01": "disk full"})
 
     tree = json.loads(files.tables.read_text(encoding="utf-8"))

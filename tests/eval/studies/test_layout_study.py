@@ -1,4 +1,4 @@
-"""The study of layouts: contents of folds, and scores of generated beliefs."""
+"""The study of layouts: its folds, its drives, and scores of given beliefs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOTHING = {"intersection": False, "left": False, "right": False}
 
 @pytest.mark.parametrize("feature", FEATURES)
 @pytest.mark.parametrize("fold", range(STUDY.folds))
-def test_every_fold_has_layouts_with_each_feature_and_without(fold: int, feature: str) -> None:
+def test_every_fold_has_layouts_with_and_without_each_feature(fold: int, feature: str) -> None:
     known = [
         layout_named(name).features.get(feature)
         for name in STUDY.layouts
@@ -36,7 +36,7 @@ def test_every_fold_has_layouts_with_each_feature_and_without(fold: int, feature
     assert {True, False} <= set(known)
 
 
-def test_there_are_a_hundred_layouts_with_two_drives_each_under_different_conditions() -> None:
+def test_study_has_at_least_100_layouts_with_two_distinct_drives_each() -> None:
     scenes = STUDY.scenes()
 
     assert len(set(STUDY.layouts)) >= 100
@@ -44,7 +44,7 @@ def test_there_are_a_hundred_layouts_with_two_drives_each_under_different_condit
     assert len({scene.name for scene in scenes}) == len(scenes)
 
 
-def test_drives_of_one_layout_are_in_one_fold_and_folds_are_about_equal() -> None:
+def test_folds_have_about_equal_numbers_of_layouts() -> None:
     sizes = np.bincount([STUDY.fold_of(name) for name in STUDY.layouts])
 
     assert len(sizes) == STUDY.folds
@@ -62,12 +62,12 @@ def test_drives_of_one_layout_are_in_one_fold_and_folds_are_about_equal() -> Non
         {"seed": -1},
     ],
 )
-def test_a_study_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+def test_invalid_layout_study_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="expected"):
         LayoutStudy(**changes)
 
 
-def test_a_drive_is_made_again_when_it_is_not_whole_or_what_made_it_has_changed(
+def test_incomplete_or_outdated_drive_is_simulated_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[str] = []
@@ -87,17 +87,17 @@ def test_a_drive_is_made_again_when_it_is_not_whole_or_what_made_it_has_changed(
         simulate(key)
     assert made == ["M12-01", "M12-01"]
 
-    (tmp_path / "M12-01" / MADE_BY).unlink()  # as if it had been interrupted
+    (tmp_path / "M12-01" / MADE_BY).unlink()  # an interrupted simulation
     simulate("b")
     assert len(made) == 3
 
-    (tmp_path / "M12-01" / "drive.mcap").touch()  # a drive that nothing says is this one
+    (tmp_path / "M12-01" / "drive.mcap").touch()  # a drive of unknown origin
     with pytest.raises(UsageError, match="M12-01"):
         simulate("c")
     assert (tmp_path / "M12-01" / MADE_BY).read_text(encoding="utf-8") == "b"
 
 
-def test_comments_and_docstrings_make_no_drive_stale_and_another_number_does() -> None:
+def test_drives_become_outdated_by_code_changes_but_not_by_comments() -> None:
     plain = "def height(x):\n    return 2 * x\n"
     said = '"""Heights."""\n\n\ndef height(x):\n    """Twice as high."""\n    return 2 * x  # m\n'
 
@@ -107,7 +107,7 @@ def test_comments_and_docstrings_make_no_drive_stale_and_another_number_does() -
     )
 
 
-def test_pictures_are_few_and_end_where_the_intersection_begins() -> None:
+def test_pictures_are_sparse_and_end_at_intersection() -> None:
     scene = SceneSettings(layout="M0", camera=camera_of_width(64))
     _, _, world = world_of(scene, is_painted=False)
     motion = world.approach.motion
@@ -133,11 +133,11 @@ def belief(
     return DriveBelief(layout, layout, features, start_m, said, said[:, 0] > 0.9, is_silent)
 
 
-SURE = {"intersection": 0.99, "left": 0.99, "right": 0.01, "straight": 0.99}
+CONFIDENT = {"intersection": 0.99, "left": 0.99, "right": 0.01, "straight": 0.99}
 
 
-def test_a_sure_and_right_belief_is_full_from_the_first_picture_and_has_no_false_feature() -> None:
-    scored = score_layouts([belief(SURE, layout=f"M{i}") for i in range(5)])
+def test_confident_right_belief_is_full_from_first_picture() -> None:
+    scored = score_layouts([belief(CONFIDENT, layout=f"M{i}") for i in range(5)])
 
     assert scored.brier.value == pytest.approx(1e-4)
     assert scored.full.value == 1.0
@@ -145,39 +145,41 @@ def test_a_sure_and_right_belief_is_full_from_the_first_picture_and_has_no_false
     assert scored.false_features.value == 0.0
 
 
-def test_one_half_scores_a_quarter_whatever_is_so() -> None:
+def test_probability_one_half_has_brier_score_one_quarter() -> None:
     scored = score_layouts([belief({}), belief({}, NOTHING, "M8")])
 
     assert scored.brier.value == pytest.approx(0.25)
     assert scored.log_score.value == pytest.approx(np.log(2.0))
 
 
-def test_false_features_are_counted_once_a_drive_and_not_where_nothing_was_said() -> None:
+def test_false_features_are_counted_once_per_drive_and_not_in_silent_frames() -> None:
     wrong = {"intersection": 0.95, "left": 0.2, "right": 0.95}
 
     assert score_layouts([belief(wrong, NOTHING)]).false_features.value == 2.0
     assert score_layouts([belief(wrong, NOTHING, silent=10)]).false_features.value == 0.0
 
 
-def test_a_way_before_the_intersection_is_counted() -> None:
+def test_road_established_before_intersection_is_counted() -> None:
     first = {"intersection": 0.5, "left": 0.95}
 
     assert score_layouts([belief(first)]).full_before_detected.value == 1.0
-    assert score_layouts([belief(SURE)]).full_before_detected.value == 0.0
+    assert score_layouts([belief(CONFIDENT)]).full_before_detected.value == 0.0
 
 
-def test_what_nobody_knows_is_not_scored() -> None:
+def test_feature_with_unknown_truth_is_not_scored() -> None:
     one = belief({"intersection": 0.0, "left": 0.0, "straight": 1.0}, NOTHING)
 
     assert np.isnan(score_layouts([one]).brier_by_feature["straight"].value)
 
 
-def test_a_difference_is_zero_against_itself_and_turns_round_with_the_order() -> None:
+def test_difference_is_zero_for_equal_beliefs_and_antisymmetric() -> None:
     some = [belief({}, layout=f"M{i}") for i in range(6)]
-    sure = [belief(SURE, layout=f"M{i}") for i in range(6)]
+    confident = [belief(CONFIDENT, layout=f"M{i}") for i in range(6)]
 
     assert difference(some, some).brier.value == 0.0
-    assert difference(some, sure).brier.value == pytest.approx(-difference(sure, some).brier.value)
-    assert difference(some, sure).brier.value < 0.0
+    assert difference(some, confident).brier.value == pytest.approx(
+        -difference(confident, some).brier.value
+    )
+    assert difference(some, confident).brier.value < 0.0
     with pytest.raises(ValueError, match="the same drives"):
-        difference(some, sure[1:])
+        difference(some, confident[1:])

@@ -1,4 +1,4 @@
-"""Studies yield the same bytes on any workers, simulate nothing twice, and name bad input."""
+"""Studies: reproducible with any number of workers, resumed after a stop, with checked input."""
 
 import json
 import math
@@ -63,13 +63,13 @@ def study_bytes(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
-def whole(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
+def run_study(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
     assert list(drive_study(study, folder, workers))[-1] == 1.0
     finish_landmarks(study, folder)
     return folder
 
 
-def driven(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
+def run_drives(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
     """Run only the drives, because summaries and figures take longer."""
     assert list(drive_study(study, folder, workers))[-1] == 1.0
     return folder
@@ -86,15 +86,15 @@ def counting(calls: list[int], fail_at: int | None = None) -> Callable[[Drive, K
 
 
 @pytest.mark.slow
-def test_any_number_of_workers_gives_the_same_bytes(tmp_path: Path) -> None:
-    one = study_bytes(whole(SMALL, tmp_path / "one", workers=1))
-    three = study_bytes(whole(SMALL, tmp_path / "three", workers=3))
+def test_study_files_do_not_depend_on_number_of_workers(tmp_path: Path) -> None:
+    one = study_bytes(run_study(SMALL, tmp_path / "one", workers=1))
+    three = study_bytes(run_study(SMALL, tmp_path / "three", workers=3))
 
     assert {"drives.parquet", "summary.json", "study.html", "landmarks_range.svg"} <= set(one)
     assert one == three
 
 
-def test_a_study_goes_on_where_a_worker_died(tmp_path: Path) -> None:
+def test_study_resumes_after_failed_worker(tmp_path: Path) -> None:
     chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
     with pytest.raises(WorkerError, match="finished chunks are kept"):
         list(run(chunks, tmp_path / "a", 1, drive=counting([], fail_at=5)))
@@ -102,7 +102,7 @@ def test_a_study_goes_on_where_a_worker_died(tmp_path: Path) -> None:
     calls: list[int] = []
     list(run(chunks, tmp_path / "a", 1, drive=counting(calls)))
     assemble(chunks, tmp_path / "a")
-    clean = driven(SMALL, tmp_path / "b")
+    clean = run_drives(SMALL, tmp_path / "b")
 
     assert kept == 4
     assert len(calls) == len(chunks) - kept
@@ -111,7 +111,7 @@ def test_a_study_goes_on_where_a_worker_died(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_study_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+def test_killed_study_resumes_to_same_bytes(tmp_path: Path) -> None:
     settings = tmp_path / "s.toml"
     settings.write_text(
         'version = 1\nkind = "landmarks"\ndrives = 600\ndensities_per_km2 = [1.0]\n'
@@ -130,14 +130,14 @@ def test_a_killed_study_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     study = load_study(settings, LandmarkStudy)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(work, "CHUNK_DRIVES", 100)
-        left = driven(study, tmp_path / "killed")
-        clean = driven(study, tmp_path / "clean")
+        left = run_drives(study, tmp_path / "killed")
+        clean = run_drives(study, tmp_path / "clean")
 
     assert process.returncode == -signal.SIGKILL
     assert study_bytes(left) == study_bytes(clean)
 
 
-def test_a_damaged_chunk_is_driven_again(tmp_path: Path) -> None:
+def test_damaged_chunk_is_simulated_again(tmp_path: Path) -> None:
     chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
     list(run(chunks, tmp_path, 1))
     victim = tmp_path / "chunks" / f"{chunks[1].name}.parquet"
@@ -150,7 +150,7 @@ def test_a_damaged_chunk_is_driven_again(tmp_path: Path) -> None:
     assert calls == [chunks[1].count]
 
 
-def test_a_larger_study_reuses_what_a_smaller_one_drove(tmp_path: Path) -> None:
+def test_larger_study_reuses_chunks_of_smaller_one(tmp_path: Path) -> None:
     few, more = (chunks_of(SMALL.cases(), drives, SMALL.seed) for drives in (4, 8))
     list(run(few, tmp_path, 1))
     calls: list[int] = []
@@ -159,7 +159,7 @@ def test_a_larger_study_reuses_what_a_smaller_one_drove(tmp_path: Path) -> None:
     assert len(calls) == len(more) - len(few)
 
 
-def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() -> None:
+def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() -> None:
     study = SMALL.model_copy(
         update={"strategies": ("straight to goal", "hybrid"), "densities_per_km2": (0.5,)}
     )
@@ -182,11 +182,11 @@ def test_ways_are_averaged_over_pairs_over_each_ones_own_goals_and_over_all() ->
     assert all(math.isnan(one.extra.value) for one in found.by_city[1:])
 
 
-def test_the_like_for_like_figure_comes_first_and_says_how_the_subset_was_chosen(
+def test_comparison_over_all_drives_precedes_published_subset_with_note(
     tmp_path: Path,
 ) -> None:
     study = SMALL.model_copy(update={"drives": 20})
-    made = finish_landmarks(study, driven(study, tmp_path))
+    made = finish_landmarks(study, run_drives(study, tmp_path))
     compared = next(table for table in made.tables if table.heading == "Against straight to goal")
 
     names = compared.head
@@ -197,7 +197,7 @@ def test_the_like_for_like_figure_comes_first_and_says_how_the_subset_was_chosen
 
 
 @pytest.mark.slow
-def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
+def test_distance_until_loss_decreases_with_compass_interval() -> None:
     study = RangeStudy(drives=100)
     found = {
         (round(one.slip_per_sqrt_m, 4), round(one.compass_interval_m, 3)): one
@@ -207,7 +207,7 @@ def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
     assert [key for key, one in found.items() if one.is_studied] == [(0.003, 1.876)]
     for slip in (0.0015, 0.003, 0.006, 0.009):
         means = [one.lost_after_m[30.0].value for key, one in found.items() if key[0] == slip]
-        # The longer a compass error lasts, the sooner the car is lost: about 1 / interval.
+        # The longer a compass error lasts, the sooner the car loses its pose: about 1 / interval.
         assert means == sorted(means, reverse=True)
         assert 1.5 < means[0] / means[-1] < 4.0
     for one in found.values():
@@ -215,14 +215,14 @@ def test_other_choices_follow_the_law_and_include_the_studied_one() -> None:
         assert one.lost_after_m[None].value < 1000.0
 
 
-def test_published_means_imply_what_the_field_would_have_reached() -> None:
+def test_implied_distance_equals_value_computed_by_hand() -> None:
     assert implied_m(20.0, 25.0) == pytest.approx(13_312.0)
     assert implied_m(30.0, 25.0) == pytest.approx(13_392.0)
     assert implied_m(20.0, 20.0) == 20_800.0
 
 
-def test_strategies_share_their_cities_and_conditions_do_not(tmp_path: Path) -> None:
-    table = RunFolder(driven(SMALL, tmp_path)).table("drives")
+def test_strategies_share_cities_and_conditions_do_not(tmp_path: Path) -> None:
+    table = RunFolder(run_drives(SMALL, tmp_path)).table("drives")
     area = table["area_km2"].to_numpy().reshape(3, 2, SMALL.drives)
 
     np.testing.assert_array_equal(area[0], area[1])
@@ -231,8 +231,8 @@ def test_strategies_share_their_cities_and_conditions_do_not(tmp_path: Path) -> 
     assert len(np.unique(table["seed"].to_numpy())) == 2 * SMALL.drives
 
 
-def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
-    whole(SMALL, tmp_path)
+def test_folder_of_another_study_is_refused(tmp_path: Path) -> None:
+    run_study(SMALL, tmp_path)
     other = SMALL.model_copy(update={"seed": 9})
 
     with pytest.raises(RunError, match="other settings"):
@@ -264,7 +264,7 @@ def test_a_folder_with_another_study_is_refused(tmp_path: Path) -> None:
         ("version = 1\nkind = \n", "not TOML"),
     ],
 )
-def test_a_study_file_that_does_not_fit_is_named_with_its_line(
+def test_invalid_study_file_is_refused_with_line_number(
     tmp_path: Path, text: str, reported: str
 ) -> None:
     path = tmp_path / "s.toml"
@@ -274,7 +274,7 @@ def test_a_study_file_that_does_not_fit_is_named_with_its_line(
         load_study(path, RangeStudy)
 
 
-def test_a_study_file_that_is_not_there_is_one_line(
+def test_missing_study_file_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["study", "range", "--settings", str(tmp_path / "none.toml")]) == 2
@@ -283,7 +283,7 @@ def test_a_study_file_that_is_not_there_is_one_line(
     assert captured.err.count("\n") == 1
 
 
-def test_a_study_file_that_never_ends_is_not_read() -> None:
+def test_oversized_study_file_is_refused() -> None:
     with pytest.raises(StudyFileError, match="/dev/zero: larger than"):
         load_study(Path("/dev/zero"), RangeStudy)
 
@@ -292,14 +292,14 @@ def test_a_study_file_that_never_ends_is_not_read() -> None:
     ("flag", "value"),
     [("--compass", "-5"), ("--detection-rate", "1.5"), ("--landmark-density", "101")],
 )
-def test_a_drive_that_cannot_be_names_its_flag(
+def test_invalid_drive_option_is_named(
     tmp_path: Path, flag: str, value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["study", "drive", "-o", str(tmp_path), f"{flag}={value}"]) == 2
     assert f"{flag} {value}" in capsys.readouterr().err
 
 
-def test_the_page_is_one_for_light_dark_and_small_screens(tmp_path: Path) -> None:
+def test_page_is_self_contained_and_adapts_to_screen_and_colour_scheme(tmp_path: Path) -> None:
     table = Table("<heading>", ("what", "km"), (("<b>", "1.0"),))
     write_page(tmp_path / "p.html", "Title", ["a & b"], [table, table], [])
     page = (tmp_path / "p.html").read_text()
@@ -313,17 +313,17 @@ def test_the_page_is_one_for_light_dark_and_small_screens(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("density", [-1.0, 101.0, math.nan])
-def test_densities_out_of_range_are_refused(density: float) -> None:
+def test_landmark_densities_out_of_range_are_refused(density: float) -> None:
     with pytest.raises(ValidationError, match="densities_per_km2"):
         LandmarkStudy(densities_per_km2=(density,))
 
 
-def test_rates_out_of_range_are_refused() -> None:
+def test_detection_rates_out_of_range_are_refused() -> None:
     with pytest.raises(ValidationError, match="detection_rates"):
         LandmarkStudy(detection_rates=(1.5,))
 
 
-def test_a_city_without_intersections_ends_the_study_in_one_line(tmp_path: Path) -> None:
+def test_city_without_intersections_is_refused(tmp_path: Path) -> None:
     blocks = City(
         smallest_km2=0.25, largest_km2=0.25, shortest_block_m=900.0, longest_block_m=950.0
     )
@@ -334,14 +334,14 @@ def test_a_city_without_intersections_ends_the_study_in_one_line(tmp_path: Path)
 
 
 @pytest.mark.parametrize("flags", [["--drives", "0"], ["--workers", "0"], ["--seed", "-3"]])
-def test_flags_out_of_range_are_refused(
+def test_study_options_out_of_range_are_refused(
     tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["study", "range", "-o", str(tmp_path), *flags]) == 2
     assert flags[0] in capsys.readouterr().err
 
 
-def test_the_command_prints_strict_json_and_no_progress_into_files(
+def test_study_prints_strict_json_without_progress(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = tmp_path / "s.toml"
@@ -359,20 +359,20 @@ def test_the_command_prints_strict_json_and_no_progress_into_files(
     assert found["study"]["drive"]["city"]["largest_km2"] == 2.0
 
 
-def test_reported_seeds_are_not_those_of_the_calibration() -> None:
+def test_default_seeds_differ_from_calibration_seed() -> None:
     assert CALIBRATION_SEED not in (RangeStudy().seed, LandmarkStudy().seed, FieldStudy().seed)
 
 
 @pytest.mark.slow
-def test_the_default_compass_interval_is_the_calibrated_one() -> None:
+def test_default_compass_interval_equals_calibrated_one() -> None:
     default = Drive()
 
     assert calibrate(default, 2, tolerance=0.01) == default.sensors.compass_interval_m
 
 
 @pytest.mark.slow
-def test_twenty_degrees_is_predicted_from_thirty(tmp_path: Path) -> None:
-    """Distances at loss are inversely proportional to the squared compass error (r ds D)."""
+def test_distance_until_loss_scales_with_squared_compass_error(tmp_path: Path) -> None:
+    """The distance until loss is inversely proportional to the squared compass error (r ds D)."""
     study = RangeStudy(drives=120, compass_2sigma_deg=(20.0, 30.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(work, "CHUNK_DRIVES", 60)
@@ -387,7 +387,7 @@ def test_twenty_degrees_is_predicted_from_thirty(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_simulated_drive_goes_through_its_log(tmp_path: Path) -> None:
+def test_simulated_drive_replayed_from_log_matches_simulation(tmp_path: Path) -> None:
     settings = Drive(
         city=City(largest_km2=1.5),
         landmarks_per_km2=20.0,
@@ -407,7 +407,7 @@ def test_a_simulated_drive_goes_through_its_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_field_runs_are_kept_and_not_driven_twice(tmp_path: Path) -> None:
+def test_field_runs_are_reused(tmp_path: Path) -> None:
     study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
     first = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
     logs = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/drive.mcap")}
@@ -422,7 +422,7 @@ def test_field_runs_are_kept_and_not_driven_twice(tmp_path: Path) -> None:
         list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1, through_log))
 
 
-def test_a_logistic_curve_finds_the_one_it_was_drawn_from() -> None:
+def test_logistic_fit_recovers_generating_curve() -> None:
     rng = np.random.default_rng(3)
     x = rng.uniform(0.0, 12_000.0, 4000)
     success = (rng.uniform(size=4000) < 1.0 / (1.0 + np.exp(-(8.0 - 1e-3 * x)))).astype(float)
@@ -434,14 +434,14 @@ def test_a_logistic_curve_finds_the_one_it_was_drawn_from() -> None:
     assert at_80.low < 8000.0 - 1000.0 * math.log(4.0) < at_80.high
 
 
-def test_a_range_that_nobody_reached_the_end_of_is_beyond() -> None:
+def test_range_is_infinite_if_all_drives_succeed_and_zero_if_none() -> None:
     x = np.linspace(0.0, 5000.0, 50)
 
     assert math.isinf(range_at(x, np.ones(50), 0.8).value)
     assert range_at(x, np.zeros(50), 0.8).value == 0.0
 
 
-def test_intervals_hold_what_they_should() -> None:
+def test_intervals_of_study_cover_true_values() -> None:
     rng = np.random.default_rng(1)
     held = [(m := mean_of(rng.normal(5.0, 2.0, 60))).low < 5.0 < m.high for _ in range(400)]
     ratio = ratio_of(rng.normal(1.3, 0.1, 300), rng.normal(1.0, 0.1, 300))
