@@ -13,6 +13,8 @@ from crosscue.replay.base import LogError
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of, identity_of_all
 
 LARGE: int = 3 * SHARE_BYTES
+BEFORE_TAIL: int = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
+"""Position between the last sample and the tail, where only an index is hashed."""
 
 
 def _log(path: Path, content: bytes | bytearray = b"rows") -> Path:
@@ -66,19 +68,20 @@ def _with_index(kind: str, start: int) -> bytearray:
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])
 def test_any_index_byte_of_large_log_changes_identity(tmp_path: Path, kind: str) -> None:
-    # Between the last sample and the tail, where only the index is hashed.
-    place = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
-    for start, counts in ((place - 10, True), (place + 1, False)):
+    for start, counts in ((BEFORE_TAIL - 10, True), (BEFORE_TAIL + 1, False)):
         content = _with_index(kind, start)
         before = identity_of(_log(tmp_path / f"a.{kind}", content))
-        content[place] ^= 1
+        content[BEFORE_TAIL] ^= 1
         assert (identity_of(_log(tmp_path / f"a.{kind}", content)) != before) is counts
 
 
 @pytest.mark.parametrize("start", [0, 1 << 63, LARGE * 2])
 def test_identity_ignores_invalid_index_position(tmp_path: Path, start: int) -> None:
     for kind in ("mcap", "bag"):
-        identity_of(_log(tmp_path / f"a.{kind}", _with_index(kind, start)))
+        content = _with_index(kind, start)
+        before = identity_of(_log(tmp_path / f"a.{kind}", content))
+        content[BEFORE_TAIL] ^= 1
+        assert identity_of(_log(tmp_path / f"a.{kind}", content)) == before
 
 
 def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None:
@@ -106,7 +109,12 @@ def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None
 
 
 def test_companion_files_change_identity(tmp_path: Path) -> None:
-    for log, companion in (("a.db3", "a.db3-wal"), ("v.mp4", "v.csv"), ("v.mp4", "v.txt")):
+    for log, companion in (
+        ("a.db3", "a.db3-wal"),
+        ("b.db3", "b.db3-journal"),
+        ("v.mp4", "v.csv"),
+        ("v.mp4", "v.txt"),
+    ):
         path = _log(tmp_path / log)
         before = identity_of(path)
         _log(tmp_path / companion, b"more")

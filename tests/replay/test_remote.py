@@ -222,12 +222,13 @@ def test_folder_version_changes_with_any_file(tmp_path: Path) -> None:
         version_of(str(tmp_path / "gone"))
 
 
-def test_remote_urls_are_strings_and_store_limit_is_validated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_strings_with_a_scheme_are_remote() -> None:
     assert is_remote("s3://bucket/a.mcap")
     assert not is_remote("folder/a.mcap")
     assert not is_remote(Path("s3://bucket/a.mcap"))
+
+
+def test_negative_store_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(remote.LIMIT_VARIABLE, "-1")
     with pytest.raises(UsageError, match="expected a number of GiB above 0"):
         remote.default_store()

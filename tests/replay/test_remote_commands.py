@@ -29,7 +29,7 @@ FIXED_BYTES = 192 << 10
 """Bytes for the head and tail of a log, which determine its identity, and for the read-ahead."""
 BRIGHT = "support.detecting:build"
 ARGUMENTS = {
-    "info": ["info"],
+    "info": ["info", "--json"],
     "convert": ["convert", "-o", "OUT.mcap", "-q"],
     "decode": ["decode", "-o", "OUT", "-q"],
     "replay": ["replay", "-o", "OUT", "-q", "--detectors", BRIGHT, "--no-cache"],
@@ -138,9 +138,11 @@ def test_remote_log_yields_same_output_as_local_log(
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()
     part = ["--from", "10", "--to", "13"]
+    printed = []
     for name, log in (("here", str(drive)), ("there", f"{web.base}/drive.mcap")):
         words = [word.replace("OUT", str(tmp_path / name)) for word in ARGUMENTS[command]]
         assert crosscue([words[0], log, *words[1:], *part]) == 0
+        printed.append(capsys.readouterr().out)
 
     files = sorted(one.relative_to(tmp_path / "here") for one in tmp_path.glob("here/*.parquet"))
     for one in files:
@@ -153,9 +155,11 @@ def test_remote_log_yields_same_output_as_local_log(
         assert there.read_bytes() == here.read_bytes()
     if command == "convert":
         assert (tmp_path / "there.mcap").read_bytes() == (tmp_path / "here.mcap").read_bytes()
-    elif command != "info":
+    elif command == "info":
+        local, remote_log = (json.loads(text)["logs"][0] for text in printed)
+        assert local | {"path": "", "notices": []} == remote_log | {"path": "", "notices": []}
+    else:
         assert files
-    capsys.readouterr()
 
 
 @pytest.mark.slow

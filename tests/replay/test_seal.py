@@ -267,6 +267,20 @@ def test_time_file_of_video_is_sealed(tmp_path: Path) -> None:
     assert "front.txt" in _losses_text(film)
 
 
+@pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+def test_journal_of_sqlite_log_is_sealed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str
+) -> None:
+    log = EVERY_FORMAT["rosbag2-sqlite3"](tmp_path)
+    journal = log.with_name(log.name + suffix)
+    journal.write_bytes(bytes(100))
+    assert run(["seal", str(log)]) == 0
+    assert set(read_seal(seal_path(log)).files) == {".", journal.name}
+    _flip(journal, 30)
+    assert run(["seal", "--check", str(log)]) == 3
+    assert f"{journal.name}: bytes 0 to 100 differ from the seal" in capsys.readouterr().err
+
+
 def _damaged_seals() -> Iterator[tuple[str, bytes]]:
     def entry(**changes: object) -> bytes:
         one = {"name": ".", "size": 3, "blocks": "00" * 16} | changes
