@@ -1,4 +1,4 @@
-"""Messages of any error fit into one line."""
+"""The message of any error is returned on one line."""
 
 from __future__ import annotations
 

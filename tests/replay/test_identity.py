@@ -54,7 +54,7 @@ def test_head_tail_and_samples_of_large_log_change_identity(tmp_path: Path, at: 
 
 
 def _with_index(kind: str, start: int) -> bytearray:
-    """A large file without content, but with an index that begins at ``start``."""
+    """Return a large file of zeros, whose header or footer places the index at ``start``."""
     content = bytearray(LARGE)
     if kind == "mcap":
         content[:8] = b"\x89MCAP0\r\n"

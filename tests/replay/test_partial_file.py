@@ -29,7 +29,7 @@ def _partials(folder: Path) -> list[str]:
 
 @contextmanager
 def _child_process(code: str) -> Iterator[subprocess.Popen[str]]:
-    """A process that prints a line when it has started, and runs until it is killed."""
+    """Run ``code`` in a process that prints a line once it has started, and kill it at the end."""
     lines = f"{code}\nprint('begun', flush=True)\nimport time; time.sleep(60)\n"
     with subprocess.Popen(
         [sys.executable, "-c", lines], stdout=subprocess.PIPE, text=True
@@ -143,7 +143,7 @@ def test_run_of_dead_process_is_unlocked_despite_reused_pid(tmp_path: Path) -> N
         process.wait()
     text = run.file(".lock").read_text()
     assert text.startswith(f"{process.pid} ")
-    # As if that number now belonged to the parent process.
+    # The process number is replaced by that of a running process, the parent.
     run.file(".lock").write_text(text.replace(str(process.pid), str(os.getppid()), 1))
 
     with locked(run):
@@ -168,7 +168,7 @@ def _simulate(folder: Path) -> list[str]:
 def test_run_after_kill_leaves_no_partial_files(
     tmp_path: Path, command: Callable[[Path], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Inherited by the forked processes.
+    # Forked processes inherit the patch.
     scenes.shorten(monkeypatch)
     argv = command(tmp_path)
     out = tmp_path / "out"

@@ -11,7 +11,7 @@ from crosscue.replay.processes import in_processes
 
 
 def slow_square(number: int) -> tuple[int, int]:
-    """Work that takes longest for the first items."""
+    """Return the square of a number and the process id; small numbers take longest."""
     time.sleep(0.05 * max(0, 3 - number))
     return number * number, os.getpid()
 

@@ -26,7 +26,7 @@ from support.rosbag_files import rows_of, write_bag
 
 MS = 1_000_000
 FIXED_BYTES = 192 << 10
-"""Bytes for the head and tail of a log, which determine its identity, and for the read-ahead."""
+"""Bytes of a log's head and tail, from which its identity is computed, and of the read-ahead."""
 BRIGHT = "support.detecting:build"
 ARGUMENTS = {
     "info": ["info", "--json"],
@@ -166,7 +166,7 @@ def test_remote_log_yields_same_output_as_local_log(
 def test_replay_of_long_window_transfers_each_byte_once(
     drive: Path, tmp_path: Path, web: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A tenth of it fits into memory, so the rest uses the temporary file.
+    # A tenth of the log fits into memory, so the rest is cached in a temporary file.
     monkeypatch.setattr("crosscue.replay.remote.ranges.KEPT_BYTES", 1 << 20)
     monkeypatch.setattr("crosscue.replay.remote.ranges.PIECE", 512 << 10)
     web.files["drive.mcap"] = drive.read_bytes()

@@ -61,7 +61,7 @@ def _losses_text(log: Path) -> str:
 
 @pytest.fixture
 def long_log(tmp_path: Path) -> Path:
-    """A sealed candump log of more than three blocks."""
+    """Write and seal a candump log of more than three blocks."""
     log = tmp_path / "can.log"
     log.write_bytes(candump(made(300)) * 300)
     assert log.stat().st_size > 3 * MIB
@@ -344,7 +344,7 @@ def test_damaged_seal_never_reports_a_different_log(tmp_path: Path) -> None:
         except LogError:
             refused += 1
 
-    # Only a blank between two words may change harmlessly.
+    # Only a change of white space between tokens is harmless.
     assert refused > 0.6 * len(whole) / 7
 
 

@@ -1,4 +1,4 @@
-"""One topic over a time range: exactly the rows of a complete pass in that range."""
+"""One topic over a time range: the same rows as when the complete log is read."""
 
 from pathlib import Path
 

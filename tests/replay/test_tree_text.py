@@ -42,7 +42,7 @@ _VALUES: Final = st.recursive(
 )
 
 
-# There is no limit on time, because generating nested values is slow on some machines.
+# There is no deadline, because generating nested values is slow on some machines.
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(_VALUES, st.integers(0, MAX_DEPTH + 5))
 def test_json_within_depth_limit_equals_json_loads(value: object, around: int) -> None:

@@ -1,4 +1,4 @@
-"""Every frame of a bus is decoded, or counted with a reason; none is decoded to a wrong value."""
+"""Every frame of a bus is either decoded or counted with a reason."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ def test_layouts_of_damaged_files_equal_cantools(text: str) -> None:
         try:
             theirs = _layout_by_cantools(source)
         except SchemaError:
-            continue  # a statement is broken that decoding does not use
+            continue  # decoding does not use the damaged statement
         assert _reprs(quick) == _reprs(theirs), source.text
         compared += 1
     assert compared > 20

@@ -1,4 +1,4 @@
-"""Exactly the damaged one of several messages is dropped; messages of unknown types are skipped."""
+"""Only damaged messages are dropped; messages of unknown types are skipped."""
 
 import json
 from base64 import b64encode

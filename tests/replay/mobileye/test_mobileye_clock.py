@@ -1,4 +1,4 @@
-"""The millisecond counter against the log's clock."""
+"""Image times are computed from the device's millisecond counter and the log's clock."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def test_missing_status_frame_does_not_mix_two_images() -> None:
 
 
 def test_frames_long_after_status_frame_are_skipped() -> None:
-    """One complete slot, the next status frame and the A of the next image are lost."""
+    """B and C of one image, the status frame of the next and its A are lost."""
     a, b, c = triple(0, 7)
     sent = [status(1, 0), a, b, c]
     tables, ledger = decode(frames(sent, [0, MS, 67 * MS, 68 * MS]))
@@ -239,7 +239,7 @@ def test_missing_mounting_calibration_is_a_notice() -> None:
 
 
 def test_obstacle_positions_are_relative_to_rear_axle() -> None:
-    """An obstacle 24 m ahead and 28 m right of a device 3 m ahead, rotated by 90 degrees left."""
+    """The device is 3 m ahead, rotated left by 90 degrees, and reports 24 m ahead and 28 m right."""
     sent = [status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]]
     turned = MobileyeSettings(mounting=Mounting(3.0, 0.5, radians(90)))
     tables, _ = decode(frames(sent), turned)

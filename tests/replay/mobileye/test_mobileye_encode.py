@@ -66,7 +66,7 @@ def assert_same_frames(actual: Block, expected: Block) -> None:
 def test_encoding_decoded_tables_restores_frames(
     revision: str, how: MobileyeSettings, seed: int
 ) -> None:
-    """Complete bursts with lanes; random lanes cannot be rotated exactly and are only moved."""
+    """Lanes are included only without a mounting angle, because rotating them is not exact."""
     drive = random_drive(5, np.random.default_rng(seed), revision, has_lanes=how is UNROTATED)
     assert_same_frames(encode_tables(decode(drive, how), how, "can1"), drive)
 

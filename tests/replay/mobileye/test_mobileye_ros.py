@@ -1,4 +1,4 @@
-"""Messages from a bag and frames yield the same columns."""
+"""ROS messages and CAN frames of a Mobileye decode to the same columns."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def frames(
 
 @pytest.fixture
 def log() -> MemoryLog:
-    """Write wheels on one bus, and the yaw rate on another, where identifier 100 differs."""
+    """Return a log with wheel speeds and yaw rate on two buses, where identifier 100 differs."""
     speed, yaw = np.full(N, 10.0), np.deg2rad(YAW_RATE_DEGPS)
     left, right = speed - 0.775 * yaw, speed + 0.775 * yaw
     other = np.full(N, 77.0)

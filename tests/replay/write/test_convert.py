@@ -143,7 +143,7 @@ class FailingFile:
         self.inner, self.left = inner, nth
 
     def write(self, content: bytes) -> int:
-        """Write, or fail."""
+        """Write ``content``, or raise ``OSError`` because the disk is full."""
         self.left -= 1
         if self.left < 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
