@@ -239,7 +239,7 @@ def test_missing_mounting_calibration_is_a_notice() -> None:
 
 
 def test_obstacle_positions_are_relative_to_rear_axle() -> None:
-    """The device is 3 m ahead, rotated left by 90 degrees, and reports 24 m ahead and 28 m right."""
+    """The device is 3 m ahead, rotated left by 90 degrees; the obstacle is 24 m ahead of it."""
     sent = [status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]]
     turned = MobileyeSettings(mounting=Mounting(3.0, 0.5, radians(90)))
     tables, _ = decode(frames(sent), turned)
