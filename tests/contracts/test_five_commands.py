@@ -28,7 +28,8 @@ FRAMES = 3
 
 def commands() -> list[str]:
     """The first block of the page, with a recording instead of a window."""
-    block = re.search(r"```\n(crosscue model init.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
+    page = PAGE.read_text(encoding="utf-8")
+    block = re.search(r"```bash\n(crosscue model init.*?)```", page, re.S)
     assert block is not None
     return block[1].replace("view run", "view run -o drive.rrd").splitlines()
 

@@ -1,0 +1,298 @@
+"""Every example in the documentation is one that crosscue understands, or a test runs it.
+
+Commands are expanded by bash and parsed by their own parsers, Python is compared with the public
+interface, settings are read as the files they belong to, and queries run on a small catalog.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import crosscue
+from crosscue.detectors.registry import BUILTIN
+from crosscue.eval import cli
+from crosscue.eval.scoring.gates import load_gates
+from crosscue.replay.plugins import GROUPS
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from support.catalog_runs import runs_below
+from support.pages import ROOT, Code, code_of_notebooks, code_of_pages, commands_of
+from support.public_calls import faults_in
+
+CODE: Final = code_of_pages()
+NOTEBOOKS: Final = code_of_notebooks()
+KINDS: Final = {"bash", "console", "python", "toml", "sql", "yaml", "text"}
+EXECUTED: Final = {
+    ("CONTRIBUTING.md", "python"): "tests/contracts/test_contributing.py",
+    ("docs/howto/query.md", "sql"): "tests/eval/catalog/test_query_page.py",
+}
+"""Blocks of a page that a test runs word by word, and that test."""
+OTHERS: Final = {
+    "--array": "SLURM",
+    "--bind": "Rerun",
+    "--decode_in_inference": "YOLOX",
+    "--grid": "YOLOv7",
+    "--include": "YOLOv5",
+    "--serve-web": "Rerun",
+}
+"""Options of other programs in inline code and messages, and those programs."""
+PACKAGES: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
+SHELL_PAGES: Final = sorted(
+    {code.page for code in CODE if code.kind in ("bash", "console", "yaml")}
+)
+OPTIONS: Final = {
+    "--version",
+    *(
+        option
+        for name in cli.COMMANDS
+        for action in cli.parser_of(name)[1]._actions
+        for option in action.option_strings
+    ),
+    *(
+        option
+        for path in (ROOT / "benchmarks").rglob("*.py")
+        for option in re.findall(r'"(--[a-z][\w-]*)"', path.read_text(encoding="utf-8"))
+    ),
+}
+"""Options of all commands and benchmarks."""
+
+
+def of_kind(kind: str) -> list[Code]:
+    """Blocks of one language that no test runs."""
+    return [code for code in CODE if code.kind == kind and (code.page, kind) not in EXECUTED]
+
+
+def words_of(text: str) -> list[str]:
+    """Words of inline code, without quotes."""
+    return re.findall(r"\"[^\"]*\"|'[^']*'|\S+", text)
+
+
+def commands_in(words: list[str]) -> list[str]:
+    """Commands that inline code names: one, several (``fit a|b``), or a group of them."""
+    for length in (2, 1):
+        first = words[: length - 1]
+        names = [
+            " ".join([*first, last]) for last in "".join(words[length - 1 : length]).split("|")
+        ]
+        if words[length - 1 :] and all(name in cli.COMMANDS for name in names):
+            return names
+    return [name for name in cli.COMMANDS if words and name.split()[0] == words[0]]
+
+
+def fault_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The error of a complete command line, empty if its parser accepts it."""
+    names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]
+    if not names:
+        return f"no command {command[:2]}"
+    name = max(names, key=len)
+    try:
+        given = vars(cli.parser_of(name)[1].parse_args(command[len(name.split()) :]))
+    except SystemExit:
+        return capsys.readouterr().err
+    known = {*BUILTIN, "none", *(model.name for model in crosscue.models())}
+    unknown = {
+        detector
+        for detector in str(given.get("detectors") or "none").split(",")
+        if detector not in known and not detector.endswith(".toml")
+    }
+    return f"no detector {unknown}" if unknown else ""
+
+
+def vehicle_of(text: str) -> Vehicle:
+    """The vehicle file that a fragment is part of."""
+    return parse(text if "version =" in text else f"version = 1\n{text}", "example")
+
+
+def test_every_block_names_its_language() -> None:
+    wrong = [
+        f"{code.place}: {code.kind or 'no language'}"
+        for code in CODE
+        if code.kind != "inline" and not code.kind.startswith("{") and code.kind not in KINDS
+    ]
+
+    assert wrong == []
+
+
+@pytest.mark.parametrize(("page", "kind"), EXECUTED)
+def test_a_page_whose_blocks_a_test_runs_is_read_there(page: str, kind: str) -> None:
+    test = (ROOT / EXECUTED[page, kind]).read_text(encoding="utf-8")
+
+    assert Path(page).name in test
+    assert f"```{kind}" in test
+    assert any((code.page, code.kind) == (page, kind) for code in CODE)
+
+
+@pytest.mark.parametrize("page", SHELL_PAGES)
+def test_a_command_on_a_page_is_understood(
+    page: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blocks = [code for code in CODE if code.page == page]
+    found = commands_of(blocks, tmp_path)
+
+    faults = [
+        f"{code.place}: {' '.join(command)}: {fault}"
+        for code, (program, *command) in found
+        if program == "crosscue" and (fault := fault_of(command, capsys))
+    ]
+    assert faults == []
+    for block in blocks:
+        if re.search(r"^(\$ )?crosscue ", block.text, re.MULTILINE) and block.kind != "inline":
+            assert any(code == block for code, _ in found), f"{block.place}: no command was run"
+
+
+def test_other_programs_on_a_page_exist(tmp_path: Path) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for number, page in enumerate(SHELL_PAGES):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for code, (program, *words) in commands_of([c for c in CODE if c.page == page], folder):
+            if program == "make":
+                assert words[0] in targets, code.place
+            elif program == "pip":
+                named = re.findall(r"\[(.*)\]", " ".join(words))
+                assert {one for text in named for one in text.split(",")} <= {*extras}, code.place
+            elif program == "python" and words[0] == "-c":
+                assert faults_in(words[1]) == [], code.place
+            elif program == "python":
+                is_module = words[0] == "-m"
+                path = words[1].replace(".", "/") + ".py" if is_module else words[0]
+                is_ours = not is_module or words[1].startswith("crosscue.")
+                assert not is_ours or (ROOT / path).is_file(), f"{code.place}: no file {path}"
+
+
+def inline_commands() -> Iterator[tuple[str, list[str]]]:
+    """Place and words of each command in inline code, of docstrings too, without ``crosscue``."""
+    for code in [*CODE, *NOTEBOOKS]:
+        if code.kind == "inline" and code.text.startswith("crosscue "):
+            yield code.place, words_of(code.text)[1:]
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            text = path.read_text(encoding="utf-8")
+            for found in re.finditer(r"``crosscue ([^`]+)``", text):
+                line = text.count("\n", 0, found.start()) + 1
+                yield f"{path.relative_to(ROOT)}:{line}", words_of(found[1])
+
+
+def test_inline_commands_and_their_options_exist() -> None:
+    wrong = []
+    for place, words in inline_commands():
+        names = commands_in(words)
+        actions = [action for name in names for action in cli.parser_of(name)[1]._actions]
+        known = {option for action in actions for option in action.option_strings} | {
+            "--help",
+            "--version",
+        }
+        unknown = {word.partition("=")[0] for word in words if re.match("--?[a-z]", word)} - known
+        if unknown or not (names or words[0] in ("--help", "--version")):
+            wrong.append(f"{place}: crosscue {' '.join(words)}: {sorted(unknown) or 'no command'}")
+
+    assert wrong == []
+
+
+def test_every_option_in_inline_code_exists() -> None:
+    texts = [code for code in [*CODE, *NOTEBOOKS] if code.kind == "inline"]
+    named = {
+        option: code.place
+        for code in texts
+        for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", code.text)
+    }
+
+    unknown = named.keys() - OPTIONS - OTHERS.keys()
+    assert {option: named[option] for option in unknown} == {}
+
+
+def test_every_option_in_a_message_exists() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{number}: {option}"
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        for option in re.findall(r"(?<![\w(-])--[a-z](?:-?\w)*(?![\w:-])", line)
+        if option not in OPTIONS | OTHERS.keys()
+    ]
+
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    [*of_kind("python"), *(c for c in NOTEBOOKS if c.kind == "python")],
+    ids=lambda c: c.place,
+)
+def test_python_uses_what_the_public_interface_has(code: Code) -> None:
+    assert [
+        f"{code.page}:{code.line + line - 1}: {fault}" for line, fault in faults_in(code.text)
+    ] == []
+
+
+@pytest.mark.parametrize("code", of_kind("toml"), ids=lambda code: code.place)
+def test_settings_are_accepted(code: Code, tmp_path: Path) -> None:
+    tree = tomllib.loads(code.text)
+    if "gate" in tree:
+        path = tmp_path / "gates.toml"
+        path.write_text(code.text)
+        assert load_gates(path), code.place
+    elif "project" in tree:
+        assert {*tree["project"]["entry-points"]} == {*GROUPS.values()}
+    else:
+        vehicle_of(code.text)
+
+
+def test_settings_called_defaults_are_the_defaults() -> None:
+    texts = {code.page: code.text for code in of_kind("toml")}
+
+    assert vehicle_of(texts["docs/explanation/time_segments.md"]) == Vehicle(version=1)
+
+
+def test_queries_in_commands_run(tmp_path: Path) -> None:
+    runs = crosscue.catalog(runs_below(tmp_path / "runs"))
+    asked = 0
+    for number, page in enumerate(SHELL_PAGES):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for _, (program, *words) in commands_of([c for c in CODE if c.page == page], folder):
+            if program == "crosscue" and words[0] == "query":
+                runs.query(words[2])
+                asked += 1
+            conditions = [
+                words[words.index(option) + 1]
+                for option in ("--runs", "--against", "--where")
+                if words[0] in ("compare", "failures") and option in words
+            ]
+            for condition in conditions:
+                runs.select(condition)
+                asked += 1
+    assert asked
+
+
+def test_a_wrong_example_is_found(capsys: pytest.CaptureFixture[str]) -> None:
+    code = (
+        "import crosscue\n"
+        "log = crosscue.open('a', nope=1)\n"
+        "log['x'].tabel()\n"
+        "[one.rum for one in crosscue.read_failures('x')]\n"
+        "crosscue.nothing()\n"
+    )
+    assert [line for line, _ in faults_in(code)] == [2, 3, 4, 5]
+    assert "no option --gnsss" in fault_of(["replay", "a", "-o", "b", "--gnsss", "off"], capsys)
+    assert "invalid" in fault_of(["view", "run", "--approach", "last"], capsys)
+    assert "yolox-pico" in fault_of(["replay", "a", "-o", "b", "--detectors", "yolox-pico"], capsys)
+
+
+def test_a_session_on_a_console_is_not_its_output(tmp_path: Path) -> None:
+    session = Code(
+        "page", 1, "console", '$ for i in 1 2; do \\\n crosscue info "$i"; done\ncrosscue x\n'
+    )
+
+    assert [words for _, words in commands_of([session], tmp_path)] == [
+        ["crosscue", "info", "1"],
+        ["crosscue", "info", "2"],
+    ]
