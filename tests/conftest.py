@@ -5,16 +5,16 @@ from __future__ import annotations
 import gc
 import os
 
-# No test reads or fills the user's own cache; those of the cache name a folder.
+# Tests do not read or fill the user's cache; tests of the cache name a folder.
 os.environ["CROSSCUE_DBC_CACHE"] = "off"
-# The tests themselves run side by side, one process a core: threads beside them only wait for each
-# other, and OpenMP waits by spinning. Tests about threads ask for a number.
+# Tests run in parallel, one process per core. Further threads would only wait for each other, and
+# OpenMP waits by spinning. Tests of threads set a number.
 os.environ["OMP_WAIT_POLICY"] = "passive"
 for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(library, "1")
 
 
 def pytest_collection_finish() -> None:
-    """Leave what is imported and collected out of every later search for garbage."""
+    """Exclude imported modules and collected tests from later garbage collections."""
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""Notebooks are kept without outputs; ``make docs`` executes each and fails if one does."""
+"""Notebooks are stored without outputs; ``make docs`` executes each and fails if one fails."""
 
 import ast
 import json
@@ -9,7 +9,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 SELF_CONTAINED = {"variable_recruitment"}
-"""Of what is not part of the toolkit: they need nothing of it."""
+"""Notebooks that do not use the toolkit."""
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 
@@ -18,19 +18,19 @@ def _cells(path: Path) -> list[dict[str, Any]]:
     return cells
 
 
-def test_there_are_notebooks() -> None:
+def test_notebooks_are_found() -> None:
     assert NOTEBOOKS
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_is_kept_without_outputs(path: Path) -> None:
+def test_notebook_is_stored_without_outputs(path: Path) -> None:
     code = [cell for cell in _cells(path) if cell["cell_type"] == "code"]
 
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in code)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_uses_the_public_interface_alone(path: Path) -> None:
+def test_notebook_uses_public_interface_only(path: Path) -> None:
     sources = ["".join(cell["source"]) for cell in _cells(path) if cell["cell_type"] == "code"]
     modules = [
         name

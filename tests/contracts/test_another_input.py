@@ -32,7 +32,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     ),
     "simulate": ("A -o {out} --width 64", "--overwrite", "--seed 3"),
 }
-"""Arguments, the flag that goes on or replaces, and what makes it another."""
+"""Arguments, the flag that resumes or overwrites, and an option that changes the input."""
 WRITERS = (
     "crosscue.detectors.networks.road.checkpoint.save_road",
     "crosscue.detectors.training.job.save_checkpoint",
@@ -59,8 +59,8 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def _begun(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A training whose state is kept since its result could not be written, or a drive."""
+def _prepare(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Leave an interrupted training or a finished drive in ``out``, and return the command."""
     argv = [*name.split(), *COMMANDS[name][0].format(folder=folder, out=out).split()]
     if name == "simulate":
         drive = out / "A-01"
@@ -83,14 +83,14 @@ def _begun(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_other_settings_are_refused_and_nothing_is_touched(
+def test_changed_settings_are_refused_and_files_are_unchanged(
     name: str,
     folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    argv = _begun(name, folder, tmp_path / "out", monkeypatch)
+    argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
     _, flag, other = COMMANDS[name]
     before = tree(tmp_path)
     capsys.readouterr()
@@ -105,14 +105,14 @@ def test_other_settings_are_refused_and_nothing_is_touched(
 
 
 @pytest.mark.parametrize("name", ["train road", "train mask-rcnn"])
-def test_other_pictures_are_refused_with_both_identities(
+def test_changed_pictures_are_refused_with_both_identities(
     name: str,
     folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    argv = _begun(name, folder, tmp_path / "out", monkeypatch)
+    argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
     (folder / "images" / "1.png").write_bytes(picture(7, width=128, height=80))
     before = tree(tmp_path)
     capsys.readouterr()
@@ -126,16 +126,16 @@ def test_other_pictures_are_refused_with_both_identities(
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_very_same_goes_on(
+def test_unchanged_inputs_are_accepted(
     name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shorten(monkeypatch)
-    argv = _begun(name, folder, tmp_path / "out", monkeypatch)
+    argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
 
     assert cli.run([*argv, COMMANDS[name][1]]) == 0
 
 
-def test_a_finished_training_is_not_begun_anew_by_resume(
+def test_resume_refuses_finished_training(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "net.safetensors"
@@ -147,7 +147,7 @@ def test_a_finished_training_is_not_begun_anew_by_resume(
     assert out.read_bytes() == b"weights"
 
 
-def test_a_drive_of_which_nothing_says_what_it_is_is_not_overwritten(
+def test_drive_without_recorded_inputs_is_not_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "A-01").mkdir()

@@ -1,7 +1,7 @@
-"""Every argument and option that names an input file answers alike when there is no such file.
+"""Every argument and option that names an input file is tested with missing and unusable files.
 
-Nor where it is empty, noise, a folder or other text: 4 for input, 2 for settings; one line that
-names it, no result, nothing left.
+For a missing or empty file, noise, a folder or other text, the exit status is 4 for input and 2 for
+settings. One line names the file, and no file is written.
 """
 
 from __future__ import annotations
@@ -170,22 +170,22 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
         SETTINGS,
     ),
 }
-"""Arguments in which ``{gone}`` is the file, and what it is."""
-NAMED_IN_THE_VEHICLE_FILE: Final[dict[str, str]] = {
-    "decode": "{log} -o {out} --vehicle {strange}",
-    "replay": "{log} -o {out} --vehicle {strange} --no-cache",
-    "estimate": "{run} --vehicle {strange}",
-    "info": "{log} --vehicle {strange}",
+"""Command lines in which ``{gone}`` is the file, and the expected exit status."""
+READS_DBC_FILES: Final[dict[str, str]] = {
+    "decode": "{log} -o {out} --vehicle {vehicle}",
+    "replay": "{log} -o {out} --vehicle {vehicle} --no-cache",
+    "estimate": "{run} --vehicle {vehicle}",
+    "info": "{log} --vehicle {vehicle}",
 }
 """Commands that read the DBC files of a vehicle file."""
 WRITTEN: Final = {"--output", "--junit", "--cache", "--figure", "--sheet"}
-"""Options whose file is made if it is missing."""
+"""Options whose file is created if it is missing."""
 NO_FILES: Final = {"LAYOUT", "SQL"}
 """Arguments that are not files."""
 ANY_BYTES: Final = {"seal", "model fetch", "completion"}
-"""Their arguments are not files that could be of another kind."""
-MADE: Final = {("landmarks add", "DB")}
-"""Made where it is missing or empty."""
+"""Commands whose arguments accept any file, or no file."""
+CREATED_IF_MISSING: Final = {("landmarks add", "DB")}
+"""Arguments whose file is created if it is missing or empty."""
 FOLDERS: Final = {
     ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"),
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
@@ -194,7 +194,7 @@ FOLDERS: Final = {
     ("failures", "RUN"), ("browse", "RUN"), ("browse", "--logs"), ("export", "--logs"),
     ("truth import", "--export"), ("truth import", "ANNOTATIONS"),
 }  # fmt: skip
-"""An empty folder in their place lacks a file, which is another error."""
+"""Arguments that accept a folder; an empty folder is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
     "missing": lambda path: None,
     "empty": lambda path: path.write_bytes(b""),
@@ -205,7 +205,7 @@ DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
 
 
 def _named_files() -> set[tuple[str, str]]:
-    """Arguments, options whose value is a path and that are not an output, and networks' names."""
+    """Return all arguments, and options whose value is an input path or a network."""
     found = set()
     for name in cli.COMMANDS:
         _, parser = cli.parser_of(name)
@@ -217,14 +217,14 @@ def _named_files() -> set[tuple[str, str]]:
     return {(name, option) for name, option in found if option not in {*WRITTEN, *NO_FILES}}
 
 
-def test_the_table_is_whole() -> None:
+def test_table_contains_every_file_argument_and_option() -> None:
     detectors = {("detect", "--detectors"), ("replay", "--detectors")}
     assert CASES.keys() - detectors == _named_files()
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Sound inputs of every kind."""
+    """Valid inputs of every kind."""
     folder = tmp_path_factory.mktemp("inputs")
     drive, photos = folder / "drive", folder / "photos"
     log = write_drive(drive, Clock(), seconds=4)
@@ -278,7 +278,7 @@ def _coco() -> str:
 
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("case", CASES, ids=" ".join)
-def test_a_file_that_an_option_names(
+def test_unusable_input_file_is_refused_in_one_line(
     case: tuple[str, str],
     damage: str,
     names: dict[str, Path],
@@ -286,24 +286,24 @@ def test_a_file_that_an_option_names(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # Weights that the user fetched before would be taken, and the file not examined.
+    # Otherwise weights that the user has fetched would be used instead of the file.
     monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
-    command, (line, wanted) = case[0], CASES[case]
+    command, (line, expected) = case[0], CASES[case]
     DAMAGE[damage](tmp_path / ("gone" + line.partition("{gone}")[2].partition(" ")[0]))
     if damage == "a folder" and case in FOLDERS:
-        pytest.skip("a folder is what is wanted; that it lacks files is another error")
-    if case in MADE and damage in ("missing", "empty"):
-        pytest.skip("made where it is missing")
+        pytest.skip("expects a folder; an empty one is another error")
+    if case in CREATED_IF_MISSING and damage in ("missing", "empty"):
+        pytest.skip("created if missing")
     if case[1] == "--class-names" and damage == "text":
-        pytest.skip("text is what is wanted")
+        pytest.skip("expects text")
     argv = line.format(**names, gone=tmp_path / "gone", out=tmp_path / "out").split()
 
-    _is_refused([*command.split(), *argv], wanted, "gone", names, tmp_path, capsys)
+    _assert_refused([*command.split(), *argv], expected, "gone", names, tmp_path, capsys)
 
 
-def _is_refused(
+def _assert_refused(
     argv: list[str],
-    wanted: int,
+    expected: int,
     named: str,
     names: dict[str, Path],
     out: Path,
@@ -315,7 +315,7 @@ def _is_refused(
     status = cli.run(argv)
 
     captured = capsys.readouterr()
-    assert status == wanted, captured.err
+    assert status == expected, captured.err
     assert captured.out == ""
     assert captured.err.startswith("crosscue: ")
     assert captured.err.count("\n") == 1
@@ -326,8 +326,8 @@ def _is_refused(
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-@pytest.mark.parametrize("command", NAMED_IN_THE_VEHICLE_FILE)
-def test_a_database_that_the_vehicle_file_names(
+@pytest.mark.parametrize("command", READS_DBC_FILES)
+def test_unusable_dbc_file_of_vehicle_file_is_refused_in_one_line(
     command: str,
     damage: str,
     names: dict[str, Path],
@@ -335,9 +335,9 @@ def test_a_database_that_the_vehicle_file_names(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     DAMAGE[damage](tmp_path / "gone.dbc")
-    strange = tmp_path / "strange.toml"
-    strange.write_text(names["car"].read_text().replace("simulated_car.dbc", "gone.dbc"))
-    line = NAMED_IN_THE_VEHICLE_FILE[command]
-    argv = line.format(**names, strange=strange, out=tmp_path / "out").split()
+    vehicle = tmp_path / "strange.toml"
+    vehicle.write_text(names["car"].read_text().replace("simulated_car.dbc", "gone.dbc"))
+    line = READS_DBC_FILES[command]
+    argv = line.format(**names, vehicle=vehicle, out=tmp_path / "out").split()
 
-    _is_refused([command, *argv], INPUT, "gone.dbc", names, tmp_path, capsys)
+    _assert_refused([command, *argv], INPUT, "gone.dbc", names, tmp_path, capsys)

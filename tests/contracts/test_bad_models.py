@@ -1,4 +1,4 @@
-"""Networks, cards and labels that do not fit: one line, and nothing is left of the run."""
+"""Invalid networks, cards and labels are refused in one line, and no run folder remains."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BAD = {
 
 
 class Everything(BoxDetector):
-    """A detector with a label of its own, which sees the whole picture."""
+    """A detector with a custom label whose box covers the whole picture."""
 
     name, labels, view = "everything", ("whatever",), View(is_grey=True)
 
@@ -48,14 +48,14 @@ class Everything(BoxDetector):
 
 
 def card(folder: Path, model: bytes, classes: list[str], width_px: int = 64) -> str:
-    """A card for a network that is written beside it."""
+    """Write a network, and return the text of a card for it."""
     (folder / "net.onnx").write_bytes(model)
     text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
     text += f"[input]\nwidth_px = {width_px}\nheight_px = 32\n[output]\n"
     return text + OUTPUT.format(json.dumps(classes))
 
 
-def made_bad(folder: Path, bad: str) -> None:
+def write_invalid_model(folder: Path, bad: str) -> None:
     """Write ``net.toml`` with its network, and ``car.toml``."""
     rows = {"nan": np.full_like(ROWS, np.nan), "other-shape": ROWS[:, :, :5]}.get(bad, ROWS)
     classes = {"other-classes": ["dog"], "no-classes": []}.get(bad, ["dog", "cat"])
@@ -81,10 +81,10 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("command", ["replay", "detect"])
 @pytest.mark.parametrize("bad", BAD)
-def test_a_network_that_does_not_fit_stops_the_run_in_one_line(
+def test_invalid_network_is_refused_in_one_line(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], bad: str, command: str
 ) -> None:
-    made_bad(tmp_path, bad)
+    write_invalid_model(tmp_path, bad)
     out, net, car = tmp_path / "out", tmp_path / "net.toml", tmp_path / "car.toml"
     argv = [command, log, "--detectors", net, "--vehicle", car, "--no-cache", "-o", out]
 
@@ -99,7 +99,7 @@ def test_a_network_that_does_not_fit_stops_the_run_in_one_line(
     assert not out.exists()
 
 
-def test_a_detector_in_python_runs_before_a_cue_counts_its_label(log: Path, tmp_path: Path) -> None:
+def test_python_detector_with_uncounted_label_runs_with_notice(log: Path, tmp_path: Path) -> None:
     detectors, vehicle = [f"{__name__}:Everything.build"], crosscue.Vehicle(version=1)
 
     run = crosscue.detect_drive(log, tmp_path / "out", vehicle, detectors)
@@ -109,7 +109,7 @@ def test_a_detector_in_python_runs_before_a_cue_counts_its_label(log: Path, tmp_
     assert '[cues.own.NAME] labels = ["whatever"]' in str(run)
 
 
-def test_no_card_is_left_for_a_network_without_numbers(
+def test_model_init_writes_no_card_for_network_with_nan_output(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "names.txt").write_text("dog\ncat\n")
@@ -127,10 +127,10 @@ def test_no_card_is_left_for_a_network_without_numbers(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_labels_of_other_pictures_are_refused(
+def test_labels_of_other_pictures_are_refused_without_scores(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made_bad(tmp_path, "nothing")
+    write_invalid_model(tmp_path, "nothing")
     out, car = tmp_path / "out", tmp_path / "car.toml"
     argv = ["detect", log, "--detectors", tmp_path / "net.toml", "--vehicle", car, "--no-cache"]
     assert cli.run([*map(str, argv), "-o", str(out)]) == 0

@@ -1,4 +1,4 @@
-"""No command believes a size: every command that opens logs or pictures keeps the limits."""
+"""Declared sizes are limited in every command that opens logs, pictures or networks."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ OPENS_LOGS: dict[str, str] = {
     "browse": "{run} --truth {truth} --any-log -o {out}",
     "export": "{failures} -o {out}",
 }
-"""Arguments with which a command reads every chunk of a log."""
+"""Arguments with which each command reads every chunk of a log."""
 REPORTS_THE_RUN = {"score", "score detector", "fit detector", "browse", "export"}
-"""They read single pictures or none, and report what was dropped as the run does."""
-OPENS_NONE: dict[str, str] = {
+"""Commands that read few pictures or none, and report only the messages that the run dropped."""
+OPENS_NO_LOG: dict[str, str] = {
     "compare": "tables", "query": "tables", "tag": "texts", "merge": "tables",
     "status": "the journal", "failures": "tables",
     "fit ranges": "tables", "fit messages": "tables", "fit temporal": "tables",
@@ -80,7 +80,7 @@ OPENS_NONE: dict[str, str] = {
 
 @pytest.fixture
 def names(tmp_path: Path) -> dict[str, Path]:
-    """A drive whose last chunk is a bomb, its run, and what else commands want."""
+    """A drive whose last chunk is a decompression bomb, its run, and other inputs of commands."""
     drive = tmp_path / "drive"
     log = write_drive(drive, Clock(), seconds=4)
     with_bomb(log)
@@ -116,7 +116,7 @@ def _words(flags: str, names: dict[str, Path]) -> list[str]:
 
 
 def with_bomb(log: Path) -> None:
-    """Put a chunk that declares more than the limit where the recording's data end."""
+    """Insert a chunk that declares more than the limit at the end of the recording's data."""
     coded, at = log.read_bytes(), len(MAGIC)
     while coded[at] != 0x0F:
         at += 9 + int(struct.unpack_from("<Q", coded, at + 1)[0])
@@ -125,13 +125,13 @@ def with_bomb(log: Path) -> None:
     log.write_bytes(coded[:at] + record(6, head + body))
 
 
-def test_every_command_is_in_one_of_the_tables() -> None:
-    assert not OPENS_LOGS.keys() & OPENS_NONE.keys()
-    assert OPENS_LOGS.keys() | OPENS_NONE.keys() == cli.COMMANDS.keys()
+def test_every_command_is_classified_by_whether_it_opens_logs() -> None:
+    assert not OPENS_LOGS.keys() & OPENS_NO_LOG.keys()
+    assert OPENS_LOGS.keys() | OPENS_NO_LOG.keys() == cli.COMMANDS.keys()
 
 
 @pytest.mark.parametrize("command", sorted(OPENS_LOGS))
-def test_max_chunk_reaches_every_command_that_opens_a_log(
+def test_max_chunk_option_limits_every_command_that_opens_log(
     command: str, names: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = _words(OPENS_LOGS[command], names)
@@ -141,8 +141,8 @@ def test_max_chunk_reaches_every_command_that_opens_a_log(
     said = " ".join("".join(capsys.readouterr()).split())
     assert status in (1, 3, 4), said
     if command not in REPORTS_THE_RUN:
-        wanted = rf"declares \d{{7}} bytes, the limit is {LIMIT_MIB * MIB} \(--max-chunk\)"
-        assert re.search(wanted, said), said
+        expected = rf"declares \d{{7}} bytes, the limit is {LIMIT_MIB * MIB} \(--max-chunk\)"
+        assert re.search(expected, said), said
 
 
 def _png() -> bytes:
@@ -220,7 +220,7 @@ READS_CAMERA: dict[str, str] = {
 
 @pytest.mark.parametrize("holder", HOLDERS)
 @pytest.mark.parametrize("command", READS_CAMERA)
-def test_a_camera_picture_that_declares_too_much_is_named_with_both_numbers(
+def test_oversized_camera_picture_is_reported_with_size_and_limit(
     command: str, holder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drive = tmp_path / "drive"
@@ -242,10 +242,10 @@ def test_a_camera_picture_that_declares_too_much_is_named_with_both_numbers(
 
     status = cli.run([*command.split(), *_words(READS_CAMERA[command], names)])
 
-    _names_both(status, capsys)
+    _assert_reports_size_and_limit(status, capsys)
 
 
-def _names_both(status: int, capsys: pytest.CaptureFixture[str]) -> None:
+def _assert_reports_size_and_limit(status: int, capsys: pytest.CaptureFixture[str]) -> None:
     said = " ".join("".join(capsys.readouterr()).split())
     assert status in (1, 3, 4), said
     assert f"{SIDE_PX} x {SIDE_PX}" in said
@@ -268,7 +268,7 @@ READS_FILES: dict[str, str] = {
 
 @pytest.mark.parametrize("coded", CODED)
 @pytest.mark.parametrize("command", READS_FILES)
-def test_a_picture_file_that_declares_too_much_is_unreadable(
+def test_oversized_picture_file_is_refused_with_status_4(
     command: str, coded: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "photos"
@@ -295,24 +295,24 @@ def test_a_picture_file_that_declares_too_much_is_unreadable(
     status = cli.run([*command.split(), *_words(READS_FILES[command], names)])
 
     assert status == 4
-    _names_both(status, capsys)
+    _assert_reports_size_and_limit(status, capsys)
     assert not (folder / "new.toml").exists()
 
 
 SIZES: dict[str, tuple[tuple[int | str, ...], dict[str, str], str]] = {
-    "a picture as large as its metadata says": (
+    "size from metadata": (
         (1, 3, "h", "w"),
         {"imgsz": "[200000, 200000]"},
         "120,000,000,000 numbers, the limit is 201,326,592",
     ),
-    "a batch": ((100_000, 3, 640, 640), {}, "122,880,000,000 numbers, the limit is 201,326,592"),
-    "a side": ((1, 3, 200_000, 200_000), {}, "120,000,000,000 numbers, the limit is 201,326,592"),
+    "batch": ((100_000, 3, 640, 640), {}, "122,880,000,000 numbers, the limit is 201,326,592"),
+    "side": ((1, 3, 200_000, 200_000), {}, "120,000,000,000 numbers, the limit is 201,326,592"),
 }
-"""Declared input, metadata, and what is said of it."""
+"""Declared input shape, metadata, and the expected message."""
 
 
 @pytest.mark.parametrize("case", SIZES)
-def test_a_network_that_declares_too_large_an_input_is_not_run(
+def test_network_with_oversized_input_is_refused(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shape, metadata, said = SIZES[case]
@@ -326,7 +326,7 @@ def test_a_network_that_declares_too_large_an_input_is_not_run(
 
 
 @pytest.mark.parametrize("shape", [(1 << 40,), (1 << 31, 1 << 31), (1 << 62, 4)])
-def test_an_array_is_as_long_as_its_file_whatever_it_declares(
+def test_array_header_exceeding_file_is_reported(
     shape: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT["comma2k19"](tmp_path)
@@ -345,7 +345,7 @@ def test_an_array_is_as_long_as_its_file_whatever_it_declares(
 
 
 def _coco(images: list[tuple[str, int]], size: tuple[int, int]) -> str:
-    """Pictures at their times, a stop sign in the first."""
+    """Return COCO annotations of pictures at given times, with a stop sign in each."""
     return json.dumps(
         {
             "categories": [{"id": 1, "name": "stop sign"}],
@@ -368,7 +368,7 @@ def _coco(images: list[tuple[str, int]], size: tuple[int, int]) -> str:
 
 
 def _annotate(drive: Path, start_ns: int) -> None:
-    """The truth of four pictures, a tenth of a second apart."""
+    """Write the truth of four pictures, a tenth of a second apart."""
     t_ns = start_ns + np.arange(4) * 100_000_000
     times = t_ns.tolist()
     (drive / "objects.json").write_text(_coco([(f"{t}.png", t) for t in times], (24, 16)))

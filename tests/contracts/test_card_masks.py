@@ -1,4 +1,4 @@
-"""Masks of a model card reach eq. 13, 15 and 16; parked cars need them."""
+"""Masks of a network with a model card are used in eq. 13, 15 and 16."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from support.onnx_models import constant_model
 from support.pictures import picture_folder
 
 WIDTH, HEIGHT = 64, 32
-"""Of the network's input; pictures of 24 x 16 pixels are stretched to it."""
+"""Size of the network's input; pictures of 24 x 16 pixels are stretched to it."""
 BOX = np.array([8.0, 12.0, 56.0, 24.0])
-"""Of one car, four times as long as high there and three times in the picture."""
+"""Box of one car: four times as long as high in the input, and three times in the picture."""
 VEHICLE = """version = 1
 [cars]
 kind = "pairs"
@@ -32,7 +32,7 @@ right = [[0.75, 0.0], [1.0, 0.0], [1.0, 1.0], [0.75, 1.0]]
 
 
 def prototypes(nose: str) -> NDArray[np.float32]:
-    """32 masks at a quarter of the input's size; the first is a car with the lower end there."""
+    """32 masks at a quarter of the input's size; the first is a car with its nose at ``nose``."""
     masks = np.full((1, 32, HEIGHT // 4, WIDTH // 4), -9.0, np.float32)
     masks[0, 0, 3:6, 2:14] = 9.0
     masks[0, 0, 3:5, 9:14] = -9.0
@@ -42,7 +42,7 @@ def prototypes(nose: str) -> NDArray[np.float32]:
 
 
 def seg(nose: str) -> tuple[str, dict[str, NDArray[np.generic]]]:
-    """Ultralytics ``-seg``."""
+    """Outputs of an Ultralytics ``-seg`` network."""
     columns = np.zeros((1, 4 + 1 + 32, 50), np.float32)
     x0, y0, x1, y1 = BOX
     columns[0, :6, 30] = [(x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0, 0.99, 1.0]
@@ -51,7 +51,7 @@ def seg(nose: str) -> tuple[str, dict[str, NDArray[np.generic]]]:
 
 
 def end_to_end(nose: str) -> tuple[str, dict[str, NDArray[np.generic]]]:
-    """The same with suppression inside."""
+    """Outputs of a network with built-in suppression."""
     rows = np.zeros((1, 5, 6 + 32), np.float32)
     rows[0, 0, :7] = [*BOX, 0.99, 0.0, 1.0]
     output = 'kind = "end-to-end"\nname = "output0"\nprototypes = "output1"\n'
@@ -59,7 +59,7 @@ def end_to_end(nose: str) -> tuple[str, dict[str, NDArray[np.generic]]]:
 
 
 def torchvision(nose: str) -> tuple[str, dict[str, NDArray[np.generic]]]:
-    """Masks of a Mask R-CNN of torchvision, over the whole input."""
+    """Outputs of a Mask R-CNN of torchvision, whose masks cover the whole input."""
     mask = (prototypes(nose)[0, :1] > 0).repeat(4, axis=1).repeat(4, axis=2).astype(np.float32)
     return 'kind = "torchvision"\nmasks = "masks"\n', {
         "boxes": BOX[None].astype(np.float32),
@@ -73,15 +73,15 @@ LAYOUTS = {"yolov8-seg": seg, "end-to-end": end_to_end, "torchvision": torchvisi
 
 
 def boxes_only() -> tuple[str, dict[str, NDArray[np.generic]]]:
-    """The car without its mask."""
+    """The same outputs without masks."""
     output, found = torchvision("left")
     return output.replace('masks = "masks"\n', ""), {k: v for k, v in found.items() if k != "masks"}
 
 
-def replayed(
+def replay_constant_network(
     folder: Path, output: str, classes: list[str], outputs: Mapping[str, NDArray[np.generic]]
 ) -> Path:
-    """Three pictures, replayed with a network that finds the same in each."""
+    """Replay three pictures with a network that returns the same outputs for each."""
     model = constant_model((1, 3, HEIGHT, WIDTH), outputs)
     (folder / "net.onnx").write_bytes(model)
     (folder / "net.toml").write_text(
@@ -97,7 +97,7 @@ def replayed(
 
 
 def positive(out: Path) -> dict[str, int]:
-    """Frames in which each cue was positive."""
+    """Return the number of positive frames of each cue."""
     counts: dict[str, int] = {}
     for row in open_run(out).table("cues").to_pylist():
         counts[row["cue"]] = counts.get(row["cue"], 0) + (row["count"] > 0)
@@ -114,10 +114,10 @@ def detector_of(out: Path) -> DetectorRow:
 
 @pytest.mark.parametrize("nose", ["left", "right"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_mask_shows_which_way_a_parked_car_faces(tmp_path: Path, layout: str, nose: str) -> None:
+def test_mask_shows_orientation_of_parked_car(tmp_path: Path, layout: str, nose: str) -> None:
     output, outputs = LAYOUTS[layout](nose)
 
-    out = replayed(tmp_path, output, ["car"], outputs)
+    out = replay_constant_network(tmp_path, output, ["car"], outputs)
 
     found = positive(out)
     other = "right" if nose == "left" else "left"
@@ -126,8 +126,8 @@ def test_a_mask_shows_which_way_a_parked_car_faces(tmp_path: Path, layout: str, 
     assert (detector.with_mask, detector.boxes_only) == (("car",), ())
 
 
-def test_without_masks_parked_cars_are_not_looked_for(tmp_path: Path) -> None:
-    out = replayed(tmp_path, boxes_only()[0], ["car"], boxes_only()[1])
+def test_parked_cars_are_not_evaluated_without_masks(tmp_path: Path) -> None:
+    out = replay_constant_network(tmp_path, boxes_only()[0], ["car"], boxes_only()[1])
 
     found = positive(out)
     assert "parked_left" not in found
@@ -140,14 +140,14 @@ def test_without_masks_parked_cars_are_not_looked_for(tmp_path: Path) -> None:
     assert (detector.with_mask, detector.boxes_only) == ((), ("car",))
 
 
-def test_a_card_of_road_feeds_eq_13(tmp_path: Path) -> None:
-    """Road in the left quarter alone."""
+def test_road_segmentation_card_yields_road_cue_on_its_side_only(tmp_path: Path) -> None:
+    """The network reports road in the left quarter of the picture."""
     scores = np.zeros((1, 2, HEIGHT // 4, WIDTH // 4), np.float32)
     scores[0, 1, :, : WIDTH // 16] = 1.0
     scores[0, 0] = 0.5
 
     output = 'kind = "segmentation"\nroad = ["road"]\n'
-    out = replayed(tmp_path, output, ["other", "road"], {"map": scores})
+    out = replay_constant_network(tmp_path, output, ["other", "road"], {"map": scores})
 
     (row, *_) = open_run(out).table("road").to_pylist()
     assert [row[f"fraction_{side}"] for side in ("left", "straight", "right")] == [1.0, 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""Laws of every command of the table: help, wrong usage, missing input, pipes, JSON."""
+"""Behaviour common to all commands: help, wrong usage, missing input, pipes and JSON."""
 
 import argparse
 import os
@@ -15,9 +15,9 @@ from crosscue.eval import cli
 from crosscue.replay.base import one_line
 
 INPUT: Final = 4
-"""Input that cannot be read: a recording, run, database, picture or annotations."""
+"""Exit status for an unreadable recording, run, database, picture or annotation file."""
 SETTINGS: Final = 2
-"""A file of settings."""
+"""Exit status for an unreadable file of settings."""
 
 MISSING: Final[dict[str, tuple[str, int]]] = {
     "info": ("gone.mcap", INPUT),
@@ -92,7 +92,7 @@ NAMED_BY_COMMAND: Final = {
     "--test",
     "--to",
 }
-"""Options whose value is a file, folder or name of the command's own kind."""
+"""Options whose value has a different kind in each command."""
 
 STREAMS: Final = {
     "reader gone": "| true",
@@ -122,23 +122,19 @@ OPTIONS: Final = sorted(
 )
 
 
-def test_the_table_of_this_test_is_whole() -> None:
+def test_every_command_has_missing_input_case_or_reads_nothing() -> None:
     assert MISSING.keys() | READS_NOTHING == cli.COMMANDS.keys()
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_help_has_an_example_of_the_command_itself(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_contains_example_of_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run([*name.split(), "--help"]) == 0
     said = capsys.readouterr().out
     assert f"\n  crosscue {name}" in said.partition("example")[2]
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_every_example_is_one_that_the_command_understands(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_examples_in_help_can_be_parsed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     cli.run([*name.split(), "--help"])
     examples = capsys.readouterr().out.replace("\\\n", " ").partition("example")[2]
 
@@ -152,15 +148,15 @@ def test_every_example_is_one_that_the_command_understands(
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_an_unknown_option_is_wrong_usage_in_one_line(
+def test_unknown_option_is_refused_in_one_line(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run([*name.split(), "--surely-unknown"]) == 2
-    _is_one_line(capsys.readouterr().err)
+    _assert_one_line(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("name", sorted(MISSING))
-def test_missing_input_is_one_line_and_leaves_nothing(
+def test_missing_input_is_reported_in_one_line_and_writes_nothing(
     name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -169,13 +165,13 @@ def test_missing_input_is_one_line_and_leaves_nothing(
     assert cli.run([*name.split(), *text.split()]) == status
     captured = capsys.readouterr()
     assert captured.out == ""
-    _is_one_line(captured.err)
+    _assert_one_line(captured.err)
     assert "gone" in captured.err
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS.keys() - ALWAYS_JSON - PRINTS_NO_RESULT))
-def test_results_can_be_had_as_json(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_with_result_has_json_option(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     cli.run([*name.split(), "--help"])
     assert "--json" in capsys.readouterr().out
 
@@ -185,7 +181,7 @@ def test_results_can_be_had_as_json(name: str, capsys: pytest.CaptureFixture[str
     ("command", "status"),
     [("--help", 0), ("info gone.mcap", 4), ("truth schema", 0), ("nosuch", 2)],
 )
-def test_no_stream_that_is_gone_or_full_brings_a_traceback(
+def test_closed_or_full_stream_causes_no_traceback(
     command: str, status: int, streams: str, tmp_path: Path
 ) -> None:
     line = (
@@ -204,7 +200,7 @@ def test_no_stream_that_is_gone_or_full_brings_a_traceback(
     assert "Exception ignored" not in done.stderr
     assert done.stderr.count("\n") <= 1
     found = (tmp_path / "status").read_text().split()[1]
-    # What could not be written is a failure; the same command may have been quicker than that.
+    # A failed write is status 1, unless the command ends before the reader does.
     failed = "1" if streams in ("reader gone", "reader stops", "stdout full") else str(status)
     assert found in {failed, str(status)}
     if streams == "stdout full" and status == 0:
@@ -212,20 +208,20 @@ def test_no_stream_that_is_gone_or_full_brings_a_traceback(
 
 
 @pytest.mark.parametrize(("name", "option"), OPTIONS)
-def test_a_misspelt_option_is_answered_with_the_nearest(
+def test_misspelt_option_is_refused_with_suggestion(
     name: str, option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     misspelt = option + "x"
 
-    # Also where a required argument is missing, or the misspelt option was one.
+    # Required arguments are missing, too: the misspelt option is reported first.
     assert cli.run([*name.split(), misspelt]) == 2
     said = capsys.readouterr().err
-    _is_one_line(said)
+    _assert_one_line(said)
     assert f"no option {misspelt}; did you mean {option}?" in said
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_a_misspelt_command_is_answered_with_the_nearest(
+def test_misspelt_command_is_refused_with_suggestion(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, _, second = name.partition(" ")
@@ -233,11 +229,11 @@ def test_a_misspelt_command_is_answered_with_the_nearest(
 
     assert cli.run(misspelt) == 2
     said = capsys.readouterr().err
-    _is_one_line(said)
+    _assert_one_line(said)
     assert f"did you mean {name!r}?" in said
 
 
-def test_the_first_word_alone_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_group_alone_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["fit"]) == 2
     assert "fit: needs one of: fit compass, fit odometry" in capsys.readouterr().err
     assert cli.run(["fit", "--help"]) == 0
@@ -245,7 +241,7 @@ def test_the_first_word_alone_lists_its_commands(capsys: pytest.CaptureFixture[s
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_every_argument_is_described_in_one_plain_phrase(name: str) -> None:
+def test_every_argument_has_one_line_help_and_metavar(name: str) -> None:
     for action in actions(name):
         where = f"{name} {'/'.join(action.option_strings) or action.dest}"
         assert action.help, where
@@ -257,7 +253,7 @@ def test_every_argument_is_described_in_one_plain_phrase(name: str) -> None:
         assert not takes_value or action.metavar, f"{where}: no metavar"
 
 
-def test_the_overview_describes_every_command_as_a_task() -> None:
+def test_command_overview_entries_are_short_and_start_with_verb() -> None:
     for name, (_, what) in cli.COMMANDS.items():
         assert what[0].islower(), name
         assert what[-1].isalnum(), name
@@ -266,11 +262,11 @@ def test_the_overview_describes_every_command_as_a_task() -> None:
         assert what.split()[0] not in {"a", "an", "the", "what", "how", "who", "any", "every"}, name
 
 
-def test_an_option_takes_the_same_kind_of_value_in_every_command() -> None:
+def test_option_has_same_kind_of_value_in_every_command() -> None:
     kinds: dict[str, dict[object, list[str]]] = {}
     for name, option in OPTIONS:
         if (name, option) == ("model fetch", "--from"):
-            continue  # A file to fetch from: a model has no times, so nobody can mistake it.
+            continue  # A source to fetch from; models have no times, so it cannot be mistaken.
         action = next(one for one in actions(name) if option in one.option_strings)
         kind = (type(action).__name__, action.type, str(action.metavar))
         if option in NAMED_BY_COMMAND:
@@ -280,7 +276,7 @@ def test_an_option_takes_the_same_kind_of_value_in_every_command() -> None:
     assert {option: list(of.values()) for option, of in kinds.items() if len(of) > 1} == {}
 
 
-def test_options_have_the_names_agreed_on() -> None:
+def test_options_follow_naming_conventions() -> None:
     options = {option for _, option in OPTIONS}
     assert not options & {"--jobs", "--threads-per-job", "--write", "--save", "--out", "--force"}
     for name in cli.COMMANDS:
@@ -325,7 +321,9 @@ def test_completion_scripts_are_printed(shell: str, capsys: pytest.CaptureFixtur
         ("crosscue info 'dri", {"drive.mcap"}),
     ],
 )
-def test_the_shell_is_offered_what_can_follow(line: str, offered: set[str], tmp_path: Path) -> None:
+def test_shell_completion_offers_valid_continuations(
+    line: str, offered: set[str], tmp_path: Path
+) -> None:
     (tmp_path / "drive.mcap").touch()
     out = tmp_path / "offered"
     environment = {
@@ -347,7 +345,7 @@ def test_the_shell_is_offered_what_can_follow(line: str, offered: set[str], tmp_
     assert found - {"--help", "--version", "offered"} == offered
 
 
-def _is_one_line(text: str) -> None:
+def _assert_one_line(text: str) -> None:
     assert text.startswith("crosscue: ")
     assert text == one_line(ValueError(text)) + "\n"
     assert "Traceback" not in text

@@ -1,4 +1,4 @@
-"""The worked examples of CONTRIBUTING.md, run as they are written there."""
+"""The worked examples of CONTRIBUTING.md run as printed."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ PAGE = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8
 
 
 def _code(title: str) -> list[str]:
-    """The Python of one example, block by block."""
+    """Return the Python code blocks of one example."""
     (part,) = re.findall(rf"^## Example: {title}\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE)
     return re.findall(r"```python\n(.*?)```", part, re.DOTALL)
 
 
 def _row(code: str, **names: object) -> Any:
-    """A row of a table: what stands behind the key and before the comma."""
+    """Evaluate a row of a table without its trailing comma."""
     code = dedent(code).strip().removesuffix(",")
     return eval("{" + code + "}" if code.startswith('"') else code, names)
 
 
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], str]:
-    """Writes a module that can be imported, and returns its name."""
+    """Return a function that writes an importable module and returns its name."""
 
     def write(name: str, code: str) -> str:
         (tmp_path / f"{name}.py").write_text(code)
@@ -45,7 +45,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, st
     return write
 
 
-def test_the_cue(module: Callable[[str, str], str]) -> None:
+def test_cue_example_fulfils_contract(module: Callable[[str, str], str]) -> None:
     rule, row = _code("a cue")
     cue: CueSpec = _row(
         row.replace("crosscue.detectors.cues.pedestrians", module("example_cue", rule)),
@@ -56,7 +56,7 @@ def test_the_cue(module: Callable[[str, str], str]) -> None:
     check_cue(cue)
 
 
-def test_the_reader(
+def test_reader_example_fulfils_contract(
     module: Callable[[str, str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reader, row, small_log, damage = _code("a reader")
@@ -71,7 +71,7 @@ def test_the_reader(
     check_reader(write(tmp_path), damage_one)
 
 
-def test_the_detector(module: Callable[[str, str], str]) -> None:
+def test_detector_example_fulfils_contract(module: Callable[[str, str], str]) -> None:
     (code,) = _code("a detector")
     place = f"{module('example_detector', code)}:Lamp.build"
 

@@ -58,13 +58,13 @@ DUMMY = CueSpec(
 
 
 def count_zebras(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
-    """The one function of the dummy cue: twice as many as there are."""
+    """Return twice the number of zebra crossings: the only function of the dummy cue."""
     assert vehicle.version == 1
     return 2 * sum(found.labels.count(cue.label or "") for found in boxes)
 
 
 @pytest.mark.parametrize("cue", CUES.values(), ids=lambda cue: str(cue.name))
-def test_every_cue_has_a_rule_a_simulator_and_a_claim(cue: CueSpec) -> None:
+def test_every_cue_has_rule_simulator_and_claim(cue: CueSpec) -> None:
     assert CUES[cue.name] is cue
     assert callable(rule_of(cue.rule))
     assert callable(SIMULATED[cue.name])
@@ -73,7 +73,7 @@ def test_every_cue_has_a_rule_a_simulator_and_a_claim(cue: CueSpec) -> None:
 
 
 @pytest.mark.parametrize("cue", CUES.values(), ids=lambda cue: str(cue.name))
-def test_every_cue_keeps_the_contract(cue: CueSpec) -> None:
+def test_every_cue_fulfils_contract(cue: CueSpec) -> None:
     check_cue(cue)
 
 
@@ -89,39 +89,39 @@ def test_every_cue_keeps_the_contract(cue: CueSpec) -> None:
         ({"rule": f"{__name__}:a_fraction"}, "expected a count"),
     ],
 )
-def test_a_cue_that_breaks_the_contract_is_reported(changes: dict[str, Any], match: str) -> None:
+def test_contract_check_reports_invalid_cue(changes: dict[str, Any], match: str) -> None:
     with pytest.raises(AssertionError, match=match):
         check_cue(replace(DUMMY, **changes))
 
 
 def always(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
-    """A rule that finds its cue where nothing is."""
+    """Return 1 for an empty picture, which violates the contract."""
     return 1
 
 
 def a_fraction(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> float:
-    """A rule that counts no whole number."""
+    """Return a count that is not an integer, which violates the contract."""
     return 0.5
 
 
-def test_a_cue_that_names_no_label_may_count_any(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So no detector can be said to be useless to it."""
+def test_cue_without_label_counts_any_label(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With such a cue, no detector is reported as unused."""
     assert not Vehicle(version=1).counts_any_label
     monkeypatch.setitem(CUES, DUMMY.name, replace(DUMMY, label=None))
     assert Vehicle(version=1).counts_any_label
 
 
-def test_cues_of_a_group_share_its_row_of_table_5() -> None:
+def test_cues_of_group_have_same_row_of_table_5() -> None:
     for group in groups().values():
         assert len({(cue.title, cue.precision, cue.scored_as) for cue in group}) == 1
 
 
-def test_no_simulator_function_is_left_of_a_cue_that_is_gone() -> None:
+def test_simulator_has_functions_of_existing_cues_only() -> None:
     assert [*SIMULATED] == [*CUES]
 
 
-class SeesZebras(GreyNumber):
-    """A zebra crossing beside the drive's stop sign, whose range makes an approach."""
+class ZebraDetector(GreyNumber):
+    """A detector that adds a zebra crossing next to the drive's stop sign."""
 
     def _one(self, frame: Frame) -> Found:
         found = super()._one(frame)
@@ -137,7 +137,7 @@ class SeesZebras(GreyNumber):
         )
 
 
-def test_a_dummy_cue_goes_from_pixels_to_tables_scores_report_and_recording(
+def test_dummy_cue_appears_in_tables_scores_report_and_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(CUES, DUMMY.name, DUMMY)
@@ -148,14 +148,14 @@ def test_a_dummy_cue_goes_from_pixels_to_tables_scores_report_and_recording(
     (tmp_path / "truth.json").write_text(stated.replace('"cue": "stop_sign"', '"cue": "zebra"'))
 
     run = crosscue.replay_drive(
-        log, tmp_path / "run", tmp_path / "car.toml", [f"{__name__}:SeesZebras"]
+        log, tmp_path / "run", tmp_path / "car.toml", [f"{__name__}:ZebraDetector"]
     )
     scored = crosscue.score_run(run, tmp_path / "truth.json", has_figures=False)
     recording = crosscue.save_recording(run, tmp_path / "zebra.rrd")
 
     rows = run["cues"].filter(pc.equal(run["cues"]["cue"], "zebra")).to_pylist()
     counts = [row["count"] for row in rows if row["count"]]
-    assert counts == [2] * 34  # the last of them where the truth ends
+    assert counts == [2] * 34  # the last of them is after the end of the truth
     assert run.belief["straight"].to_pylist()[-1] > 0.6
     (score,) = [row for row in scored.cues.to_pylist() if row["cue"] == "zebra"]
     assert (score["precision"], score["precision_of"]) == (1.0, 33)
@@ -164,7 +164,7 @@ def test_a_dummy_cue_goes_from_pixels_to_tables_scores_report_and_recording(
 
 
 def _static(recording: Path, entity: str, component: str) -> list[object]:
-    """Static components of an entity in a recording."""
+    """Return the static components of an entity in a recording."""
     batches = [
         chunk.to_record_batch()
         for chunk in RrdReader(recording).stream()
@@ -179,12 +179,12 @@ def _static(recording: Path, entity: str, component: str) -> list[object]:
     ]
 
 
-def test_a_dummy_cue_is_one_row_and_one_function(
+def test_dummy_cue_requires_only_one_row_and_one_function(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(CUES, DUMMY.name, DUMMY)
 
-    # Detected by its own rule, and believed with its own strength.
+    # It is detected by its rule and fused with its precision.
     boxes = Detections(
         t_ns=0,
         size_px=(64, 48),
@@ -198,7 +198,7 @@ def test_a_dummy_cue_is_one_row_and_one_function(
     schema = json_schema()
     assert "zebra" in schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]
 
-    # Scored as its row says, reported with its published precision, drawn in its colour.
+    # It is scored as its row states, reported with its published precision, drawn in its colour.
     found = {"frames": frame_table(40), "cues": cue_table({"zebra": {5: 1, 6: 0}})}
     run = run_folder(tmp_path / "run", found)
     reported = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])

@@ -1,4 +1,4 @@
-"""Every format cut in the middle: what is left is used and 3 returned, or nothing is and 4."""
+"""Truncated logs of every format: readable rows are used with exit status 3, or it is 4."""
 
 from pathlib import Path
 
@@ -14,14 +14,14 @@ from support.accounted import read
 from support.every_format import EVERY_FORMAT
 
 INDEX_AT_THE_END = {"mf4", "video"}
-"""Files whose writer puts at their end what is needed to read any of it, if it gets there."""
+"""Formats with an index at the end of the file, without which no row can be read."""
 TIME_FILES = {
     "kitti-raw": ("oxts/timestamps.txt", "image_02/timestamps.txt"),
     "comma2k19": ("processed_log/IMU/gyro/t", "processed_log/IMU/gyro/value"),
     "video": ("front.txt",),
     "images": ("timestamps.txt",),
 }
-"""Formats that keep the times of their rows in a file of their own, and these files."""
+"""Formats with separate files for the times of rows, and these files."""
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +31,16 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
     return write_drive(folder, DriveSettings(seed=3, blocks=1, block_m=60.0))
 
 
-def test_every_format_is_here() -> None:
+def test_every_format_has_sample_log() -> None:
     assert EVERY_FORMAT.keys() == FORMATS.keys()
 
 
 BODY_UNSEEN = {"images": "pictures are not opened"}
-"""Formats whose cut ``info --quick`` cannot see, and why."""
+"""Formats whose truncation ``info --quick`` cannot detect, and why."""
 
 
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
-def test_a_quick_look_at_a_cut_log_says_so(
+def test_quick_info_reports_truncated_log(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT[name](tmp_path)
@@ -65,7 +65,7 @@ def test_a_quick_look_at_a_cut_log_says_so(
 
 
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
-def test_a_quick_look_never_reports_what_reading_does_not(name: str, tmp_path: Path) -> None:
+def test_quick_info_reports_no_loss_that_reading_does_not(name: str, tmp_path: Path) -> None:
     log = EVERY_FORMAT[name](tmp_path)
     files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
     largest = max(files, key=lambda path: path.stat().st_size)
@@ -84,7 +84,7 @@ def test_a_quick_look_never_reports_what_reading_does_not(name: str, tmp_path: P
 
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
 @pytest.mark.parametrize("command", ["info", "convert"])
-def test_a_log_cut_in_the_middle(
+def test_truncated_log_is_read_in_part_or_refused(
     name: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT[name](tmp_path)
@@ -115,7 +115,7 @@ def _times(log: Path) -> tuple[dict[str, set[int]], Ledger]:
 @pytest.mark.parametrize(
     ("name", "file"), [(name, file) for name in TIME_FILES for file in TIME_FILES[name]]
 )
-def test_rows_whose_times_are_cut_off_are_dropped_and_no_time_is_invented(
+def test_rows_without_time_stamp_are_dropped(
     name: str, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT[name](tmp_path)
@@ -154,7 +154,7 @@ def test_rows_whose_times_are_cut_off_are_dropped_and_no_time_is_invented(
         "fit odometry --vehicle {car}",
     ],
 )
-def test_a_log_cut_before_its_first_topic_is_unreadable_and_not_wrong_usage(
+def test_log_truncated_before_first_topic_is_unreadable_not_wrong_usage(
     drive: DriveFiles, flags: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "cut.mcap"
@@ -171,7 +171,7 @@ def test_a_log_cut_before_its_first_topic_is_unreadable_and_not_wrong_usage(
 @pytest.mark.parametrize(
     "flags", ["replay -o {out} --vehicle {car}", "decode -o {out}", "convert -o {out}.mcap"]
 )
-def test_commands_that_read_a_damaged_log_name_salvage(
+def test_commands_suggest_salvage_for_damaged_log(
     drive: DriveFiles, flags: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "damaged.mcap"
@@ -185,7 +185,7 @@ def test_commands_that_read_a_damaged_log_name_salvage(
     assert "--salvage" in said
 
 
-def test_a_topic_that_a_whole_log_lacks_is_wrong_usage(
+def test_topic_missing_from_complete_log_is_wrong_usage(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["decode", str(drive.log), "-o", str(tmp_path / "out"), "--topics", "/cam"]

@@ -1,4 +1,4 @@
-"""Every data set carries a truth that fits its log; see ``crosscue.testing.check_dataset``."""
+"""Every data set fulfils the contract of ``crosscue.testing.check_dataset``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from support.pandaset_drive import pandaset_drive
 
 
 def _comma(path: Path) -> Path:
-    """A segment of ten seconds along a straight road near Paris, and its speed."""
+    """Write a segment of ten seconds along a straight road near Paris, with its speed."""
     times = np.arange(200) * 0.05
     east = np.outer(20.0 * times, (-0.0406, 0.9992, 0.0))
     arrays = {
@@ -44,13 +44,13 @@ DRIVES: Final[dict[str, Callable[[Path], Path]]] = {
     "nuscenes": nuscenes_drive,
     "pandaset": pandaset_drive,
 }
-"""By format: writes a small drive."""
+"""By format: a function that writes a small drive."""
 
 
-def test_every_data_set_is_here() -> None:
+def test_every_data_set_has_sample_drive() -> None:
     assert DRIVES.keys() == CARRIED.keys()
 
 
 @pytest.mark.parametrize("name", sorted(CARRIED))
-def test_every_data_set_keeps_the_contract(name: str, tmp_path: Path) -> None:
+def test_every_data_set_fulfils_contract(name: str, tmp_path: Path) -> None:
     check_dataset(DRIVES[name](tmp_path / "drive"), tmp_path / "truth")

@@ -1,4 +1,4 @@
-"""One row taken out of the middle of a log: formats with a counter report exactly one missing."""
+"""Formats with a row counter report exactly one missing row if one is removed from a log."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _mcap(folder: Path) -> Path:
     at, size = raw.index(b"message 20") - 31, 41
     assert raw[at] == 0x05
     del raw[at : at + size]
-    # Checksums would show it, too: 0 says that none exists.
+    # A checksum of 0 means that none exists; otherwise it would reveal the removal as well.
     end = raw.rindex(b"\x0f" + struct.pack("<Q", 4))
     raw[end + 9 : end + 13] = bytes(4)
     (summary_at,) = struct.unpack_from("<Q", raw, len(raw) - 28)
@@ -55,7 +55,7 @@ def _mcap(folder: Path) -> Path:
 
 
 def _bag(folder: Path) -> Path:
-    """Ten messages by its index, nine in its chunk."""
+    """Write a bag with ten messages in its index and nine in its chunk."""
 
     def stamp(t_ns: int) -> bytes:
         return struct.pack("<II", *divmod(t_ns, 10**9))
@@ -137,7 +137,7 @@ def _trc(folder: Path) -> Path:
 
 
 def _mf4(folder: Path) -> Path:
-    """A group's data holds one record less than its counter says."""
+    """Write a file in which a group has one record fewer than its counter states."""
     path = EVERY_FORMAT["mf4"](folder)
     raw = bytearray(path.read_bytes())
     at = -1
@@ -195,7 +195,7 @@ def _pandaset(folder: Path) -> Path:
     return log
 
 
-ONE_TAKEN_OUT: Final[dict[str, Callable[[Path], Path]]] = {
+ONE_REMOVED: Final[dict[str, Callable[[Path], Path]]] = {
     "mcap": _mcap,
     "rosbag1": _bag,
     "rosbag2-sqlite3": _db3,
@@ -211,7 +211,7 @@ ONE_TAKEN_OUT: Final[dict[str, Callable[[Path], Path]]] = {
     "video": _video,
     "images": _images,
 }
-"""Formats that count their rows, and a log of each with a row taken out of its middle."""
+"""Formats that count their rows, and functions that write a log with one row removed."""
 WITHOUT_COUNTER: Final = {
     "candump": "candump",
     "asc": "ASC",
@@ -220,16 +220,16 @@ WITHOUT_COUNTER: Final = {
 """Formats in which a removed row cannot be detected, with their names in the docs."""
 
 
-def test_every_format_counts_its_rows_or_is_named() -> None:
-    assert ONE_TAKEN_OUT.keys() | WITHOUT_COUNTER.keys() == FORMATS.keys()
-    assert not ONE_TAKEN_OUT.keys() & WITHOUT_COUNTER.keys()
+def test_every_format_is_classified_by_row_counter() -> None:
+    assert ONE_REMOVED.keys() | WITHOUT_COUNTER.keys() == FORMATS.keys()
+    assert not ONE_REMOVED.keys() & WITHOUT_COUNTER.keys()
 
 
-@pytest.mark.parametrize("name", sorted(ONE_TAKEN_OUT))
-def test_exactly_one_row_is_reported_missing(
+@pytest.mark.parametrize("name", sorted(ONE_REMOVED))
+def test_removed_row_is_reported_as_one_dropped_row(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = ONE_TAKEN_OUT[name](tmp_path)
+    log = ONE_REMOVED[name](tmp_path)
 
     _, ledger = read(log)
 
@@ -241,7 +241,7 @@ def test_exactly_one_row_is_reported_missing(
 
 
 @pytest.mark.parametrize("name", sorted(WITHOUT_COUNTER))
-def test_a_format_without_a_counter_says_so(name: str, tmp_path: Path) -> None:
+def test_format_without_counter_reports_undetectable_loss(name: str, tmp_path: Path) -> None:
     log = EVERY_FORMAT[name](tmp_path)
     file = log if log.is_file() else next(log.glob("*_car.csv"))
     lines = file.read_bytes().splitlines(keepends=True)
@@ -257,7 +257,7 @@ def test_a_format_without_a_counter_says_so(name: str, tmp_path: Path) -> None:
     assert WITHOUT_COUNTER[name] in row.partition("no usable count")[0]
 
 
-def test_a_row_that_metadata_counts_and_no_file_holds_is_dropped(tmp_path: Path) -> None:
+def test_row_counted_only_in_metadata_is_reported_as_dropped(tmp_path: Path) -> None:
     log = EVERY_FORMAT["rosbag2"](tmp_path)
     text = (log / "metadata.yaml").read_text()
     shutil.copy(log / "metadata.yaml", tmp_path)

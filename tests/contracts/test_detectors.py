@@ -1,4 +1,4 @@
-"""Every detector of the table keeps the contract of ``crosscue.testing.check_detector``."""
+"""Every built-in detector fulfils the contract of ``crosscue.testing.check_detector``."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ NEEDS_A_CARD: Final = {"model"}
 
 
 @pytest.mark.parametrize("name", sorted(BUILTIN.keys() - NEEDS_A_CARD))
-def test_every_detector_keeps_the_contract(name: str) -> None:
+def test_every_detector_fulfils_contract(name: str) -> None:
     check_detector(lambda: make(Choice(name, name)))
 
 
-def test_a_model_card_keeps_the_contract(tmp_path: Path) -> None:
+def test_detector_of_model_card_fulfils_contract(tmp_path: Path) -> None:
     card = str(yolox_card(tmp_path))
 
     check_detector(lambda: make(Choice("yolox", "model", {"card": card})))
 
 
-class _OfAnotherTime(BrightBlob):
+class _WrongTime(BrightBlob):
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         return [replace(self._one(frame), t_ns=frame.t_ns + 1) for frame in frames]
 
 
-class _Outside(BrightBlob):
+class _BoxOutsidePicture(BrightBlob):
     def _one(self, frame: Frame) -> Detections:
         found = super()._one(frame)
         return replace(found, boxes_px=found.boxes_px + 1.0)
 
 
-class _OverSure(BrightBlob):
+class _ScoreAboveOne(BrightBlob):
     def _one(self, frame: Frame) -> Detections:
         found = super()._one(frame)
         return replace(found, scores=found.scores * 1.01)
 
 
-class _Painting(BrightBlob):
+class _ChangesPixels(BrightBlob):
     def _one(self, frame: Frame) -> Detections:
         found = super()._one(frame)
         np.asarray(frame.pixels)[0] = 0
         return found
 
 
-class _Unannounced(BrightBlob):
+class _UndeclaredLabel(BrightBlob):
     labels = ("zebra",)
 
 
-class _Remembering(BrightBlob):
+class _RepeatsFirstFrame(BrightBlob):
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         return [self._one(frames[0]) for _ in frames]
 
@@ -65,22 +65,20 @@ class _Remembering(BrightBlob):
 @pytest.mark.parametrize(
     ("kind", "match"),
     [
-        (_OfAnotherTime, "time is"),
-        (_Outside, "outside the picture"),
-        (_OverSure, "outside 0 to 1"),
-        (_Painting, "changed a frame's pixels"),
-        (_Unannounced, "are not among its labels"),
-        (_Remembering, "frame 17: the result's time"),
+        (_WrongTime, "time is"),
+        (_BoxOutsidePicture, "outside the picture"),
+        (_ScoreAboveOne, "outside 0 to 1"),
+        (_ChangesPixels, "changed a frame's pixels"),
+        (_UndeclaredLabel, "are not among its labels"),
+        (_RepeatsFirstFrame, "frame 17: the result's time"),
     ],
 )
-def test_a_detector_that_breaks_the_contract_is_reported(
-    kind: type[BrightBlob], match: str
-) -> None:
+def test_contract_check_reports_invalid_detector(kind: type[BrightBlob], match: str) -> None:
     with pytest.raises(AssertionError, match=match):
         check_detector(lambda: kind(BrightSettings()))
 
 
-def test_a_detector_that_forgets_frames_is_reported() -> None:
+def test_contract_check_reports_missing_results() -> None:
     check_detector(build)
     with pytest.raises(AssertionError, match="3 frames, 0 results"):
         check_detector(too_few)

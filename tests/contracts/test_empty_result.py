@@ -1,4 +1,4 @@
-"""An empty result is never exit status 0 in silence, and leaves nothing that looks finished."""
+"""An empty result is an error with exit status 1, and leaves no finished result."""
 
 import json
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
 
 
 def _fails(capsys: pytest.CaptureFixture[str], out: Path, *argv: object) -> str:
-    """The one line; nothing that looks finished is left."""
+    """Run a command that fails with one line and without output, and return the line."""
     assert cli.run([str(one) for one in argv]) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -33,7 +33,7 @@ def _fails(capsys: pytest.CaptureFixture[str], out: Path, *argv: object) -> str:
 
 
 @pytest.mark.parametrize("command", ["replay", "decode"])
-def test_a_part_past_the_end_names_what_found_no_rows(
+def test_part_after_end_of_log_reports_topics_without_rows(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     out = tmp_path / "out"
@@ -47,7 +47,7 @@ def test_a_part_past_the_end_names_what_found_no_rows(
     assert "--from" in said
 
 
-def test_convert_of_a_part_past_the_end_writes_no_file(
+def test_convert_of_part_after_end_writes_no_file(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out.mcap"
@@ -57,7 +57,7 @@ def test_convert_of_a_part_past_the_end_writes_no_file(
     )
 
 
-def test_a_vehicle_file_of_another_car_is_no_empty_run(
+def test_replay_with_vehicle_file_of_another_car_is_refused(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dbc = next(drive.vehicle.parent.glob("*.dbc")).read_text()
@@ -81,7 +81,7 @@ def test_a_vehicle_file_of_another_car_is_no_empty_run(
     assert "the wheel speeds, planned from /can, found no rows" in said
 
 
-def test_a_log_without_anything_to_estimate_from(
+def test_replay_of_log_without_wheel_speeds_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, out = EVERY_FORMAT["candump"](tmp_path), tmp_path / "out"
@@ -90,14 +90,14 @@ def test_a_log_without_anything_to_estimate_from(
 
 
 @pytest.mark.parametrize(
-    "spoil", [lambda path: path.write_bytes(b"\x89PNG"), lambda path: path.write_bytes(b"")]
+    "damage", [lambda path: path.write_bytes(b"\x89PNG"), lambda path: path.write_bytes(b"")]
 )
-def test_a_camera_without_one_usable_picture(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], object]
+def test_detect_without_usable_pictures_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], object]
 ) -> None:
     log, out = picture_folder(tmp_path / "front", 3, "rate_hz: 10\n"), tmp_path / "out"
     for picture in log.glob("*.png"):
-        spoil(picture)
+        damage(picture)
 
     said = _fails(capsys, out, "detect", log, "--detectors", "signs", "-o", out)
 
@@ -105,7 +105,7 @@ def test_a_camera_without_one_usable_picture(
 
 
 def _content(folder: Path) -> dict[str, bytes]:
-    """Every file of a folder."""
+    """Return the content of every file of a folder."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -114,7 +114,7 @@ def _content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("command", ["replay", "estimate", "decode", "detect"])
-def test_a_finished_run_stays_as_it_was_where_nothing_comes_of_the_next(
+def test_finished_run_is_unchanged_if_next_result_is_empty(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     out, car = tmp_path / "out", tmp_path / "car.toml"
@@ -139,7 +139,7 @@ def test_a_finished_run_stays_as_it_was_where_nothing_comes_of_the_next(
     assert _content(out) == before
 
 
-def test_a_run_that_is_replaced_holds_only_what_is_new(
+def test_overwritten_run_contains_only_new_files(
     drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, fresh = tmp_path / "out", tmp_path / "fresh"

@@ -1,4 +1,4 @@
-"""Every row of docs/reference/exit_status.md is provoked by running commands."""
+"""Commands return the exit status that docs/reference/exit_status.md states in each row."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ LATER: Final = "--from 100000"
 STAGES: Final = ("reading", "detecting", "estimating", "scoring")
 
 
-def _nothing(*first_words: str) -> list[tuple[int, str]]:
-    """Commands of which nothing comes, by their first word."""
+def _empty_cases(*first_words: str) -> list[tuple[int, str]]:
+    """Return cases of commands with an empty result, selected by their first word."""
     return [
         (1, f"{name} {line}") for name, line in COMMANDS.items() if name.split()[0] in first_words
     ]
@@ -103,12 +103,12 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
         (3, "convert {unwritable} -o {out}.mcap"),
     ],
     "all four": _all_four("{nothing_whole}"),
-    "`score`": _nothing("score"),
-    "`truth`, `truth import`, `truth check`": _nothing("truth"),
-    "`fit ...`, `train ...`": _nothing("fit", "train"),
-    "`landmarks add`": _nothing("landmarks"),
-    "`vehicle init`, `vehicle check`": _nothing("vehicle"),
-    "`merge`": _nothing("merge"),
+    "`score`": _empty_cases("score"),
+    "`truth`, `truth import`, `truth check`": _empty_cases("truth"),
+    "`fit ...`, `train ...`": _empty_cases("fit", "train"),
+    "`landmarks add`": _empty_cases("landmarks"),
+    "`vehicle init`, `vehicle check`": _empty_cases("vehicle"),
+    "`merge`": _empty_cases("merge"),
     "`info`, `query`": [
         (0, "info {rowless}"),
         (3, "info {nothing_whole}"),
@@ -123,7 +123,7 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
 
 
 def _rows() -> list[list[str]]:
-    """The cells of every row of the page's tables."""
+    """Return the cells of every row of the page's tables."""
     lines = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:1] == "|"]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [
@@ -136,13 +136,13 @@ def _rows() -> list[list[str]]:
 ROWS: Final = _rows()
 
 
-def test_every_row_is_provoked_and_every_case_has_its_row() -> None:
+def test_every_row_of_exit_status_page_has_case() -> None:
     assert [row[0] for row in ROWS] == [*STATUS, *STAGES, *EMPTY]
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Inputs: sound, empty, cut, of another version."""
+    """Valid, empty and truncated inputs, and inputs of another version."""
     folder = tmp_path_factory.mktemp("inputs")
     found = empty_inputs(folder)
     log, run, drive = found["log"], found["run"], found["car"].parent
@@ -168,15 +168,15 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     spoiled = picture_folder(folder / "spoiled", 3, "rate_hz: 10\n")
     for one in spoiled.glob("*.png"):
         one.write_bytes(b"\x89PNG")
-    strange = [
+    invalid_schema = [
         schema(1, "made_msgs/msg/Bad", body=b"not a definition ~~\n"),
         channel(1, 1, "/bad"),
         *(message(1, k, bytes(4)) for k in range(3)),
     ]
     parts = {
         "rowless": [],
-        "unwritable": [ChunkOf(strange)],
-        "nothing_whole": [ChunkOf(strange, crc=1)],
+        "unwritable": [ChunkOf(invalid_schema)],
+        "nothing_whole": [ChunkOf(invalid_schema, crc=1)],
     }
     for name, chunks in parts.items():
         (folder / f"{name}.mcap").write_bytes(McapFile(chunks).coded())
@@ -221,17 +221,17 @@ def _newer(truth: Path) -> Path:
     return place
 
 
-def _last(row: list[str]) -> set[int]:
-    """The statuses that a row names."""
+def _statuses(row: list[str]) -> set[int]:
+    """Return the exit statuses that a row names."""
     return {int(number) for number in re.findall(r"\b\d+\b", row[-1])}
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row[0] not in STAGES], ids=lambda r: r[0])
-def test_a_row_of_statuses(
+def test_commands_return_documented_exit_status(
     row: list[str], names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cases = STATUS.get(row[0]) or EMPTY[row[0]]
-    stated = {int(n) for n in row[0].split(", ")} if row[0] in STATUS else _last(row)
+    stated = {int(n) for n in row[0].split(", ")} if row[0] in STATUS else _statuses(row)
     found = {}
 
     for number, (status, line) in enumerate(cases):
@@ -245,7 +245,7 @@ def test_a_row_of_statuses(
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_accounts_for_everything(
+def test_every_stage_accounts_for_all_its_inputs(
     stage: str, names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"

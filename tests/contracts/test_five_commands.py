@@ -1,4 +1,4 @@
-"""From a fresh export of each layout to a scored drive, by the commands of the how-to page."""
+"""The commands of the how-to page lead from an exported network to a scored drive."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from support.torchvision_files import network
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "networks.md"
 HOME = Path("datasets") / "real" / "pandaset_002"
-"""Where the page has the vehicle file and the truth of its drive."""
+"""Folder in which the page expects the vehicle file and the truth of its drive."""
 FRAMES = 3
 
 
 def commands() -> list[str]:
-    """The first block of the page, with a recording instead of a window."""
+    """Return the commands of the page's first block; ``view`` writes a recording instead."""
     page = PAGE.read_text(encoding="utf-8")
     block = re.search(r"```bash\n(crosscue model init.*?)```", page, re.S)
     assert block is not None
@@ -36,7 +36,7 @@ def commands() -> list[str]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with all that the page speaks of, but the network: pictures of 24 x 16 pixels."""
+    """A folder with all inputs of the page except the network; pictures have 24 x 16 pixels."""
     place = tmp_path_factory.mktemp("place")
     camera = pandaset_drive(place / "PANDASET", FRAMES) / "camera" / "front_camera"
     (camera / "intrinsics.json").write_text('{"fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 8.0}')
@@ -51,7 +51,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def export(path: Path, kind: str) -> None:
-    """A network of a layout that finds a stop sign in every picture."""
+    """Write a network of one kind that finds a stop sign in every picture."""
     sample = SAMPLES[kind]()
     outputs = {
         name: values if values.dtype.kind == "i" else values.astype(np.float32)
@@ -65,25 +65,25 @@ def export(path: Path, kind: str) -> None:
     path.write_bytes(model.SerializeToString())
 
 
-def followed(
+def follow_page(
     place: Path,
     weights: str,
     kind: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> tuple[int, int, int]:
-    """Run the page's commands for a file of weights; its stop sign cue: right, of, frames."""
+    """Run the page's commands; return right and all positives and frames of the stop sign cue."""
     monkeypatch.chdir(place)
     lines = commands()
     assert len(lines) == 5
     for line in lines:
-        asked = line.replace("my.onnx", weights).removeprefix("crosscue ").split()
+        words = line.replace("my.onnx", weights).removeprefix("crosscue ").split()
         more = {
             "model init": ["--overwrite"],
             "replay PANDASET": ["--overwrite", "--no-cache"],
             "view run": ["--overwrite"],
         }
-        assert cli.run([*asked, *more.get(" ".join(asked[:2]), [])]) == 0, capsys.readouterr().err
+        assert cli.run([*words, *more.get(" ".join(words[:2]), [])]) == 0, capsys.readouterr().err
     assert Path("drive.rrd").stat().st_size
     metrics = json.loads(Path("run", "score", "metrics.json").read_text())
     found = metrics["cues"]["stop_sign"]
@@ -92,23 +92,23 @@ def followed(
 
 
 @pytest.mark.parametrize("kind", SAMPLES)
-def test_an_export_gets_to_a_scored_drive_by_the_page(
+def test_exported_network_is_scored_with_commands_of_page(
     place: Path, kind: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export(place / "my.onnx", kind)
 
-    scored = followed(place, "my.onnx", kind, capsys, monkeypatch)
+    scored = follow_page(place, "my.onnx", kind, capsys, monkeypatch)
 
     assert read_card(place / "my.toml").output.kind == kind
     assert scored == (FRAMES, FRAMES, FRAMES)
 
 
-def test_weights_of_torchvision_get_there_by_the_same_commands(
+def test_torchvision_weights_are_scored_with_commands_of_page(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state = network("ssdlite320_mobilenet_v3_large", classes=1 + len(CLASSES)).state_dict()
     torch.save(state, place / "my.pth")
 
-    scored = followed(place, "my.pth", "torchvision", capsys, monkeypatch)
+    scored = follow_page(place, "my.pth", "torchvision", capsys, monkeypatch)
 
     assert scored[2] == FRAMES

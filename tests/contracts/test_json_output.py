@@ -1,4 +1,4 @@
-"""With ``--json`` a command prints one strict JSON document and nothing else, whatever it met."""
+"""With ``--json`` every command prints exactly one strict JSON document."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from support.onnx_models import bright_box_model
 from support.pictures import picture
 from support.scenes import shorten
 
-# In this order: each reads what those before it wrote. LOG is a drive with a gap.
+# The order matters: commands read results of earlier ones. LOG is a drive with a gap.
 LINES: Final[dict[str, tuple[str, int]]] = {
     "info": ("LOG --vehicle CAR", 3),
     "seal": ("LOG", 0),
@@ -79,7 +79,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
         0,
     ),
 }
-"""The same for commands that make something or learn from it."""
+"""The same for commands that create or fit something."""
 ELSEWHERE: Final[dict[str, str]] = {
     "demo": "simulates and replays for minutes",
     "study intersections": "simulates and replays for minutes",
@@ -94,7 +94,7 @@ ELSEWHERE: Final[dict[str, str]] = {
 
 
 def strict(text: str) -> Any:
-    """The one document that a text is, without NaN, infinities or a key given twice."""
+    """Parse a text as one document without NaN, infinities or duplicate keys."""
 
     def refuse(name: str) -> Any:
         raise ValueError(f"{name} is not JSON")
@@ -106,12 +106,12 @@ def strict(text: str) -> Any:
     return json.loads(text, parse_constant=refuse, object_pairs_hook=once)
 
 
-def test_the_table_is_whole() -> None:
+def test_every_command_is_tested_or_excluded_with_reason() -> None:
     assert LINES.keys() | MADE.keys() | NO_JSON | ELSEWHERE.keys() == cli.COMMANDS.keys()
     assert not (LINES.keys() | MADE.keys()) & ELSEWHERE.keys()
 
 
-def test_every_result_is_one_strict_document(
+def test_json_of_reading_commands_is_one_strict_document(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -122,7 +122,7 @@ def test_every_result_is_one_strict_document(
     _run(LINES, places, capsys)
 
 
-def test_every_made_result_is_one_strict_document(
+def test_json_of_creating_commands_is_one_strict_document(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -158,7 +158,7 @@ def _run(
 
 
 def _write_photos(folder: Path) -> None:
-    """Four walls, each seen twice, and a table of each kind about them."""
+    """Write two pictures of each of four walls, and one table of each kind about them."""
     folder.mkdir()
     places, pairs = ["image,x_m,y_m,sd_m"], ["query,known,same"]
     for k in range(4):
@@ -176,7 +176,7 @@ def _write_photos(folder: Path) -> None:
 
 
 def _write_road(folder: Path) -> None:
-    """Two annotated pictures, at the times of the drive's first two frames, and road masks."""
+    """Write road masks and two annotated pictures at the times of the drive's first two frames."""
     for place in ("images", "masks"):
         (folder / place).mkdir(parents=True)
         for k in range(2):
@@ -195,7 +195,7 @@ def _write_road(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("clock", [Clock(pause_s=(0.3, 13.5)), Clock(pause_s=(2.0, 20.0))])
-def test_figures_that_do_not_exist_are_null(
+def test_missing_values_are_null_in_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], clock: Clock
 ) -> None:
     log = write_drive(tmp_path, clock)

@@ -1,4 +1,4 @@
-"""Every format for labelling tools returns the boxes, labels and times that were written."""
+"""Formats of labelling tools preserve boxes, labels and times when written and read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIZE: Final = (1280, 719)
 
 
 def labels() -> Annotations:
-    """Boxes at edges and between pixels, a label that needs escaping, a picture without any."""
+    """Boxes at edges and between pixels, a label that needs escaping, a picture without boxes."""
     names = ("stop sign", 'a "car" & <more>: #1')
     things = (
         Thing(names[0], (0.0, 0.0, 1280.0, 719.0), score=0.25),
@@ -30,8 +30,8 @@ def labels() -> Annotations:
     return Annotations("worst.parquet", names, pictures)
 
 
-def confirmed(path: Path) -> Path:
-    """As Label Studio exports tasks whose predictions a person has confirmed."""
+def confirm_predictions(path: Path) -> Path:
+    """Turn predictions into annotations, as Label Studio does once a person confirms them."""
     tree = json.loads(path.read_text())
     if isinstance(tree, list):
         for task in tree:
@@ -51,10 +51,10 @@ def times(read: Annotations) -> dict[int, Picture]:
 
 @pytest.mark.parametrize("name", LABEL_FORMATS)
 @pytest.mark.parametrize("is_named", [True, False], ids=["format named", "recognised"])
-def test_what_was_written_is_read(name: str, is_named: bool, tmp_path: Path) -> None:
+def test_written_labels_are_read_back_unchanged(name: str, is_named: bool, tmp_path: Path) -> None:
     wrote = labels()
     path = LABEL_FORMATS[name].write(tmp_path, wrote)
-    path = confirmed(path) if path.suffix == ".json" else path
+    path = confirm_predictions(path) if path.suffix == ".json" else path
 
     sizes = {Path(one.name).stem: one.size_px for one in wrote.pictures}
     read = read_labels(path, sizes, name if is_named else None)
@@ -72,7 +72,7 @@ def test_what_was_written_is_read(name: str, is_named: bool, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", LABEL_FORMATS)
 @pytest.mark.parametrize("content", [b"{", b"[1]", b'{"labels": 3}', b"<a", b"\xff\xfe"])
-def test_what_is_damaged_is_one_error_that_names_the_file(
+def test_damaged_labels_are_refused_with_file_name(
     name: str, content: bytes, tmp_path: Path
 ) -> None:
     path = LABEL_FORMATS[name].write(tmp_path, labels())
@@ -85,7 +85,7 @@ def test_what_is_damaged_is_one_error_that_names_the_file(
     assert str(tmp_path) in str(caught.value)
 
 
-def test_another_format_or_file_is_wrong_usage(tmp_path: Path) -> None:
+def test_unknown_label_format_is_wrong_usage(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x")
     with pytest.raises(UsageError, match="expected one of coco, cvat"):
         read_labels(tmp_path / "a.csv", {}, "voc")
@@ -93,7 +93,7 @@ def test_another_format_or_file_is_wrong_usage(tmp_path: Path) -> None:
         read_labels(tmp_path / "a.csv", {})
 
 
-def test_predictions_that_nobody_confirmed_are_not_labels(tmp_path: Path) -> None:
+def test_unconfirmed_predictions_are_not_read_as_labels(tmp_path: Path) -> None:
     path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
 
     read = read_labels(path, {})
@@ -101,7 +101,7 @@ def test_predictions_that_nobody_confirmed_are_not_labels(tmp_path: Path) -> Non
     assert read.ignored == {"tasks without an annotation": 2}
 
 
-def test_the_last_annotation_that_was_not_cancelled_counts(tmp_path: Path) -> None:
+def test_last_annotation_not_cancelled_is_read(tmp_path: Path) -> None:
     path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
     tasks: list[dict[str, Any]] = json.loads(path.read_text())
     result = tasks[0]["predictions"][0]["result"]
@@ -125,7 +125,7 @@ def test_the_last_annotation_that_was_not_cancelled_counts(tmp_path: Path) -> No
     ],
     ids=["FiftyOne", "CVAT, Ultralytics", "CVAT, Darknet"],
 )
-def test_yolo_is_read_in_the_layouts_that_tools_export(
+def test_yolo_labels_are_read_in_layouts_of_common_tools(
     place: str, names: dict[str, str], tmp_path: Path
 ) -> None:
     (tmp_path / place).mkdir(parents=True)
@@ -137,14 +137,14 @@ def test_yolo_is_read_in_the_layouts_that_tools_export(
     assert [(one.label, one.box_px) for one in picture.things] == [("car", (25, 20, 75, 60))]
 
 
-def test_yolo_pictures_are_named_relative_to_the_file_itself(tmp_path: Path) -> None:
-    """Ultralytics takes a ``path`` to be relative to wherever it was started."""
+def test_yolo_data_file_has_no_path_key(tmp_path: Path) -> None:
+    """Ultralytics resolves ``path`` relative to its working directory, not to the file."""
     text = LABEL_FORMATS["yolo"].write(tmp_path, labels()).read_text()
 
     assert [line.split(":")[0] for line in text.splitlines()[:3]] == ["train", "val", "names"]
 
 
-def test_coco_is_what_pycocotools_reads(tmp_path: Path) -> None:
+def test_coco_file_is_readable_by_pycocotools(tmp_path: Path) -> None:
     tools = pytest.importorskip("pycocotools.coco")
     tree = tools.COCO(str(LABEL_FORMATS["coco"].write(tmp_path, labels())))
 

@@ -1,4 +1,4 @@
-"""Laws of the text of every module: formatting is ruff's, with few exceptions."""
+"""Modules are formatted by ruff, with few exceptions."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ FOLDERS: Final = (
 MAX_SKIPS: Final = 40
 
 
-def test_only_constant_tables_are_laid_out_by_hand() -> None:
+def test_only_constant_tables_are_formatted_by_hand() -> None:
     marker = "# fmt: " + "skip"
     found: list[str] = []
     for folder in FOLDERS:
@@ -20,7 +20,7 @@ def test_only_constant_tables_are_laid_out_by_hand() -> None:
             for number, line in enumerate(lines, 1):
                 if line.endswith(marker):
                     found.append(f"{path.relative_to(ROOT)}:{number}: {line}")
-                    # The end of a table at the top level of a module: nothing of a function.
+                    # Only the end of a table at the top level of a module may have the marker.
                     assert re.match(r"[)\]}]", line), found[-1]
 
     assert len(found) <= MAX_SKIPS, "\n".join(found)

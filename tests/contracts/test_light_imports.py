@@ -1,4 +1,4 @@
-"""Whoever reads, decodes, replays or scores a drive needs none of the heavy libraries."""
+"""Reading, decoding, replaying and scoring a drive import none of the heavy libraries."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ card = "card.toml"
 """
 
 
-def without(
+def run_without(
     modules: tuple[str, ...], code: str, *arguments: str, folder: Path | None = None
 ) -> str:
-    """Output of a Python that cannot import ``modules``; any attempt fails, even a guarded one."""
+    """Run code that fails on any attempt to import ``modules``, and return its output."""
     done = subprocess.run(
         [sys.executable, "-c", BLOCKED_RUN + code, ",".join(modules), *arguments],
         capture_output=True,
@@ -76,7 +76,7 @@ def without(
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drive with camera, CAN and truth; its vehicle file names a detector of our own making."""
+    """A drive with camera, CAN and truth; its vehicle file names a small network as detector."""
     folder = tmp_path_factory.mktemp("light")
     log = write_drive(folder, Clock())
     network = bright_box_model()
@@ -88,24 +88,24 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return log
 
 
-def test_the_refusal_refuses() -> None:
+def test_import_of_blocked_module_fails() -> None:
     with pytest.raises(AssertionError, match="json is imported"):
-        without(("json",), "import json")
+        run_without(("json",), "import json")
 
 
-def test_importing_crosscue_and_asking_for_help_compile_nothing() -> None:
-    without(COMPILER, "import crosscue")
-    assert "exit status" in without(COMPILER, COMMAND, "--help")
+def test_import_and_help_do_not_import_compiler() -> None:
+    run_without(COMPILER, "import crosscue")
+    assert "exit status" in run_without(COMPILER, COMMAND, "--help")
 
 
-def test_a_log_is_described_without_a_compiler(drive: Path) -> None:
-    assert "/can" in without(COMPILER, COMMAND, "info", str(drive))
+def test_info_does_not_import_compiler(drive: Path) -> None:
+    assert "/can" in run_without(COMPILER, COMMAND, "info", str(drive))
 
 
-def test_a_drive_is_replayed_with_an_onnx_detector_and_scored(drive: Path) -> None:
+def test_replay_with_onnx_detector_and_score_need_no_heavy_library(drive: Path) -> None:
     run = drive.parent / "run"
 
-    printed = without(
+    printed = run_without(
         HEAVY,
         CHAIN,
         "convert drive.mcap -o copy.mcap -q",

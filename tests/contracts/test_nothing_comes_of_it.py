@@ -1,4 +1,4 @@
-"""Sound input of which nothing comes: one line, exit status 1, nothing that looks finished."""
+"""Valid input without a result: one line, exit status 1, and no files."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ ELSEWHERE: dict[str, str] = {
     "model show": "prints a card", "model check": "that nothing is found is its result",
     "model fetch": "copies a file", "model init": "copies a file",
 }  # fmt: skip
-"""Commands of which the table above says nothing, and why."""
+"""Commands that are tested elsewhere or have a result for any valid input."""
 
 
-def test_every_command_is_in_one_of_the_tables() -> None:
+def test_every_command_is_tested_or_excluded_with_reason() -> None:
     assert not COMMANDS.keys() & ELSEWHERE.keys()
     assert COMMANDS.keys() | ELSEWHERE.keys() == cli.COMMANDS.keys()
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A drive and its run, and inputs of every kind that are whole and hold nothing."""
+    """A drive and its run, and valid empty inputs of every kind."""
     return empty_inputs(tmp_path_factory.mktemp("inputs"))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_nothing_comes_of_it(
+def test_empty_result_is_reported_in_one_line_without_files(
     command: str, names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.rmtree(names["run"] / "score", ignore_errors=True)

@@ -1,4 +1,4 @@
-"""A package of a user's own adds a detector, a cue, a reader and a data set, and tests them."""
+"""An installed package adds a detector, a cue, a reader and a data set, and checks them."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ print("kept")
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files that pip would install of the user's package."""
+    """A folder with the files that pip would install of the package."""
     folder = tmp_path_factory.mktemp("site")
     (folder / "dummy_package.py").write_text(MODULE)
     info = folder / "dummy_package-1.2.dist-info"
@@ -156,7 +156,7 @@ def _run(site: Path, *argv: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_plugins_are_listed_with_what_is_wrong_with_them(site: Path) -> None:
+def test_plugins_are_listed_with_their_problems(site: Path) -> None:
     done = _run(site, "-m", "crosscue.eval.cli", "plugins", "--json")
 
     assert done.returncode == 1, done.stderr
@@ -167,8 +167,8 @@ def test_plugins_are_listed_with_what_is_wrong_with_them(site: Path) -> None:
         if one["package"] == "dummy-package"
     }
     assert all(one["version"] == "1.2" for one in listed if one["package"] == "dummy-package")
-    whole = [key for key, problem in ours.items() if not problem]
-    assert sorted(whole) == [
+    sound = [key for key, problem in ours.items() if not problem]
+    assert sorted(sound) == [
         ("cue", "zebra"),
         ("dataset", "line-drive"),
         ("detector", "bright"),
@@ -179,7 +179,7 @@ def test_plugins_are_listed_with_what_is_wrong_with_them(site: Path) -> None:
     assert "is CueSpec; expected Format" in ours["reader", "wrong"]
 
 
-def test_the_list_is_a_line_each(site: Path) -> None:
+def test_plugin_list_has_one_line_per_plugin(site: Path) -> None:
     done = _run(site, "-m", "crosscue.eval.cli", "plugins")
 
     lines = [line for line in done.stdout.splitlines() if "dummy-package" in line]
@@ -187,13 +187,13 @@ def test_the_list_is_a_line_each(site: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_plugins_work_and_keep_the_contract(site: Path, tmp_path: Path) -> None:
+def test_plugins_work_and_fulfil_contracts(site: Path, tmp_path: Path) -> None:
     done = _run(site, "-c", CHECKS, str(tmp_path))
 
     assert done.stdout.strip() == "kept", done.stderr
 
 
-def test_a_cue_named_unlike_its_entry_point_is_refused(site: Path, tmp_path: Path) -> None:
+def test_cue_with_name_other_than_entry_point_is_refused(site: Path, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     info = tmp_path / "other" / "dummy_package-1.2.dist-info"
     info.mkdir()

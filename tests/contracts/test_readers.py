@@ -1,4 +1,4 @@
-"""Every reader keeps the contract of ``crosscue.testing.check_reader``, and one row is one row."""
+"""Every reader fulfils the contract of ``crosscue.testing.check_reader``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.every_format import EVERY_FORMAT
 from support.mcap_files import McapFile, channel, message, schema
 from support.one_row import ONE_ROW
 
-WITHOUT_ROWS_OF_THEIR_OWN: Final = {
+WITHOUT_SINGLE_ROW_DAMAGE: Final = {
     "mf4": "records have a fixed size and no mark or checksum: a damaged one cannot be reported",
     "comma2k19": "an .npy array has neither: a damaged number is another number",
     "kitti-raw": "a row is a line in each of several files",
@@ -23,29 +23,29 @@ WITHOUT_ROWS_OF_THEIR_OWN: Final = {
 }
 
 
-def test_every_format_is_here() -> None:
+def test_every_format_is_classified() -> None:
     assert EVERY_FORMAT.keys() == FORMATS.keys()
-    assert ONE_ROW.keys() | WITHOUT_ROWS_OF_THEIR_OWN.keys() == FORMATS.keys()
+    assert ONE_ROW.keys() | WITHOUT_SINGLE_ROW_DAMAGE.keys() == FORMATS.keys()
 
 
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
-def test_every_reader_keeps_the_contract(name: str, tmp_path: Path) -> None:
+def test_every_reader_fulfils_contract(name: str, tmp_path: Path) -> None:
     check_reader(EVERY_FORMAT[name](tmp_path), is_in_order=name != "video")
 
 
 @pytest.mark.parametrize("name", sorted(ONE_ROW))
-def test_one_damaged_row_is_one_lost_row(name: str, tmp_path: Path) -> None:
+def test_damaged_row_is_counted_as_one_dropped_row(name: str, tmp_path: Path) -> None:
     write, damage = ONE_ROW[name]
 
     check_reader(write(tmp_path), damage)
 
 
-def test_a_damaged_row_that_the_statistics_count_is_lost_once(tmp_path: Path) -> None:
+def test_damaged_row_counted_in_statistics_is_dropped_once(tmp_path: Path) -> None:
     messages = [message(1, 10 * i, b"%4d" % i) for i in range(20)]
-    whole = McapFile([schema(1), channel(1, 1, "/a"), *messages]).coded()
+    intact = McapFile([schema(1), channel(1, 1, "/a"), *messages]).coded()
     log = tmp_path / "log.mcap"
-    at = whole.index(messages[7])
-    log.write_bytes(whole[: at + 9] + b"\x4d\0" + whole[at + 11 :])
+    at = intact.index(messages[7])
+    log.write_bytes(intact[: at + 9] + b"\x4d\0" + intact[at + 11 :])
 
     ledger = Ledger(str(log))
     with open_log(log) as opened:

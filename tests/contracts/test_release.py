@@ -1,4 +1,4 @@
-"""One version, said everywhere, and by the tag of a release."""
+"""The package, changelog, citation and release tag state the same version."""
 
 import re
 import subprocess
@@ -15,7 +15,7 @@ def newest_heading() -> str:
     return found[1]
 
 
-def test_changelog_and_citation_are_of_the_packages_version() -> None:
+def test_changelog_and_citation_have_version_of_package() -> None:
     cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
 
     assert newest_heading().split()[0] == VERSION
@@ -23,7 +23,7 @@ def test_changelog_and_citation_are_of_the_packages_version() -> None:
     assert cited[1] == VERSION
 
 
-def test_a_tag_is_of_the_packages_version_and_its_changelog_has_a_date() -> None:
+def test_release_tag_has_version_of_package_and_dated_changelog() -> None:
     command = ["git", "-C", str(ROOT), "tag", "--points-at", "HEAD", "v*"]
     tags = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split()
 

@@ -1,7 +1,7 @@
-"""Measures of the import graph may improve, not deteriorate.
+"""The import graph stays within bounds.
 
-The goals of architecture.md are a longest chain of 12, 3.5 imports a module and about a dozen files
-a folder; lower the bounds when the numbers fall.
+The goals of architecture.md are a longest chain of 12, 3.5 imports per module and about a dozen
+files per folder. Lower the bounds when the numbers fall.
 """
 
 import ast
@@ -19,7 +19,7 @@ PACKAGES = [
     for name in ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 ]
 TOP = ("crosscue", "crosscue.testing")
-"""Modules of the package itself, whose links to the other folders grimp does not follow."""
+"""Modules of the package ``crosscue``, whose links to the other folders grimp does not follow."""
 LONGEST_CHAIN = 12
 IMPORTS_PER_MODULE = 3.50
 FILES_PER_FOLDER = 13
@@ -28,9 +28,9 @@ Graph = dict[str, set[str]]
 
 @pytest.fixture(scope="module")
 def imports() -> Graph:
-    """From a module to those of ours that it imports, wherever in the file it does."""
+    """Modules of ours that each module imports, anywhere in its file."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
-    # The six folders have no file of their own, so they would only lower the average.
+    # The six folders have no files, so they would only lower the average.
     named = graph.modules - set(PACKAGES)
     found = {one: set(graph.find_modules_directly_imported_by(one)) for one in named}
     folder = Path(crosscue.__file__).parent
@@ -40,7 +40,7 @@ def imports() -> Graph:
 
 
 def imported_by(path: Path, known: set[str]) -> set[str]:
-    """Modules of ours that a file imports, wherever in it."""
+    """Return the modules of ours that a file imports, anywhere in it."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -52,7 +52,7 @@ def imported_by(path: Path, known: set[str]) -> set[str]:
 
 
 def longest_chain(imports: Graph) -> list[str]:
-    """The longest chain of imports, the importing module first."""
+    """Return the longest chain of imports, the importing module first."""
     open_now: set[str] = set()
 
     @cache
@@ -69,17 +69,17 @@ def longest_chain(imports: Graph) -> list[str]:
     return list(longest)
 
 
-def test_no_chain_of_imports_is_longer_than_it_was(imports: Graph) -> None:
+def test_longest_chain_of_imports_is_within_bound(imports: Graph) -> None:
     chain = longest_chain(imports)
 
     assert len(chain) <= LONGEST_CHAIN, "\n".join(chain)
 
 
-def test_modules_import_no_more_than_they_did(imports: Graph) -> None:
+def test_average_number_of_imports_is_within_bound(imports: Graph) -> None:
     assert sum(map(len, imports.values())) / len(imports) <= IMPORTS_PER_MODULE
 
 
-def test_no_folder_is_fuller_than_it_was(imports: Graph) -> None:
+def test_number_of_files_per_folder_is_within_bound(imports: Graph) -> None:
     packages = {name.rsplit(".", 1)[0] for name in imports}
     files = Counter(
         name.rsplit(".", 1)[0] for name in imports if name not in packages and "." in name
@@ -89,11 +89,11 @@ def test_no_folder_is_fuller_than_it_was(imports: Graph) -> None:
     assert not full
 
 
-def test_one_line_imports_the_ground(imports: Graph) -> None:
-    """``replay.base`` hands on what all need; who needs a part alone imports that part instead."""
+def test_modules_import_base_or_one_part_of_it(imports: Graph) -> None:
+    """``replay.base`` re-exports common names; a module that needs one part imports that part."""
     base = "crosscue.replay.base"
     ground = {base, *imports[base]} - {"crosscue.replay.safe_text"}
-    # One prints the list of commands, the other is imported, without NumPy, which base needs.
+    # These two must be importable without NumPy, which base needs.
     without = {"crosscue", "crosscue.eval.cli"}
     several = {
         name: sorted(found)
@@ -104,7 +104,7 @@ def test_one_line_imports_the_ground(imports: Graph) -> None:
     assert not several
 
 
-def test_a_chain_is_measured_and_a_cycle_is_found() -> None:
+def test_chain_is_measured_and_cycle_is_reported() -> None:
     assert longest_chain({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == ["a", "b", "c"]
     with pytest.raises(AssertionError, match="imports itself"):
         longest_chain({"a": {"b"}, "b": {"a"}})

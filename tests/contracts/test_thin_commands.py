@@ -1,4 +1,4 @@
-"""Every command is a thin call of a public function: whatever it does, Python can do as well."""
+"""Every command calls public functions only, so that Python can do the same."""
 
 from __future__ import annotations
 
@@ -87,27 +87,27 @@ CALLS: Final = {
     "model init": ("draft_card",),
     "model check": ("check_card",),
 }
-"""The public functions that a command is made of."""
+"""Public functions that each command calls."""
 WITHOUT: Final = {"completion": "it is about the shell"}
 ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|safe_text))?")
-"""Modules that a command may import: the public interface, options, and safe text.
+"""Modules that a command may import: the public interface, options and safe text.
 
-Constants, too, for the help."""
+Constants of other modules are allowed as well, for the help."""
 
 
 def tree_of(command: str) -> ast.Module:
-    """The source of a command's module."""
+    """Return the syntax tree of a command's module."""
     module = import_module(f"crosscue.eval.commands.{cli.COMMANDS[command][0]}")
     return ast.parse(inspect.getsource(module))
 
 
-def test_every_command_is_in_one_of_the_tables() -> None:
+def test_every_command_has_public_functions_or_reason() -> None:
     assert not CALLS.keys() & WITHOUT.keys()
     assert CALLS.keys() | WITHOUT.keys() == cli.COMMANDS.keys()
 
 
 @pytest.mark.parametrize("command", CALLS)
-def test_a_command_calls_public_functions(command: str) -> None:
+def test_command_calls_listed_public_functions_only(command: str) -> None:
     called = {
         node.func.attr
         for node in ast.walk(tree_of(command))
@@ -122,7 +122,7 @@ def test_a_command_calls_public_functions(command: str) -> None:
 
 
 @pytest.mark.parametrize("command", CALLS)
-def test_a_command_imports_nothing_but_the_interface(command: str) -> None:
+def test_command_imports_public_interface_only(command: str) -> None:
     imported: dict[str, list[str]] = {}
     for node in ast.walk(tree_of(command)):
         if isinstance(node, ast.ImportFrom):
@@ -141,7 +141,7 @@ def test_a_command_imports_nothing_but_the_interface(command: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted({name for names in CALLS.values() for name in names}))
-def test_a_public_function_is_documented(name: str) -> None:
+def test_public_function_is_documented_with_its_arguments(name: str) -> None:
     function = getattr(crosscue, name)
     page = (ROOT / "docs" / "reference" / "interface.md").read_text(encoding="utf-8")
 
