@@ -12,7 +12,7 @@ from crosscue.replay.logs.opening import open_log
 def read(
     path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT_LIMITS
 ) -> tuple[list[Block], Ledger]:
-    """All blocks; what was found was used or skipped, and used is what was handed on."""
+    """Read all blocks, and check that every row found was skipped or used and returned."""
     ledger = Ledger(str(path))
     with open_log(path, limits) as log:
         blocks = list(log.read(ledger, selection))

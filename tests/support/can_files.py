@@ -1,4 +1,4 @@
-"""CAN logs made from a list of frames, and read back as one."""
+"""CAN logs written from a list of frames, and read back as such a list."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from crosscue.replay.base import DATA, ERROR, EVERYTHING, REMOTE, CanFrames, Led
 from crosscue.replay.logs.opening import open_log
 
 START_NS = 1_436_529_600_000_000_000
-"""Noon of 10 July 2015, which days since 1899 spell exactly."""
+"""Noon of 10 July 2015, which the day count of TRC files represents exactly."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """One frame as it was on the bus."""
+    """One frame on the bus."""
 
     t_ns: int
     bus: str
@@ -33,24 +33,24 @@ class Sent:
 
 
 def made(count: int, seed: int = 1, *, fd: bool = True, step_ns: int = 1_000) -> list[Sent]:
-    """``count`` simulated frames on two buses, in time order, of all kinds."""
-    chance = random.Random(seed)
+    """Generate ``count`` random frames of all kinds on two buses, in time order."""
+    rng = random.Random(seed)
     frames, t_ns = [], START_NS
     for _ in range(count):
-        t_ns += step_ns * chance.randrange(0, 2_000)
-        is_extended = chance.random() < 0.3
-        identifier = chance.randrange(0x20000000 if is_extended else 0x800)
-        is_fd = fd and chance.random() < 0.2
-        length = chance.choice(FD_LENGTHS) if is_fd else chance.randrange(9)
-        kind = REMOTE if not is_fd and chance.random() < 0.05 else DATA
-        payload = b"" if kind == REMOTE else chance.randbytes(length)
-        bus = chance.choice(("1", "2"))
+        t_ns += step_ns * rng.randrange(0, 2_000)
+        is_extended = rng.random() < 0.3
+        identifier = rng.randrange(0x20000000 if is_extended else 0x800)
+        is_fd = fd and rng.random() < 0.2
+        length = rng.choice(FD_LENGTHS) if is_fd else rng.randrange(9)
+        kind = REMOTE if not is_fd and rng.random() < 0.05 else DATA
+        payload = b"" if kind == REMOTE else rng.randbytes(length)
+        bus = rng.choice(("1", "2"))
         frames.append(Sent(t_ns, bus, identifier, payload, is_extended, kind, is_fd))
     return frames
 
 
 def candump_line(frame: Sent) -> str:
-    """As ``candump -l`` writes it."""
+    """Format a frame as ``candump -l`` does."""
     flags = 0x20000000 if frame.kind == ERROR else 0
     width = 8 if frame.is_extended or flags else 3
     separator = "##1" if frame.is_fd else "#R" if frame.kind == REMOTE else "#"
@@ -153,13 +153,13 @@ def blf(
     is_closed: bool = True,
     is_old: bool = False,
 ) -> bytes:
-    """A Vector BLF log: objects run on from one container to the next, as Vector's do.
+    """A Vector BLF log, in which objects may span containers, as in those of Vector's tools.
 
     Args:
-        frames: What it holds.
+        frames: Frames to write.
         container: Bytes of content in each container.
-        stored: Not compressed.
-        is_closed: Its writer came to write counts and times into the header.
+        stored: Containers are not compressed.
+        is_closed: The header has counts and times, which a writer adds when it closes the file.
         is_old: Times in steps of ten microseconds, header version 2, CAN_MESSAGE2.
     """
     content = b"".join(_blf_object(frame, is_old) for frame in frames)
@@ -231,7 +231,7 @@ def _blf_object(frame: Sent, is_old: bool) -> bytes:
 
 
 def frames_of(columns: CanFrames, log_ns: Sequence[int], bus: str) -> Iterator[Sent]:
-    """Rows of a block as frames."""
+    """Yield the rows of a block as frames."""
     for k, t_ns in enumerate(log_ns):
         yield Sent(
             int(t_ns),
@@ -247,7 +247,7 @@ def frames_of(columns: CanFrames, log_ns: Sequence[int], bus: str) -> Iterator[S
 def read_back(
     path: Path, selection: Selection = EVERYTHING
 ) -> tuple[dict[str, list[Sent]], Ledger]:
-    """All frames by topic, and the account."""
+    """Return all frames by topic, and the ledger."""
     ledger = Ledger(str(path))
     found: dict[str, list[Sent]] = {}
     with open_log(path) as log:
@@ -276,17 +276,17 @@ def by_bus(frames: Sequence[Sent], spelled: str = "can/{}") -> dict[str, list[Se
 
 
 def damaged(whole: bytes, seed: int) -> bytes:
-    """A copy with 1 to 64 consecutive bytes replaced: random ones, zeros, or one bit flipped."""
-    chance = random.Random(seed)
-    at = chance.randrange(len(whole))
-    count = min(chance.randrange(1, 65), len(whole) - at)
-    match chance.randrange(3):
+    """Replace 1 to 64 consecutive bytes by random ones or zeros, or flip one bit."""
+    rng = random.Random(seed)
+    at = rng.randrange(len(whole))
+    count = min(rng.randrange(1, 65), len(whole) - at)
+    match rng.randrange(3):
         case 0:
-            patch = chance.randbytes(count)
+            patch = rng.randbytes(count)
         case 1:
             patch = bytes(count)
         case _:
-            patch = bytes([whole[at] ^ 1 << chance.randrange(8)])
+            patch = bytes([whole[at] ^ 1 << rng.randrange(8)])
     return whole[:at] + patch + whole[at + len(patch) :]
 
 
@@ -297,7 +297,7 @@ def same_as_python_can(
     within_ns: int = 300,
     missing: int = 0,
 ) -> None:
-    """Hold our frames against python-can's, one by one; its times are binary fractions."""
+    """Compare our frames with python-can's, whose times are floats in seconds."""
     found, ledger = read_back(path)
     theirs: dict[str, list[can.Message]] = {}
     for message in peer:

@@ -1,4 +1,4 @@
-"""Every way to write CAN frames into a file, and what a reader must make of it."""
+"""Formats and variants of CAN log files, and the expected result of reading them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from support.can_files import START_NS, Sent, asc, blf, by_bus, candump, made, r
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One way to write frames down.
+    """One format or variant of a CAN log.
 
     Attributes:
-        spell: From frames to a file.
-        suffix: Of the file.
-        fd: It can hold CAN FD frames.
-        buses: It names buses.
-        declares_end: It shows whether its end is missing, even after a whole line.
-        start_ns: Log time at which its clock begins.
-        step_ns: Its clock's step.
+        spell: Function from frames to the bytes of a file.
+        suffix: Suffix of the file.
+        fd: Supports CAN FD frames.
+        buses: Records the bus of each frame.
+        declares_end: A missing end can be detected, even after a complete line.
+        start_ns: Log time at which its clock starts.
+        step_ns: Resolution of its clock.
     """
 
     spell: Callable[[Sequence[Sent]], bytes]
@@ -35,12 +35,12 @@ class Kind:
     step_ns: int = 1_000
 
     def frames(self, count: int, seed: int = 1) -> list[Sent]:
-        """Frames that it can hold."""
+        """Generate frames that the format supports."""
         frames = made(count, seed, fd=self.fd, step_ns=self.step_ns)
         return frames if self.buses else [replace(f, bus="1") for f in frames]
 
     def expected(self, frames: Sequence[Sent]) -> dict[str, list[Sent]]:
-        """Expected columns of a reader."""
+        """Return the frames that a reader is expected to yield, by topic."""
         shifted = [replace(f, t_ns=f.t_ns - START_NS + self.start_ns) for f in frames]
         return by_bus(shifted, "can{}" if self.suffix == ".log" else "can/{}")
 
@@ -68,7 +68,7 @@ class Verdict:
 
     Attributes:
         word: ``refused``, ``same``, ``reported``, ``undetectable`` or, in capitals, a fault.
-        why: Numbers behind it.
+        why: Error message or counts that explain it.
     """
 
     word: str
@@ -76,12 +76,12 @@ class Verdict:
 
     @property
     def is_fault(self) -> bool:
-        """Something was lost or invented without a word."""
+        """True if frames were lost or invented without a report, or an error was unclear."""
         return self.word.isupper()
 
 
 def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: Path) -> Verdict:
-    """Read ``copy``, which is ``whole`` cut or damaged, and hold it against ``frames``."""
+    """Read ``copy``, a truncated or damaged ``whole``, and compare it with ``frames``."""
     path.write_bytes(copy)
     try:
         open_log(path).close()
@@ -101,7 +101,7 @@ def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: P
     if not ledger.is_whole or ledger.topic("").skipped.total() > events or is_empty_reported:
         return Verdict("reported", numbers)
     if read.total() < len(frames):
-        # Text that ends with a whole line is a shorter log, as good as any other.
+        # A text log that ends with a complete line is a valid, shorter log.
         is_short = not kind.declares_end and whole.startswith(copy) and copy.endswith(b"\n")
         return Verdict("undetectable" if is_short else "SILENT", numbers)
     return Verdict("same" if found == kind.expected(frames) else "undetectable", numbers)

@@ -1,4 +1,4 @@
-"""CAN layouts and frames for tests: random ones as DBC text, and those of a real drive."""
+"""CAN layouts and frames for tests: random ones, and frames of real drives."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FRAME_LENGTHS = (1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 
 def comma2k19_frames(bus: int) -> Block:
-    """All frames of one bus of the real minute; 8 bytes each, since the set lost the lengths."""
+    """All frames of one bus of a real segment, 8 bytes each because it does not store lengths."""
     folder = shared(
         *("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40"),
         *("processed_log", "CAN", "raw_can"),
@@ -35,7 +35,7 @@ def comma2k19_frames(bus: int) -> Block:
 
 
 def ford_frames() -> Block:
-    """All frames of the real Ford bus (a candump), read the plain way."""
+    """All frames of a real candump log of a Ford, parsed without crosscue."""
     path = shared(
         "can", "ford_fusion_2017", "acc_on_speed_changing_from_30km_to_80km_per_hour.candump"
     )
@@ -62,7 +62,7 @@ def frames_of(
     is_extended: NDArray[np.bool_] | bool = False,
     length: NDArray[np.uint8] | None = None,
 ) -> CanFrames:
-    """Frames with these payloads; CAN FD when longer than 8 bytes."""
+    """Frames with the given payloads; CAN FD if longer than 8 bytes."""
     n, carried = payload.shape
     width = 8 if carried <= 8 else 64
     data = np.zeros((n, width), dtype=np.uint8)
@@ -79,7 +79,7 @@ def frames_of(
 
 
 def block_of(frames: CanFrames, topic: str = "can0") -> Block:
-    """Frames a millisecond apart."""
+    """A block of frames that are a millisecond apart."""
     return Block(topic, np.arange(len(frames), dtype=np.int64) * 1_000_000, frames)
 
 
@@ -112,13 +112,13 @@ def dbc_text(messages: list[CanMessage]) -> str:
 
 @dataclass(slots=True)
 class _Packing:
-    """Bits of a message that are still free."""
+    """Bits of a message that signals use already."""
 
     length: int
     taken: set[int] = field(default_factory=set)
 
     def fit(self, signal: CanSignal) -> bool:
-        """Take the signal's bits if all are free."""
+        """Mark the signal's bits as used if all are free, and return whether they were."""
         if signal.end_bit > 8 * self.length:
             return False
         run = range(signal.first_bit, signal.end_bit)
@@ -129,7 +129,7 @@ class _Packing:
         return True
 
     def copy(self) -> _Packing:
-        """The same free bits."""
+        """Return an independent copy."""
         return _Packing(self.length, set(self.taken))
 
 
@@ -139,7 +139,7 @@ OFFSETS = st.sampled_from([0, 0, 0, -40, 1, 500, 0.5, -273.15, -(2**31), 1e-3])
 
 @st.composite
 def signals(draw: st.DrawFn, name: str, length_bytes: int) -> CanSignal:
-    """One signal that fits into so many bytes."""
+    """One random signal that fits into ``length_bytes``."""
     is_float = length_bytes >= 4 and draw(st.integers(0, 7)) == 0
     max_count = min(64, 8 * length_bytes)
     short = st.integers(1, min(16, max_count))
@@ -164,7 +164,7 @@ def signals(draw: st.DrawFn, name: str, length_bytes: int) -> CanSignal:
 
 @st.composite
 def messages(draw: st.DrawFn, multiplexed: bool = False) -> CanMessage:
-    """A random message whose signals do not overlap; with nested multiplexers if asked for."""
+    """A random message whose signals do not overlap, optionally with nested multiplexers."""
     length = draw(st.sampled_from(FRAME_LENGTHS[2:] if multiplexed else FRAME_LENGTHS))
     packing = _Packing(length)
     made: list[CanSignal] = []
@@ -191,7 +191,7 @@ def _add_multiplexer(
     below: tuple[str, frozenset[int]] | None,
     depth: int,
 ) -> None:
-    """A multiplexer of 1 to 4 bits with branches, which may hold another one."""
+    """Add a multiplexer of 1 to 4 bits with branches, which may contain another one."""
     selector = draw(signals(f"M{len(made)}", packing.length))
     selector = replace(
         selector,

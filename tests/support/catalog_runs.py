@@ -1,4 +1,4 @@
-"""A few finished runs below one folder, quickly made: two drives, each with two settings."""
+"""Finished runs below one folder: two made-up drives, each with two settings."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .manifests import estimate_manifest
 from .scoring import run_folder
 
 ESTABLISHED: Final = {"a": 0.9, "b": 0.3}
-"""By folder of runs, the setting that they differ in."""
+"""Threshold ``fusion.established`` of the runs in each folder."""
 
 
 def seen(number: int, detected_m: float | None) -> ApproachRow:
-    """An approach as a run saw it."""
+    """Summary of an approach in a run."""
     return ApproachRow(
         number=number,
         start_ns=1_000_000_000,
@@ -33,7 +33,7 @@ def seen(number: int, detected_m: float | None) -> ApproachRow:
 
 
 def scene(*approaches: ApproachRow) -> SceneSummary:
-    """With these approaches."""
+    """Summary of a scene with the given approaches."""
     return SceneSummary(
         frames=50,
         positive={},
@@ -47,7 +47,7 @@ def scene(*approaches: ApproachRow) -> SceneSummary:
 
 
 def add_run(path: Path, drive: str, established: float = 0.9, **changes: Any) -> RunFolder:
-    """One run of a drive, with cues, belief and range."""
+    """Write one run of a drive, with cues, belief and range."""
     path.parent.mkdir(parents=True, exist_ok=True)
     log = LogRow(
         name=f"{drive}.mcap",
@@ -66,7 +66,7 @@ def add_run(path: Path, drive: str, established: float = 0.9, **changes: Any) ->
 
 
 def runs_below(folder: Path) -> Path:
-    """Runs ``a/monday``, ``a/tuesday``, ``b/monday`` and ``b/tuesday`` below a folder."""
+    """Write runs ``a/monday``, ``a/tuesday``, ``b/monday`` and ``b/tuesday`` below a folder."""
     for name, established in ESTABLISHED.items():
         for drive in ("monday", "tuesday"):
             add_run(folder / name / drive, drive, established)

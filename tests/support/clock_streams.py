@@ -1,4 +1,4 @@
-"""Simulated streams whose clocks are known: what was put in is what the report must give back."""
+"""Simulated streams with known clocks, for comparison with clock reports."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Stream:
     """A simulated topic; row ``i`` is measured at ``START_NS + i * period_ns``.
 
     Attributes:
-        rows: How many rows.
-        period_ns: Time between two.
-        offset_ns: Header clock less log clock at the first row.
-        drift_ppm: How much faster the header clock runs.
-        wait_ns: Mean of the exponential wait between stamp and storage.
-        jumps: From row to what the header clock is set by there.
-        seed: Of the waits.
+        rows: Number of rows.
+        period_ns: Time between rows.
+        offset_ns: Header clock minus log clock at the first row.
+        drift_ppm: Drift of the header clock relative to the log clock.
+        wait_ns: Mean of the exponential delay between stamp and storage.
+        jumps: Jumps of the header clock, by row.
+        seed: Seed of the delays.
     """
 
     rows: int = 1200
@@ -40,12 +40,12 @@ class Stream:
         return START_NS + self.period_ns * np.arange(self.rows, dtype=np.int64)
 
     def log_ns(self) -> Int64s:
-        """Log times: measured, then waited; a queue keeps its order."""
+        """Log times: measured times plus delays, in the order of a queue."""
         wait = np.random.default_rng(self.seed).exponential(1.0, self.rows) * self.wait_ns
         return np.maximum.accumulate(self.measured_ns() + wait.astype(np.int64))
 
     def header_ns(self) -> Int64s:
-        """Header stamps: the measured time on the sensor's own clock."""
+        """Header stamps: the measured times on the sensor's clock."""
         since = self.measured_ns() - START_NS
         ahead = np.rint(since * (self.drift_ppm * 1e-6)).astype(np.int64)
         for row, by_ns in self.jumps.items():
@@ -65,7 +65,7 @@ def table_of(
 
 
 def watch(block: Block, rows_per_block: int = 700) -> ClockReport:
-    """The report on one topic, fed in pieces."""
+    """Return the clock report on one topic, read in several blocks."""
     seen = ClockWatch()
     for start in range(0, max(len(block), 1), rows_per_block):
         seen.see(block.take(slice(start, start + rows_per_block)))
@@ -73,5 +73,5 @@ def watch(block: Block, rows_per_block: int = 700) -> ClockReport:
 
 
 def watch_stream(stream: Stream, rows_per_block: int = 700) -> ClockReport:
-    """The report on a simulated stream with log time and header stamp."""
+    """Return the clock report on a simulated stream with log times and header stamps."""
     return watch(table_of("/s", stream.log_ns(), stream.header_ns()), rows_per_block)

@@ -1,4 +1,4 @@
-"""Where the real recordings lie, and a visible skip where they do not."""
+"""Paths of real recordings; tests without them are skipped."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _ROOT = Path(__file__).parents[2]
 
 
 def shared(*parts: str) -> Path:
-    """Path of a real recording below the data folder; skips the test when it is missing."""
+    """Return the path of a real recording below the data folder; skip the test if it is missing."""
     base = Path(os.environ.get("CROSSCUE_DATA", _ROOT.parent / "shared" / "data"))
     path = base.joinpath(*parts)
     if not path.exists():
-        pytest.skip(f"real data not at hand: {path}; set CROSSCUE_DATA")
+        pytest.skip(f"real data missing: {path}; set CROSSCUE_DATA")
     return path

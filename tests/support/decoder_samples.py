@@ -1,4 +1,4 @@
-"""Outputs of every layout that mean one known box, in an input that is not square."""
+"""Network outputs of every layout that encode one known box in an input that is not square."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CLASS = 2
 
 @dataclass(frozen=True)
 class Sample:
-    """Outputs that mean one box ``BOX`` of class ``CLASS`` with ``SCORE`` among others below."""
+    """Outputs that encode ``BOX`` of class ``CLASS`` with ``SCORE``; all other scores are lower."""
 
     settings: dict[str, Any]
     outputs: dict[str, Array]
@@ -42,7 +42,7 @@ def _logit(p: float) -> float:
 def _yolox() -> Sample:
     strides = (8, 16, 32)
     rows = np.zeros((1, sum(SIZE[0] * SIZE[1] // s**2 for s in strides), 8))
-    # The cell of stride 16 whose column is 10 and row 5: 40 * 80 cells of stride 8 come before.
+    # The cell of stride 16 in column 10 and row 5, after 40 * 80 cells of stride 8.
     cell = 80 * 40 + 5 * 40 + 10
     x, y, w, h = _centered()
     rows[0, cell] = [x / 16 - 10, y / 16 - 5, np.log(w / 16), np.log(h / 16), 1.0, *_scores()]
@@ -63,7 +63,7 @@ def _yolov8() -> Sample:
 
 
 def _prototypes() -> Array:
-    """The first of 32 is a mask of the box's left half, over the input at a quarter of its size."""
+    """32 masks at a quarter of the input's size; the first covers the box's left half."""
     masks = np.full((1, 32, SIZE[1] // 4, SIZE[0] // 4), -9.0)
     masks[0, 0, :, : int(BOX[[0, 2]].mean()) // 4] = 9.0
     return masks

@@ -1,4 +1,4 @@
-"""A small camera log, a model card and a detector to run over it."""
+"""A simple detector, invalid variants of it, and a card for the real YOLOX-nano."""
 
 from __future__ import annotations
 
@@ -101,14 +101,14 @@ COCO = tuple(
 
 
 class BrightSettings(Settings):
-    """Settings of the detector below."""
+    """Settings of ``BrightBlob``."""
 
     threshold: int = 200
 
 
 @dataclass(frozen=True, slots=True)
 class BrightBlob:
-    """One box around all bright pixels: simple enough to check by eye."""
+    """A detector that returns one box around all bright pixels."""
 
     settings: BrightSettings
 
@@ -119,7 +119,7 @@ class BrightBlob:
 
     @property
     def identity(self) -> str:
-        """Of the settings."""
+        """Identity of the settings."""
         return identity_of("bright", self.settings.model_dump())
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
@@ -136,12 +136,12 @@ class BrightBlob:
 
 
 def build(**given: object) -> BrightBlob:
-    """A factory as users write them."""
+    """Build the detector, as a user's factory does."""
     return BrightBlob(settings_of(BrightSettings, given, "detector bright"))
 
 
 def too_few(**given: object) -> BrightBlob:
-    """A factory of a detector that forgets frames."""
+    """Build a detector that returns no results, which violates the contract."""
 
     class Forgetful(BrightBlob):
         def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
@@ -151,7 +151,7 @@ def too_few(**given: object) -> BrightBlob:
 
 
 def yolox_card(folder: Path, **changes: str) -> Path:
-    """A card for the real YOLOX-nano, with values changed."""
+    """Write a card for the real YOLOX-nano, with the given values changed."""
     weights = shared("weights", "yolox_nano", "yolox_nano.onnx")
     values = {
         "weights": f'"{weights}"',

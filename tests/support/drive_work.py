@@ -1,4 +1,4 @@
-"""Work on made-up drives, importable by workers: a log's word says what shall happen."""
+"""Work on made-up drives, importable by workers; the word in a log selects the outcome."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCHEMA = pa.schema([("t_ns", pa.int64()), ("letter", pa.string())])
 
 @dataclass(frozen=True, slots=True)
 class Letters:
-    """Result of the work on a synthetic drive."""
+    """Result of the work on one made-up drive."""
 
     rows: int
     exit_status: int
@@ -36,7 +36,7 @@ class Letters:
 
 
 def made_jobs(folder: Path, says: Sequence[str], runs: str = "runs") -> list[Job]:
-    """One drive for each word."""
+    """Write one log for each word, and return their jobs."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
     for i, word in enumerate(says):
@@ -48,7 +48,7 @@ def made_jobs(folder: Path, says: Sequence[str], runs: str = "runs") -> list[Job
 
 
 def letters(job: Job) -> Letters:
-    """Write the log's letters as rows, or fail as its first word asks."""
+    """Write the letters of the log's word as rows, or fail in the way that the word names."""
     log = Path(job.logs[0])
     word = log.read_text()
     run = create(job.run, overwrite=True)
@@ -74,7 +74,7 @@ def _account(log: Path, word: str) -> LogAccount:
 
 
 def _node() -> str:
-    """The Ray node that this process works for, as its cluster calls it."""
+    """Return the identifier of the Ray node on which this process runs."""
     import ray
 
     return str(ray.get_runtime_context().get_node_id())

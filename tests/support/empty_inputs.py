@@ -1,4 +1,4 @@
-"""Inputs of every kind that are whole and of which nothing comes, and commands that want more."""
+"""Valid empty inputs of every kind, and commands that require more than that."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ COMMANDS: dict[str, str] = {
     "browse": "{empty}/failures.parquet -o {out}",
     "export": "{empty}/failures.parquet -o {out}",
 }
-"""Commands that find nothing in such input, and their arguments."""
+"""Commands without a result for such input, and their arguments."""
 
 
 def empty_inputs(folder: Path) -> dict[str, Path]:
-    """A drive and its run, and inputs of every kind that are whole and hold nothing."""
+    """Write a drive, its run, and valid empty inputs of every kind."""
     drive, empty = folder / "drive", folder / "empty"
     log = write_drive(drive, Clock(), seconds=4)
     run = replayed(drive, log, "../run")

@@ -1,4 +1,4 @@
-"""One small log of every format that ``open_log`` knows, made on the spot."""
+"""One small log of every format that ``open_log`` supports."""
 
 from __future__ import annotations
 
@@ -94,4 +94,4 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "video": _video,
     "images": lambda folder: picture_folder(folder / "front", 12, "rate_hz: 10\n"),
 }
-"""By the names in ``FORMATS``: writes a log into an empty folder and returns it."""
+"""For each name in ``FORMATS``, a function that writes a log into a folder and returns its path."""

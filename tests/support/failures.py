@@ -1,4 +1,4 @@
-"""A table of failures, for what takes one."""
+"""A table of failures, for commands that read one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from crosscue.eval.failures.record import Failure, write_failures
 
 
 def table_of_failures(run: Path, table: Path, *times_ns: int) -> Path:
-    """A table in which a run believed ``left`` too late at these times."""
+    """Write a table in which a run established ``left`` too late at the given times."""
     failures = [
         Failure(
             run=str(run),

@@ -1,6 +1,6 @@
-"""Commands in a forked process, where file operations can be made to kill or to fail.
+"""Commands in a forked process in which file operations kill the process or fail.
 
-Forked from a process that has everything imported and compiled, so that dozens of runs are quick.
+The parent process has everything imported and compiled, so that dozens of runs are fast.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Ended:
 
     Attributes:
         status: Exit status; minus the signal's number if it was killed.
-        said: On stderr.
+        said: Text on stderr.
     """
 
     status: int
@@ -40,7 +40,7 @@ class Ended:
 
 def forked(prepare: Callable[[], None], argv: Sequence[str]) -> Ended:
     """Run one command line in a forked process, after ``prepare``."""
-    # A pipe, since files may be what the command is not allowed to write.
+    # A pipe, because the command may be unable to write files.
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
@@ -67,9 +67,9 @@ def _run(prepare: Callable[[], None], argv: Sequence[str], said: int) -> NoRetur
 
 
 def watched(folder: Path, names: frozenset[str], then: Callable[[int, str], None]) -> None:
-    """From now on, for good, call ``then`` before every operation that changes ``folder``.
+    """Call ``then`` before every operation that changes ``folder``, until the process ends.
 
-    It is reported a number from 0 and what is to be done.
+    Its arguments are the operation's number, starting at 0, and a description.
     """
     count = 0
     inside = str(folder)
@@ -92,7 +92,7 @@ def _writes(args: tuple[object, ...]) -> bool:
 
 
 def operations(folder: Path, names: frozenset[str], argv: Sequence[str]) -> list[str]:
-    """All operations on ``folder`` of an untroubled run."""
+    """Return all operations on ``folder`` of a run without faults."""
     with tempfile.NamedTemporaryFile("r") as reported:
 
         def prepare() -> None:
@@ -131,13 +131,13 @@ def failing_from(
 
 
 def with_files_up_to(size: int, argv: Sequence[str]) -> Ended:
-    """No file may grow beyond ``size`` bytes: writes fail in the middle."""
+    """Run the command with a limit of ``size`` bytes per file, so that writes fail midway."""
     limit = (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
     return forked(lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit), argv)
 
 
 def with_failing_fsync(call: int, argv: Sequence[str]) -> Ended:
-    """The ``call``-th flush to the disk fails, as on a dying disk."""
+    """Run the command with an I/O error in fsync call number ``call``, starting at 0."""
 
     def prepare() -> None:
         real, left = os.fsync, call

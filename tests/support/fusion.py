@@ -1,4 +1,4 @@
-"""Random factor graphs, situations for their cues, and evidence for made-up drives."""
+"""Random factor graphs, situations of their cues, and evidence of made-up drives."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NONE_SEEN: Mapping[str, int] = {
 
 @st.composite
 def graphs(draw: st.DrawFn) -> FactorGraph:
-    """Up to four features and six cues, joined at random."""
+    """Up to four features and six cues with random edges."""
     features = [f"f{i}" for i in range(draw(st.integers(1, 4)))]
     cues = [f"z{i}" for i in range(draw(st.integers(1, 6)))]
     inside = st.floats(0.02, 0.98)
@@ -47,7 +47,7 @@ def graphs(draw: st.DrawFn) -> FactorGraph:
 
 @st.composite
 def graphs_heard(draw: st.DrawFn) -> tuple[FactorGraph, list[dict[str, int]]]:
-    """A graph and what its cues counted in some frames; a cue may not have been looked for."""
+    """A graph and counts of its cues in several frames; a cue can be missing in a frame."""
     graph = draw(graphs())
     names = st.sampled_from([cue.name for cue in graph.cues])
     frames = st.lists(st.dictionaries(names, st.integers(0, 3)), max_size=5)
@@ -64,7 +64,7 @@ def situation(
     moved_m: float = 1.0,
     passed_s: float = 0.1,
 ) -> Situation:
-    """One frame, by default of an established approach that is far away."""
+    """The situation of one frame, by default in an established approach far from its end."""
     return Situation(counts, established, near, near, objects or {}, new_picture, moved_m, passed_s)
 
 
@@ -86,14 +86,14 @@ def drive(
     step_m: float = 1.0,
     begin_ns: int = 0,
 ) -> Iterator[FrameEvidence]:
-    """A car that goes towards an intersection at ten frames per second.
+    """Yield the evidence of a car that approaches an intersection, at ten frames per second.
 
     Args:
         from_m: First distance to the start of the intersection.
-        to_m: Last one, below it; negative is past.
-        seen: From cue to (distance below which it is seen until passed, how many). A stop sign
-            reports its range.
-        step_m: Way between frames.
+        to_m: Last distance; negative after the start of the intersection.
+        seen: For each cue, the distance below which it is visible, and its count. A stop sign
+            yields a range.
+        step_m: Distance between frames.
         begin_ns: Time of the first frame.
     """
     frames = int((from_m - to_m) / step_m) + 1
@@ -107,7 +107,7 @@ def drive(
 
 
 def chain(rng: np.random.Generator, way_m: Floats, rate: float, fade_m: float) -> NDArray[np.int64]:
-    """Looks of a cue along a way: positive at a rate, alike over a fading length."""
+    """Simulate a cue along a path: positive at ``rate``, correlated over ``fade_m``."""
     out = [int(rng.random() < rate)]
     for step_m in np.diff(way_m).tolist():
         rho = math.exp(-step_m / fade_m)
@@ -125,7 +125,7 @@ FADE_M = 4.0
 
 
 def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]:
-    """Simulated approaches whose cues follow ``RATES`` and resemble themselves over ``FADE_M``."""
+    """Simulated approaches whose cues follow ``RATES`` and are correlated over ``FADE_M``."""
     rng = np.random.default_rng(seed)
     out = []
     for i in range(many):
@@ -144,7 +144,7 @@ def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]
 
 
 def other_side(name: str) -> str:
-    """A cue's or a feature's name in the mirror."""
+    """Return the name of a cue or feature with left and right exchanged."""
     if "left" in name:
         return name.replace("left", "right")
     return name.replace("right", "left")

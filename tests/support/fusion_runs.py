@@ -1,4 +1,4 @@
-"""Run folders of made-up drives, as far as the fit of messages reads them."""
+"""Run folders of made-up drives with the tables that the fit of messages reads."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ FRAME_NS = SECOND_NS // 10
 
 
 def made_up_drive(rng: np.random.Generator, *, left: bool, signed: bool) -> list[FrameEvidence]:
-    """Sixty metres up to an intersection; the road to the left is mostly seen where there is one.
+    """Evidence of sixty metres up to an intersection, with a noisy cue of the road to the left.
 
-    Without a sign, a road seen to the right keeps the approach open.
+    Without a sign, a road to the right keeps the approach open.
     """
     out = []
     for i in range(60):
@@ -46,7 +46,7 @@ def made_up_drive(rng: np.random.Generator, *, left: bool, signed: bool) -> list
 def write_run(
     folder: Path, evidence: Iterable[FrameEvidence], vehicle: Vehicle | None = None
 ) -> RunFolder:
-    """A finished run over the evidence."""
+    """Write a finished run with the given evidence."""
     vehicle = vehicle or Vehicle(version=1, fusion=Fusion(kind="source"))
     run = create(folder, overwrite=False)
     loop = Approaches(graph_of(vehicle.fusion), vehicle.fusion, vehicle.range_filter)
@@ -92,7 +92,7 @@ def _write_steps(run: RunFolder, steps: list[Step]) -> None:
 
 
 def write_truth(folder: Path, *, left: bool | None, enter_ns: int = 59 * FRAME_NS) -> Path:
-    """The truth of one drive: one approach over all of it."""
+    """Write the truth of a drive that consists of one approach."""
     folder.mkdir()
     one = Approach(
         id=0,
@@ -106,6 +106,6 @@ def write_truth(folder: Path, *, left: bool | None, enter_ns: int = 59 * FRAME_N
 
 
 def write_empty_truth(folder: Path, end_ns: int = 10**12) -> Path:
-    """The truth of a drive that meets no intersection."""
+    """Write the truth of a drive without an intersection."""
     folder.mkdir()
     return save(Truth(version=1, start_ns=0, end_ns=end_ns), folder)

@@ -1,7 +1,7 @@
-"""A made-up drive towards a stop sign whose log's clock is set or pauses, small and exact.
+"""A small simulated drive towards a stop sign, with a log whose clock is set or pauses.
 
-Pictures are one grey level, the number of the frame, so that the detector below finds its sign by
-what it sees and not by a time that the clock has changed.
+The grey level of each picture is the number of its frame. The detector below computes the sign from
+it, so that detections do not depend on times, which the clock changes.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ ROW: Final = SECOND // 10
 """Ten wheel rows and pictures per second."""
 SPEED_MPS: Final = 6.0
 START_M: Final = 70.0
-"""From the first frame to the intersection."""
+"""Distance from the first frame to the intersection."""
 SIGN_M: Final = (8.0, 55.0)
-"""The sign is seen between these distances."""
+"""Range of distances in which the sign is visible."""
 SIZE: Final = (160, 90)
 FOCAL_PX: Final = 200.0
 BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")
@@ -85,12 +85,12 @@ kind = "{CHOICE}"
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Mapping from true times to the log's.
+    """Mapping from true times to log times.
 
     Attributes:
-        set_at_s: The clock is set then,
-        by_s: by so much.
-        pause_s: Rows from the first to before the second of these were never recorded.
+        set_at_s: Time at which the clock is set.
+        by_s: Change of the clock at that time.
+        pause_s: Half-open interval in which no rows are recorded.
     """
 
     set_at_s: float = 0.0
@@ -98,7 +98,7 @@ class Clock:
     pause_s: tuple[float, float] = (0.0, 0.0)
 
     def recorded(self, t_ns: Int64s) -> tuple[Int64s, Int64s]:
-        """Indices of the rows that were recorded, and their stamps."""
+        """Return the indices of the recorded rows, and their stamps."""
         first, last = (BEGIN + round(s * SECOND) for s in self.pause_s)
         rows = np.flatnonzero((t_ns < first) | (t_ns >= last))
         is_later = t_ns[rows] >= BEGIN + round(self.set_at_s * SECOND)
@@ -106,7 +106,7 @@ class Clock:
 
 
 def distance_m(t_ns: Int64s) -> Floats:
-    """True distance still to go, shape (N,)."""
+    """True distance to the intersection, shape (N,)."""
     left: Floats = START_M - SPEED_MPS * (t_ns - BEGIN) / SECOND
     return left
 
@@ -119,7 +119,7 @@ def write_drive(
     name: str = "drive.mcap",
     topics: Sequence[Topic] = (BUS, CAMERA),
 ) -> Path:
-    """Write log, vehicle file and truth; the log's path comes back."""
+    """Write log, vehicle file and truth, and return the path of the log."""
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / name
     true_ns = np.arange(seconds * 10) * ROW + BEGIN
@@ -149,7 +149,7 @@ def replay(folder: Path, log: Path, run: str = "run", selection: Selection = EVE
 
 
 def replayed(folder: Path, log: Path, run: str = "run") -> RunFolder:
-    """The run of ``replay``."""
+    """Replay a log like ``replay``, and return the run folder."""
     return replay(folder, log, run).run
 
 
@@ -206,7 +206,7 @@ def _write_truth(folder: Path, true_ns: Int64s) -> None:
 
 
 class GreyNumber:
-    """Reads the frame's number and returns the sign that is seen from there."""
+    """A detector that reads the frame's number and returns the sign visible at that position."""
 
     @property
     def view(self) -> View:
@@ -215,7 +215,7 @@ class GreyNumber:
 
     @property
     def identity(self) -> str:
-        """There is one kind."""
+        """The same for all, because it has no settings."""
         return "grey number"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
@@ -233,5 +233,5 @@ class GreyNumber:
 
 
 def build() -> GreyNumber:
-    """A factory, as ``module:factory`` names it."""
+    """Build the detector, as ``CHOICE`` specifies."""
     return GreyNumber()

@@ -1,4 +1,4 @@
-"""Landmarks along ``gap_drive``, whose pictures say by their grey level where they were made."""
+"""Landmarks along ``gap_drive``, whose pictures encode their position as a grey level."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .gap_drive import ROW, SECOND, SPEED_MPS
 from .landmark_drive import NearnessMatcher, there
 
 STEP_M: Final = SPEED_MPS * ROW / SECOND
-"""From row to row."""
+"""Distance between rows."""
 
 
 class PlaceByNumber(NearnessMatcher):
-    """Takes a picture for the place where it was made, which its grey level says."""
+    """A matcher that computes the position of a picture from its grey level."""
 
     def describe(self, grey: Bytes, /) -> Features:
-        """The place."""
+        """Return the position as features."""
         return there(np.array([STEP_M * float(np.median(grey)), 0.0]))
 
 
 def matcher(_camera: CameraGeometry) -> PlaceByNumber:
-    """A factory, as the vehicle file names it."""
+    """Build the matcher, as the vehicle file specifies."""
     return PlaceByNumber(5.0)

@@ -1,4 +1,4 @@
-"""A simulated KITTI raw drive: a constant turn at constant speed, written as the set writes it."""
+"""A simulated KITTI raw drive in the published layout: a constant turn at constant speed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FIRST_S = 1317042120
 
 
 def dates(count: int, start_ns: int = 964_389_445) -> str:
-    """``timestamps.txt`` at 10 Hz from 13:02:00 on, to the nanosecond."""
+    """Text of ``timestamps.txt`` at 10 Hz from 13:02:00 on, in nanoseconds."""
     lines = []
     for i in range(count):
         whole, rest = divmod(start_ns + 100_000_000 * i, 1_000_000_000)
@@ -75,7 +75,7 @@ def packet_lines(count: int) -> list[str]:
 
 
 def raw_drive(path: Path, count: int = 30, cameras: tuple[str, ...] = ("image_02",)) -> Path:
-    """A raw drive's folder."""
+    """Write the folder of a raw drive."""
     (path / "oxts" / "data").mkdir(parents=True)
     (path / "oxts" / "timestamps.txt").write_text(dates(count))
     for i, line in enumerate(packet_lines(count)):
@@ -89,7 +89,7 @@ def raw_drive(path: Path, count: int = 30, cameras: tuple[str, ...] = ("image_02
 
 
 def tracking_drive(path: Path, count: int = 30) -> Path:
-    """One sequence in the tracking set's layout."""
+    """Write one sequence in the layout of the tracking benchmark."""
     (path / "oxts").mkdir(parents=True)
     (path / "oxts" / "0003.txt").write_text("\n".join(packet_lines(count)) + "\n")
     (path / "image_02" / "0003").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A made KITTI odometry sequence in the published layout: a constant left turn."""
+"""A simulated KITTI odometry sequence in the published layout: a constant left turn."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ FOCAL_PX: Final = 718.856
 
 
 def pose_line(seconds: float) -> str:
-    """The upper rows of the camera's matrix: axes right, down, ahead."""
+    """The upper rows of the camera's pose matrix, with axes right, down, ahead."""
     yaw = YAW_RATE_RADPS * seconds
     radius = SPEED_MPS / YAW_RATE_RADPS
-    # To the left is -x, ahead is z; a left turn is negative about y, which points down.
+    # Left is -x and ahead is z. A left turn is negative about y, which points down.
     place = [-radius * (1.0 - np.cos(yaw)), 0.0, radius * np.sin(yaw)]
     matrix = np.column_stack([Rotation.from_euler("y", -yaw).as_matrix(), place])
     return " ".join(f"{value:.9e}" for value in matrix.ravel())
 
 
 def kitti_odometry_drive(path: Path, count: int = 20) -> Path:
-    """A sequence's folder below ``path``, with its poses."""
+    """Write a sequence below ``path`` with its poses, and return its folder."""
     folder = path / "sequences" / "04"
     (folder / "image_2").mkdir(parents=True)
     for i in range(count):

@@ -1,4 +1,4 @@
-"""A simulated drive past landmarks whose 'pictures' are the place where they were taken."""
+"""A simulated drive past landmarks whose 'pictures' encode the position of the camera."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from support.simulated_drive import Truth
 
 
 def there(xy_m: Floats) -> Features:
-    """Camera image at a place: in this simulation, the place itself."""
+    """Features of the picture at a position, which encode the position itself."""
     where = np.ascontiguousarray(xy_m, np.float64).view(np.uint8).reshape(1, 16)
     return Features(640, 480, np.zeros((1, 2), np.float32), where)
 
 
 class NearnessMatcher:
-    """Scores 100 less a point for each metre between the places of two pictures."""
+    """A matcher with a score of 100 minus the distance of two pictures' positions in metres."""
 
     kind = "nearness"
 
@@ -32,11 +32,11 @@ class NearnessMatcher:
         self.compared = 0
 
     def describe(self, grey: Bytes, /) -> Features:
-        """Not needed: pictures are places."""
+        """Fail, because pictures are positions here."""
         raise AssertionError("pictures are places in this simulation")
 
     def match(self, seen: Features, known: Features, /) -> Match:
-        """Nearer is better."""
+        """Score two pictures by their distance."""
         self.compared += 1
         here, other = (f.descriptors.reshape(-1).view(np.float64) for f in (seen, known))
         apart_m = float(np.hypot(*(here - other)))
@@ -44,7 +44,7 @@ class NearnessMatcher:
 
 
 def camera_path(truth: Truth, lever_m: tuple[float, float]) -> Floats:
-    """Where the camera truly is, shape (N, 2)."""
+    """True positions of the camera, shape (N, 2)."""
     lever = complex(*lever_m) * np.exp(1j * truth.xyh[:, 2])
     camera_m: Floats = truth.xyh[:, :2] + np.column_stack([lever.real, lever.imag])
     return camera_m
@@ -58,7 +58,7 @@ def landmarks_along(
     cov_m2: Floats,
     lever_m: tuple[float, float] = (0.0, 0.0),
 ) -> Path:
-    """A database of landmarks on the camera's way, coordinates off as their covariance says."""
+    """Write landmarks along the camera's path, with errors drawn from ``cov_m2``."""
     camera_m = camera_path(truth, lever_m)
     way_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(camera_m, axis=0).T))])
     at = np.searchsorted(way_m, np.arange(every_m / 2, way_m[-1], every_m))
@@ -72,7 +72,7 @@ def landmarks_along(
 
 @dataclass(slots=True)
 class PlaceMeasurements:
-    """A ``MeasurementSource`` whose frames show the true position of the car."""
+    """A ``MeasurementSource`` whose frames encode the true position of the camera."""
 
     search: LandmarkSearch
     truth: Truth
@@ -81,12 +81,12 @@ class PlaceMeasurements:
     times: list[int] = field(default_factory=list)
 
     def times_ns(self) -> Sequence[int]:
-        """Every so many true samples."""
+        """Times of every ``every``-th true sample."""
         times: list[int] = self.truth.t_ns[:: self.every].tolist()
         return times
 
     def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
-        """Look at the true place."""
+        """Match the picture at the true position."""
         row = int(np.searchsorted(self.truth.t_ns, belief.t_ns))
         camera_m = camera_path(self.truth, self.lever_m)[row]
         found = self.search.process(belief, travelled_m, lambda: there(camera_m))
@@ -96,5 +96,5 @@ class PlaceMeasurements:
 
 
 def search_in(database: LandmarkDatabase, settings: LandmarkSettings) -> LandmarkSearch:
-    """A search with the nearness matcher."""
+    """A search with ``NearnessMatcher``."""
     return LandmarkSearch(database, NearnessMatcher(), settings)

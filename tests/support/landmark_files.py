@@ -1,4 +1,4 @@
-"""Small landmark databases and the simulated pictures that go with them."""
+"""Small landmark databases and simulated pictures of landmarks."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from crosscue.replay.base import Bytes, Floats
 
 
 def some_features(seed: int, count: int = 20) -> Features:
-    """Made-up descriptors of the size of ORB's."""
+    """Random descriptors of the size of ORB's."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(0.0, 640.0, (count, 2)).astype(np.float32)
     return Features(640, 480, points, rng.integers(0, 256, (count, 32), dtype=np.uint8))
 
 
 def place_at(x_m: float, y_m: float, name: str | None = None, sd_m: float = 2.0) -> Place:
-    """A landmark with a round covariance."""
+    """A landmark with an isotropic covariance."""
     return Place(name or f"at {x_m} {y_m}", np.array([x_m, y_m]), sd_m**2 * np.eye(2), 0.5, "made")
 
 
 def database_of(path: Path, xy_m: Floats, sd_m: float = 2.0, kind: str = "orb") -> Path:
-    """A database with made-up features at the positions of shape (N, 2), named ``0``, ``1``..."""
+    """Write a database with random features at positions of shape (N, 2), named ``0``, ``1``..."""
     with LandmarkWriter(path, kind) as writer:
         for i, (x, y) in enumerate(xy_m.tolist()):
             writer.add(place_at(x, y, str(i), sd_m), some_features(i))
@@ -33,7 +33,7 @@ def database_of(path: Path, xy_m: Floats, sd_m: float = 2.0, kind: str = "orb") 
 
 
 def wall(seed: int, width_px: int = 640, height_px: int = 480) -> Bytes:
-    """A simulated textured wall: random patches of all sizes, grey."""
+    """A simulated textured wall: grey, with random patches of all sizes."""
     rng = np.random.default_rng(seed)
     picture = np.full((height_px, width_px), 128, np.uint8)
     for _ in range(400):
@@ -45,7 +45,7 @@ def wall(seed: int, width_px: int = 640, height_px: int = 480) -> Bytes:
 
 
 def seen_from(picture: Bytes, turn_deg: float, scale: float, noise: float, seed: int) -> Bytes:
-    """The same wall from another place: warped, darker, noisy; simulated."""
+    """Simulate the same wall from another position: warped, darker and noisy."""
     height, width = picture.shape
     turn = cv2.getRotationMatrix2D((width / 2, height / 2), turn_deg, scale)
     warp = np.vstack([turn, [1e-5 * turn_deg, 5e-6 * turn_deg, 1.0]])
@@ -56,29 +56,29 @@ def seen_from(picture: Bytes, turn_deg: float, scale: float, noise: float, seed:
 
 
 def encoded(picture: Bytes, suffix: str = ".png") -> bytes:
-    """The picture as a file's bytes."""
+    """The picture as the bytes of an image file."""
     ok, found = cv2.imencode(suffix, picture)
     assert ok
     return found.tobytes()
 
 
 class ShadeMatcher:
-    """A stand-in for a matcher of one's own: pictures are alike if they are as bright."""
+    """A custom matcher, which scores the similarity of mean brightness."""
 
     kind = "shade"
 
     def describe(self, grey: Bytes, /) -> Features:
-        """The mean brightness, twenty-five times."""
+        """Return the mean brightness as 25 equal descriptors."""
         height, width = grey.shape
         shade = np.full((25, 1), round(float(grey.mean())), np.uint8)
         return Features(width, height, np.zeros((25, 2), np.float32), shade)
 
     def match(self, seen: Features, known: Features, /) -> Match:
-        """The nearer in brightness, the surer."""
+        """Return 100 minus the difference in brightness."""
         apart = abs(float(seen.descriptors[0, 0]) - float(known.descriptors[0, 0]))
         return Match(100.0 - apart, 25, 25)
 
 
 def shade(camera: CameraGeometry) -> ShadeMatcher:
-    """For ``--matcher support.landmark_files:shade``."""
+    """Build the matcher, for ``--matcher support.landmark_files:shade``."""
     return ShadeMatcher()

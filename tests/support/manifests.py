@@ -39,7 +39,7 @@ def _drive() -> dict[str, Any]:
 
 
 def estimated(**changes: Any) -> EstimateManifest:
-    """A whole run of nothing, but for the changes."""
+    """Manifest of a finished run without rows, with the given changes."""
     content = {
         **_drive(),
         "sources": {},
@@ -54,12 +54,12 @@ def estimated(**changes: Any) -> EstimateManifest:
 
 
 def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectManifest:
-    """A finished detect stage.
+    """Manifest of a finished detect stage.
 
     Args:
-        camera: Its topic.
+        camera: Topic of the camera.
         detectors: Roles by name.
-        changes: Of anything else.
+        changes: Changes of other fields.
     """
     content = {
         **_drive(),
@@ -78,14 +78,14 @@ def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectMa
 
 
 def estimate_manifest(run: RunFolder) -> EstimateManifest:
-    """The manifest of a run that is whole."""
+    """Return the manifest of a finished run."""
     found = run.manifest()
     assert isinstance(found, EstimateManifest)
     return found
 
 
 def log_account(log: str, topic: str, **counts: Any) -> LogAccount:
-    """The account of a log with one topic, not whole where something was dropped."""
+    """Account of a log with one topic; incomplete if messages were dropped."""
     used, skipped, dropped = counts["used"], counts.get("skipped", {}), counts.get("dropped", {})
     found = used + sum(skipped.values())
     one = TopicLine(

@@ -27,7 +27,7 @@ def plan_of(width_px: int = 128, **changes: Any) -> Plan:
 
 @cache
 def random_checkpoint(seed: int = 0) -> Checkpoint:
-    """A network that has learnt nothing, but whose scores differ from place to place."""
+    """An untrained network whose scores vary over the picture."""
     torch.manual_seed(seed)
     network = build_network(plan_of())
     with torch.no_grad():
@@ -44,7 +44,7 @@ def noise_frame(seed: int = 0, width: int = 128, height: int = 96, t_ns: int = 5
 
 
 def bars(seed: int) -> tuple[Bytes, list[tuple[int, int, int, int]]]:
-    """Grey with two bright bars, 128 x 96, and their boxes as x, y, width, height."""
+    """A grey 128 x 96 picture with two bright bars, and their boxes as x, y, width, height."""
     rng = np.random.default_rng(seed)
     pixels = rng.integers(60, 90, (96, 128, 3), np.uint8)
     boxes = []
@@ -57,7 +57,7 @@ def bars(seed: int) -> tuple[Bytes, list[tuple[int, int, int, int]]]:
 
 
 def write_bars(folder: Path, count: int) -> Path:
-    """A COCO file of such pictures, in ``folder/images``; the bars are called cars."""
+    """Write a COCO file of such pictures in ``folder/images``, with the bars labelled as cars."""
     (folder / "images").mkdir(parents=True)
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

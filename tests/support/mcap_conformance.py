@@ -1,7 +1,8 @@
 """The conformance files of the MCAP project, from its folder ``tests/conformance/data``.
 
-That folder holds for each file a JSON of its records. A checkout without Git LFS has pointers in
-place of the files; the file is then rebuilt from its records, and must have the pointer's SHA-256.
+That folder has a JSON description of each file's records. A checkout without Git LFS has pointers
+instead of the files. A file is then rebuilt from its records and compared with the pointer's
+SHA-256.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ PADDING = b"\x01\xff\xff"
 
 @dataclass(frozen=True, slots=True)
 class Conformance:
-    """One file of the suite and what it holds.
+    """One file of the suite and its content.
 
     Attributes:
-        name: Its name.
-        coded: Its bytes.
-        messages: Its messages by topic, in stored order.
-        is_exact: The bytes are those of the suite, by their SHA-256.
+        name: Name of the file.
+        coded: Bytes of the file.
+        messages: Messages by topic, in stored order.
+        is_exact: The bytes have the SHA-256 of the suite's file.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Conformance:
 
 
 def load(description: Path) -> Conformance:
-    """The file described by one JSON file."""
+    """Load the file that a JSON file describes."""
     reported = json.loads(description.read_text())
     records = [(r["type"], dict(r["fields"])) for r in reported["records"]]
     stored = description.with_suffix(".mcap").read_bytes()
@@ -79,7 +80,7 @@ def _messages(records: list[tuple[str, dict[str, Any]]]) -> dict[str, list[Messa
 
 
 def rebuild(records: list[tuple[str, dict[str, Any]]], features: frozenset[str]) -> bytes:
-    """A file of these records, chunked, indexed and padded as the features say."""
+    """Build a file from records, chunked, indexed and padded as the features specify."""
     pad = PADDING if "pad" in features else b""
     out = bytearray(MAGIC)
     chunk: list[tuple[str, dict[str, Any]]] = []

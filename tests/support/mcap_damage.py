@@ -1,4 +1,4 @@
-"""Seeded damage to MCAP files, and what a reader must make of it."""
+"""Seeded damage to MCAP files, and a classification of what a reader returns."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from support.mcap_files import (
 )
 
 UNCOVERED = ("no checksum covers", "checksum is wrong", "has no checksums")
-"""Text of the account if a changed byte cannot be detected."""
+"""Parts of the ledger's integrity if a changed byte cannot be detected."""
 TOPICS = ("/imu", "/can", "/camera")
 
 
 def sound_parts(compression: str, is_chunked: bool, per_chunk: int = 25) -> list[bytes | ChunkOf]:
-    """Six hundred messages on three topics, as chunks or as bare records."""
+    """Six hundred messages on three topics, in chunks or as records without chunks."""
     rng = np.random.default_rng(7)
     defined = [schema(1)] + [channel(i + 1, 1, name) for i, name in enumerate(TOPICS)]
-    # Payloads that say their own number cannot pass for one another.
+    # Payloads contain their number, so that they cannot be confused.
     messages = [
         message(1 + i % 3, 10**9 + i * 1000, b"%06d" % i + rng.bytes(i * 13 % 60) + bytes(i % 40))
         for i in range(600)
@@ -47,7 +47,7 @@ def _without_index(part: bytes | ChunkOf) -> bytes | ChunkOf:
 
 
 def sound_files() -> Iterator[tuple[str, bytes]]:
-    """Files with checksums, by name."""
+    """Yield undamaged files with different checksums and indexes, by name."""
     for compression in ("", "lz4", "zstd"):
         parts = sound_parts(compression, is_chunked=True)
         name = compression or "none"
@@ -73,7 +73,7 @@ def sound_files() -> Iterator[tuple[str, bytes]]:
 
 
 class Kind(Enum):
-    """Outcome of one damaged copy."""
+    """Kind of outcome of reading one damaged copy."""
 
     REFUSED = "refused with one line"
     SAME = "everything read, nothing to report"
@@ -87,14 +87,14 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Outcome of one damaged copy, and the fraction of messages kept."""
+    """Outcome of reading one damaged copy, and the fraction of messages read."""
 
     kind: Kind
     kept: float = 0.0
 
 
 def judge(path: Path, truth: Reading) -> Verdict:
-    """Read a damaged copy and compare it with what the sound file gave."""
+    """Read a damaged copy and compare it with the reading of the undamaged file."""
     try:
         reading = read_back(path)
     except CrosscueError as error:
@@ -124,7 +124,7 @@ def _of_all(reading: Reading) -> Counter[tuple[str, Message]]:
 def _are_changed(
     strange: Counter[tuple[str, Message]], missing: Counter[tuple[str, Message]]
 ) -> bool:
-    """May every strange message be a missing one with changed bytes, or a renamed topic's?
+    """Return whether changed bytes or a renamed topic can explain every unexpected message.
 
     Damage of at most 64 bytes touches at most three records.
     """
@@ -134,12 +134,12 @@ def _are_changed(
 
 
 def cut(coded: bytes, rng: np.random.Generator) -> bytes:
-    """The file up to a random byte."""
+    """Truncate a file at a random byte."""
     return coded[: int(rng.integers(0, len(coded)))]
 
 
 def damage(coded: bytes, rng: np.random.Generator) -> bytes:
-    """1 to 64 bytes overwritten: by noise, zeros, ones, one flipped bit, or moved bytes."""
+    """Overwrite 1 to 64 bytes by noise, zeros, ones or other bytes of the file, or flip one bit."""
     out = bytearray(coded)
     size = int(rng.integers(1, 65))
     at = int(rng.integers(0, len(coded) - size))
@@ -159,7 +159,7 @@ def damage(coded: bytes, rng: np.random.Generator) -> bytes:
 
 
 def copies(coded: bytes, seed: int, cuts: int, damages: int) -> Iterator[tuple[str, bytes]]:
-    """Damaged copies of a file, each with a word on what was done; the seed fixes them all."""
+    """Yield damaged copies of a file, each with a description; the seed determines all."""
     rng = np.random.default_rng(seed)
     for i in range(cuts):
         yield f"cut {i}", cut(coded, rng)

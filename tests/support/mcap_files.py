@@ -1,4 +1,4 @@
-"""MCAP files made record by record, right or wrong on purpose, and what a reader made of them."""
+"""MCAP files written record by record, valid or with intended defects, and read back."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def text(string: str | bytes) -> bytes:
 
 
 def mapping(pairs: Iterable[bytes]) -> bytes:
-    """A length-prefixed map of entries already coded."""
+    """A length-prefixed map of encoded entries."""
     return text(b"".join(pairs))
 
 
@@ -68,7 +68,7 @@ def message_index(number: int, entries: Sequence[tuple[int, int]]) -> bytes:
 
 
 def attachment(name: str, body: bytes, crc: int | None = None) -> bytes:
-    """An Attachment record with its right checksum unless another is given."""
+    """An Attachment record with its valid checksum unless another one is specified."""
     content = struct.pack("<QQ", 0, 0) + text(name) + text("x/y") + struct.pack("<Q", len(body))
     content += body
     return record(9, content + struct.pack("<I", zlib.crc32(content) if crc is None else crc))
@@ -76,15 +76,15 @@ def attachment(name: str, body: bytes, crc: int | None = None) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class ChunkOf:
-    """A chunk to be written, right in every way unless a field says otherwise.
+    """A chunk to be written, valid unless a field specifies otherwise.
 
     Attributes:
-        records: Its records, each coded.
+        records: Encoded records.
         compression: "", "lz4" or "zstd".
-        crc: Its checksum, if not the right one.
-        size: Its declared size, if not the right one.
-        is_indexed: Message indexes follow it.
-        times: Its declared span, if not the right one.
+        crc: Checksum instead of the valid one.
+        size: Declared size instead of the true one.
+        is_indexed: Message indexes follow the chunk.
+        times: Declared first and last time instead of the true ones.
     """
 
     records: Sequence[bytes]
@@ -128,16 +128,16 @@ class ChunkOf:
 
 @dataclass(slots=True)
 class McapFile:
-    """A file being put together; every part may be left out.
+    """A file to be written; every optional part can be omitted.
 
     Attributes:
-        parts: What the data section holds, in order: coded records or chunks.
-        data_crc: With the data section's checksum.
-        summary: With a summary section, of these parts:
-        repeats: the schemas and channels again,
-        statistics: counts,
-        chunk_index: an index of the chunks.
-        summary_crc: With the summary's checksum.
+        parts: Encoded records or chunks of the data section, in order.
+        data_crc: Write the checksum of the data section.
+        summary: Write a summary section with the three parts below.
+        repeats: Repeat the schemas and channels in the summary.
+        statistics: Write the statistics record.
+        chunk_index: Write an index of the chunks.
+        summary_crc: Write the checksum of the summary.
     """
 
     parts: Sequence[bytes | ChunkOf] = field(default_factory=list)
@@ -149,7 +149,7 @@ class McapFile:
     summary_crc: bool = True
 
     def coded(self) -> bytes:
-        """The whole file."""
+        """Bytes of the file."""
         out = bytearray(MAGIC + header())
         indexes: list[bytes] = []
         definitions: dict[bytes, None] = {}
@@ -206,12 +206,12 @@ def _statistics(counts: Mapping[int, int], logs: Sequence[int], chunks: int) -> 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """All that came out of one pass.
+    """Result of reading a file once.
 
     Attributes:
-        messages: By topic, in the order given.
-        ledger: The account.
-        names: The topics listed before reading.
+        messages: Messages by topic, in the order of reading.
+        ledger: Account of the reading.
+        names: Topics listed before reading.
     """
 
     messages: Mapping[str, list[Message]]
@@ -219,11 +219,11 @@ class Reading:
     names: tuple[str, ...]
 
     def count(self) -> int:
-        """Messages given."""
+        """Number of messages read."""
         return sum(len(found) for found in self.messages.values())
 
     def adds_up(self) -> bool:
-        """Is every topic's given count what the account says was used?"""
+        """Return whether the number of messages of every topic equals the account's."""
         accounts = self.ledger.accounts
         return all(
             len(self.messages.get(name, ())) == account.used for name, account in accounts.items()

@@ -1,4 +1,4 @@
-"""A command in a process of its own, with its peak of memory."""
+"""Run a command in a separate process and measure its peak memory."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ status = run(sys.argv[1:])
 peak = next(x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
 print(status, int(peak.split()[1]) // 1024)
 """
-"""Its own peak: what the system counts for a child begins with the peak of its parent."""
+"""The child reads its peak itself, because ``getrusage`` of a child includes its parent's peak."""
 
 
 def measured(argv: list[str]) -> tuple[int, str, float]:
-    """Exit status, what was said on one line, and the peak of memory in MB."""
+    """Return the exit status, the output on one line, and the peak memory in MB."""
     child = subprocess.run(
         [sys.executable, "-c", _CHILD, *argv],
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""A log whose blocks are given, for tests of what stands on readers."""
+"""A log in memory, for tests of code that uses readers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAGNETOMETER = Topic("mag", "sensor_msgs/msg/MagneticField", "columns")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MemoryLog:
-    """Blocks in stored order."""
+    """A log that yields given blocks in their order."""
 
     topics: tuple[Topic, ...]
     blocks: Sequence[Block]
@@ -36,7 +36,7 @@ class MemoryLog:
     format: str = "memory"
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """All blocks of the topics wanted."""
+        """Yield all blocks of the selected topics."""
         for block in self.blocks:
             ledger.find(block.topic, len(block))
             if selection.wants(block.topic):
@@ -60,13 +60,13 @@ class MemoryLog:
 
 
 def wheel_block(t_ns: Sequence[int], speed_mps: Sequence[float]) -> Block:
-    """Four equal wheels."""
+    """Wheel speeds with four equal wheels."""
     speed = np.asarray(speed_mps, np.float64)
     names = ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps")
     return Block("wheels", np.asarray(t_ns, np.int64), Table(dict.fromkeys(names, speed)))
 
 
 def gyro_block(t_ns: Sequence[int], yaw_rate_radps: Sequence[float]) -> Block:
-    """Yaw rate."""
+    """Yaw rates of a gyro."""
     column: Floats = np.asarray(yaw_rate_radps, np.float64)
     return Block("gyro", np.asarray(t_ns, np.int64), Table({"gyro_z_radps": column}))

@@ -1,4 +1,4 @@
-"""MDF 4 bus logs block by block: what loggers leave on their cards and no library writes."""
+"""MDF 4 bus logs written block by block, as unsorted and unfinalized logs of data loggers are."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNSIGNED, REAL, BYTES = 0, 4, 10
 
 
 class Blocks:
-    """A file under construction: children are written before their parents."""
+    """A file under construction, in which children precede their parents."""
 
     def __init__(self, *, is_finalized: bool, flags: int, version: bytes = b"4.11    ") -> None:
         name = b"MDF     " if is_finalized else b"UnFinMF "
@@ -29,7 +29,7 @@ class Blocks:
         """Write one block.
 
         Returns:
-            Where it is.
+            Offset of the block.
         """
         self.content += bytes(-len(self.content) % 8)
         at = len(self.content)
@@ -39,27 +39,27 @@ class Blocks:
         return at
 
     def link(self, at: int, which: int, target: int) -> None:
-        """Fill in a link of a block that was written before what it leads to."""
+        """Set a link of a block that was written before its target."""
         struct.pack_into("<Q", self.content, at + 24 + 8 * which, target)
 
     def text(self, text: str) -> int:
-        """A text block."""
+        """Write a text block."""
         raw = text.encode() + b"\0"
         return self.add(b"##TX", [], raw + bytes(-len(raw) % 8))
 
     def linear(self, offset: float, factor: float) -> int:
-        """A linear conversion."""
+        """Write a linear conversion."""
         return self.conversion(1, (offset, factor))
 
     def conversion(self, type_: int, values: Sequence[float]) -> int:
-        """A conversion of any kind without texts."""
+        """Write a conversion of any type without texts."""
         body = struct.pack("<BBHHHdd", type_, 0, 0, 0, len(values), 0.0, 0.0)
         return self.add(b"##CC", [0] * 4, body + struct.pack(f"<{len(values)}d", *values))
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One channel: where its bits lie, after the record's identifier."""
+    """One channel; bit positions are relative to the end of the record's identifier."""
 
     name: str
     byte: int = 0
@@ -73,7 +73,7 @@ class Field:
 
 
 def constant(name: str, value: float) -> Field:
-    """A virtual channel: nothing in the record, the value lives in its conversion."""
+    """A virtual channel, whose value is stored in its conversion instead of the record."""
     return Field(name, type=VIRTUAL, conversion=(1, (value, 0.0)))
 
 
@@ -85,10 +85,10 @@ class Made:
         name: Acquisition name.
         size: Bytes of each record.
         fields: Its channels.
-        encode: A frame's record, where the frame's payload begins among the group's values given.
-        identifier: Before each record in unsorted data.
+        encode: Function from a frame and the offset of its payload to its record.
+        identifier: Record identifier in unsorted data.
         values: Identifier of the group with its payloads, None without one.
-        invalid_bytes: After the values of each record.
+        invalid_bytes: Number of invalidation bytes at the end of each record.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Made:
 
 
 def channels(blocks: Blocks, fields: Sequence[Field]) -> int:
-    """The chain of channels.
+    """Write a chain of channels.
 
     Returns:
         Link to the first one.
@@ -139,7 +139,7 @@ def channels(blocks: Blocks, fields: Sequence[Field]) -> int:
 
 
 def one_group(id_bytes_of_offset: int = 8) -> Made:
-    """As older CANedge firmware: one group of frames with payloads of variable length."""
+    """The group of older CANedge firmware, with payloads of variable length."""
     prefix = "CAN_DataFrame."
 
     def encode(frame: Sent, offset: int) -> bytes:
@@ -165,10 +165,10 @@ def one_group(id_bytes_of_offset: int = 8) -> Made:
 
 
 def virtual_group(bus: int, kind: int, *, is_extended: bool, is_fd: bool, is_long: bool) -> Made:
-    """As newer CANedge firmware: a group for each bus and kind of frame.
+    """A group of newer CANedge firmware, which has one for each bus and kind of frame.
 
-    Bus, kind of identifier, direction and CAN FD are virtual channels, the payload's length is a
-    table over its code.
+    Bus, kind of identifier, direction and CAN FD are virtual channels. The payload's length is a
+    table conversion of its code.
     """
     prefix = f"{KINDS[kind]}."
     width = 4 if is_extended else 2
@@ -205,10 +205,10 @@ class Unsorted:
     """An unsorted log.
 
     Attributes:
-        content: The file.
-        data_at: Where its data begin.
-        ends: For each frame, where the last byte that it needs ends in the file.
-        starts: Where each record begins in the file, and where the last one ends.
+        content: Bytes of the file.
+        data_at: Offset of the data.
+        ends: For each frame, the end of its last byte in the file.
+        starts: Start of each record in the file, and the end of the last one.
     """
 
     content: bytes
@@ -228,17 +228,17 @@ def unsorted(
     stretch: int = 0,
     coding: int = -1,
 ) -> Unsorted:
-    """Frames of several groups, mixed.
+    """Write frames of several groups in one unsorted data section.
 
     Args:
-        frames: What it holds.
-        virtual: Groups as newer CANedge firmware has them, else as older.
-        id_bytes: Of each record's identifier.
-        order: Payloads of variable length come ``after`` their record, ``before`` it, or ``last``.
-        flags: What the logger never wrote.
-        is_finalized: All counters are there.
+        frames: Frames to write.
+        virtual: Use groups of newer CANedge firmware instead of older.
+        id_bytes: Size of each record's identifier.
+        order: Payloads of variable length are ``after`` or ``before`` their record, or ``last``.
+        flags: Finalization steps that the logger has not done.
+        is_finalized: All counters are written.
         stretch: Bytes in each data block of a list; 0 for one block.
-        coding: Of those blocks: -1 plain, 0 deflated, 1 deflated and transposed.
+        coding: Compression of those blocks: -1 none, 0 deflate, 1 transposition and deflate.
     """
     groups: dict[object, Made] = {}
     data, late, later = bytearray(), bytearray(), []
@@ -359,7 +359,7 @@ def _store(
     for k, part in enumerate(parts):
         one = blocks.add(b"##DZ", [], deflated(part, coding)) if coding >= 0 else 0
         one = one or blocks.add(b"##DT", [], part)
-        # A logger that was cut off never reported the list of its last blocks.
+        # An interrupted logger has not listed its last blocks.
         if is_finalized or not flags & 0x10 or k < len(parts) // 2:
             blocks.link(listed, 1 + k, one)
     return at or listed

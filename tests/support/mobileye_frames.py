@@ -1,4 +1,4 @@
-"""Made-up Mobileye frames: by hand from hex, or at random within what the layout table allows."""
+"""Mobileye frames from hexadecimal text, or random ones within the ranges of the layout table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def frames(
     is_extended: bool = False,
     is_fd: bool = False,
 ) -> Block:
-    """Frames from (identifier, bytes in hex), a millisecond apart unless times are given."""
+    """Frames from pairs of identifier and hexadecimal bytes, by default a millisecond apart."""
     payloads = [bytes.fromhex(text) for _, text in sent]
     n = len(sent)
     data = np.zeros((n, 64 if is_fd else 8), dtype=np.uint8)
@@ -40,7 +40,7 @@ def frames(
 
 
 def join(blocks: Sequence[Block]) -> Block:
-    """Several blocks of frames as one."""
+    """Concatenate blocks of frames."""
     rows = [b.rows for b in blocks if isinstance(b.rows, CanFrames)]
     columns = ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd")
     joined = CanFrames(*(np.concatenate([getattr(r, name) for r in rows]) for name in columns))
@@ -54,7 +54,7 @@ def status(count: int, counter_ms: int, tail: str = "00F203", length: int = 6) -
 
 
 def triple(slot: int, mark: int) -> list[tuple[int, str]]:
-    """A, B and C of one slot; ``mark`` is the obstacle's id and makes the frames differ."""
+    """Frames A, B and C of one obstacle slot; ``mark`` is the obstacle's id."""
     first = 0x739 + 3 * slot
     return [
         (first, f"{mark:02X}80010000000300"),
@@ -64,9 +64,9 @@ def triple(slot: int, mark: int) -> list[tuple[int, str]]:
 
 
 def random_words(message: Message, n: int, rng: np.random.Generator, variant: str = "") -> Words:
-    """Payloads whose fields are all within the ranges that the table declares.
+    """Random payloads within the ranges that the table declares.
 
-    Missing codes come up too, together with what hangs on them.
+    Fields can have their code for a missing value, together with the fields that depend on them.
     """
     words = np.zeros(n, dtype=np.uint64)
     raws: dict[str, Int64s] = {}
@@ -125,7 +125,7 @@ def block_of(
 def random_drive(
     bursts: int, rng: np.random.Generator, revision: str = "classic", *, has_lanes: bool = True
 ) -> Block:
-    """Whole bursts of obstacles, lanes and further lanes, as a device would send them."""
+    """Complete bursts of obstacles, lanes and further lanes, as a device sends them."""
     parts: list[Block] = []
     for k in range(bursts):
         log_ns = 10_000 * MS + k * 66 * MS
@@ -166,5 +166,5 @@ def _burst(
 
 
 def values(table: Table, name: str) -> Floats:
-    """A column in float64, whatever it is stored in."""
+    """A column converted to float64."""
     return table[name].astype(np.float64)

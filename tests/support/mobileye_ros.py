@@ -1,6 +1,7 @@
-"""Frames as the messages that a driver would make of them, already decoded to columns.
+"""Mobileye frames as decoded ROS messages.
 
-The driver is imagined: fields one for one, values as on the wire, types as in the definitions.
+They are those of a hypothetical driver that copies each field, with values as on the wire and types
+as in the message definitions.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ _FLOAT32: Final = (
 
 
 def messages_of(block: Block, only: str = "") -> list[Block]:
-    """One block of messages for each topic that the frames feed."""
+    """Return one block of messages for each topic with frames."""
     frames = block.rows
     assert isinstance(frames, CanFrames)
     topics = [
@@ -115,7 +116,7 @@ def _in_time(blocks: list[Block]) -> Block:
 
 
 def as_cdr(block: Block) -> tuple[Topic, Block]:
-    """The messages of a block as rosbags writes them: a topic with its definition, and bytes."""
+    """Encode the messages of a block with rosbags, and return their topic and the encoded block."""
     rows = block.rows
     assert isinstance(rows, Table)
     assert block.header_ns is not None

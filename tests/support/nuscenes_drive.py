@@ -1,4 +1,4 @@
-"""A made nuScenes scene in the published schema, with the CAN expansion: a constant left turn."""
+"""A simulated nuScenes scene in the published schema, with the CAN expansion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOCAL_PX: Final = 1266.0
 WHEEL_RADIUS_M: Final = 0.305
 CAMERA_M: Final = (1.7, 0.0, 1.5)
 OF_CAMERA: Final = (0.5, -0.5, 0.5, -0.5)
-"""Axes right, down, ahead seen from ahead, left, up."""
+"""Rotation from the camera's axes (right, down, ahead) to the vehicle's (ahead, left, up)."""
 
 
 def pose(seconds: float) -> tuple[float, float, float]:
@@ -29,17 +29,17 @@ def pose(seconds: float) -> tuple[float, float, float]:
 
 
 def turn_wxyz(yaw: float) -> list[float]:
-    """About z."""
+    """Quaternion of a rotation about z."""
     return [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
 
 def table(folder: Path, name: str, rows: Sequence[Mapping[str, object]]) -> None:
-    """As the set writes them: every key on a line of its own."""
+    """Write a table as in the published files, with each key on a separate line."""
     (folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
 
 
 def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes: int = 1) -> Path:
-    """A data root with one scene of ``count`` pictures at 10 Hz, every fifth a key frame."""
+    """Write a data root with one scene of ``count`` pictures at 10 Hz, every fifth a key frame."""
     tables = path / "v1.0-mini"
     tables.mkdir(parents=True)
     names = [f"scene-{61 + i:04d}" for i in range(scenes)]
@@ -120,7 +120,7 @@ def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes
 
 
 def _boxes(tables: Path, count: int) -> None:
-    """A parked car 20 m ahead of the first key frame, a walker behind it, one box behind us."""
+    """Write boxes: a parked car 20 m ahead of the first pose, a pedestrian, and a car behind."""
     table(
         tables,
         "attribute",
@@ -184,7 +184,7 @@ def _boxes(tables: Path, count: int) -> None:
 
 
 def _can(path: Path, count: int) -> None:
-    """Steering is positive to the right there; wheels in revolutions a minute."""
+    """Write CAN messages; steering is positive to the right, wheel speeds are in rpm."""
     folder = path / "can_bus"
     folder.mkdir()
     wheels, steering, imu = [], [], []

@@ -1,4 +1,4 @@
-"""Small ONNX networks made on the spot, whose answers are known."""
+"""Small ONNX networks with known outputs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def constant_model(shape: tuple[int, ...], outputs: Mapping[str, Array]) -> byte
 
 
 def open_model(shape: tuple[int | str, ...], metadata: Mapping[str, str]) -> bytes:
-    """A network with input ``shape``, whose output is as long as running it says."""
+    """A network with input ``shape`` and an output whose length is known only when it runs."""
     value = numpy_helper.from_array(np.zeros((1, 84, 100), np.float32))
     node = helper.make_node("Constant", [], ["output0"], value=value)
     given = helper.make_tensor_value_info("images", TensorProto.FLOAT, shape)
@@ -39,10 +39,10 @@ def open_model(shape: tuple[int | str, ...], metadata: Mapping[str, str]) -> byt
 
 
 def bright_box_model(*, by_brightness: bool = False) -> bytes:
-    """One box (N, 1, 6) around all pixels above 127, with score 1 if there are any, class 0.
+    """A network that returns one box around all pixels above 127, shape (N, 1, 6), with class 0.
 
-    Input (N, 3, H, W) of any size: ranges of bright columns and rows by arg max from both ends.
-    ``by_brightness``: the score is the brightest pixel, of 255.
+    The input has shape (N, 3, H, W) of any size. The score is 1 if any pixel is bright and 0
+    otherwise; with ``by_brightness`` it is the value of the brightest pixel divided by 255.
     """
     scored = [helper.make_node("ReduceMax", ["columns"], ["score"], axes=[1], keepdims=1)]
     if by_brightness:

@@ -1,6 +1,6 @@
-"""A detector that knows the truth of a simulated drive: tests of what comes after detectors.
+"""A detector that returns the truth of a simulated drive, for tests of later stages.
 
-It is given the truth's objects by name, so no test can mistake it for a real one.
+Its settings name the file of true objects, so that it cannot be mistaken for a real detector.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from crosscue.detectors.base import Detections, Found, Frame, View, nothing_foun
 
 
 class Oracle:
-    """Returns every labelled object with a score of 0.99."""
+    """A detector that returns every labelled object with a score of 0.99."""
 
     def __init__(self, objects: str) -> None:
         tree = json.loads(Path(objects).read_text())
@@ -29,16 +29,16 @@ class Oracle:
 
     @property
     def view(self) -> View:
-        """Hardly any pixels: it does not look at them."""
+        """Small pictures, because it does not use them."""
         return View(min_width_px=64)
 
     @property
     def identity(self) -> str:
-        """Truth that it reports."""
+        """Identity by the text of the setting."""
         return f"oracle {self._text}"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """The labelled objects of each frame's time."""
+        """Return the labelled objects at the time of each frame."""
         return [self._of(frame) for frame in frames]
 
     def _of(self, frame: Frame) -> Found:
@@ -58,5 +58,5 @@ class Oracle:
 
 
 def build(objects: str) -> Oracle:
-    """The oracle of a drive's ``objects.json``."""
+    """Build the oracle of a drive's ``objects.json``."""
     return Oracle(objects)

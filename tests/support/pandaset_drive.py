@@ -1,4 +1,4 @@
-"""A simulated PandaSet sequence: a constant turn at constant speed, as the set writes it."""
+"""A simulated PandaSet sequence in the published layout: a constant turn at constant speed."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ CAMERA_AHEAD_M = 1.8
 
 
 def pandaset_drive(folder: Path, count: int = COUNT) -> Path:
-    """Write a sequence; the camera lies ``CAMERA_AHEAD_M`` ahead of the rear axle."""
+    """Write a sequence; the camera is ``CAMERA_AHEAD_M`` ahead of the rear axle."""
     times = START_S + 0.1 * np.arange(count)
     yaw = YAW_RATE_RADPS * (times - START_S)
     radius = SPEED_MPS / YAW_RATE_RADPS
     axle = radius * np.column_stack([np.sin(yaw), 1.0 - np.cos(yaw)])
     camera = axle + CAMERA_AHEAD_M * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    # The camera's axes right, down, forward in the local frame's forward, left, up.
+    # Rotation from the camera's axes (right, down, forward) to the vehicle's (forward, left, up).
     axes = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     wxyz = (Rotation.from_euler("z", yaw[:, None]) * axes).as_quat()[:, [3, 0, 1, 2]]
     place = folder / "camera" / "front_camera"

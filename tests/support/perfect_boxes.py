@@ -1,4 +1,4 @@
-"""The true objects of a simulated drive as a perfect detector would find them."""
+"""The true objects of a simulated drive as detections of a perfect detector."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from crosscue.detectors.base import Detections
 from crosscue.eval.scoring.truth import cue_at
 
 MIN_NEAR = 0.5
-"""A true car counts where its middle is so near, in lengths of its box."""
+"""Max distance of a true car's center, in units of the longer side of its box."""
 KINDS = {
     "cross": "car on the crossroad that moves",
     "parked_cross": "car parked on the crossroad",
@@ -26,7 +26,7 @@ KINDS = {
 
 
 def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
-    """From a frame's time to its cars."""
+    """Return the true cars of each frame, by time."""
     content = json.loads((drive / "objects.json").read_text())
     times = {one["id"]: one["t_ns"] for one in content["images"]}
     car = next(one["id"] for one in content["categories"] if one["name"] == "car")
@@ -38,7 +38,7 @@ def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
 
 
 def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
-    """Motion of the nearest true car, or that none exists."""
+    """Return the role of the nearest true car, or ``no car``."""
     best, nearest = "no car", MIN_NEAR
     for one in cars:
         x0, y0, width, height = one["bbox"]
@@ -49,7 +49,7 @@ def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
 
 
 def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
-    """The drive's objects as a perfect detector would find them, picture by picture."""
+    """Yield the drive's objects as detections, picture by picture."""
     content: dict[str, Any] = json.loads((drive / "objects.json").read_text())
     names = {one["id"]: one["name"] for one in content["categories"]}
     by_image: dict[int, list[dict[str, Any]]] = {one["id"]: [] for one in content["images"]}
@@ -71,6 +71,6 @@ def frames(drive: Path, min_visible: float) -> Iterator[Detections]:
 
 
 def is_there(truth: Truth, cue: str, t_ns: int) -> bool | None:
-    """Truth of a cue in the frame; None if unknown."""
+    """Return whether a cue is truly present in a frame; None if unknown."""
     at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
     return None if at.present[0] < 0 else bool(at.present[0])

@@ -1,4 +1,4 @@
-"""A made drive in the layout of the smartphone driving data set: straight on, then a left turn."""
+"""A simulated drive in the layout of the smartphone driving data set, with a left turn."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ PHONE: Final = (
     "motionGravityX(G),motionGravityY(G),motionGravityZ(G)"
 )
 START_S: Final = 1_523_201_497
-"""10:31:37 on the wall clock of a place five hours behind UTC."""
+"""10:31:37 local time in a time zone five hours behind UTC."""
 LATE_S: Final = 1.1
-"""Age of a position when the phone logs it."""
+"""Age of a position fix when the phone logs it."""
 
 
 def phone_drive(path: Path, count: int = 60) -> Path:
-    """Both files, ten rows per second; the phone is on its right side, leaning back a little."""
+    """Write both files at ten rows per second; the phone is on its right side and tilted back."""
     path.mkdir(parents=True)
     car, phone = [CAR], [PHONE]
     lean = 0.3

@@ -1,4 +1,4 @@
-"""A plain web server on loopback that gives ranges of files, counts bytes and can misbehave."""
+"""A local web server that supports range requests, counts bytes and can interrupt responses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Served:
     """Content and log of the server.
 
     Attributes:
-        base: Its URL.
+        base: URL of the server.
         files: Contents by name.
-        sent: Bytes of bodies sent.
-        gets: Ranges asked for, as in the requests.
-        failing: How many more GETs to cut off in the middle.
+        sent: Number of bytes sent in bodies.
+        gets: ``Range`` headers of the GET requests.
+        failing: Number of further GET requests to interrupt midway.
     """
 
     base: str = ""
@@ -31,7 +31,7 @@ class Served:
 
 @contextmanager
 def serving() -> Iterator[Served]:
-    """A server of ``Served.files`` as long as the ``with`` block lasts."""
+    """Serve ``Served.files`` for the duration of the ``with`` block."""
     served = Served()
 
     class Handler(BaseHTTPRequestHandler):
@@ -44,7 +44,7 @@ def serving() -> Iterator[Served]:
             self._answer(with_body=True)
 
         def log_message(self, *args: object) -> None:
-            """Nothing: the tests look at ``Served``."""
+            """Log nothing; tests examine ``Served``."""
 
         def _answer(self, *, with_body: bool) -> None:
             content = served.files.get(self.path.lstrip("/"))

@@ -1,4 +1,4 @@
-"""Random ROS types and messages, coded by rosbags, as an independent check of our decoder."""
+"""Random ROS types and messages, encoded by rosbags, as an independent check of our decoder."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def ros1_store() -> Typestore:
 
 
 def random_definition(rng: np.random.Generator, name: str, depth: int = 2) -> str:
-    """Text of a made-up type with all its dependencies, as a log stores it."""
+    """Text of a random type with all its dependencies, as a log stores it."""
     parts: list[str] = []
     _describe(rng, name, depth, parts)
     separator = "=" * 80 + "\n"
@@ -93,7 +93,7 @@ def _describe(rng: np.random.Generator, name: str, depth: int, parts: list[str])
 
 
 def random_message(rng: np.random.Generator, store: Typestore, name: str) -> object:
-    """One message of the type with random values, NaN and infinities among them."""
+    """One message of the type with random values, including NaN and infinities."""
     fields = store.fielddefs[name][1]
     return store.types[name](*(_value(rng, store, desc) for _, desc in fields))
 
@@ -128,7 +128,7 @@ def _scalar(rng: np.random.Generator, name: str) -> object:
 def numbers_in(
     message: object, store: Typestore, name: str, prefix: str = ""
 ) -> Iterator[tuple[str, object]]:
-    """The numbers, strings and sequence lengths of a message under our dotted names."""
+    """Yield the numbers and sequence lengths of a message with our dotted names."""
     for field, (node, inner) in store.fielddefs[name][1]:
         if field == "structure_needs_at_least_one_member":
             continue
@@ -147,7 +147,11 @@ def numbers_in(
 
 
 def _nanoseconds(value: Any, name: str, *, is_ros1: bool) -> int:
-    """ROS 1 times are unsigned and its durations signed in both halves; rosbags reads ROS 2's."""
+    """Nanoseconds of a time or duration.
+
+    In ROS 1 both parts of a time are unsigned, and both parts of a duration are signed. rosbags
+    reads them as those of ROS 2.
+    """
     seconds, rest = int(value.sec), int(value.nanosec)
     if is_ros1 and name == TIME:
         seconds %= 1 << 32
@@ -157,7 +161,7 @@ def _nanoseconds(value: Any, name: str, *, is_ros1: bool) -> int:
 
 
 def messages_of(payloads: Sequence[bytes], gap: int = 0) -> Messages:
-    """Payloads one after the other in one buffer, with ``gap`` foreign bytes between them."""
+    """Payloads in one buffer, with ``gap`` unrelated bytes before each."""
     whole, start, stop = bytearray(), [], []
     for payload in payloads:
         whole += b"\xa5" * gap
@@ -175,21 +179,21 @@ def block_of(topic: str, payloads: Sequence[bytes], gap: int = 3) -> Block:
 
 
 def ros2_topic(name: str, type_name: str, text: str | None = None) -> Topic:
-    """A CDR topic; with ``text`` None the definition comes from rosbags' own store."""
+    """A CDR topic; without ``text``, the definition is from the store of rosbags."""
     if text is None:
         text, _ = ros2_store().generate_msgdef(type_name, ros_version=2)
     return Topic(name, type_name, "cdr", text.encode(), "ros2msg")
 
 
 def ros1_topic(name: str, type_name: str, text: str | None = None) -> Topic:
-    """A ROS 1 topic; with ``text`` None the definition comes from rosbags' own store."""
+    """A ROS 1 topic; without ``text``, the definition is from the store of rosbags."""
     if text is None:
         text, _ = ros1_store().generate_msgdef(type_name)
     return Topic(name, type_name, "ros1", text.encode(), "ros1msg")
 
 
 def must_decode(topic: Topic) -> Decoder:
-    """The decoder of a topic that has one."""
+    """Return the decoder of a topic, which must have one."""
     decoder = decoder_for(topic)
     assert decoder is not None
     return decoder

@@ -1,4 +1,4 @@
-"""Small ROS bags of known content, damaged copies of them, and a judge of what a reader gave."""
+"""Small ROS bags of known content, damaged copies of them, and a comparison of readings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ START_NS: Final = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One message as a reader or a writer sees it."""
+    """One message, as written or read."""
 
     topic: str
     log_ns: int
@@ -35,7 +35,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Result of one pass over a log."""
+    """Result of reading a log once."""
 
     rows: tuple[Row, ...]
     ledger: Ledger
@@ -54,7 +54,7 @@ TOPICS: Final = (
 def rows_of(
     count: int, seed: int = 7, topics: Sequence[tuple[str, str, int]] = TOPICS
 ) -> list[Row]:
-    """``count`` messages of made-up bytes, most of them on ``/can``, in time order."""
+    """Generate ``count`` messages of random bytes in time order, most of them on ``/can``."""
     rng = np.random.default_rng(seed)
     which = rng.choice(len(topics), size=count, p=np.array([2, 6, 1, 1]) / 10)
     steps = rng.integers(1, 2_000_000, size=count)
@@ -62,7 +62,7 @@ def rows_of(
     made = []
     for i, topic in enumerate(which):
         name, _, size = topics[topic]
-        # ROS 2 payloads begin with the CDR header; ROS 1 readers see opaque bytes.
+        # ROS 2 payloads begin with the CDR header; to ROS 1 readers it is data.
         body = rng.integers(0, 256, size=size - 4 + int(rng.integers(0, 9)), dtype=np.uint8)
         made.append(Row(name, int(times[i]), b"\x00\x01\x00\x00" + body.tobytes()))
     return made
@@ -71,7 +71,7 @@ def rows_of(
 def write_bag(
     path: Path, rows: Sequence[Row], compression: str = "none", chunk_bytes: int = 8192
 ) -> Path:
-    """A ROS 1 bag holding ``rows``, written by rosbags."""
+    """Write a ROS 1 bag of ``rows`` with rosbags."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Writer1(path)
     if compression == "lz4 checked":
@@ -96,7 +96,7 @@ def _write_rows(writer: Writer1 | Writer2, rows: Sequence[Row], store: Typestore
 
 
 def unclosed(bag: bytes) -> bytes:
-    """The bag as a killed recorder leaves it: no index section, and no word of one."""
+    """Return the bag as a killed recorder leaves it, without index section or its position."""
     at = bag.index(b"index_pos=") + len(b"index_pos=")
     index_at = int.from_bytes(bag[at : at + 8], "little")
     return bag[:at] + bytes(8) + bag[at + 8 : index_at]
@@ -108,7 +108,7 @@ def write_folder(
     storage: Literal["sqlite3", "mcap"] = "sqlite3",
     compression: Literal["none", "file", "message"] = "none",
 ) -> Path:
-    """A ROS 2 bag folder holding ``rows``, written by rosbags."""
+    """Write a ROS 2 bag folder of ``rows`` with rosbags."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     writer = Writer2(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if compression != "none":
@@ -118,7 +118,7 @@ def write_folder(
 
 
 def read_rows(path: Path, selection: Selection = EVERYTHING) -> Reading:
-    """Everything our reader yields of ``path``."""
+    """Read all rows of ``path`` with our reader."""
     ledger = Ledger(str(path))
     rows: list[Row] = []
     with open_log(path) as log:
@@ -130,7 +130,7 @@ def read_rows(path: Path, selection: Selection = EVERYTHING) -> Reading:
 
 
 def by_topic(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of each topic, in the order given."""
+    """Group rows by topic, in their order."""
     sorted_rows: dict[str, list[Row]] = {}
     for row in rows:
         sorted_rows.setdefault(row.topic, []).append(row)
@@ -143,12 +143,12 @@ Verdict = Literal[
 
 
 def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) -> Verdict:
-    """Read a damaged copy and say how the reader did against the truth.
+    """Read a damaged copy and classify the result.
 
     Args:
-        path: The copy.
+        path: Damaged copy.
         truth: Rows of the undamaged file.
-        calm: Notices that the undamaged file gives too.
+        calm: Notices of the undamaged file.
     """
     try:
         reading = read_rows(path)
@@ -172,10 +172,10 @@ def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) 
 def _only_payloads_differ(
     rows: Sequence[Row], truth: Sequence[Row], strange: Counter[Row], is_sqlite: bool
 ) -> bool:
-    """Every strange row stands where a row is missing.
+    """Return whether every unexpected row replaces a missing one.
 
-    A bag's record headers are backed by its index, so topic, time and length must be the same. In
-    SQLite only the time is: a row's topic number and payload length stand there once.
+    A bag stores topic, time and length in record headers and in its index, so they must be equal.
+    SQLite stores topic number and payload length only once, so only the time must be equal.
     """
 
     def place(row: Row) -> tuple[str, int, int]:
@@ -186,7 +186,7 @@ def _only_payloads_differ(
 
 
 def _check_identity(ledger: Ledger, rows: Sequence[Row]) -> None:
-    """In file = used + skipped + lost, and used is what was handed on."""
+    """Check that rows in the file are used, skipped or dropped, and used rows were returned."""
     given = Counter(row.topic for row in rows)
     for name, account in ledger.accounts.items():
         assert account.used == given.get(name, 0), (name, account)
@@ -195,7 +195,7 @@ def _check_identity(ledger: Ledger, rows: Sequence[Row]) -> None:
 
 
 def damaged_copies(whole: bytes, cuts: int, flips: int, seed: int) -> Iterator[tuple[str, bytes]]:
-    """Seeded damage: what was done, and the damaged bytes."""
+    """Yield damaged copies with a description; the seed determines all."""
     rng = np.random.default_rng(seed)
     for at in rng.integers(0, len(whole), size=cuts):
         yield f"cut at {at}", whole[: int(at)]

@@ -1,4 +1,4 @@
-"""The made-up drive of ``support.scoring`` with a camera: pictures in a log, detections, a pose."""
+"""The made-up drive of ``support.scoring`` with pictures in a log, detections and poses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ TOPIC: Final = "/camera/[red]<script>alert(1)</script>"
 
 
 def write_pictures(path: Path, frames: int = FRAMES) -> int:
-    """A log with one JPEG a frame; how many bytes of JPEG it holds."""
+    """Write a log with one JPEG per frame, and return the size of all JPEGs in bytes."""
     noise = np.random.default_rng(1).integers(0, 255, (frames, SIZE[1], SIZE[0], 3), np.uint8)
     jpegs = [cv2.imencode(".jpg", picture)[1].ravel() for picture in noise]
     edges = np.cumsum([0, *map(len, jpegs)])
@@ -54,7 +54,7 @@ def write_pictures(path: Path, frames: int = FRAMES) -> int:
 
 
 def detections(frames: int = FRAMES) -> pa.Table:
-    """A side view of a car that drives to the right, and a thing with a hostile name."""
+    """A car in side view that drives to the right, and an object whose label contains markup."""
     rows: list[dict[str, Any]] = []
     for frame in range(frames):
         x = 20.0 + frame
@@ -86,7 +86,7 @@ def detections(frames: int = FRAMES) -> pa.Table:
 
 
 def road(frames: int = FRAMES) -> pa.Table:
-    """The lower half of every picture is road."""
+    """Road table in which the lower half of every picture is road."""
     mask = rle.encode(np.ones((5, 16), np.bool_), (0, 4), (16, 9))
     rows = [
         {
@@ -106,7 +106,7 @@ def road(frames: int = FRAMES) -> pa.Table:
 
 
 def frames_seen(frames: int = FRAMES) -> pa.Table:
-    """As the detect stage reports them."""
+    """Frames table of the detect stage."""
     times = frame_table(frames)["t_ns"].to_pylist()
     rows = [
         {"frame": i, "t_ns": t, "camera": TOPIC, "width_px": SIZE[0], "height_px": SIZE[1]}
@@ -116,7 +116,7 @@ def frames_seen(frames: int = FRAMES) -> pa.Table:
 
 
 def poses(frames: int = FRAMES) -> pa.Table:
-    """Straight to the east at 10 m/s."""
+    """Poses of a drive straight to the east at 10 m/s."""
     schema = pose_schema()
     rows = [
         {name: None if name == "landmark" else 1.0 for name in schema.names}
@@ -127,11 +127,11 @@ def poses(frames: int = FRAMES) -> pa.Table:
 
 
 def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFolder:
-    """A finished run ``folder/run`` over ``folder/drive.mcap``.
+    """Write a finished run ``folder/run`` of ``folder/drive.mcap``.
 
     Args:
-        folder: Made.
-        without: Tables to leave out.
+        folder: Folder to create.
+        without: Tables to omit.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_pictures(folder / "drive.mcap")

@@ -1,4 +1,4 @@
-"""Small simulated scenes, made once for all tests, and the mirror image of a world."""
+"""Small simulated scenes, built once for all tests, and mirror images of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def world(layout: str = "D", run: int = 1, seed: int = 0) -> World:
 
 
 def shorten(patch: pytest.MonkeyPatch, pictures: int = 15) -> None:
-    """Simulated drives end after so many pictures, and a world is built once."""
+    """End simulated drives after a number of pictures, and build each world only once."""
     all_times = drive.picture_times
     patch.setattr(drive, "picture_times", lambda *of: all_times(*of)[:pictures])
     patch.setattr(drive, "world_of", cache(world_of))
@@ -40,7 +40,7 @@ def renderer(of: World, camera: Camera = SMALL) -> Renderer:
 
 
 def when_at(of: World, x_m: float) -> float:
-    """Seconds until the rear axle is ``x_m`` along the road."""
+    """Time in seconds at which the rear axle reaches ``x_m`` along the road."""
     return float(np.argmax(of.approach.motion.x_m >= x_m)) / 100.0
 
 
@@ -49,7 +49,7 @@ def picture_at(of: World, x_m: float, camera: Camera = SMALL) -> Picture:
 
 
 def mirrored(of: World) -> World:
-    """The same world with left and right exchanged, lettering too."""
+    """The same world with left and right exchanged, including text."""
     motion = of.approach.motion
     turned = replace(
         motion,
@@ -74,7 +74,7 @@ def mirrored(of: World) -> World:
 
 
 def _mesh(mesh: Mesh) -> Mesh:
-    # Corners change places, too, so that outsides stay outsides.
+    # The order of corners changes as well, so that faces keep pointing outwards.
     order = [0, 2, 1]
     corners = mesh.corners[:, order] * np.array([1, -1, 1], np.float32)
     return replace(mesh, corners=corners, uv=np.ascontiguousarray(mesh.uv[:, order]))

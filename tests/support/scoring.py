@@ -1,4 +1,4 @@
-"""A small made-up drive to score, checked by hand: one approach, ten frames per second."""
+"""A small made-up drive with scores known by hand: one approach, ten frames per second."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .manifests import estimated
 
 STEP_NS: Final = 100_000_000
 ENTER: Final = 40
-"""Frame at which the car enters; it starts 40 m away and drives 10 m/s: 1 m a frame."""
+"""Frame at which the car enters; it starts 40 m away and drives 10 m/s, 1 m per frame."""
 
 
 def at(frame: int) -> int:
@@ -34,7 +34,7 @@ def at(frame: int) -> int:
 
 
 def approach(**changes: Any) -> Approach:
-    """A T junction with a stop sign: left and right, not straight."""
+    """A T junction with a stop sign and roads to the left and right."""
     content: dict[str, Any] = {
         "id": 0,
         "intersection": "A",
@@ -49,7 +49,7 @@ def approach(**changes: Any) -> Approach:
 
 
 def span(cue: str, first: int, end: int, present: bool = True, **more: Any) -> CueTruth:
-    """Truth of a cue from one frame to before another."""
+    """Truth of a cue in a half-open range of frames."""
     content = {"cue": cue, "present": present, "start_ns": at(first), "end_ns": at(end)}
     return CueTruth.model_validate(content | more)
 
@@ -60,7 +60,7 @@ def truth(
     drive: str = "made up",
     end: int = 60,
 ) -> DriveTruth:
-    """The made-up drive's truth; ranges go on beyond none of its approaches."""
+    """Truth of the made-up drive, with ranges during its approaches only."""
     approaches = [approach()] if approaches is None else approaches
     reported = Truth(
         version=1,
@@ -74,7 +74,7 @@ def truth(
 
 
 def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
-    """One metre a frame until entering."""
+    """Ranges that decrease by one metre per frame until the car enters."""
     rows = [
         (t, one.id, (one.enter_ns - t) / STEP_NS)
         for one in approaches
@@ -90,7 +90,7 @@ def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
 
 
 def cue_table(found: Mapping[str, Mapping[int, int]]) -> pa.Table:
-    """From cue to frame to count."""
+    """Cues table from counts by cue and frame."""
     rows = [
         (at(frame), cue, count) for cue, frames in found.items() for frame, count in frames.items()
     ]
@@ -111,7 +111,7 @@ def frame_table(frames: int) -> pa.Table:
 def belief_table(
     features: Mapping[str, Mapping[int, float]], number: int = 7, frames: Sequence[int] = range(50)
 ) -> pa.Table:
-    """Each feature holds 0.5 until the first frame named, then that frame's value, and so on."""
+    """Belief table in which each feature is 0.5 until it changes to values at given frames."""
     columns: dict[str, Any] = {
         "t_ns": pa.array([at(frame) for frame in frames], pa.int64()),
         "approach": pa.array([number] * len(frames), pa.int64()),
@@ -138,7 +138,7 @@ def range_table(
     number: int = 7,
     reference: str = "start",
 ) -> pa.Table:
-    """Ranges that are wrong by ``error_m``, frame by frame."""
+    """Range table of one row per frame with a constant error."""
     frames = range(first, last)
     offset = 0.0 if reference == "start" else 10.0
     return pa.table(
@@ -188,7 +188,7 @@ def good_tables() -> RunTables:
 
 
 def good_truth(drive: str = "made up") -> DriveTruth:
-    """Its truth: the sign can be seen from frame 5 on, road to the left always."""
+    """Truth of that run: the sign is visible from frame 5 on, the road to the left always."""
     return truth(
         [
             span("stop_sign", 0, 5, present=False),
@@ -200,7 +200,7 @@ def good_truth(drive: str = "made up") -> DriveTruth:
 
 
 def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> LogRow:
-    """A log as a manifest reports it; of one that is not there, with a made-up identity."""
+    """Manifest row of a log; a missing log gets a made-up identity."""
     found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
     return LogRow(
         name=log.name,
@@ -215,7 +215,7 @@ def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> Log
 def run_folder(
     path: Path, found: Mapping[str, pa.Table] | None = None, **manifest: Any
 ) -> RunFolder:
-    """A finished run folder with tables of the made-up drive."""
+    """Write a finished run folder, by default with tables of the made-up drive."""
     run = create(path, overwrite=False)
     if found is None:
         found = {
@@ -232,7 +232,7 @@ def run_folder(
 
 
 def truth_folder(path: Path, drive_truth: DriveTruth | None = None) -> Path:
-    """The made-up truth as files; the path of ``truth.json`` comes back."""
+    """Write the truth of the made-up drive, and return the path of ``truth.json``."""
     path.mkdir(parents=True, exist_ok=True)
     one = good_truth() if drive_truth is None else drive_truth
     reported = one.truth

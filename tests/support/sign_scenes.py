@@ -1,4 +1,4 @@
-"""Simulated pictures: our sign drawings, blurred, noisy and scaled, over clutter."""
+"""Simulated pictures of sign templates, scaled, blurred and noisy, over clutter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Scene(NamedTuple):
 
 
 def clutter(seed: int, size_px: tuple[int, int] = (640, 360)) -> Bytes:
-    """Rectangles, lines and noise, as towns have them."""
+    """Draw rectangles, lines and noise as a cluttered background."""
     rng = np.random.default_rng(seed)
     width, height = size_px
     grey = np.full((height, width), 150, np.uint8)
@@ -34,7 +34,7 @@ def clutter(seed: int, size_px: tuple[int, int] = (640, 360)) -> Bytes:
 
 
 def scene(kind: Kind, seed: int, height_px: int | None = None) -> Scene:
-    """One sign somewhere in clutter, 44 to 110 pixels high (a one-way sign half that)."""
+    """One sign at a random position in clutter, 44 to 110 pixels high (one-way signs half that)."""
     rng = np.random.default_rng(seed)
     height = int(rng.integers(44, 110)) if height_px is None else height_px
     drawing = draw(kind, height)

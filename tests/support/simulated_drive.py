@@ -1,4 +1,4 @@
-"""Simulated drives of a car with wheel sensors, gyro and compass, truth beside."""
+"""Simulated drives of a car with wheel sensors, gyro and compass, and their truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Truth:
 
 
 def drive(rng: np.random.Generator, seconds: float = 60.0, rate_hz: float = 20.0) -> Truth:
-    """A made-up drive with stops, backing and turns; arcs between samples."""
+    """Simulate a drive with stops, reversing and turns, with circular arcs between samples."""
     n = round(seconds * rate_hz) + 1
     t_s = np.arange(n) / rate_hz
     phase = rng.uniform(0.0, 2 * np.pi, 3)
@@ -54,7 +54,7 @@ def drive(rng: np.random.Generator, seconds: float = 60.0, rate_hz: float = 20.0
 def wheels(
     truth: Truth, settings: OdometrySettings, rng: np.random.Generator | None = None
 ) -> WheelSpeeds:
-    """Rear wheels, with slip and rounding as the settings say; exact without ``rng``."""
+    """Rear wheel speeds, with slip and rounding of the settings; exact without ``rng``."""
     speed = truth.speed_mps.copy()
     if rng is not None:
         dt_s = np.median(np.diff(truth.t_ns)) * 1e-9
@@ -70,7 +70,7 @@ def wheels(
 def gyro(
     truth: Truth, settings: OdometrySettings, rng: np.random.Generator | None = None
 ) -> TurnSignal:
-    """Yaw rate with the settings' noise density; exact without ``rng``."""
+    """Yaw rate with the noise density of the settings; exact without ``rng``."""
     values = truth.yaw_radps.copy()
     if rng is not None:
         dt_s = np.median(np.diff(truth.t_ns)) * 1e-9
@@ -86,7 +86,7 @@ def compass(
     every: int = 2,
     persists_s: float = 0.0,
 ) -> Headings:
-    """Every few samples a heading; its error is white or fades with ``persists_s`` (AR(1))."""
+    """Headings at every ``every``-th sample, with white or AR(1) errors (``persists_s``)."""
     t_ns = truth.t_ns[1::every]
     error = rng.normal(0.0, sd_rad, len(t_ns))
     if persists_s > 0.0:

@@ -1,4 +1,4 @@
-"""A made-up recording in place of the real one, on a local server, with a network of its own."""
+"""A simulated recording and a small network on a local server, in place of the real ones."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ classes = ["stop sign"]
 
 @dataclass(frozen=True, slots=True)
 class StandIn:
-    """Served content, and its origin.
+    """Served content and its source.
 
     Attributes:
-        known: The recording's entry, ``pandaset_002`` to the product.
-        folder: With the recording in ``sequences/pandaset_002`` and the network in ``weights``.
-        server: Has every file.
+        known: Entry of the recording, with the name ``pandaset_002``.
+        folder: Contains the recording in ``sequences/pandaset_002`` and the network in ``weights``.
+        server: Server of all files.
     """
 
     known: recordings.Recording
@@ -48,7 +48,7 @@ class StandIn:
 
 
 def stand_in(place: Path, server: Served, monkeypatch: pytest.MonkeyPatch) -> StandIn:
-    """Make a drive and a network, serve both, and let the product know no others."""
+    """Write and serve a drive and a network, and replace the product's entries by them."""
     data = place / "published"
     drive = pandaset_drive(data / "sequences" / "pandaset_002", COUNT)
     network = data / "weights" / "net" / "net.onnx"
@@ -56,7 +56,7 @@ def stand_in(place: Path, server: Served, monkeypatch: pytest.MonkeyPatch) -> St
     network.write_bytes(bright_box_model())
     kept = place / "own" / "pandaset_002"
     kept.mkdir(parents=True)
-    _write_own(kept, drive, network)
+    _write_bundled(kept, drive, network)
     files = sorted(path for path in drive.rglob("*") if path.is_file())
     lines = [_line(path, drive) for path in files]
     for path in files:
@@ -99,8 +99,8 @@ def _card(network: Path, server: Served) -> ModelCard:
     return whole.model_copy(update={"weights": network.name, "sha256": sha256, "files": (file,)})
 
 
-def _write_own(kept: Path, drive: Path, network: Path) -> None:
-    """Vehicle file, card and truth, as the product keeps them."""
+def _write_bundled(kept: Path, drive: Path, network: Path) -> None:
+    """Write vehicle file, card and truth, which the product bundles."""
     sha256 = hashlib.sha256(network.read_bytes()).hexdigest()
     (kept / network.name).write_bytes(network.read_bytes())
     (kept / "card.toml").write_text(CARD.format(sha256=sha256))

@@ -1,4 +1,4 @@
-"""Detectors that stop the program, as a user or the system does."""
+"""Detectors that stop the program by a signal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from crosscue.detectors.base import Found, Frame, View, nothing_found
 
 @dataclass(frozen=True, slots=True)
 class Stopping:
-    """Sends its own process a signal at the first frame."""
+    """A detector that sends a signal to its process at the first frame."""
 
     number: signal.Signals
 
@@ -22,11 +22,11 @@ class Stopping:
 
     @property
     def identity(self) -> str:
-        """Of this signal."""
+        """Identity of the signal."""
         return f"stopping by {self.number.name}"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Stop. A shell that started the tests in its background had the interrupt ignored."""
+        """Raise the signal; background jobs of a shell ignore interrupts, so the handler is set."""
         if self.number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.raise_signal(self.number)
@@ -34,10 +34,10 @@ class Stopping:
 
 
 def interrupted() -> Stopping:
-    """As control-C."""
+    """Build a detector that stops like Control-C."""
     return Stopping(signal.SIGINT)
 
 
 def terminated() -> Stopping:
-    """As ``kill``."""
+    """Build a detector that stops like ``kill``."""
     return Stopping(signal.SIGTERM)

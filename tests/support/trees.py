@@ -1,4 +1,4 @@
-"""Folders as plain values, to hold two against each other."""
+"""Contents of folders as values that can be compared."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 
 NO_RESULTS = {".drives", "failure.log"}
-"""Where and when drives were worked on."""
+"""Files that depend on the time and place of processing."""
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """From relative name to a hash of the bytes; of a manifest without timings and logs' places."""
+    """Map relative names to hashes; manifests are hashed without timings and paths of logs."""
     return {
         path.relative_to(folder).as_posix(): _hash(path)
         for path in sorted(folder.rglob("*"))

@@ -1,4 +1,4 @@
-"""Small simulated videos whose pictures say their number by their shade."""
+"""Small simulated videos whose pictures encode their number as a grey level."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from crosscue.replay.base import Block, Images
 
 STEP = 9
-"""Shades between two pictures; coding changes a shade by less than half of it."""
+"""Grey levels between consecutive pictures; encoding errors are less than half of it."""
 SIZE_PX = (64, 48)
 
 
@@ -24,7 +24,7 @@ def video(
     container: dict[str, str] | None = None,
     file_format: str | None = None,
 ) -> Path:
-    """A video of ``count`` plain pictures at 20 Hz."""
+    """Write a video of ``count`` uniform pictures at 20 Hz."""
     with av.open(str(path), mode="w", options=container or {}, format=file_format) as out:
         stream = cast("av.VideoStream", out.add_stream(codec, rate=20, options=options or {}))
         stream.width, stream.height = SIZE_PX
@@ -43,7 +43,7 @@ def video(
 
 
 def numbers_at_times(blocks: list[Block], codec: str) -> dict[int, int]:
-    """Decode blocks of packets: from time to the number that the picture shows."""
+    """Decode blocks of packets, and return the number of the picture at each time."""
     decoder = av.CodecContext.create(codec, "r")
     shown: dict[int, int] = {}
     packets: list[av.Packet | None] = []  # type: ignore[type-arg]
@@ -60,5 +60,5 @@ def numbers_at_times(blocks: list[Block], codec: str) -> dict[int, int]:
 
 
 def number_of(rgb: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> int:
-    """The number that a plain picture shows."""
+    """Number of a picture, from its grey level."""
     return round((float(rgb.mean()) - 10) / STEP)
