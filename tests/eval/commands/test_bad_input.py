@@ -30,19 +30,19 @@ def _info(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str
     return status, captured.out, captured.err
 
 
-def _one_line(err: str) -> bool:
+def _is_one_line(err: str) -> bool:
     return err.startswith("crosscue: ") and err.count("\n") == 1
 
 
-def _nothing(path: Path) -> None:
+def _write_empty(path: Path) -> None:
     path.write_bytes(b"")
 
 
-def _noise(path: Path) -> None:
+def _write_noise(path: Path) -> None:
     path.write_bytes(np.random.default_rng(1).bytes(5000))
 
 
-def _declares_gigabytes(path: Path) -> None:
+def _write_huge_chunk_header(path: Path) -> None:
     # A chunk record that declares 2**40 bytes in a file of 100 bytes.
     path.write_bytes(MAGIC + struct.pack("<BQ", 0x06, 1 << 40) + bytes(80))
 
@@ -50,26 +50,28 @@ def _declares_gigabytes(path: Path) -> None:
 @pytest.mark.parametrize(
     "suffix", [".mcap", ".bag", ".db3", ".log", ".asc", ".blf", ".trc", ".mf4"]
 )
-@pytest.mark.parametrize("spoil", [_nothing, _noise], ids=["empty", "noise"])
-def test_a_file_without_a_log_in_it(
+@pytest.mark.parametrize("write_content", [_write_empty, _write_noise], ids=["empty", "noise"])
+def test_file_without_log_content_is_refused_or_reports_losses(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     suffix: str,
-    spoil: Callable[[Path], None],
+    write_content: Callable[[Path], None],
 ) -> None:
     path = tmp_path / f"drive{suffix}"
-    spoil(path)
+    write_content(path)
 
     status, _, err = _info(path, capsys)
 
     # In text formats, an empty or unsupported file looks like a log without readable rows.
     assert status in (3, 4)
-    assert status == 3 or (_one_line(err) and path.name in err)
+    assert status == 3 or (_is_one_line(err) and path.name in err)
 
 
-def test_a_declared_size_of_gigabytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_huge_declared_chunk_size_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "drive.mcap"
-    _declares_gigabytes(path)
+    _write_huge_chunk_header(path)
 
     status, _, _ = _info(path, capsys)
 
@@ -77,12 +79,12 @@ def test_a_declared_size_of_gigabytes(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.35, 0.8, 0.999])
-def test_a_cut_log_gives_what_is_there_and_says_so(
+def test_truncated_log_reports_dropped_rows(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles, fraction: float
 ) -> None:
-    whole = drive.log.read_bytes()
+    content = drive.log.read_bytes()
     path = tmp_path / "cut.mcap"
-    path.write_bytes(whole[: int(len(whole) * fraction)])
+    path.write_bytes(content[: int(len(content) * fraction)])
 
     status, out, _ = _info(path, capsys)
 
@@ -90,7 +92,7 @@ def test_a_cut_log_gives_what_is_there_and_says_so(
     assert "dropped" in out
 
 
-def test_a_flipped_byte_in_the_only_chunk_leaves_nothing_and_says_so(
+def test_damage_to_the_only_chunk_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles
 ) -> None:
     damaged = bytearray(drive.log.read_bytes())
@@ -100,14 +102,16 @@ def test_a_flipped_byte_in_the_only_chunk_leaves_nothing_and_says_so(
     argv = ["replay", str(path), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "run")]
 
     assert cli.run(argv) == 4
-    said = capsys.readouterr().err
-    assert "damaged chunk" in said
-    assert "not one row is left" in said
+    message = capsys.readouterr().err
+    assert "damaged chunk" in message
+    assert "not one row is left" in message
     assert not (tmp_path / "run" / "manifest.json").exists()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_no_permission(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_log_without_read_permission_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "drive.mcap"
     path.write_bytes(MAGIC)
     path.chmod(0)
@@ -118,8 +122,8 @@ def test_no_permission(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert "permission" in err
 
 
-@pytest.mark.parametrize("kind", ["missing", "fifo", "loop", "foreign folder", "empty folder"])
-def test_what_is_no_file_is_refused_at_once(
+@pytest.mark.parametrize("kind", ["missing", "fifo", "loop", "folder without log", "empty folder"])
+def test_path_that_is_not_a_log_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
     path = tmp_path / "drive.mcap"
@@ -129,23 +133,23 @@ def test_what_is_no_file_is_refused_at_once(
         path.symlink_to(path)
     elif "folder" in kind:
         path.mkdir()
-        if kind == "foreign folder":
+        if kind == "folder without log":
             (path / "thesis.tex").write_text("no drive")
 
     status, _, err = _info(path, capsys)
 
     assert status == 4
-    assert _one_line(err)
+    assert _is_one_line(err)
     assert str(path) in err
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [("", "car.dbc"), ("BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0", "car.dbc"), ("\0\0\0", "car.dbc")],
     ids=["empty", "cut", "binary"],
 )
-def test_a_dbc_that_does_not_parse(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles, text: str, said: str
+def test_invalid_dbc_file_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles, text: str, message: str
 ) -> None:
     (tmp_path / "car.dbc").write_text(text)
     vehicle = drive.vehicle.read_text().replace("simulated_car.dbc", "car.dbc")
@@ -156,12 +160,12 @@ def test_a_dbc_that_does_not_parse(
 
     err = capsys.readouterr().err
     assert status in (2, 4)
-    assert _one_line(err)
-    assert said in err
+    assert _is_one_line(err)
+    assert message in err
     assert not (tmp_path / "run" / "manifest.json").exists()
 
 
-def test_a_disk_that_fills_up_leaves_nothing_half(
+def test_full_disk_leaves_no_run_folder(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     drive: DriveFiles,
@@ -178,7 +182,7 @@ def test_a_disk_that_fills_up_leaves_nothing_half(
     assert not (tmp_path / "run").exists()
 
 
-def test_the_same_drive_through_other_clothes_gives_the_same_pose(
+def test_converted_log_replays_to_the_same_pose(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles
 ) -> None:
     copy = tmp_path / "copy.mcap"
@@ -192,7 +196,7 @@ def test_the_same_drive_through_other_clothes_gives_the_same_pose(
     assert one == other
 
 
-def test_json_is_strict(capsys: pytest.CaptureFixture[str], drive: DriveFiles) -> None:
+def test_info_json_is_strict(capsys: pytest.CaptureFixture[str], drive: DriveFiles) -> None:
     assert cli.run(["info", str(drive.log), "--json"]) == 0
 
     def refuse(constant: str) -> None:

@@ -11,7 +11,7 @@ from crosscue.eval import cli
 from crosscue.replay.base import CrosscueError, LogError, UsageError
 
 
-def _command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> None:
+def _register_command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> None:
     module = ModuleType("crosscue.eval.commands.fake", "A command for the test.")
 
     def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,13 +39,13 @@ def _command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> No
         (MemoryError(), 1),
     ],
 )
-def test_every_error_is_one_line_and_a_status(
+def test_errors_are_one_line_with_documented_exit_status(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     error: BaseException,
     status: int,
 ) -> None:
-    _command(monkeypatch, error)
+    _register_command(monkeypatch, error)
 
     assert cli.run(["fake"]) == status
     captured = capsys.readouterr()
@@ -54,10 +54,10 @@ def test_every_error_is_one_line_and_a_status(
     assert captured.err.count("\n") == 1
 
 
-def test_hostile_bytes_in_an_error_are_shown_not_executed(
+def test_control_characters_in_an_error_are_escaped(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _command(monkeypatch, LogError("\x1b[31mred\x07 /t\udcff"))
+    _register_command(monkeypatch, LogError("\x1b[31mred\x07 /t\udcff"))
     cli.run(["fake"])
 
     assert capsys.readouterr().err == "crosscue: \\x1b[31mred\\x07 /t\\udcff\n"
@@ -75,13 +75,13 @@ def test_hostile_bytes_in_an_error_are_shown_not_executed(
         (["--version"], 0),
     ],
 )
-def test_usage(
+def test_arguments_yield_documented_exit_status(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     argv: list[str],
     status: int,
 ) -> None:
-    _command(monkeypatch, None)
+    _register_command(monkeypatch, None)
 
     assert cli.run(argv) == status
     capsys.readouterr()
@@ -91,27 +91,29 @@ def test_usage(
 @pytest.mark.parametrize(
     "flag", ["score run --rpe", "landmarks add db --every", "fit landmarks --same-within"]
 )
-def test_a_length_is_above_nothing(
+def test_length_option_must_be_positive(
     flag: str, length: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(f"{flag}={length}".split()) == 2
     assert f"'{length}': expected metres, above 0" in capsys.readouterr().err
 
 
-def test_a_slip_of_the_pen_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
+def test_misspelt_command_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["replya"]) == 2
     assert "did you mean 'replay'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_each_command_has_example_and_exit_status(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.run([*name.split(), "--help"]) == 0
-    said = capsys.readouterr().out
-    assert "example" in said
-    assert "exit status" in said
+    help_text = capsys.readouterr().out
+    assert "example" in help_text
+    assert "exit status" in help_text
 
 
-def test_the_overview_imports_nothing_heavy() -> None:
+def test_help_imports_no_heavy_packages() -> None:
     code = (
         "import sys; from crosscue.eval import cli; cli.run(['--help']);"
         "heavy = {'numpy', 'torch', 'rerun', 'pyarrow', 'pydantic'} & set(sys.modules);"

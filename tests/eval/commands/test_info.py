@@ -35,12 +35,12 @@ from support.data import shared
 from support.gap_drive import Clock, write_drive
 
 MS = 1_000_000
-NASTY = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
+HOSTILE = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
 
 
 @dataclass(slots=True)
-class MadeLog:
-    """A log in memory, with given blocks and losses."""
+class BlockLog:
+    """A log in memory of the given blocks and losses."""
 
     blocks: tuple[Block, ...]
     topics: tuple[Topic, ...]
@@ -79,7 +79,9 @@ class MadeLog:
         self.close()
 
 
-def columns(name: str, type_name: str = "crosscue/Table", declared: int | None = None) -> Topic:
+def column_topic(
+    name: str, type_name: str = "crosscue/Table", declared: int | None = None
+) -> Topic:
     return Topic(name, type_name, "columns", declared=declared)
 
 
@@ -96,25 +98,25 @@ def can_block(bus: str, ids: list[int], extended: list[bool]) -> Block:
     return Block(bus, START_NS + MS * np.arange(n, dtype=np.int64), frames)
 
 
-def made(**changes: Any) -> MadeLog:
+def example_log(**changes: Any) -> BlockLog:
     stream = Stream(300, 50 * MS, wait_ns=MS)
     blocks = (
         table_of("/imu", stream.log_ns(), stream.header_ns()),
         can_block("can0", [0x100, 0x100, 0x100, 0x200] * 5, [False, True, False, False] * 5),
     )
     topics = (
-        columns("/imu", "sensor_msgs/msg/Imu", 300 + changes.get("dropped", 0)),
-        columns("can0", "crosscue/CanFrames"),
+        column_topic("/imu", "sensor_msgs/msg/Imu", 300 + changes.get("dropped", 0)),
+        column_topic("can0", "crosscue/CanFrames"),
     )
-    return replace(MadeLog(blocks, topics), **changes)
+    return replace(BlockLog(blocks, topics), **changes)
 
 
-def shown(log: MadeLog, width: int = 80) -> str:
+def text_of(log: BlockLog, width: int = 80) -> str:
     return "\n".join(lines_of(summarise(log), width))
 
 
-def test_a_whole_log_shows_topics_roles_rates_clock_account_and_no_finding() -> None:
-    text = shown(made())
+def test_summary_of_complete_log_lists_topics_and_no_findings() -> None:
+    text = text_of(example_log())
 
     assert re.search(r"^/imu +sensor_msgs/msg/Imu +inertial unit +300 +20$", text, re.M)
     assert re.search(r"^/imu +header stamp +50 ms +0 +50 ms", text, re.M)
@@ -124,8 +126,8 @@ def test_a_whole_log_shows_topics_roles_rates_clock_account_and_no_finding() -> 
     assert "losses" not in text
 
 
-def test_identifiers_are_counted_apart_by_length_and_most_frequent_first() -> None:
-    summary = summarise(made())
+def test_can_identifiers_are_counted_by_frame_format_and_frequency() -> None:
+    summary = summarise(example_log())
     bus = next(t for t in summary.topics if t.name == "can0")
 
     assert bus.can_id_count == 3
@@ -134,11 +136,11 @@ def test_identifiers_are_counted_apart_by_length_and_most_frequent_first() -> No
         (0x200, False, 5),
         (0x100, True, 5),
     ]
-    assert "can0: 3 ids; 0x100 526 Hz, 0x200 263 Hz, 0x100x 263 Hz" in shown(made())
+    assert "can0: 3 ids; 0x100 526 Hz, 0x200 263 Hz, 0x100x 263 Hz" in text_of(example_log())
 
 
 def test_losses_are_reported_by_topic_reason_and_place() -> None:
-    summary = summarise(made(dropped=31, unknown=True))
+    summary = summarise(example_log(dropped=31, unknown=True))
     text = "\n".join(lines_of(summary, 100))
 
     assert not summary.is_whole
@@ -150,8 +152,8 @@ def test_losses_are_reported_by_topic_reason_and_place() -> None:
 
 
 @pytest.mark.parametrize("dropped", [0, 1, 40])
-def test_the_account_adds_up(dropped: int) -> None:
-    summary = summarise(made(dropped=dropped))
+def test_rows_of_the_account_add_up(dropped: int) -> None:
+    summary = summarise(example_log(dropped=dropped))
 
     for topic in summary.topics:
         assert topic.found == topic.used + sum(topic.skipped.values())
@@ -159,12 +161,12 @@ def test_the_account_adds_up(dropped: int) -> None:
             assert topic.declared == topic.found + sum(topic.dropped.values())
 
 
-def test_what_cannot_be_decoded_is_skipped_with_a_reason_and_still_timed() -> None:
+def test_undecodable_topic_is_skipped_with_reason_and_rate() -> None:
     n = 40
     zeros = np.zeros(n, dtype=np.int64)
     rows = Messages(np.zeros(4, dtype=np.uint8), zeros, zeros + 4)
     block = Block("/odd", START_NS + 100 * MS * np.arange(n, dtype=np.int64), rows)
-    log = MadeLog((block,), (Topic("/odd", "odd_msgs/msg/Odd", "bson"),))
+    log = BlockLog((block,), (Topic("/odd", "odd_msgs/msg/Odd", "bson"),))
 
     summary = summarise(log)
 
@@ -177,38 +179,40 @@ def test_what_cannot_be_decoded_is_skipped_with_a_reason_and_still_timed() -> No
     )
 
 
-def test_two_cameras_or_buses_ask_for_a_line_in_the_vehicle_file() -> None:
-    log = made()
-    two = replace(log, topics=(*log.topics, columns("can1", "crosscue/CanFrames")))
+def test_two_can_buses_are_reported_as_ambiguous() -> None:
+    log = example_log()
+    two = replace(log, topics=(*log.topics, column_topic("can1", "crosscue/CanFrames")))
 
     assert "2 topics could be the CAN bus (can0, can1): select one of them in the vehicle file" in (
         summarise(two).findings
     )
 
 
-def test_a_log_whose_topics_share_no_clock_says_so() -> None:
+def test_topics_without_common_clock_are_reported() -> None:
     stream = Stream(300, 50 * MS)
-    log = MadeLog(
+    log = BlockLog(
         (table_of("/a", stream.log_ns()), table_of("/b", stream.log_ns() - START_NS)),
-        (columns("/a"), columns("/b")),
+        (column_topic("/a"), column_topic("/b")),
     )
 
     assert any(f.startswith("no two share a clock") for f in summarise(log).findings)
 
 
-def test_logs_shown_together_report_their_common_time_or_that_there_is_none() -> None:
-    early = summarise(made(path=Path("a.mcap")))
+def test_combined_logs_report_their_common_time() -> None:
+    early = summarise(example_log(path=Path("a.mcap")))
     late_stream = Stream(300, 50 * MS)
     late = summarise(
-        MadeLog(
+        BlockLog(
             (table_of("/x", late_stream.log_ns() + 10 * SECOND_NS),),
-            (columns("/x"),),
+            (column_topic("/x"),),
             path=Path("b.mcap"),
         )
     )
     boot = summarise(
-        MadeLog(
-            (table_of("/x", late_stream.log_ns() - START_NS),), (columns("/x"),), path=Path("c.log")
+        BlockLog(
+            (table_of("/x", late_stream.log_ns() - START_NS),),
+            (column_topic("/x"),),
+            path=Path("c.log"),
         )
     )
 
@@ -221,32 +225,32 @@ def test_logs_shown_together_report_their_common_time_or_that_there_is_none() ->
     assert together([]).start_ns is None
 
 
-def test_an_empty_log_is_no_error_and_says_that_it_is_empty() -> None:
-    text = shown(MadeLog((), (columns("/imu"),)))
+def test_empty_log_is_reported_as_empty() -> None:
+    text = text_of(BlockLog((), (column_topic("/imu"),)))
 
     assert "- it contains no rows" in text
     assert "no rows" in text
 
 
-def test_quick_reads_no_body() -> None:
-    class Unreadable(MadeLog):
+def test_quick_summary_reads_no_messages() -> None:
+    class Unreadable(BlockLog):
         def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
             raise AssertionError("the body was read")
 
-    log = made()
+    log = example_log()
     text = "\n".join(lines_of(quick_summary(Unreadable(log.blocks, log.topics)), 80))
 
     assert re.search(r"^/imu +sensor_msgs/msg/Imu +inertial unit +300$", text, re.M)
     assert "not one row" not in text
 
 
-def test_nothing_in_a_name_reaches_the_terminal_or_breaks_json() -> None:
+def test_hostile_names_are_escaped_in_text_and_json() -> None:
     stream = Stream(40, 50 * MS)
-    log = MadeLog(
-        (table_of(NASTY, stream.log_ns() * 0),),
-        (Topic(NASTY, NASTY, "columns"),),
+    log = BlockLog(
+        (table_of(HOSTILE, stream.log_ns() * 0),),
+        (Topic(HOSTILE, HOSTILE, "columns"),),
         dropped=1,
-        path=Path(NASTY),
+        path=Path(HOSTILE),
     )
 
     summary = summarise(log)
@@ -259,8 +263,8 @@ def test_nothing_in_a_name_reaches_the_terminal_or_breaks_json() -> None:
     assert "\\\\x1b[31m" in text
 
 
-def test_json_is_strict_sorted_and_holds_every_field() -> None:
-    text = strict_json(plain(summarise(made())))
+def test_json_summary_is_strict_and_sorted() -> None:
+    text = strict_json(plain(summarise(example_log())))
 
     tree = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert list(tree) == sorted(tree)
@@ -276,7 +280,9 @@ def test_json_is_strict_sorted_and_holds_every_field() -> None:
     st.lists(st.tuples(st.text(max_size=90), st.text(max_size=60)), max_size=4),
     st.integers(40, 120),
 )
-def test_tables_and_sentences_fit_the_terminal(rows: list[tuple[str, str]], width: int) -> None:
+def test_tables_and_sentences_fit_the_terminal_width(
+    rows: list[tuple[str, str]], width: int
+) -> None:
     cut = list(table(("topic", "type", "count"), [(*r, "123456") for r in rows], width, (0, 1)))
 
     assert len(cut) == len(rows) + 1
@@ -285,16 +291,16 @@ def test_tables_and_sentences_fit_the_terminal(rows: list[tuple[str, str]], widt
         assert "\x1b" not in line
 
 
-def test_eighty_columns_are_enough_for_a_usual_log() -> None:
+def test_summary_of_typical_log_fits_eighty_columns() -> None:
     long = "/vehicle/sensors/front_left/camera_driver/image_rect_color/compressed"
     stream = Stream(300, 50 * MS, wait_ns=MS)
-    log = MadeLog(
+    log = BlockLog(
         (table_of(long, stream.log_ns(), stream.header_ns()),),
-        (columns(long, "sensor_msgs/msg/CompressedImage"),),
+        (column_topic(long, "sensor_msgs/msg/CompressedImage"),),
         dropped=12,
     )
 
-    assert max(cells(line) for line in shown(log, 80).split("\n")) <= 80
+    assert max(cells(line) for line in text_of(log, 80).split("\n")) <= 80
 
 
 @pytest.mark.parametrize(
@@ -308,11 +314,11 @@ def test_eighty_columns_are_enough_for_a_usual_log() -> None:
         ("\udcff", "\\udcff"),
     ],
 )
-def test_visible_text_keeps_letters_and_shows_the_rest(raw: str, safe: str) -> None:
+def test_visible_text_keeps_letters_and_escapes_the_rest(raw: str, safe: str) -> None:
     assert visible(raw) == safe
 
 
-def test_the_command_on_a_real_minute(
+def test_info_of_recorded_minute_reports_its_losses(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     segment = next(shared("comma2k19", "Example_1").glob("*/*"))
@@ -327,7 +333,7 @@ def test_the_command_on_a_real_minute(
     assert max(cells(line) for line in out.split("\n")) <= 80
 
 
-def test_the_command_with_json_on_two_logs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_two_logs_as_json_combines_them(capsys: pytest.CaptureFixture[str]) -> None:
     segment = next(shared("comma2k19", "Example_1").glob("*/*"))
 
     status = run(["info", "--json", str(segment), str(segment)])
@@ -339,7 +345,7 @@ def test_the_command_with_json_on_two_logs(capsys: pytest.CaptureFixture[str]) -
     assert tree["together"]["start_ns"] == tree["logs"][0]["start_ns"]
 
 
-def test_the_command_on_nothing_readable_ends_with_four(
+def test_info_of_folder_without_log_exits_4(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert run(["info", str(tmp_path)]) == 4
@@ -356,7 +362,7 @@ def test_the_command_on_nothing_readable_ends_with_four(
         (Clock(set_at_s=6.0, by_s=-10.0), False, ["start", "clock set back"]),
     ],
 )
-def test_segments_are_listed_and_more_than_one_exits_3(
+def test_time_segments_are_listed_and_several_exit_3(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     clock: Clock,

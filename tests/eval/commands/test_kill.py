@@ -1,4 +1,4 @@
-"""Killed or disturbed at any time, a run folder is complete or marked as incomplete."""
+"""A run folder is complete or marked as incomplete after a kill or fault at any time."""
 
 from __future__ import annotations
 
@@ -48,12 +48,11 @@ class Drive:
         self.vehicle.write_text(
             self.vehicle.read_text() + DETECTORS.format(folder / "objects.json")
         )
-        # Twice: the manifest reports how many results came from the cache, which is all from now
-        # on.
-        assert cli.run(self.replay(folder / "whole", "-q")) == 0
-        assert cli.run(self.replay(folder / "whole", "-q", "--overwrite")) == 0
-        self.whole = tree(folder / "whole")
-        assert {"manifest.json", "pose.parquet", "belief.parquet"} <= set(self.whole)
+        # Twice, because the manifest records the number of cached results: all, in later runs.
+        assert cli.run(self.replay(folder / "complete", "-q")) == 0
+        assert cli.run(self.replay(folder / "complete", "-q", "--overwrite")) == 0
+        self.complete = tree(folder / "complete")
+        assert {"manifest.json", "pose.parquet", "belief.parquet"} <= set(self.complete)
 
     def replay(self, run: Path, *more: str) -> list[str]:
         """Return the command line that replays two seconds of the drive."""
@@ -76,7 +75,7 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive() -> Iterator[Drive]:
-    # Not below pytest's folder, which only its owner may read.
+    # Not below pytest's folder, which only its owner can read.
     folder = Path(tempfile.mkdtemp(prefix="crosscue-kill-"))
     folder.chmod(0o755)
     try:
@@ -85,131 +84,131 @@ def drive() -> Iterator[Drive]:
         shutil.rmtree(folder)
 
 
-def _some(count: int, of: int, seed: int) -> list[int]:
+def _sampled_points(count: int, of: int, seed: int) -> list[int]:
     """Return the first, the last, and some random points."""
     between = random.Random(seed).sample(range(1, of - 1), min(count, of - 2))
     return [0, *sorted(between), of - 1]
 
 
-def _is_text(ended: faults.Ended) -> None:
+def _check_message(ended: faults.Ended) -> None:
     assert ended.status == 1, ended
     assert ended.said.startswith("crosscue: ")
     assert ended.said.count("\n") == 1, ended.said
     assert "bug" not in ended.said
 
 
-def _is_whole_or_says_so(run: Path, *wholes: dict[str, str]) -> None:
-    """Check that the run is incomplete by its manifest, or that all bytes are right."""
+def _check_complete_or_marked(run: Path, *expected: dict[str, str]) -> None:
+    """Check that a run has no valid manifest, or that all of its bytes are expected."""
     try:
         manifest = open_run(run).manifest()
     except RunError:
         return
     if manifest.stage == "estimate":
-        there = {name: of for name, of in tree(run).items() if not name.startswith(".")}
-        assert there in wholes
+        present = {name: of for name, of in tree(run).items() if not name.startswith(".")}
+        assert present in expected
 
 
-def test_killed_anywhere_a_second_start_gives_the_same_bytes(drive: Drive, tmp_path: Path) -> None:
+def test_run_killed_anywhere_restarts_to_equal_bytes(drive: Drive, tmp_path: Path) -> None:
     run = tmp_path / "run"
     argv = drive.replay(run)
     count = len(faults.operations(run, faults.CHANGES, argv))
     assert count > 30
 
-    for operation in _some(5, count, seed=1):
+    for operation in _sampled_points(5, count, seed=1):
         shutil.rmtree(run)
         ended = faults.killed_before(run, operation, argv)
         assert ended.status == -signal.SIGKILL
         if run.exists():
-            _is_whole_or_says_so(run, drive.whole)
+            _check_complete_or_marked(run, drive.complete)
         again = "--resume" if operation % 2 else "--overwrite"
         assert cli.run(drive.replay(run, again, "-q")) == 0
-        assert tree(run) == drive.whole
+        assert tree(run) == drive.complete
 
 
-def test_killed_while_it_replaces_another_run(drive: Drive, tmp_path: Path) -> None:
+def test_run_killed_while_replacing_another_is_complete_or_marked(
+    drive: Drive, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     argv = drive.replay(run, "--overwrite")
-    shutil.copytree(drive.folder / "whole", run)
+    shutil.copytree(drive.folder / "complete", run)
     text = run.joinpath("manifest.json").read_text()
     run.joinpath("manifest.json").write_text(text.replace("crosscue simulated car", "earlier"))
     count = len(faults.operations(run, faults.CHANGES, argv))
 
-    for operation in _some(3, count, seed=2):
+    for operation in _sampled_points(3, count, seed=2):
         shutil.rmtree(run)
-        shutil.copytree(drive.folder / "whole", run)
+        shutil.copytree(drive.folder / "complete", run)
         run.joinpath("manifest.json").write_text(text.replace("simulated car", "earlier car"))
         assert faults.killed_before(run, operation, argv).status == -signal.SIGKILL
         manifest = run / "manifest.json"
         if manifest.exists() and "earlier car" in manifest.read_text():
-            assert {name for name in tree(run) if not name.startswith(".")} == set(drive.whole)
+            assert {name for name in tree(run) if not name.startswith(".")} == set(drive.complete)
         else:
-            _is_whole_or_says_so(run, drive.whole)
+            _check_complete_or_marked(run, drive.complete)
         assert cli.run([*argv, "-q"]) == 0
-        assert tree(run) == drive.whole
+        assert tree(run) == drive.complete
 
 
-def test_an_estimate_killed_midway_is_never_taken_for_whole(drive: Drive, tmp_path: Path) -> None:
+def test_killed_estimate_is_complete_or_marked(drive: Drive, tmp_path: Path) -> None:
     run, other = tmp_path / "run", tmp_path / "other.toml"
-    shutil.copytree(drive.folder / "whole", run)
+    shutil.copytree(drive.folder / "complete", run)
     text = drive.vehicle.read_text().replace("x_m = 1.7", "x_m = 1.2")
     other.write_text(text.replace('"simulated_car.dbc"', f'"{drive.folder}/simulated_car.dbc"'))
     argv = ["estimate", str(run), "--vehicle", str(other), "--logs", str(drive.folder)]
     count = len(faults.operations(run, faults.CHANGES, argv))
     replaced = tree(run)
-    assert replaced != drive.whole
+    assert replaced != drive.complete
 
-    for operation in _some(3, count, seed=3):
+    for operation in _sampled_points(3, count, seed=3):
         shutil.rmtree(run)
-        shutil.copytree(drive.folder / "whole", run)
+        shutil.copytree(drive.folder / "complete", run)
         assert faults.killed_before(run, operation, argv).status == -signal.SIGKILL
-        _is_whole_or_says_so(run, drive.whole, replaced)
+        _check_complete_or_marked(run, drive.complete, replaced)
         assert cli.run([*argv, "-q"]) == 0
         assert tree(run) == replaced
 
 
 @pytest.mark.parametrize("once", [True, False])
-def test_a_write_that_fails_anywhere_leaves_nothing_half(
+def test_failed_write_anywhere_leaves_no_partial_files(
     drive: Drive, tmp_path: Path, once: bool
 ) -> None:
     run = tmp_path / "run"
     argv = drive.replay(run)
     count = len(faults.operations(run, faults.WRITES, argv))
 
-    for operation in _some(4, count, seed=4):
+    for operation in _sampled_points(4, count, seed=4):
         shutil.rmtree(run, ignore_errors=True)
         ended = faults.failing_from(run, operation, argv, once=once)
-        _is_text(ended)
+        _check_message(ended)
         assert "the disk is full" in ended.said
-        _left_clean(run, drive)
+        _check_clean(run, drive)
 
 
-def test_a_disk_that_fails_to_flush_is_reported(drive: Drive, tmp_path: Path) -> None:
+def test_failed_fsync_is_reported(drive: Drive, tmp_path: Path) -> None:
     for call in (0, 3, 9):
         ended = faults.with_failing_fsync(call, drive.replay(tmp_path / f"run{call}"))
-        _is_text(ended)
+        _check_message(ended)
         assert "Input/output error" in ended.said
-        _left_clean(tmp_path / f"run{call}", drive)
+        _check_clean(tmp_path / f"run{call}", drive)
 
 
-def test_a_file_that_cannot_grow_is_reported(drive: Drive, tmp_path: Path) -> None:
+def test_file_size_limit_is_reported(drive: Drive, tmp_path: Path) -> None:
     # The manifest's length varies by a few bytes because of its timings.
-    sizes = sorted(p.stat().st_size for p in (drive.folder / "whole").glob("*.parquet"))
+    sizes = sorted(p.stat().st_size for p in (drive.folder / "complete").glob("*.parquet"))
 
     for size in (0, 100, sizes[len(sizes) // 2], sizes[-1] - 1):
         ended = faults.with_files_up_to(size, drive.replay(tmp_path / f"run{size}"))
-        _is_text(ended)
-        _left_clean(tmp_path / f"run{size}", drive)
+        _check_message(ended)
+        _check_clean(tmp_path / f"run{size}", drive)
 
 
-def _left_clean(run: Path, drive: Drive) -> None:
+def _check_clean(run: Path, drive: Drive) -> None:
     if run.exists():
         assert not [p.name for p in run.iterdir() if p.suffix == ".partial" or p.name == ".lock"]
-        _is_whole_or_says_so(run, drive.whole)
+        _check_complete_or_marked(run, drive.complete)
 
 
-def test_of_two_at_once_the_second_is_refused_and_reported_whose_it_is(
-    drive: Drive, tmp_path: Path
-) -> None:
+def test_locked_run_is_refused_and_names_the_process(drive: Drive, tmp_path: Path) -> None:
     run = tmp_path / "run"
     read, write = os.pipe()
     child = os.fork()
@@ -228,13 +227,13 @@ def test_of_two_at_once_the_second_is_refused_and_reported_whose_it_is(
     assert cli.run(drive.replay(run, "--overwrite", "-q")) == 0
 
 
-def test_of_many_that_find_a_dead_lock_one_at_a_time_gets_it(tmp_path: Path) -> None:
+def test_lock_is_exclusive_among_many_processes(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     children = []
     for _ in range(8):
         child = os.fork()
         if child == 0:
-            os._exit(_takes_turns(run.path, 40))
+            os._exit(_lock_in_turn(run.path, 40))
         children.append(child)
 
     statuses = {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children}
@@ -242,7 +241,7 @@ def test_of_many_that_find_a_dead_lock_one_at_a_time_gets_it(tmp_path: Path) -> 
     assert statuses == {0}
 
 
-def _takes_turns(path: Path, rounds: int) -> int:
+def _lock_in_turn(path: Path, rounds: int) -> int:
     """Return 0 if the lock was exclusive, else 1; imitate a killed process every third time."""
     run, inside = create(path, overwrite=True), path.parent / "inside"
     for number in range(rounds):
@@ -265,7 +264,7 @@ def _takes_turns(path: Path, rounds: int) -> int:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become nobody")
-def test_what_may_not_be_read_or_written_is_reported(drive: Drive, tmp_path: Path) -> None:
+def test_missing_permissions_are_reported(drive: Drive, tmp_path: Path) -> None:
     def as_nobody() -> None:
         os.setgid(65534)
         os.setuid(65534)
@@ -275,19 +274,19 @@ def test_what_may_not_be_read_or_written_is_reported(drive: Drive, tmp_path: Pat
     secret.chmod(0o600)
 
     output = faults.forked(as_nobody, drive.replay(drive.folder / "theirs"))
-    there = faults.forked(as_nobody, drive.replay(drive.folder / "whole", "--overwrite"))
-    estimate = faults.forked(as_nobody, ["estimate", str(drive.folder / "whole")])
+    present = faults.forked(as_nobody, drive.replay(drive.folder / "complete", "--overwrite"))
+    estimate = faults.forked(as_nobody, ["estimate", str(drive.folder / "complete")])
     log = faults.forked(as_nobody, ["replay", str(secret), "-o", str(drive.folder / "theirs")])
 
-    for ended in (output, there, estimate):
-        _is_text(ended)
+    for ended in (output, present, estimate):
+        _check_message(ended)
         assert "Permission denied" in ended.said
     assert log.status == 4
     assert "no permission to read it" in log.said
-    assert tree(drive.folder / "whole") == drive.whole
+    assert tree(drive.folder / "complete") == drive.complete
 
 
-def test_zone_locale_and_hash_seed_change_no_byte(drive: Drive, tmp_path: Path) -> None:
+def test_time_zone_locale_and_hash_seed_do_not_change_output(drive: Drive, tmp_path: Path) -> None:
     variants = (
         {"TZ": "America/Los_Angeles", "LC_ALL": "C", "PYTHONHASHSEED": "1", "COLUMNS": "20"},
         {"TZ": "Asia/Kolkata", "LC_ALL": "tr_TR.UTF-8", "PYTHONHASHSEED": "2", "HOME": "/nowhere"},
@@ -301,13 +300,13 @@ def test_zone_locale_and_hash_seed_change_no_byte(drive: Drive, tmp_path: Path) 
         )
         for i, variant in enumerate(variants)
     ]
-    said = [command.communicate(timeout=60)[1] for command in commands]
+    stderr = [command.communicate(timeout=60)[1] for command in commands]
 
-    assert said == [b"", b""]
-    assert [tree(tmp_path / f"run{i}") == drive.whole for i in (0, 1)] == [True, True]
+    assert stderr == [b"", b""]
+    assert [tree(tmp_path / f"run{i}") == drive.complete for i in (0, 1)] == [True, True]
 
 
-def test_a_replay_opens_no_socket(drive: Drive, tmp_path: Path) -> None:
+def test_replay_opens_no_socket(drive: Drive, tmp_path: Path) -> None:
     def prepare() -> None:
         def hook(event: str, args: tuple[object, ...]) -> None:
             if event.startswith("socket.") and event != "socket.gethostname":

@@ -27,39 +27,39 @@ from support.pictures import picture
 ULTRALYTICS = {"names": "{0: 'person', 1: 'car', 2: 'stop-sign'}", "imgsz": "[64, 128]"}
 
 
-def _rows(*shape: int) -> Array:
+def _zeros(*shape: int) -> Array:
     return np.zeros(shape, np.float32)
 
 
 LAYOUTS: dict[str, tuple[tuple[int, ...], Mapping[str, Array], bool]] = {
-    "yolov8": ((1, 3, 64, 128), {"output0": _rows(1, 7, 168)}, True),
-    "yolov5": ((1, 3, 64, 128), {"output0": _rows(1, 504, 8)}, True),
+    "yolov8": ((1, 3, 64, 128), {"output0": _zeros(1, 7, 168)}, True),
+    "yolov5": ((1, 3, 64, 128), {"output0": _zeros(1, 504, 8)}, True),
     "yolov8-seg": (
         (1, 3, 64, 128),
-        {"output0": _rows(1, 39, 168), "output1": _rows(1, 32, 16, 32)},
+        {"output0": _zeros(1, 39, 168), "output1": _zeros(1, 32, 16, 32)},
         True,
     ),
-    "end-to-end": ((1, 3, 64, 128), {"output0": _rows(1, 300, 6)}, True),
-    "detr": ((1, 3, 64, 128), {"dets": _rows(1, 50, 4), "labels": _rows(1, 50, 3)}, True),
+    "end-to-end": ((1, 3, 64, 128), {"output0": _zeros(1, 300, 6)}, True),
+    "detr": ((1, 3, 64, 128), {"dets": _zeros(1, 50, 4), "labels": _zeros(1, 50, 3)}, True),
     "torchvision": (
         (3, 64, 128),
-        {"boxes": _rows(2, 4), "labels": np.ones(2, np.int64), "scores": _rows(2)},
+        {"boxes": _zeros(2, 4), "labels": np.ones(2, np.int64), "scores": _zeros(2)},
         True,
     ),
     "ssd": ((1, 3, 64, 128), {"detection_out": -np.ones((1, 1, 9, 7), np.float32)}, True),
     "ssd-tensorflow": (
         (1, 64, 128, 3),
         {
-            "detection_boxes": _rows(1, 9, 4),
-            "detection_classes": _rows(1, 9) + 1,
-            "detection_scores": _rows(1, 9),
+            "detection_boxes": _zeros(1, 9, 4),
+            "detection_classes": _zeros(1, 9) + 1,
+            "detection_scores": _zeros(1, 9),
         },
         True,
     ),
 }
 
 
-def _file(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
+def _write_export(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
     shape, outputs, _ = LAYOUTS[kind]
     model = onnx.load_model_from_string(constant_model(shape, outputs))
     if kind == "ssd-tensorflow":
@@ -72,11 +72,11 @@ def _file(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
     return path
 
 
-def test_a_rt_detr_of_selected_boxes_is_known_by_its_head(tmp_path: Path) -> None:
+def test_rt_detr_with_selected_boxes_is_recognised_by_its_head(tmp_path: Path) -> None:
     """Ultralytics 8.4 writes rows as in an end-to-end export, but in fractions."""
     metadata = {**ULTRALYTICS, "head": "RTDETRDecoder", "task": "detect"}
 
-    assert run(["model", "init", str(_file(tmp_path, "end-to-end", metadata))]) == 0
+    assert run(["model", "init", str(_write_export(tmp_path, "end-to-end", metadata))]) == 0
 
     output = read_card(tmp_path / "my.toml").output
     assert isinstance(output, DetrOutput)
@@ -91,7 +91,7 @@ def test_a_rt_detr_of_selected_boxes_is_known_by_its_head(tmp_path: Path) -> Non
     ("row", "kind"),
     [((30.0, 10.0, 50.0, 40.0, 0.8, 2.0), "end-to-end"), ((0.5, 0.5, 0.3, 0.4, 0.8, 2.0), "detr")],
 )
-def test_rows_without_metadata_are_known_by_their_sizes(
+def test_layout_without_metadata_is_recognised_by_box_size(
     tmp_path: Path, row: tuple[float, ...], kind: str
 ) -> None:
     rows = np.tile(np.array(row, np.float32), (1, 300, 1))
@@ -133,7 +133,7 @@ def _openvino_file(folder: Path, labels: list[str] | None = None) -> Path:
         (None, ["cat", "stop_sign", "dog"], None),
     ],
 )
-def test_class_names_of_an_openvino_file_are_read(
+def test_class_names_of_openvino_file_are_read(
     tmp_path: Path, metadata: str | None, labels: list[str] | None, classes: tuple[str, ...] | None
 ) -> None:
     path = _openvino_file(tmp_path, labels)
@@ -152,7 +152,7 @@ def test_class_names_of_an_openvino_file_are_read(
     "metadata",
     ["names: [a, b", "names: " + 500 * "[" + 500 * "]", "names: {0: \xff}", "a: !!python/name:os"],
 )
-def test_damaged_metadata_beside_an_openvino_file_is_one_line(
+def test_damaged_openvino_metadata_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], metadata: str
 ) -> None:
     path = _openvino_file(tmp_path)
@@ -160,15 +160,15 @@ def test_damaged_metadata_beside_an_openvino_file_is_one_line(
 
     assert run(["model", "init", str(path)]) == 2
 
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "metadata.yaml: not readable as metadata: " in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "metadata.yaml: not readable as metadata: " in message
     assert not (tmp_path / "my.toml").exists()
 
 
-def test_torchvision_is_known_without_names_of_its_outputs(tmp_path: Path) -> None:
+def test_torchvision_export_with_unnamed_outputs_is_recognised(tmp_path: Path) -> None:
     """torch.onnx numbers unnamed outputs."""
-    outputs = {"1042": _rows(2, 4), "1043": np.ones(2, np.int64), "1044": _rows(2)}
+    outputs = {"1042": _zeros(2, 4), "1043": np.ones(2, np.int64), "1044": _zeros(2)}
     path = tmp_path / "my.onnx"
     path.write_bytes(constant_model((3, 64, 128), outputs))
 
@@ -179,10 +179,11 @@ def test_torchvision_is_known_without_names_of_its_outputs(tmp_path: Path) -> No
     assert (output.boxes, output.labels, output.scores) == ("1042", "1043", "1044")
 
 
-def test_an_open_size_of_torchvision_keeps_the_proportions_of_a_street(tmp_path: Path) -> None:
+def test_torchvision_export_of_dynamic_size_gets_default_input_size(tmp_path: Path) -> None:
     model = onnx.load_model_from_string(
         constant_model(
-            (3, 64, 128), {"boxes": _rows(0, 4), "labels": np.ones(0, np.int64), "scores": _rows(0)}
+            (3, 64, 128),
+            {"boxes": _zeros(0, 4), "labels": np.ones(0, np.int64), "scores": _zeros(0)},
         )
     )
     for axis in (1, 2):
@@ -205,11 +206,11 @@ def test_an_open_size_of_torchvision_keeps_the_proportions_of_a_street(tmp_path:
     ],
     ids=("RT-DETR", "DETR", "RF-DETR"),
 )
-def test_members_of_the_detr_family_are_told_apart(
+def test_detr_variants_are_distinguished(
     tmp_path: Path, names: tuple[str, str], columns: int, activation: str, is_normalised: bool
 ) -> None:
     path = tmp_path / "my.onnx"
-    outputs = {names[0]: _rows(1, 50, columns), names[1]: _rows(1, 50, 4)}
+    outputs = {names[0]: _zeros(1, 50, columns), names[1]: _zeros(1, 50, 4)}
     path.write_bytes(constant_model((1, 3, 64, 128), outputs))
 
     crosscue.draft_card(path)
@@ -222,11 +223,11 @@ def test_members_of_the_detr_family_are_told_apart(
     assert number == (11 if columns == 80 else 13)
 
 
-def test_a_yolox_with_decoded_boxes_keeps_its_colours(tmp_path: Path) -> None:
-    """One row per cell, as in YOLOX; networks with three anchors per cell have other inputs."""
+def test_decoded_yolox_export_gets_bgr_input_without_scaling(tmp_path: Path) -> None:
+    """Tell YOLOX, with one row per cell, from networks with three anchors per cell."""
     for rows, colour, scale in ((168, "bgr", 1.0), (504, "rgb", 1 / 255)):
         path = tmp_path / "my.onnx"
-        path.write_bytes(constant_model((1, 3, 64, 128), {"output": _rows(1, rows, 85)}))
+        path.write_bytes(constant_model((1, 3, 64, 128), {"output": _zeros(1, rows, 85)}))
 
         crosscue.draft_card(path, kind="yolov5", overwrite=True)
 
@@ -235,17 +236,15 @@ def test_a_yolox_with_decoded_boxes_keeps_its_colours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "number"), [("end-to-end", 11), ("torchvision", 12)])
-def test_coco_s_classes_are_numbered_as_the_layout_s_networks_do(
-    tmp_path: Path, kind: str, number: int
-) -> None:
+def test_coco_class_numbers_depend_on_the_layout(tmp_path: Path, kind: str, number: int) -> None:
     """YOLO numbers 80 classes without gaps; torchvision and TensorFlow keep COCO's numbers."""
-    crosscue.draft_card(_file(tmp_path, kind, {}), kind=kind)
+    crosscue.draft_card(_write_export(tmp_path, kind, {}), kind=kind)
 
     assert read_card(tmp_path / "my.toml").output.classes.index("stop sign") == number
 
 
-def test_a_network_that_scales_its_boxes_is_given_the_size(tmp_path: Path) -> None:
-    """RT-DETR's own exporter asks for width and height, and multiplies its boxes by them."""
+def test_network_with_size_input_receives_the_picture_size(tmp_path: Path) -> None:
+    """RT-DETR's own exporter adds an input of width and height, by which it scales boxes."""
     tensors = {"labels": np.array([[11]]), "scores": np.array([[0.9]], np.float32)}
     model = onnx.load_model_from_string(constant_model((1, 3, 64, 128), tensors))
     graph, helper = model.graph, onnx.helper
@@ -280,10 +279,10 @@ def test_a_network_that_scales_its_boxes_is_given_the_size(tmp_path: Path) -> No
     )
 
 
-def test_a_network_for_another_task_is_said_to_be_one(tmp_path: Path) -> None:
+def test_network_for_unsupported_task_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "my.onnx"
     model = onnx.load_model_from_string(
-        constant_model((1, 3, 64, 128), {"output0": _rows(1, 56, 168)})
+        constant_model((1, 3, 64, 128), {"output0": _zeros(1, 56, 168)})
     )
     onnx.helper.set_model_props(model, {"names": "{0: 'person'}", "task": "pose"})
     path.write_bytes(model.SerializeToString())
@@ -292,7 +291,7 @@ def test_a_network_for_another_task_is_said_to_be_one(tmp_path: Path) -> None:
         crosscue.draft_card(path)
 
 
-def test_a_folder_of_images_gets_no_drawing(
+def test_check_picture_is_not_written_to_an_image_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The folder is a log, and every image in it is a frame."""
@@ -316,15 +315,15 @@ def test_a_folder_of_images_gets_no_drawing(
 
 
 @pytest.mark.parametrize("kind", LAYOUTS)
-def test_a_fresh_export_gets_a_card_that_runs(
+def test_export_of_each_layout_gets_a_working_card(
     tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = _file(tmp_path, kind, ULTRALYTICS)
+    path = _write_export(tmp_path, kind, ULTRALYTICS)
 
     assert run(["model", "init", str(path)]) == 0
 
-    said = capsys.readouterr().out
-    assert f"my.toml: {kind}; the network runs with it" in said
+    message = capsys.readouterr().out
+    assert f"my.toml: {kind}; the network runs with it" in message
     card = read_card(tmp_path / "my.toml")
     assert card.output.kind == kind
     assert card.output.classes == ("person", "car", "stop-sign")
@@ -333,10 +332,10 @@ def test_a_fresh_export_gets_a_card_that_runs(
     assert run(["model", "check", str(tmp_path / "my.toml")]) == 0
 
 
-def test_what_the_file_does_not_say_is_assumed_aloud(
+def test_assumptions_are_reported_and_written_to_the_card(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = _file(tmp_path, "detr", {})
+    path = _write_export(tmp_path, "detr", {})
     names = tmp_path / "names.txt"
     names.write_text("person\ncar\nstop sign\n", encoding="utf-8")
 
@@ -344,13 +343,13 @@ def test_what_the_file_does_not_say_is_assumed_aloud(
     assert "3 classes without names" in capsys.readouterr().err
     assert run(["model", "init", str(path), "--class-names", str(names)]) == 0
 
-    said = capsys.readouterr().out
-    assert "assumed    logits become scores by the logistic function" in said
+    message = capsys.readouterr().out
+    assert "assumed    logits become scores by the logistic function" in message
     text = (tmp_path / "my.toml").read_text(encoding="utf-8")
     assert "# Assumed, please check: logits become scores" in text
 
 
-def test_sizes_that_a_file_leaves_open_are_found_by_running_it(
+def test_dynamic_output_sizes_are_found_by_running_the_network(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = onnx.load_model_from_string(bright_box_model())
@@ -368,7 +367,7 @@ def test_sizes_that_a_file_leaves_open_are_found_by_running_it(
     assert (card.input.width_px, card.input.height_px) == (96, 64)
 
 
-def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ambiguous_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One row per cell, and boxes that are wrong in both layouts."""
     model = constant_model((1, 3, 64, 128), {"output": np.full((1, 168, 85), 20.0, np.float32)})
     path = tmp_path / "my.onnx"
@@ -376,14 +375,14 @@ def test_several_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixtur
 
     assert run(["model", "init", str(path)]) == 2
 
-    said = capsys.readouterr().err
-    assert "several kinds fit: yolox (" in said
-    assert "; yolov5 (" in said
-    assert "choose one with --kind" in said
+    message = capsys.readouterr().err
+    assert "several kinds fit: yolox (" in message
+    assert "; yolov5 (" in message
+    assert "choose one with --kind" in message
     assert run(["model", "init", str(path), "--kind", "yolox"]) == 0
 
 
-def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
+def test_published_yolox_is_recognised_by_running_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "yolox.onnx"
@@ -401,7 +400,7 @@ def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("my.onnx", b"not a model", "not a complete model file"),
         ("my.pkl", b"", "a pickle runs code when it is read"),
@@ -409,8 +408,8 @@ def test_the_real_yolox_is_reported_from_its_twin_by_running_it(
         ("my.bin", b"", "expected .onnx, .xml, or weights"),
     ],
 )
-def test_what_is_no_model_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes, said: str
+def test_unsupported_model_file_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes, message: str
 ) -> None:
     path = tmp_path / name
     path.write_bytes(content)
@@ -418,7 +417,7 @@ def test_what_is_no_model_is_one_line(
     assert run(["model", "init", str(path)]) == 2
 
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1
     assert not list(tmp_path.glob("*.toml"))
     assert not list(tmp_path.glob(".*.toml"))
@@ -435,5 +434,5 @@ def test_what_is_no_model_is_one_line(
         ("", ()),
     ],
 )
-def test_class_names_are_read_and_never_run(text: str, names: tuple[str, ...]) -> None:
+def test_class_names_are_parsed_without_execution(text: str, names: tuple[str, ...]) -> None:
     assert class_names({"names": text}) == names

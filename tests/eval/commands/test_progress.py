@@ -24,14 +24,14 @@ COMMAND: Final = (
 
 
 class Terminal(io.StringIO):
-    """Stream that records what is written, and reports to be a terminal."""
+    """Stream that records what is written and reports that it is a terminal."""
 
     def isatty(self) -> bool:
         """Return True."""
         return True
 
 
-def stderr_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+def replaced_stderr(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     """Replace stderr; called inside the test, because pytest replaces stderr before it."""
     made = Terminal()
     monkeypatch.setattr(sys, "stderr", made)
@@ -41,7 +41,7 @@ def stderr_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     return made
 
 
-def shown(line: ProgressLine, terminal: Terminal) -> str:
+def shown_text(line: ProgressLine, terminal: Terminal) -> str:
     """Return the text that the terminal shows."""
     assert line._bar is not None
     terminal.truncate(0)
@@ -49,59 +49,59 @@ def shown(line: ProgressLine, terminal: Terminal) -> str:
     return terminal.getvalue()
 
 
-def test_the_line_says_how_much_of_what_is_done_and_how_fast(
+def test_line_shows_amount_rate_and_time_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    terminal = stderr_of(monkeypatch)
+    terminal = replaced_stderr(monkeypatch)
     with ProgressLine("converting", is_shown=True) as line:
         line.at(Done(1500, 6000, "rows"))
-        text = shown(line, terminal)
+        text = shown_text(line, terminal)
         line.at(Done(3000, 6000, "rows"))
 
         assert "converting" in text
         assert "1,500 of 6,000 rows" in text
         assert "a second" in text
         assert "left" in text
-        assert "3,000 of 6,000 rows" in shown(line, terminal)
+        assert "3,000 of 6,000 rows" in shown_text(line, terminal)
 
 
 @pytest.mark.parametrize("total", [None, 0, 5])
-def test_a_total_that_is_not_known_or_too_small_is_not_shown(
+def test_unknown_or_exceeded_total_is_not_shown(
     monkeypatch: pytest.MonkeyPatch, total: int | None
 ) -> None:
-    terminal = stderr_of(monkeypatch)
+    terminal = replaced_stderr(monkeypatch)
     with ProgressLine("reading", is_shown=True) as line:
         line.at(Done(10, total, "rows"))
-        text = shown(line, terminal)
+        text = shown_text(line, terminal)
 
     assert "10 rows" in text
     assert "left" not in text
 
 
-def test_names_from_a_log_are_neither_markup_nor_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = stderr_of(monkeypatch)
+def test_names_are_shown_without_markup_and_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = replaced_stderr(monkeypatch)
     with ProgressLine("sealing [red]a\x1b[2Jb.bag", is_shown=True) as line:
         line.at(Done(1, 2, "MB"))
-        text = shown(line, terminal)
+        text = shown_text(line, terminal)
 
     assert "sealing [red]a\\x1b[2Jb.bag" in text
 
 
-def test_a_drive_counts_frames_then_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = stderr_of(monkeypatch)
+def test_drive_line_counts_frames_then_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = replaced_stderr(monkeypatch)
     with DriveLine("replaying", is_shown=True) as line:
         line.at_frame(3, 10)
-        assert "3 of 10 frames" in shown(line, terminal)
+        assert "3 of 10 frames" in shown_text(line, terminal)
         line.at_time(2.0, 60.0)
-        text = shown(line, terminal)
+        text = shown_text(line, terminal)
 
     assert "replaying" in text
     assert "2 of 60 s of log" in text
     assert "frames" not in text
 
 
-def test_nothing_is_written_where_nobody_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = stderr_of(monkeypatch)
+def test_hidden_line_writes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = replaced_stderr(monkeypatch)
     with ProgressLine("reading", is_shown=False) as line:
         line.at(Done(1, 2, "rows"))
 
@@ -116,7 +116,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "total"),
     [
         ("detect drive.mcap -o d --vehicle car.toml --detectors grey --no-cache", "of 300 frames"),
         ("replay drive.mcap -o r --vehicle car.toml", "of 30 s of log"),
@@ -126,8 +126,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=lambda text: text.split()[0],
 )
-def test_long_commands_show_a_total_on_a_terminal(drive: Path, command: str, said: str) -> None:
-    ours, theirs = pty.openpty()
+def test_long_commands_show_a_total_on_a_terminal(drive: Path, command: str, total: str) -> None:
+    reading_end, writing_end = pty.openpty()
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(sys.path),
@@ -138,23 +138,23 @@ def test_long_commands_show_a_total_on_a_terminal(drive: Path, command: str, sai
         [sys.executable, "-c", COMMAND, *command.split()],
         cwd=drive.parent,
         stdout=subprocess.DEVNULL,
-        stderr=theirs,
+        stderr=writing_end,
         env=environment,
     ) as process:
-        os.close(theirs)
-        text = _everything(ours)
+        os.close(writing_end)
+        text = _read_to_end(reading_end)
 
     assert process.returncode == 0, text
-    assert said in text
+    assert total in text
 
 
-def _everything(terminal: int) -> str:
+def _read_to_end(terminal: int) -> str:
     parts = []
     with os.fdopen(terminal, "rb", buffering=0) as stream:
         while True:
             try:
                 part = stream.read(65536)
-            except OSError:  # Linux says so when nobody has the other end any more.
+            except OSError:  # Linux raises this once the other end is closed.
                 break
             if not part:
                 break

@@ -23,7 +23,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs_below(tmp_path_factory.mktemp("fleet"))
 
 
-def test_it_prints_a_table(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_query_prints_a_table(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["query", str(runs), "select name, count(*) as n from runs group by 1"]) == 0
 
     head, *rows, last = capsys.readouterr().out.splitlines()
@@ -32,7 +32,7 @@ def test_it_prints_a_table(runs: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert last == "2 rows"
 
 
-def test_every_format_holds_the_same_rows(
+def test_all_output_formats_contain_the_same_rows(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["query", str(runs), SQL, "--json"]) == 0
@@ -49,9 +49,7 @@ def test_every_format_holds_the_same_rows(
     assert pq.read_table(tmp_path / "x.parquet").equals(crosscue.catalog(runs).query(SQL))
 
 
-def test_the_schema_lists_tables_and_columns(
-    runs: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_schema_lists_tables_and_columns(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["query", str(runs), "--schema", "--json"]) == 0
 
     listed = {(row["table"], row["column"]) for row in json.loads(capsys.readouterr().out)}
@@ -60,7 +58,7 @@ def test_the_schema_lists_tables_and_columns(
     assert ("frames", "run, ...") in listed
 
 
-def test_what_is_left_out_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_left_out_runs_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     add_run(tmp_path / "good", "good")
     add_run(tmp_path / "half", "half").file("manifest.json").unlink()
 
@@ -72,7 +70,7 @@ def test_what_is_left_out_is_reported(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         ([], "expected either SQL or --schema"),
         (["from runs", "--schema"], "expected either SQL or --schema"),
@@ -88,15 +86,15 @@ def test_what_is_left_out_is_reported(tmp_path: Path, capsys: pytest.CaptureFixt
         (["select vehicle::int from runs"], "could not convert"),
     ],
 )
-def test_wrong_usage_is_one_line(
-    runs: Path, argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_query_is_refused_in_one_line(
+    runs: Path, argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["query", str(runs), *argv]) == 2
 
     printed = capsys.readouterr()
     assert printed.out == ""
     [line] = printed.err.splitlines()
-    assert said.lower() in line.lower()
+    assert message.lower() in line.lower()
 
 
 @pytest.mark.parametrize(
@@ -137,7 +135,7 @@ def test_wrong_usage_is_one_line(
         "from in_python",
     ],
 )
-def test_a_query_reaches_nothing_but_the_tables(
+def test_query_cannot_access_files_or_change_data(
     runs: Path, tmp_path: Path, sql: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -156,7 +154,7 @@ def test_a_query_reaches_nothing_but_the_tables(
     assert (tree(runs), sorted(tmp_path.iterdir())) == before
 
 
-def test_settings_cannot_be_changed_and_files_not_reached(runs: Path) -> None:
+def test_database_settings_are_locked(runs: Path) -> None:
     settings = crosscue.catalog(runs).query(
         "select name, value from duckdb_settings() where name in "
         "('enable_external_access', 'lock_configuration', 'autoload_known_extensions')"

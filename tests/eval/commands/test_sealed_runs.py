@@ -23,7 +23,7 @@ def _run_with_sealed_log(folder: Path) -> tuple[Path, Path]:
     return run, log
 
 
-def _flip(log: Path) -> None:
+def _damage_middle(log: Path) -> None:
     """Damage bytes in the middle, not in head, tail and index, which identify a large log."""
     raw = bytearray(log.read_bytes())
     assert len(raw) > 5 * MIB
@@ -32,7 +32,7 @@ def _flip(log: Path) -> None:
     log.write_bytes(raw)
 
 
-def _argv(command: str, runs: list[Path], out: Path) -> list[str]:
+def _command_line(command: str, runs: list[Path], out: Path) -> list[str]:
     named = [str(run) for run in runs]
     return {
         "view": ["view", named[0], "-o", str(out / "out.rrd")],
@@ -43,7 +43,7 @@ def _argv(command: str, runs: list[Path], out: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["view", "score", "score --workers"])
-def test_a_sealed_log_damaged_after_the_run_is_reported(
+def test_damage_to_sealed_log_after_the_run_is_reported(
     command: str,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
@@ -51,16 +51,18 @@ def test_a_sealed_log_damaged_after_the_run_is_reported(
 ) -> None:
     monkeypatch.setattr(pictured, "SIZE", (400, 225))
     made = [_run_with_sealed_log(tmp_path / name) for name in ("one", "two")]
-    argv = _argv(command, [run for run, _ in made], tmp_path)
+    argv = _command_line(command, [run for run, _ in made], tmp_path)
     cli.run(argv)
     assert "differ from the seal" not in capfd.readouterr().err
 
     log = made[0][1]
-    _flip(log)
+    _damage_middle(log)
     again = [*argv, "--overwrite"] if command == "view" else argv
 
     assert cli.run(again) == 3
-    said = [line for line in capfd.readouterr().err.splitlines() if "differ from the seal" in line]
-    assert said
-    assert all(line.startswith("crosscue: dropped: ") for line in said)
-    assert all("one" in line and "drive.mcap: bytes " in line for line in said)
+    reported = [
+        line for line in capfd.readouterr().err.splitlines() if "differ from the seal" in line
+    ]
+    assert reported
+    assert all(line.startswith("crosscue: dropped: ") for line in reported)
+    assert all("one" in line and "drive.mcap: bytes " in line for line in reported)
