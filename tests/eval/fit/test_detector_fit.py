@@ -26,8 +26,8 @@ from crosscue.replay.base import SchemaError, UsageError
 from support.onnx_models import bright_box_model
 
 
-def test_the_bound_is_clopper_and_pearson_s() -> None:
-    # Of n of n the bound is the n-th root of the risk (the rule of three: about 1 - 3 / n).
+def test_lower_bound_equals_clopper_pearson() -> None:
+    # For n of n, the bound is the n-th root of the risk (rule of three: about 1 - 3 / n).
     assert lower_bound(59, 59, 0.95) == pytest.approx(0.05 ** (1 / 59))
     assert lower_bound(59, 59, 0.95) > 0.95 > lower_bound(58, 58, 0.95)
     assert lower_bound(0, 10, 0.95) == 0.0
@@ -40,7 +40,7 @@ def probability(scores: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 + np.exp(-12.0 * (scores - 0.45)))
 
 
-def test_a_chosen_threshold_is_too_imprecise_no_more_often_than_stated() -> None:
+def test_chosen_threshold_reaches_precision_with_stated_confidence() -> None:
     """Simulated: 400 fits to 600 detections each; the true precision above a score is known."""
     rng = np.random.default_rng(11)
     grid = np.linspace(0.2, 1.0, 4001)
@@ -59,7 +59,7 @@ def test_a_chosen_threshold_is_too_imprecise_no_more_often_than_stated() -> None
     assert too_low / 400 <= 0.05
 
 
-def test_equal_scores_are_on_one_side_and_too_few_choose_nothing() -> None:
+def test_threshold_keeps_equal_scores_together_and_needs_enough_detections() -> None:
     scores = np.repeat([0.9, 0.5], 200)
     is_right = np.arange(400) < 200
 
@@ -71,14 +71,14 @@ def test_equal_scores_are_on_one_side_and_too_few_choose_nothing() -> None:
     assert threshold_for(scores[:few], is_right[:few], 0.95, 0.95) is None
 
 
-def test_a_threshold_is_a_short_number_between_its_neighbours() -> None:
+def test_threshold_is_rounded_between_neighbouring_scores() -> None:
     assert round_between(0.612, 0.6349) == 0.62
     low, high = 0.123456, 0.123458
     assert low <= round_between(low, high) < high
 
 
 @pytest.mark.parametrize("fit", [fit_platt, fit_isotonic])
-def test_a_calibration_makes_scores_probabilities_and_keeps_their_order(fit) -> None:  # type: ignore[no-untyped-def]
+def test_calibrated_scores_are_probabilities_in_the_same_order(fit) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(2)
     scores = rng.random(4000)
     is_right = rng.random(4000) < probability(scores)
@@ -94,19 +94,19 @@ def test_a_calibration_makes_scores_probabilities_and_keeps_their_order(fit) -> 
     assert (np.diff(after[order]) > 0.0).all()
 
 
-def test_platt_without_slope_and_offset_changes_nothing() -> None:
+def test_platt_of_unit_slope_is_the_identity() -> None:
     scores = np.linspace(0.05, 0.95, 10)
     np.testing.assert_allclose(
         Platt(kind="platt", slope=1.0, offset=0.0).probabilities(scores), scores
     )
 
 
-def test_points_that_fall_are_refused() -> None:
+def test_decreasing_isotonic_points_are_refused() -> None:
     with pytest.raises(ValueError, match="increasing numbers"):
         Isotonic(kind="isotonic", scores=(0.2, 0.4), fractions=(0.6, 0.5))
 
 
-def test_the_source_s_thresholds_are_its_network_s_only() -> None:
+def test_published_thresholds_apply_only_to_their_network() -> None:
     vehicle = crosscue.Vehicle(version=1)
     assert (vehicle.cues.stop_sign_score, vehicle.cars.score) == (None, None)
     assert SOURCE_SCORES == {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
@@ -126,7 +126,7 @@ SIZE = (64, 48)
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Simulated pictures with one bright box each; brighter ones are more often traffic lights."""
+    """Write simulated pictures of one box; bright boxes are more often traffic lights."""
     folder = tmp_path_factory.mktemp("lights")
     (folder / "log").mkdir()
     (folder / "labels").mkdir()
@@ -148,22 +148,22 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"[input]\nwidth_px = {SIZE[0]}\nheight_px = {SIZE[1]}\n"
         '[output]\nkind = "end-to-end"\nclasses = ["traffic light", "bench"]\nscore = 0.3\n'
     )
-    detected(folder, "net")
+    detect_with_card(folder, "net")
     return folder
 
 
-def detected(folder: Path, card: str) -> crosscue.Run:
-    """Detections of a card's network, in the folder of the card's name."""
+def detect_with_card(folder: Path, card: str) -> crosscue.Run:
+    """Detect with a card's network, and write the run to a folder named after the card."""
     return crosscue.detect_drive(
         folder / "log", folder / card.replace("net", "run"), detectors=[f"{folder}/{card}.toml"]
     )
 
 
 @pytest.mark.slow
-def test_a_fitted_card_makes_cues_as_precise_as_asked(drive: Path) -> None:
+def test_fitted_card_reaches_required_precision_of_cues(drive: Path) -> None:
     before = crosscue.score_detector(drive / "run", drive / "labels", has_figures=False)
     found = crosscue.fit_detector(drive / "run", drive / "labels", drive / "net_fitted.toml")
-    run = detected(drive, "net_fitted")
+    run = detect_with_card(drive, "net_fitted")
     after = crosscue.score_detector(run, drive / "labels", has_figures=False)
 
     (one,) = found.classes
@@ -190,16 +190,16 @@ def test_a_fitted_card_makes_cues_as_precise_as_asked(drive: Path) -> None:
     assert again.classes[0].scores == one.scores
 
 
-def test_scores_that_are_calibrated_are_not_fitted_again(drive: Path) -> None:
+def test_calibrated_scores_are_not_fitted_again(drive: Path) -> None:
     run = drive / "run_fitted"
     if not run.exists():
         crosscue.fit_detector(drive / "run", drive / "labels", drive / "net_fitted.toml")
-        detected(drive, "net_fitted")
+        detect_with_card(drive, "net_fitted")
     with pytest.raises(UsageError, match="calibrated already"):
         crosscue.fit_detector(run, drive / "labels")
 
 
-def test_a_class_with_few_labels_is_left_as_it_is_and_said(drive: Path, tmp_path: Path) -> None:
+def test_class_with_few_labels_is_not_fitted(drive: Path, tmp_path: Path) -> None:
     for number in range(30):
         text = (drive / "labels" / f"frame_{number}.txt").read_text()
         (tmp_path / f"frame_{number}.txt").write_text(text)
@@ -214,7 +214,7 @@ def test_a_class_with_few_labels_is_left_as_it_is_and_said(drive: Path, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("rows", "meanings", "error", "said"),
+    ("rows", "meanings", "error", "message"),
     [
         ({"frame_9999.txt": "0 .5 .5 .2 .2"}, {}, SchemaError, "none of its 1 images is in"),
         ({"frame_1.txt": "1 .5 .5 .2 .2"}, {"cat": "dog"}, UsageError, "--map cat=dog: no such"),
@@ -230,13 +230,13 @@ def test_a_class_with_few_labels_is_left_as_it_is_and_said(drive: Path, tmp_path
         ({}, {}, crosscue.CrosscueError, "no labels of boxes"),
     ],
 )
-def test_labels_that_do_not_fit_are_one_line_and_leave_nothing(
+def test_invalid_labels_are_refused_in_one_line_without_output(
     drive: Path,
     tmp_path: Path,
     rows: dict[str, str],
     meanings: dict[str, str],
     error: type[Exception],
-    said: str,
+    message: str,
 ) -> None:
     for name, row in rows.items():
         (tmp_path / name).write_text(row + "\n")
@@ -244,14 +244,14 @@ def test_labels_that_do_not_fit_are_one_line_and_leave_nothing(
         (tmp_path / "classes.txt").write_text("traffic light\nvan\n")
     out = tmp_path / "out"
 
-    with pytest.raises(error, match=said) as raised:
+    with pytest.raises(error, match=message) as raised:
         crosscue.score_detector(drive / "run", tmp_path, out, meanings=meanings)
 
     assert "\n" not in str(raised.value)
     assert not out.exists()
 
 
-def test_what_is_left_out_of_labels_is_counted(drive: Path, tmp_path: Path) -> None:
+def test_left_out_labels_are_counted_by_reason(drive: Path, tmp_path: Path) -> None:
     box = (drive / "labels" / "frame_0.txt").read_text() or "0 .375 .333 .25 .333\n"
     (tmp_path / "classes.txt").write_text("traffic light\nvan\n")
     (tmp_path / "frame_0.txt").write_text(box + "0 .95 .5 .2 .2\n0 3 3 .1 .1\n1 .5 .5 .2 .2\n")

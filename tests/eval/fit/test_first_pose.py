@@ -34,7 +34,7 @@ SPEED_MPS = 8.0
 GNSS = Topic("/gnss", "sensor_msgs/msg/NavSatFix", "columns")
 
 
-def along(t_s: Floats, speed_mps: float) -> Table:
+def gnss_positions(t_s: Floats, speed_mps: float) -> Table:
     """Positions of a straight drive, as a receiver reports them."""
     east, north = np.cos(HEADING_RAD) * t_s * speed_mps, np.sin(HEADING_RAD) * t_s * speed_mps
     turn = ecef_to_enu_matrix(math.radians(PLACE[0]), math.radians(PLACE[1]))
@@ -50,23 +50,27 @@ def along(t_s: Floats, speed_mps: float) -> Table:
     )
 
 
-def driven(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog:
+def straight_drive(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog:
     blocks: list[Block] = []
     for second in range(seconds):
         t = [second * SECOND + i * SECOND // 10 for i in range(10)]
         blocks.append(gyro_block(t, [0.0] * 10))
         blocks.append(wheel_block(t, [speed_mps] * 10))
         at = np.array([second * SECOND], np.int64)
-        blocks.append(Block("/gnss", at, along(np.asarray(at * 1e-9, np.float64), speed_mps)))
+        blocks.append(
+            Block("/gnss", at, gnss_positions(np.asarray(at * 1e-9, np.float64), speed_mps))
+        )
     return MemoryLog((WHEELS, GYRO, GNSS), blocks, path=Path(__file__))
 
 
-def run_of(folder: Path, vehicle: Vehicle) -> RunFolder:
-    return replay_drive([driven()], vehicle, create(folder, overwrite=False), EVERYTHING).run
+def replayed(folder: Path, vehicle: Vehicle) -> RunFolder:
+    return replay_drive(
+        [straight_drive()], vehicle, create(folder, overwrite=False), EVERYTHING
+    ).run
 
 
-def test_gnss_says_where_a_drive_begins_and_which_way_the_car_faces() -> None:
-    start = with_start([driven()], Vehicle(version=1), EVERYTHING).start
+def test_gnss_determines_first_position_and_heading() -> None:
+    start = with_start([straight_drive()], Vehicle(version=1), EVERYTHING).start
 
     assert start.heading_rad == pytest.approx(HEADING_RAD, abs=1e-4)
     assert start.map_origin is not None
@@ -83,27 +87,27 @@ def test_gnss_says_where_a_drive_begins_and_which_way_the_car_faces() -> None:
         Vehicle(version=1, gnss=Gnss(use="off")),
     ],
 )
-def test_a_heading_of_the_vehicle_file_and_a_wish_are_kept(vehicle: Vehicle) -> None:
-    assert with_start([driven()], vehicle, EVERYTHING) == vehicle
+def test_start_settings_of_the_vehicle_file_are_kept(vehicle: Vehicle) -> None:
+    assert with_start([straight_drive()], vehicle, EVERYTHING) == vehicle
 
 
-def test_a_car_that_stands_gets_no_heading_from_gnss() -> None:
-    assert with_start([driven(0.0)], Vehicle(version=1), EVERYTHING) == Vehicle(version=1)
+def test_stationary_car_gets_no_heading_from_gnss() -> None:
+    assert with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING) == Vehicle(version=1)
 
 
-def test_a_run_that_begins_by_gnss_is_scored_in_the_map_of_its_own_gnss(tmp_path: Path) -> None:
-    vehicle = with_start([driven()], Vehicle(version=1), EVERYTHING)
-    run = run_of(tmp_path / "run", vehicle)
-    truth = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
+def test_run_started_by_gnss_is_scored_in_its_own_map(tmp_path: Path) -> None:
+    vehicle = with_start([straight_drive()], Vehicle(version=1), EVERYTHING)
+    run = replayed(tmp_path / "run", vehicle)
+    truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
     found = score_pose(run, truth)
 
     assert found.ape["none"].translation_m.max < 0.1
     assert found.ape["none"].rotation_deg.max < 0.1
 
 
-def test_gnss_as_truth_states_its_quality_its_antenna_and_its_place(tmp_path: Path) -> None:
+def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, gnss=Gnss(x_m=1.2, y_m=-0.3))
-    path = write_gnss_truth([driven()], vehicle, EVERYTHING, tmp_path)
+    path = write_gnss_truth([straight_drive()], vehicle, EVERYTHING, tmp_path)
     truth = load(path)
     track = read_tum(tmp_path / str(truth.pose))
 
@@ -116,46 +120,46 @@ def test_gnss_as_truth_states_its_quality_its_antenna_and_its_place(tmp_path: Pa
     np.testing.assert_allclose(heading_rad(track), HEADING_RAD, atol=1e-4)
 
 
-def test_a_truth_file_gives_the_pose_in_its_own_map(tmp_path: Path) -> None:
-    path = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path)
-    start = with_start([driven()], Vehicle(version=1), EVERYTHING, start=str(path)).start
+def test_truth_file_determines_first_pose_in_its_map(tmp_path: Path) -> None:
+    path = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path)
+    start = with_start([straight_drive()], Vehicle(version=1), EVERYTHING, start=str(path)).start
 
     assert start.heading_rad == pytest.approx(HEADING_RAD, abs=1e-4)
     assert [start.x_m, start.y_m] == pytest.approx([0.0, 0.0], abs=0.01)
     assert start.map_origin is None
 
 
-def test_three_numbers_are_a_pose() -> None:
-    start = with_start([driven()], Vehicle(version=1), EVERYTHING, start="3,-4.5,90").start
+def test_three_numbers_specify_the_first_pose() -> None:
+    start = with_start([straight_drive()], Vehicle(version=1), EVERYTHING, start="3,-4.5,90").start
 
     assert (start.x_m, start.y_m) == (3.0, -4.5)
     assert start.heading_rad == pytest.approx(math.pi / 2)
 
 
 @pytest.mark.parametrize("text", ["1,2,north", "1,nan,3", "1,2", "1,2,3,4", "90"])
-def test_other_than_three_finite_numbers_are_wrong_usage(text: str) -> None:
+def test_start_option_needs_three_finite_numbers(text: str) -> None:
     with pytest.raises(UsageError, match=r"expected X,Y,HEADING in metres and degrees"):
-        with_start([driven()], Vehicle(version=1), EVERYTHING, start=text)
+        with_start([straight_drive()], Vehicle(version=1), EVERYTHING, start=text)
 
 
-def test_a_truth_that_cannot_show_the_heading_is_refused(tmp_path: Path) -> None:
-    path = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path)
+def test_truth_without_observable_heading_is_refused(tmp_path: Path) -> None:
+    path = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path)
 
     with pytest.raises(VehicleError, match="does not show the first pose"):
-        with_start([driven(0.0)], Vehicle(version=1), EVERYTHING, start=str(path))
+        with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING, start=str(path))
 
 
 LONG_WHEELS = Vehicle(version=1, odometry=Odometry(wheel_scale=1.05, slip_per_sqrt_m=1.0))
 """Scale error of the wheels, five per cent: 12 m over the drive."""
 
 
-def test_fused_positions_hold_a_pose_that_odometry_alone_loses(tmp_path: Path) -> None:
+def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> None:
     errors_m: dict[str, float] = {}
-    at_end = along(np.array([29.9]), SPEED_MPS).columns
+    at_end = gnss_positions(np.array([29.9]), SPEED_MPS).columns
     uses: tuple[GnssUse, ...] = ("start", "fuse")
     for use in uses:
-        vehicle = with_start([driven()], LONG_WHEELS, EVERYTHING, gnss=use)
-        run = run_of(tmp_path / use, vehicle)
+        vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss=use)
+        run = replayed(tmp_path / use, vehicle)
         table = run.table("pose")
         origin = vehicle.start.map_origin
         assert origin is not None
@@ -168,9 +172,9 @@ def test_fused_positions_hold_a_pose_that_odometry_alone_loses(tmp_path: Path) -
     assert errors_m["fuse"] < 1.0
 
 
-def test_what_became_of_every_position_is_counted(tmp_path: Path) -> None:
-    vehicle = with_start([driven()], LONG_WHEELS, EVERYTHING, gnss="fuse")
-    run = run_of(tmp_path / "run", vehicle)
+def test_every_gnss_position_is_accounted_for(tmp_path: Path) -> None:
+    vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
+    run = replayed(tmp_path / "run", vehicle)
     line = run.drive_manifest().account.estimating["positions"]
 
     assert line.entered == 30
@@ -180,15 +184,15 @@ def test_what_became_of_every_position_is_counted(tmp_path: Path) -> None:
     assert kinds.count("position") == line.used > 20
 
 
-def test_the_smoother_weighs_in_what_the_filter_was_given(tmp_path: Path) -> None:
+def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:
     pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
-    vehicle = with_start([driven()], LONG_WHEELS, EVERYTHING, gnss="fuse")
-    run = run_of(tmp_path / "run", vehicle)
-    truth = write_gnss_truth([driven()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
+    vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
+    run = replayed(tmp_path / "run", vehicle)
+    truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
 
     assert score_smoother(run, truth, {}).smoother_rmse_m < 1.0
 
 
-def test_positions_cannot_be_weighed_into_a_map_that_lies_nowhere() -> None:
+def test_gnss_fusion_needs_a_map_origin() -> None:
     with pytest.raises(VehicleError, match=r"the map's origin is unknown; expected GNSS"):
-        with_start([driven(0.0)], Vehicle(version=1), EVERYTHING, gnss="fuse")
+        with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING, gnss="fuse")

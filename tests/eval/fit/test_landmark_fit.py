@@ -1,4 +1,4 @@
-"""Fit of the threshold: required rates, valid intervals, pairs from tables and drives."""
+"""Fit of the landmark threshold: required rates, intervals, pairs from tables and drives."""
 
 from __future__ import annotations
 
@@ -25,43 +25,45 @@ from support.data import shared
 from support.landmark_files import encoded, seen_from, wall
 
 
-def made(seed: int, false: int = 4000, same: int = 400) -> ScoredPairs:
-    """Two-place scores exponential around 5, same-place ones around 40; twenty pairs a query."""
+def simulated_pairs(seed: int, false: int = 4000, same: int = 400) -> ScoredPairs:
+    """Simulate exponential two-place scores of mean 5, and same-place scores around 40."""
     rng = np.random.default_rng(seed)
     score = np.concatenate([rng.exponential(5.0, false), rng.normal(40.0, 12.0, same)])
     is_same = np.arange(false + same) >= false
     return ScoredPairs(score, is_same, rng.integers(0, (false + same) // 20, false + same))
 
 
-@pytest.mark.parametrize("wanted", [0.0, 0.002, 0.05])
-def test_the_fitted_half_keeps_the_wanted_rate_and_no_lower_threshold_would(wanted: float) -> None:
-    pairs = made(1)
-    fitted = fit_landmarks(pairs, wanted)
+@pytest.mark.parametrize("required", [0.0, 0.002, 0.05])
+def test_threshold_is_the_lowest_that_meets_the_required_rate(required: float) -> None:
+    pairs = simulated_pairs(1)
+    fitted = fit_landmarks(pairs, required)
 
-    assert fitted.fitted_false.hits <= wanted * fitted.fitted_false.of
-    assert fitted.fitted_false.hits + 1 > wanted * fitted.fitted_false.of - 1
+    assert fitted.fitted_false.hits <= required * fitted.fitted_false.of
+    assert fitted.fitted_false.hits + 1 > required * fitted.fitted_false.of - 1
     assert fitted.fitted_false.of + fitted.held_out_false.of == 4000
     assert fitted.fitted_found.of + fitted.held_out_found.of == 400
 
 
-def test_held_out_pairs_keep_about_the_wanted_rate() -> None:
-    """Over 40 simulated fits, the mean true rate at the threshold is the required one."""
-    true_rates = [np.exp(-fit_landmarks(made(seed), 0.02).min_score / 5.0) for seed in range(40)]
+def test_mean_false_match_rate_equals_the_required_rate() -> None:
+    """Over 40 simulated fits, the mean true rate at the threshold equals the required rate."""
+    true_rates = [
+        np.exp(-fit_landmarks(simulated_pairs(seed), 0.02).min_score / 5.0) for seed in range(40)
+    ]
 
     assert np.mean(true_rates) == pytest.approx(0.02, rel=0.1)
 
 
-def test_the_interval_of_false_matches_holds_the_true_rate() -> None:
+def test_false_match_interval_contains_the_true_rate() -> None:
     inside = 0
     for seed in range(60):
-        fitted = fit_landmarks(made(seed), 0.01)
+        fitted = fit_landmarks(simulated_pairs(seed), 0.01)
         true = float(np.exp(-fitted.min_score / 5.0))
         inside += fitted.held_out_false.low <= true <= fitted.held_out_false.high
 
     assert inside >= 52
 
 
-def test_queries_are_never_in_both_halves() -> None:
+def test_pairs_of_a_query_stay_in_one_half() -> None:
     pairs = ScoredPairs(
         np.array([1.0, 50.0, 2.0, 60.0]),
         np.array([False, True, False, True]),
@@ -74,17 +76,17 @@ def test_queries_are_never_in_both_halves() -> None:
     assert not fitted.is_shown
 
 
-def test_too_few_pairs_and_odd_rates_are_refused() -> None:
+def test_too_few_pairs_and_invalid_arguments_are_refused() -> None:
     one = ScoredPairs(np.array([1.0]), np.array([False]), np.array([0]))
     with pytest.raises(ValueError, match="two-place pairs of at least two queries"):
         fit_landmarks(one, 0.01)
     with pytest.raises(ValueError, match=r"wanted_rate: expected 0 to 1, got 1\.5"):
-        fit_landmarks(made(1), 1.5)
+        fit_landmarks(simulated_pairs(1), 1.5)
     with pytest.raises(ValueError, match=r"is_same: expected \(2,\), got \(1,\)"):
         ScoredPairs(np.zeros(2), np.zeros(1, np.bool_), np.zeros(2, np.int64))
 
 
-def test_intervals_are_those_of_the_books() -> None:
+def test_intervals_equal_published_values() -> None:
     """Clopper-Pearson 0 of 100: 1 - 0.025^(1/100); 10 of 100 and Wilson from published tables."""
 
     def ends(rate: Rate) -> tuple[float, float]:
@@ -100,7 +102,9 @@ def test_intervals_are_those_of_the_books() -> None:
 
 @given(st.integers(1, 3000), st.data())
 @settings(max_examples=60, deadline=None)
-def test_intervals_hold_their_share_and_mirror(of: int, data: st.DataObject) -> None:
+def test_intervals_contain_the_observed_rate_and_are_symmetric(
+    of: int, data: st.DataObject
+) -> None:
     count = data.draw(st.integers(0, of))
     for interval in (clopper_pearson, wilson):
         rate, mirror = interval(count, of), interval(of - count, of)
@@ -108,7 +112,7 @@ def test_intervals_hold_their_share_and_mirror(of: int, data: st.DataObject) -> 
         assert rate.low == pytest.approx(1.0 - mirror.high, abs=1e-9)
 
 
-def test_pairs_from_a_table_fit_a_threshold_and_write_it(
+def test_threshold_fitted_to_a_table_of_pairs_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Eight simulated walls, each observed again, compared with all eight."""
@@ -136,7 +140,7 @@ def test_pairs_from_a_table_fit_a_threshold_and_write_it(
 
 
 @pytest.mark.parametrize(
-    ("table", "why"),
+    ("table", "message"),
     [
         ("a,b\n", "expected columns query,known,same"),
         ("query,known,same\nx.png,y.png,maybe\n", "pairs.csv:2: same: expected 1 or 0"),
@@ -144,33 +148,33 @@ def test_pairs_from_a_table_fit_a_threshold_and_write_it(
         ("query,known,same\n", "use more labelled pictures"),
     ],
 )
-def test_bad_tables_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, why: str
+def test_invalid_tables_of_pairs_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, message: str
 ) -> None:
     (tmp_path / "pairs.csv").write_text(table)
 
     assert cli.run(["fit", "landmarks", "--pairs", str(tmp_path / "pairs.csv")]) in (1, 4)
-    assert why in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("flags", "why"),
+    ("flags", "message"),
     [
         (["--max-landmarks", "0"], "--max-landmarks 0"),
         (["--same-within", "60"], "--same-within 60: expected less"),
     ],
 )
-def test_flags_that_leave_no_pairs_are_refused(
-    capsys: pytest.CaptureFixture[str], flags: list[str], why: str
+def test_options_that_leave_no_pairs_are_refused(
+    capsys: pytest.CaptureFixture[str], flags: list[str], message: str
 ) -> None:
     assert cli.run(["fit", "landmarks", "--pairs", "pairs.csv", *flags]) == 2
-    assert why in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_a_real_drive_with_poses_fits_a_threshold(
+def test_threshold_is_fitted_to_a_recorded_drive_with_poses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """KITTI, 51 frames: even ones as landmarks, odd ones as the drive; far means 25 m here."""
+    """KITTI, 51 frames: even frames are landmarks, odd frames the drive; far is over 25 m."""
     folder = shared("sequences", "kitti_seq2_right_turn_98deg")
     pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
     heading = np.arctan2(-pose[:, 0, 2], pose[:, 2, 2])

@@ -39,16 +39,16 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[P
     return runs, truths
 
 
-def annotated(run: RunFolder, truth: Path) -> Annotated:
+def annotated_run(run: RunFolder, truth: Path) -> Annotated:
     found = Annotated([], Counter())
     annotate(run, load(truth), Vehicle(version=1), found)
     return found
 
 
-def test_a_runs_approach_takes_its_features_from_the_truth_and_ends_at_the_intersection(
+def test_approach_has_features_of_truth_and_ends_at_intersection(
     drives: tuple[list[Path], list[Path]],
 ) -> None:
-    found = annotated(open_run(drives[0][0]), drives[1][0])
+    found = annotated_run(open_run(drives[0][0]), drives[1][0])
 
     (one,) = found.approaches
     assert one.features == {"intersection": True, "left": True, "right": True, "straight": True}
@@ -63,11 +63,11 @@ def test_a_runs_approach_takes_its_features_from_the_truth_and_ends_at_the_inter
     assert found.used == {"to an intersection": 1}
 
 
-def test_an_approach_to_nothing_lacks_intersection_left_and_right(tmp_path: Path) -> None:
+def test_drive_without_intersection_is_annotated_as_negative(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     run = write_run(tmp_path / "run", made_up_drive(rng, left=False, signed=False))
 
-    found = annotated(run, write_empty_truth(tmp_path / "truth"))
+    found = annotated_run(run, write_empty_truth(tmp_path / "truth"))
 
     assert {tuple(one.features.items()) for one in found.approaches} == {
         (("intersection", False), ("left", False), ("right", False))
@@ -75,39 +75,39 @@ def test_an_approach_to_nothing_lacks_intersection_left_and_right(tmp_path: Path
     assert not found.approaches[0].is_near.any()
 
 
-def test_an_approach_that_begins_in_an_intersection_is_left_out(tmp_path: Path) -> None:
+def test_approach_that_begins_in_an_intersection_is_left_out(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]
     run = write_run(tmp_path / "run", late)
 
-    found = annotated(run, write_truth(tmp_path / "truth", left=True, enter_ns=2_000_000_000))
+    found = annotated_run(run, write_truth(tmp_path / "truth", left=True, enter_ns=2_000_000_000))
 
     assert not found.approaches
     assert found.used == {"in an intersection, left out": 1}
 
 
-def test_an_approach_with_a_road_that_nobody_knows_is_left_out(tmp_path: Path) -> None:
+def test_approach_with_unknown_roads_is_left_out(tmp_path: Path) -> None:
     run = write_run(
         tmp_path / "run", made_up_drive(np.random.default_rng(0), left=True, signed=True)
     )
 
-    found = annotated(run, write_truth(tmp_path / "truth", left=None))
+    found = annotated_run(run, write_truth(tmp_path / "truth", left=None))
 
     assert not found.approaches
     assert found.used == {"to an intersection with unknown roads, left out": 1}
 
 
-def test_another_drives_truth_is_refused(tmp_path: Path) -> None:
+def test_truth_of_another_drive_is_refused(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]
     run = write_run(tmp_path / "run", late)
 
     with pytest.raises(RunError, match="give the truth of this drive"):
-        annotated(run, write_empty_truth(tmp_path / "truth", end_ns=2_000_000_000))
+        annotated_run(run, write_empty_truth(tmp_path / "truth", end_ns=2_000_000_000))
 
 
-def test_a_run_without_a_single_approach_gives_none(tmp_path: Path) -> None:
-    found = annotated(write_run(tmp_path / "run", []), write_empty_truth(tmp_path / "truth"))
+def test_empty_run_has_no_approaches(tmp_path: Path) -> None:
+    found = annotated_run(write_run(tmp_path / "run", []), write_empty_truth(tmp_path / "truth"))
 
     assert not found.approaches
 
@@ -122,7 +122,7 @@ def test_runs_with_different_graphs_are_refused(
         graph_of_runs([open_run(drives[0][0]), run])
 
 
-def test_the_command_writes_a_section_that_a_vehicle_file_takes(
+def test_command_writes_a_section_for_the_vehicle_file(
     drives: tuple[list[Path], list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs, truths = drives
@@ -145,7 +145,7 @@ def test_the_command_writes_a_section_that_a_vehicle_file_takes(
     assert set(by_place) == {("road_left", "left", near) for near in (False, True)}
 
 
-def test_the_section_is_printed_where_no_file_is_named(
+def test_section_is_printed_without_output_option(
     drives: tuple[list[Path], list[Path]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs, truths = drives
@@ -166,7 +166,7 @@ def test_the_section_is_printed_where_no_file_is_named(
         assert low < rate["there"]["rate"] < high
 
 
-def test_each_run_needs_its_truth(
+def test_each_run_needs_a_truth_file(
     drives: tuple[list[Path], list[Path]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs, truths = drives

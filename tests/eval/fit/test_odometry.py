@@ -31,14 +31,14 @@ def fitted(files: DriveFiles) -> crosscue.FittedOdometry:
     return crosscue.fit_odometry(files.log, vehicle, output, truth=files.truth)
 
 
-def test_the_bias_of_a_simulated_gyro_is_found(fitted: crosscue.FittedOdometry) -> None:
+def test_simulated_gyro_bias_is_estimated(fitted: crosscue.FittedOdometry) -> None:
     fit = fitted.fitted.sources[0].fit
     (bias,) = (one for one in fit.fitted if one.parameter == "gyro_bias_radps")
 
     assert abs(bias.value - BIAS) < 4.0 * bias.sd
 
 
-def test_the_held_out_half_is_nearer_to_the_truth_and_errors_are_as_large_as_claimed(
+def test_fit_reduces_held_out_error_and_nees_is_within_band(
     fitted: crosscue.FittedOdometry,
 ) -> None:
     one = fitted.fitted.sources[0]
@@ -47,35 +47,35 @@ def test_the_held_out_half_is_nearer_to_the_truth_and_errors_are_as_large_as_cla
     assert one.after.all_nees < fitted.fitted.nees_band[1]
 
 
-def test_the_vehicle_file_says_where_its_odometry_comes_from(
+def test_vehicle_file_records_the_source_of_its_odometry(
     fitted: crosscue.FittedOdometry, files: DriveFiles
 ) -> None:
     assert fitted.path is not None
     written = crosscue.load_vehicle(fitted.path).odometry
-    came_from = written.fitted
+    source = written.fitted
 
     assert written.gyro_bias_radps == fitted.section["gyro_bias_radps"]
-    assert came_from is not None
-    assert came_from.log == files.log.name
-    assert came_from.start_ns < came_from.end_ns
-    assert came_from.sd["gyro_bias_radps"] > 0.0
+    assert source is not None
+    assert source.log == files.log.name
+    assert source.start_ns < source.end_ns
+    assert source.sd["gyro_bias_radps"] > 0.0
     assert files.vehicle.read_text().splitlines()[0] == fitted.path.read_text().splitlines()[0]
 
 
-def test_a_log_without_positions_names_what_to_do(files: DriveFiles, tmp_path: Path) -> None:
+def test_log_without_positions_is_refused(files: DriveFiles, tmp_path: Path) -> None:
     with pytest.raises(EmptyResultError, match=r"no positions to fit to: .*--truth"):
         crosscue.fit_odometry(files.log, files.vehicle, tmp_path / "out.toml")
     assert not (tmp_path / "out.toml").exists()
 
 
-def test_without_a_vehicle_file_the_fit_becomes_one(tmp_path: Path) -> None:
+def test_fit_without_vehicle_file_writes_a_new_one(tmp_path: Path) -> None:
     path = write_fit(None, tmp_path / "out.toml", lambda text: text + "lost_above_m = 50.0\n")
 
     assert path is not None
     assert crosscue.load_vehicle(path).lost_above_m == 50.0
 
 
-def test_settings_in_memory_are_no_file_to_write_into(tmp_path: Path) -> None:
+def test_settings_in_memory_cannot_be_written_to_a_vehicle_file(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="expected a vehicle file"):
         check_output(Vehicle(version=1), tmp_path / "out.toml", overwrite=False)
     check_output(None, tmp_path / "out.toml", overwrite=False)

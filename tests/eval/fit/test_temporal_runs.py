@@ -22,7 +22,7 @@ Drives = tuple[list[Path], list[Path]]
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
-    """Run folders and truth files: with and without a road to the left, and no intersection."""
+    """Run folders and truth files with and without a road to the left, or an intersection."""
     folder = tmp_path_factory.mktemp("drives")
     rng = np.random.default_rng(4)
     runs, truths = [], []
@@ -38,7 +38,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
     return runs, truths
 
 
-def test_a_drive_is_divided_at_the_intersection_and_keeps_what_is_true(drives: Drives) -> None:
+def test_drive_is_divided_at_the_intersection(drives: Drives) -> None:
     before, *after = annotated_drives(
         open_run(drives[0][0]), load(drives[1][0], "a"), Vehicle(version=1)
     )
@@ -49,14 +49,14 @@ def test_a_drive_is_divided_at_the_intersection_and_keeps_what_is_true(drives: D
     assert not any(one.features["intersection"] for one in after)
 
 
-def test_where_no_intersection_is_ahead_nothing_is_there(drives: Drives) -> None:
+def test_drive_without_intersection_has_no_features(drives: Drives) -> None:
     (one,) = annotated_drives(open_run(drives[0][2]), load(drives[1][2], "c"), Vehicle(version=1))
 
     assert one.features == {"intersection": False, "left": False, "right": False}
     assert np.isnan(one.start_m).all()
 
 
-def test_the_command_writes_a_section_that_a_vehicle_file_takes(
+def test_command_writes_a_section_for_the_vehicle_file(
     drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs, truths = drives
@@ -73,7 +73,7 @@ def test_the_command_writes_a_section_that_a_vehicle_file_takes(
     assert learned.model_dump(mode="json") == reported["temporal"]
 
 
-def test_one_place_is_too_few(drives: Drives, capsys: pytest.CaptureFixture[str]) -> None:
+def test_single_place_is_refused(drives: Drives, capsys: pytest.CaptureFixture[str]) -> None:
     status = crosscue(["fit", "temporal", str(drives[0][0]), "--truth", str(drives[1][0])])
 
     assert status == 1

@@ -13,41 +13,41 @@ from support.gap_drive import SECOND, Clock, replayed, write_drive
 NEVER_S = 1e6
 
 
-def _checked(folder: Path, log: Path) -> int:
+def _status_of_check(folder: Path, log: Path) -> int:
     return cli.run(["truth", "check", str(folder / "truth.json"), "--log", str(log)])
 
 
-def _scored(folder: Path, log: Path) -> int:
+def _status_of_score(folder: Path, log: Path) -> int:
     run = replayed(folder, log)
     return cli.run(["score", str(run.path), "--truth", str(folder / "truth.json")])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("by_s", [-7.0, -3600.0])
-def test_truth_of_a_log_that_was_set_back_fits(
+def test_truth_of_log_with_clock_set_back_is_accepted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], by_s: float
 ) -> None:
     log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
 
-    assert _checked(tmp_path, log) == 0
+    assert _status_of_check(tmp_path, log) == 0
     # The approach and its stop sign end at 11.6 s, the log's own clock at 6 or 7.
     assert "outside    2 of them reach beyond the log" in capsys.readouterr().out
-    assert _scored(tmp_path, log) == 0
+    assert _status_of_score(tmp_path, log) == 0
 
 
-def test_truth_that_outlasts_a_log_of_one_clock_is_refused(
+def test_truth_beyond_the_end_of_a_log_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = write_drive(tmp_path, Clock(pause_s=(6.0, NEVER_S)))
 
-    assert _checked(tmp_path, log) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "approach 0 from" in said
-    assert "give the truth of this log" in said
+    assert _status_of_check(tmp_path, log) == 1
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert "approach 0 from" in printed
+    assert "give the truth of this log" in printed
 
 
-def test_truth_of_another_time_is_refused_by_both(
+def test_truth_of_another_time_is_refused_by_check_and_score(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-7.0))
@@ -57,5 +57,5 @@ def test_truth_of_another_time_is_refused_by_both(
             part[name] += 1000 * SECOND
     (tmp_path / "truth.json").write_text(json.dumps(truth))
 
-    assert _checked(tmp_path, log) == _scored(tmp_path, log) == 1
+    assert _status_of_check(tmp_path, log) == _status_of_score(tmp_path, log) == 1
     assert capsys.readouterr().err.count("\n") == 2
