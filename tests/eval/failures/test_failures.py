@@ -1,4 +1,4 @@
-"""Failures of runs: found at the right moment, ranked, and selected from many causes."""
+"""Failures of runs: their frames, their ranking and a selection of diverse causes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from support.scoring import at, truth_folder
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A made-up run and its truth, in one folder."""
+    """Write a synthetic run and its truth to one folder."""
     folder = tmp_path_factory.mktemp("failing")
     return scene_run(folder).path, truth_folder(folder / "truth")
 
@@ -50,7 +50,7 @@ def failure(severity: float = 1.0, **changes: object) -> Failure:
     return Failure(**(usual | {"severity": severity} | changes))  # type: ignore[arg-type]
 
 
-def test_a_sign_in_plain_view_that_was_not_found_at_first_is_missed_until_it_is(
+def test_visible_sign_is_missed_until_its_first_detection(
     drive: tuple[Path, Path],
 ) -> None:
     found = crosscue.failures(drive[0], truth=drive[1])
@@ -65,7 +65,7 @@ def test_a_sign_in_plain_view_that_was_not_found_at_first_is_missed_until_it_is(
     assert sign.severity == pytest.approx(math.log2(6))
 
 
-def test_a_right_range_is_no_failure_and_one_sure_of_itself_and_off_is(tmp_path: Path) -> None:
+def test_overconfident_range_is_a_failure(tmp_path: Path) -> None:
     folder = scene_run(tmp_path / "drive").path
     truth = truth_folder(tmp_path / "truth")
     assert not [f for f in crosscue.failures(folder, truth=truth).failures if f.kind == "range"]
@@ -90,7 +90,7 @@ def test_a_right_range_is_no_failure_and_one_sure_of_itself_and_off_is(tmp_path:
     assert wrong.severity == pytest.approx(25.0 / (2.0 * math.log(2.0)))
 
 
-def test_a_run_without_truth_still_shows_beliefs_that_it_took_back(
+def test_run_without_truth_reports_only_flipped_beliefs(
     drive: tuple[Path, Path],
 ) -> None:
     found = crosscue.failures(drive[0])
@@ -114,7 +114,7 @@ def _flips(belief: BeliefRows, cues: Mapping[str, list[int]] | None = None) -> l
     return flips_without_truth(belief, positives, "run", 0.9)
 
 
-def test_a_belief_that_was_decided_and_then_went_over_is_flipped_where_it_crosses() -> None:
+def test_decided_belief_is_flipped_where_it_crosses_one_half() -> None:
     (flip,) = _flips(_belief(straight=[0.5, 0.95, 0.95, 0.6, 0.4, 0.05]))
 
     assert (flip.kind, flip.what, flip.t_ns, flip.start_ns) == (
@@ -127,7 +127,7 @@ def test_a_belief_that_was_decided_and_then_went_over_is_flipped_where_it_crosse
     assert flip.cause == "no cue speaks against it"
 
 
-def test_the_same_flip_towards_the_other_answer_is_as_severe() -> None:
+def test_flip_severity_is_equal_in_both_directions() -> None:
     (yes,) = _flips(_belief(left=[0.5, 0.95, 0.2]))
     (no,) = _flips(_belief(left=[0.5, 0.05, 0.8]))
 
@@ -137,35 +137,37 @@ def test_the_same_flip_towards_the_other_answer_is_as_severe() -> None:
 @pytest.mark.parametrize(
     "values",
     [[0.5, 0.95, 0.99], [0.5, 0.85, 0.1], [0.02, 0.02, 0.6, 0.95], [0.5, 0.95, 0.55]],
-    ids=["it stays", "never decided", "a prior is no decision", "it only weakens"],
+    ids=["unchanged", "undecided", "prior", "weakened"],
 )
-def test_what_was_never_decided_or_never_given_up_is_no_flip(values: list[float]) -> None:
+def test_undecided_or_unchanged_belief_is_not_a_flip(values: list[float]) -> None:
     assert not _flips(_belief(left=values))
 
 
-def test_a_flip_names_the_cue_that_spoke_against_it() -> None:
+def test_flip_names_the_contradicting_cue() -> None:
     belief = _belief(intersection=[0.5, 0.95, 0.4], left=[0.5, 0.95, 0.1])
     (left,) = [
         one for one in _flips(belief, {"one_way_right": [2]}) if one.what == "left"
-    ]  # its row excludes a turn to the left
+    ]  # one-way right excludes a turn to the left
 
     assert left.cause == "a cue speaks against it"
     assert "one way right in 1 frames" in left.reported
 
 
-def test_order_does_not_depend_on_the_order_of_runs_or_of_what_was_found() -> None:
-    several = [failure(s, run=run, t_ns=t) for s, run, t in itertools.product([1, 2], "ab", [1, 2])]
+def test_ranking_is_independent_of_input_order() -> None:
+    failures = [
+        failure(s, run=run, t_ns=t) for s, run, t in itertools.product([1, 2], "ab", [1, 2])
+    ]
 
-    assert ranked(several) == ranked(several[::-1])
-    assert diverse(several, 3) == diverse(several[::-1], 3)
-    assert [one.severity for one in ranked(several)] == sorted([1, 2] * 4, reverse=True)
+    assert ranked(failures) == ranked(failures[::-1])
+    assert diverse(failures, 3) == diverse(failures[::-1], 3)
+    assert [one.severity for one in ranked(failures)] == sorted([1, 2] * 4, reverse=True)
 
 
-def test_no_group_and_no_run_has_two_before_every_other_has_one() -> None:
-    loud = [failure(9.0, run="a", t_ns=t) for t in range(5)]
+def test_diverse_selection_alternates_between_causes_and_runs() -> None:
+    severe = [failure(9.0, run="a", t_ns=t) for t in range(5)]
     same_cause = [failure(1.0, run="b")]
     rare = [failure(0.1, cause="score too low")]
-    everything = [*loud, *same_cause, *rare]
+    everything = [*severe, *same_cause, *rare]
 
     first_two = diverse(everything, 2)
     assert {one.cause for one in first_two} == {"not detected", "score too low"}
@@ -175,7 +177,7 @@ def test_no_group_and_no_run_has_two_before_every_other_has_one() -> None:
     assert sorted(diverse(everything, 99), key=repr) == sorted(everything, key=repr)
 
 
-def test_groups_count_every_failure_once() -> None:
+def test_cause_groups_count_each_failure_once() -> None:
     groups = cause_groups([failure(), failure(3.0, run="b"), failure(kind="late")])
 
     assert [(g.kind, g.failures, g.runs, g.severity) for g in groups] == [
@@ -185,7 +187,7 @@ def test_groups_count_every_failure_once() -> None:
 
 
 @pytest.mark.parametrize("ending", ["parquet", "json"])
-def test_a_table_reads_back_as_it_was_also_after_both_folders_moved(
+def test_failure_table_is_read_back_also_after_its_folder_moved(
     tmp_path: Path, ending: str
 ) -> None:
     (tmp_path / "before").mkdir()
@@ -199,16 +201,14 @@ def test_a_table_reads_back_as_it_was_also_after_both_folders_moved(
     assert moved.run == str(tmp_path / "after" / "run")
 
 
-def test_a_damaged_table_is_refused_with_its_name(tmp_path: Path) -> None:
+def test_damaged_failure_table_is_refused_by_name(tmp_path: Path) -> None:
     for name, text in (("a.parquet", "x"), ("b.json", "{}"), ("c.json", '{"failures": [{}]}')):
         (tmp_path / name).write_text(text)
         with pytest.raises(AnnotationError, match=name):
             read_failures(tmp_path / name)
 
 
-def test_one_run_that_cannot_be_read_does_not_hide_the_others(
-    drive: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_unreadable_run_does_not_hide_the_others(drive: tuple[Path, Path], tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "manifest.json").write_text("{")
@@ -219,7 +219,7 @@ def test_one_run_that_cannot_be_read_does_not_hide_the_others(
         crosscue.failures(broken)
 
 
-def test_the_result_is_a_table_a_text_and_plain_values(
+def test_result_is_available_as_table_text_and_dict(
     drive: tuple[Path, Path], tmp_path: Path
 ) -> None:
     found = crosscue.failures(drive[0], truth=drive[1], top=2, output=tmp_path / "top.json")
@@ -231,13 +231,13 @@ def test_the_result_is_a_table_a_text_and_plain_values(
     assert found.as_dict()["found"] == found.found
 
 
-def test_values_that_mean_nothing_are_wrong_usage(drive: tuple[Path, Path]) -> None:
+def test_invalid_arguments_are_refused(drive: tuple[Path, Path]) -> None:
     for wrong in ({"top": 0}, {"threshold": 0.4}, {"workers": 0}, {"output": "x.csv"}):
         with pytest.raises(UsageError):
             crosscue.failures(drive[0], truth=drive[1], **wrong)
 
 
-def test_every_distance_has_one_bin() -> None:
+def test_each_distance_has_one_bin() -> None:
     assert [distance_bin(d) for d in (None, -1.0, 0.0, 9.9, 10.0, 79.9, 80.0)] == [
         "unknown",
         "0-10 m",
@@ -249,7 +249,7 @@ def test_every_distance_has_one_bin() -> None:
     ]
 
 
-def test_a_query_selects_the_runs_of_one_folder(
+def test_where_option_selects_runs(
     drive: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     line = ["failures", str(drive[0].parent), "--truth", str(drive[1]), "--json"]

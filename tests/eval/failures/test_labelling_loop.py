@@ -1,4 +1,4 @@
-"""The labelling loop: failing frames are exported with detections, corrected, imported and used."""
+"""The labelling loop: failing frames are exported, corrected, imported and used."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def exported(worst: Path) -> Path:
     return crosscue.export(worst, worst.parent / "labelling").file
 
 
-def corrected(exported: Path, to: Path, change: Callable[[dict[str, object]], None]) -> Path:
-    """The export after each box has been corrected."""
+def write_corrected(exported: Path, to: Path, change: Callable[[dict[str, object]], None]) -> Path:
+    """Write the export with a change applied to each box."""
     tree = json.loads(exported.read_text())
     for box in tree["annotations"]:
         change(box)
@@ -48,7 +48,7 @@ def corrected(exported: Path, to: Path, change: Callable[[dict[str, object]], No
     return to
 
 
-def test_pictures_go_out_once_as_recorded_with_what_detectors_found(
+def test_export_writes_each_recorded_picture_with_its_detections(
     worst: Path, exported: Path
 ) -> None:
     import pyarrow.parquet as pq
@@ -60,32 +60,32 @@ def test_pictures_go_out_once_as_recorded_with_what_detectors_found(
     assert {one.size_px for one in labels.pictures} == {SIZE}
     for one in labels.pictures:
         assert (exported.parent / "images" / one.name).read_bytes()[:2] == b"\xff\xd8"
-        # The car, but not the object that no cue uses.
+        # The car is exported, the object that no cue uses is not.
         assert one.t_ns is not None
         x = 20.0 + (one.t_ns - at(0)) // 100_000_000
         assert [thing.box_px for thing in one.things] == [(x, 40.0, x + 40.0, 52.0)]
 
 
-def test_a_corrected_box_comes_back_with_its_time_and_is_trained_and_fitted_with(
+def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
     worst: Path, exported: Path, tmp_path: Path
 ) -> None:
     def wider(box: dict[str, object]) -> None:
         box["bbox"] = [*box["bbox"][:2], 44.0, 12.0]  # type: ignore[index]
 
-    mine = corrected(exported, tmp_path / "corrected.json", wider)
-    found = crosscue.import_labels(mine, exported.parent, tmp_path / "labelled")
+    corrected_file = write_corrected(exported, tmp_path / "corrected.json", wider)
+    found = crosscue.import_labels(corrected_file, exported.parent, tmp_path / "labelled")
 
     (drive,) = found.drives.values()
     assert found.missing == 0
     objects = read_coco(Path(drive.objects))
-    was = {one.t_ns: one for one in read_coco(exported).pictures}
+    original = {one.t_ns: one for one in read_coco(exported).pictures}
     for one in objects.pictures:
-        (thing,), (before,) = one.things, was[one.t_ns].things
+        (thing,), (before,) = one.things, original[one.t_ns].things
         assert thing.box_px is not None
         assert before.box_px is not None
         assert thing.box_px[2] - thing.box_px[0] == 44.0
         assert thing.box_px[0] == before.box_px[0]
-    # Its truth fits the log; train reads pictures and boxes; the detector's score reads times.
+    # The truth fits the log, and training and the fit of the detector read all pictures.
     log = worst.parent / "drive.mcap"
     assert crosscue.check_truth(drive.truth, log).objects == len(objects.pictures)
     assert read_to_train(found.coco, found.images, ("car",)).objects == len(objects.pictures)
@@ -97,23 +97,21 @@ def test_a_corrected_box_comes_back_with_its_time_and_is_trained_and_fitted_with
         data=found.coco, images=found.images, classes=("car",), steps=1, batch=1, check_images=1
     )
     small = replace(settings, width_px=SIZE[0], window_px=(64, 64), device="cpu")
-    said: list[str] = []
-    trained = crosscue.train_mask_rcnn(small, tmp_path / "net.safetensors", on_line=said.append)
+    lines: list[str] = []
+    trained = crosscue.train_mask_rcnn(small, tmp_path / "net.safetensors", on_line=lines.append)
     assert trained.path.stat().st_size > 0
-    counts = [re.search(r"(\d+) pictures, \d+ of (\d+) objects", line) for line in said[:2]]
-    assert [sum(int(one[n]) for one in counts if one) for n in (1, 2)] == [len(was)] * 2
+    counts = [re.search(r"(\d+) pictures, \d+ of (\d+) objects", line) for line in lines[:2]]
+    assert [sum(int(one[n]) for one in counts if one) for n in (1, 2)] == [len(original)] * 2
 
 
-def test_a_picture_without_its_cue_says_that_the_cue_is_not_there(
-    exported: Path, tmp_path: Path
-) -> None:
+def test_imported_picture_without_cue_records_its_absence(exported: Path, tmp_path: Path) -> None:
     found = crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
 
     (drive,) = found.drives.values()
     assert drive.cues["stop_sign"] == 0
 
 
-def test_pictures_that_did_not_come_back_are_counted_and_others_or_doubles_refused(
+def test_missing_pictures_are_counted_and_unknown_or_duplicate_ones_refused(
     exported: Path, tmp_path: Path
 ) -> None:
     tree = json.loads(exported.read_text())
@@ -136,7 +134,7 @@ def test_pictures_that_did_not_come_back_are_counted_and_others_or_doubles_refus
     assert not (tmp_path / "other").exists()
 
 
-def test_what_exists_is_not_replaced_unasked(worst: Path, exported: Path, tmp_path: Path) -> None:
+def test_existing_output_is_not_replaced(worst: Path, exported: Path, tmp_path: Path) -> None:
     crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
     with pytest.raises(OutputError, match="exists"):
         crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
@@ -148,7 +146,7 @@ def test_what_exists_is_not_replaced_unasked(worst: Path, exported: Path, tmp_pa
         crosscue.export(worst, worst.parent, overwrite=True)
 
 
-def test_a_folder_that_is_no_export_and_a_format_that_is_none_are_refused(
+def test_folder_without_export_and_unknown_format_are_refused(
     worst: Path, exported: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(AnnotationError, match="crosscue export wrote"):
@@ -157,12 +155,12 @@ def test_a_folder_that_is_no_export_and_a_format_that_is_none_are_refused(
         crosscue.export(worst, tmp_path / "x", to="voc")
 
 
-def test_a_run_that_is_gone_is_left_out_with_its_reason(worst: Path, tmp_path: Path) -> None:
+def test_deleted_run_is_left_out_of_the_export(worst: Path, tmp_path: Path) -> None:
     from crosscue.eval.failures.record import read_failures
 
-    here: tuple[Failure, ...] = read_failures(worst)
-    gone = replace(here[0], run=str(tmp_path / "gone"))
+    kept: tuple[Failure, ...] = read_failures(worst)
+    gone = replace(kept[0], run=str(tmp_path / "gone"))
 
-    found = crosscue.export([*here, gone], tmp_path / "labelling")
+    found = crosscue.export([*kept, gone], tmp_path / "labelling")
     assert list(found.failed) == [gone.run]
-    assert found.pictures == len({one.t_ns for one in here})
+    assert found.pictures == len({one.t_ns for one in kept})

@@ -1,4 +1,4 @@
-"""A site of failures: every failure has its page, found without the script as well as with it."""
+"""A site of failures: each failure has a page that lists reach with and without the script."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class Links(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, crosscue.Site]:
+def site_of_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, crosscue.Site]:
     folder = tmp_path_factory.mktemp("site")
     run, truth = scene_run(folder).path, truth_folder(folder / "truth")
     return folder, crosscue.browse(run, folder / "site", truth=truth)
 
 
-def test_every_link_leads_to_a_file_and_every_failure_has_a_page_and_a_picture(
-    made: tuple[Path, crosscue.Site],
+def test_all_links_resolve_and_each_failure_has_page_and_picture(
+    site_of_run: tuple[Path, crosscue.Site],
 ) -> None:
-    folder, site = made
+    folder, site = site_of_run
     pages = sorted((folder / "site").rglob("*.html"))
 
     for page in pages:
@@ -56,10 +56,10 @@ def test_every_link_leads_to_a_file_and_every_failure_has_a_page_and_a_picture(
     assert small == large
 
 
-def test_a_page_shows_the_belief_and_the_command_that_opens_rerun_there(
-    made: tuple[Path, crosscue.Site],
+def test_failure_page_shows_belief_and_view_command(
+    site_of_run: tuple[Path, crosscue.Site],
 ) -> None:
-    folder, _ = made
+    folder, _ = site_of_run
     page = (folder / "site" / "f" / "00001.html").read_text()
 
     assert "<svg" in page
@@ -69,8 +69,8 @@ def test_a_page_shows_the_belief_and_the_command_that_opens_rerun_there(
     assert crosscue.save_recording(at[1], folder / "at.rrd", at=at[2], only=("belief",)).exists()
 
 
-def test_names_from_a_log_stay_text(made: tuple[Path, crosscue.Site]) -> None:
-    folder, _ = made
+def test_names_are_escaped_in_pages(site_of_run: tuple[Path, crosscue.Site]) -> None:
+    folder, _ = site_of_run
     for page in (folder / "site").rglob("*.html"):
         assert "<img src=x" not in page.read_text()
 
@@ -97,7 +97,7 @@ def failure(number: int, **changes: object) -> Failure:
     return Failure(**(usual | changes))  # type: ignore[arg-type]
 
 
-def test_without_the_script_pages_reach_every_failure_by_each_facet(tmp_path: Path) -> None:
+def test_pages_without_script_list_all_failures_by_each_facet(tmp_path: Path) -> None:
     entries = entries_of([failure(number) for number in range(2 * PER_PAGE + 1)])
     write_lists(tmp_path, entries, frozenset())
 
@@ -106,17 +106,17 @@ def test_without_the_script_pages_reach_every_failure_by_each_facet(tmp_path: Pa
             path.name for page in pages for path in Links(page).found if path.parent.name == "f"
         )
 
-    wanted = sorted(one.page for one in entries)
-    assert listed([tmp_path / "index.html", *tmp_path.glob("page-*.html")]) == wanted
+    expected = sorted(one.page for one in entries)
+    assert listed([tmp_path / "index.html", *tmp_path.glob("page-*.html")]) == expected
     for facet in FACETS:
         pages = list((tmp_path / "by").glob(f"{facet}-*.html"))
-        assert set(listed(pages)) == set(wanted)
+        assert set(listed(pages)) == set(expected)
         # A failure with two conditions is in the lists of both.
-        assert facet == "condition" or listed(pages) == wanted
+        assert facet == "condition" or listed(pages) == expected
         assert all(Links(page).scripts == 0 for page in pages)
 
 
-def test_what_the_script_lists_is_json_that_cannot_end_its_element(tmp_path: Path) -> None:
+def test_embedded_json_cannot_close_its_script_element(tmp_path: Path) -> None:
     write_lists(tmp_path, entries_of([failure(1)]), frozenset())
     page = (tmp_path / "index.html").read_text()
 
@@ -125,8 +125,8 @@ def test_what_the_script_lists_is_json_that_cannot_end_its_element(tmp_path: Pat
     assert page.count("</script>") == 2
 
 
-def test_the_same_runs_make_the_same_bytes(made: tuple[Path, crosscue.Site]) -> None:
-    folder, _ = made
+def test_same_runs_yield_equal_sites(site_of_run: tuple[Path, crosscue.Site]) -> None:
+    folder, _ = site_of_run
     truth = folder / "truth"
     crosscue.browse(folder / "run", folder / "again", truth=truth)
 
@@ -135,10 +135,10 @@ def test_the_same_runs_make_the_same_bytes(made: tuple[Path, crosscue.Site]) -> 
         assert (folder / "site" / path).read_bytes() == (folder / "again" / path).read_bytes()
 
 
-def test_a_table_of_failures_makes_a_site_of_those_alone(
-    made: tuple[Path, crosscue.Site], tmp_path: Path
+def test_site_of_failure_table_has_only_its_failures(
+    site_of_run: tuple[Path, crosscue.Site], tmp_path: Path
 ) -> None:
-    folder, _ = made
+    folder, _ = site_of_run
     truth = folder / "truth"
     crosscue.failures(folder / "run", truth=truth, top=2, output=tmp_path / "two.parquet")
 
@@ -147,7 +147,7 @@ def test_a_table_of_failures_makes_a_site_of_those_alone(
     assert crosscue.browse(tmp_path / "two.parquet", tmp_path / "two", overwrite=True)
 
 
-def test_a_log_that_is_gone_leaves_pages_without_pictures_and_the_reason(tmp_path: Path) -> None:
+def test_missing_log_yields_pages_without_pictures(tmp_path: Path) -> None:
     run, truth = scene_run(tmp_path / "drive").path, truth_folder(tmp_path / "truth")
     (tmp_path / "drive" / "drive.mcap").unlink()
 
@@ -157,10 +157,10 @@ def test_a_log_that_is_gone_leaves_pages_without_pictures_and_the_reason(tmp_pat
     assert "drive.mcap" in site.reasons[0]
 
 
-def test_a_folder_that_is_not_a_site_is_never_replaced(
-    made: tuple[Path, crosscue.Site], tmp_path: Path
+def test_folder_other_than_a_site_is_not_replaced(
+    site_of_run: tuple[Path, crosscue.Site], tmp_path: Path
 ) -> None:
-    folder, _ = made
+    folder, _ = site_of_run
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
 
@@ -171,12 +171,14 @@ def test_a_folder_that_is_not_a_site_is_never_replaced(
     assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
 
 
-def test_nothing_wrong_writes_nothing(made: tuple[Path, crosscue.Site], tmp_path: Path) -> None:
+def test_site_of_no_failures_is_not_written(
+    site_of_run: tuple[Path, crosscue.Site], tmp_path: Path
+) -> None:
     write_failures([], tmp_path / "none.json")
     assert read_failures(tmp_path / "none.json") == ()
 
     with pytest.raises(EmptyResultError):
         crosscue.browse(tmp_path / "none.json", tmp_path / "site")
     with pytest.raises(UsageError):
-        crosscue.browse([tmp_path / "none.json", made[0] / "run"], tmp_path / "site")
+        crosscue.browse([tmp_path / "none.json", site_of_run[0] / "run"], tmp_path / "site")
     assert not (tmp_path / "site").exists()
