@@ -22,7 +22,7 @@ from support.mf4_files import unsorted
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_folder
 
-from .test_bombs import BOMB_BYTES, MAX_MB, PIECE, with_zstd
+from .test_bombs import BOMB_BYTES, MAX_MB, PIECE, zstd_bomb
 
 SIDE_PX = 60_000
 MAX_WITH_DETECTOR_MB = 500
@@ -38,7 +38,7 @@ def _blf(declared: int) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         path = folder / "bomb.blf"
         body = struct.pack("<H6xL4x", 2, declared) + _deflated(BOMB_BYTES)
-        size = 16 + len(body)  # of the object, its header included
+        size = 16 + len(body)  # Of the object, including its header.
         padded = body + bytes(size % 4)
         path.write_bytes(blf(made(30)) + struct.pack("<4sHHII", b"LOBJ", 16, 1, size, 10) + padded)
         return path
@@ -60,7 +60,7 @@ def _in_db3(content: Callable[[], bytes]) -> Callable[[Path], Path]:
     return make
 
 
-def _honest() -> bytes:
+def _zstd_with_declared_size() -> bytes:
     """Return a zstd frame that declares its size."""
     import zstandard
 
@@ -68,10 +68,10 @@ def _honest() -> bytes:
     return b"".join(packer.compress(PIECE) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
 
 
-def _packed_file(folder: Path) -> Path:
+def _bag_with_zstd_file(folder: Path) -> Path:
     bag = write_folder(folder / "bag", rows_of(40))
     (plain,) = bag.glob("*.db3")
-    plain.with_name(plain.name + ".zstd").write_bytes(with_zstd())
+    plain.with_name(plain.name + ".zstd").write_bytes(zstd_bomb())
     plain.unlink()
     return bag
 
@@ -86,7 +86,8 @@ def _in_wal(folder: Path) -> Path:
         database.execute("PRAGMA journal_mode = WAL")
         database.execute("PRAGMA wal_autocheckpoint = 0")
         database.execute(
-            "UPDATE messages SET data = ? WHERE id = (SELECT max(id) FROM messages)", (_honest(),)
+            "UPDATE messages SET data = ? WHERE id = (SELECT max(id) FROM messages)",
+            (_zstd_with_declared_size(),),
         )
         database.commit()
         for one in bag.glob("*.db3*"):
@@ -113,10 +114,10 @@ def _mf4(size: int, declared: int) -> Callable[[Path], Path]:
     return make
 
 
-def _packed_file_that_declares(folder: Path) -> Path:
-    bag = _packed_file(folder)
+def _bag_with_zstd_file_of_declared_size(folder: Path) -> Path:
+    bag = _bag_with_zstd_file(folder)
     (packed,) = bag.glob("*.zstd")
-    packed.write_bytes(_honest())
+    packed.write_bytes(_zstd_with_declared_size())
     return bag
 
 
@@ -128,12 +129,12 @@ LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
     ),
     "BLF more than declared": (_blf(1000), 3, ("more than 1000", "declares 1000")),
     "db3 message over the limit": (
-        _in_db3(_honest),
+        _in_db3(_zstd_with_declared_size),
         3,
         (str(BOMB_BYTES), str(DEFAULT_LIMITS.message_bytes)),
     ),
-    "db3 message that says nothing": (
-        _in_db3(with_zstd),
+    "db3 message without declared size": (
+        _in_db3(zstd_bomb),
         3,
         (f"more than {DEFAULT_LIMITS.message_bytes}", str(DEFAULT_LIMITS.message_bytes)),
     ),
@@ -148,18 +149,22 @@ LOGS: dict[str, tuple[Callable[[Path], Path], int, tuple[str, str]]] = {
         3,
         (str(BOMB_BYTES), str(DEFAULT_LIMITS.message_bytes)),
     ),
-    "zstd file that declares": (
-        _packed_file_that_declares,
+    "zstd file with declared size": (
+        _bag_with_zstd_file_of_declared_size,
         4,
         (str(BOMB_BYTES), str(DEFAULT_LIMITS.chunk_bytes)),
     ),
-    "zstd file": (_packed_file, 4, (r"\d+ bytes decompress", str(DEFAULT_LIMITS.chunk_bytes))),
+    "zstd file": (
+        _bag_with_zstd_file,
+        4,
+        (r"\d+ bytes decompress", str(DEFAULT_LIMITS.chunk_bytes)),
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", list(LOGS), ids=lambda name: name.replace(" ", "-"))
-def test_a_bomb_in_a_log_is_refused_with_both_numbers(tmp_path: Path, case: str) -> None:
+def test_bomb_in_log_is_refused_with_size_and_limit(tmp_path: Path, case: str) -> None:
     make, wanted, numbers = LOGS[case]
     path = make(tmp_path)
 
@@ -172,7 +177,7 @@ def test_a_bomb_in_a_log_is_refused_with_both_numbers(tmp_path: Path, case: str)
 
 
 @pytest.mark.slow
-def test_max_chunk_moves_the_limit(tmp_path: Path) -> None:
+def test_max_chunk_option_sets_limit(tmp_path: Path) -> None:
     path = _blf(3 * MIB)(tmp_path)
 
     _, said, _ = measured(["info", str(path), "--max-chunk", "2"])
@@ -182,8 +187,12 @@ def test_max_chunk_moves_the_limit(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["message", "file"])
-def test_max_chunk_bounds_what_zstd_declares_in_a_bag(tmp_path: Path, kind: str) -> None:
-    path = _in_db3(_honest)(tmp_path) if kind == "message" else _packed_file_that_declares(tmp_path)
+def test_max_chunk_option_limits_zstd_size_in_bag(tmp_path: Path, kind: str) -> None:
+    path = (
+        _in_db3(_zstd_with_declared_size)(tmp_path)
+        if kind == "message"
+        else _bag_with_zstd_file_of_declared_size(tmp_path)
+    )
 
     status, said, _ = measured(["info", str(path), "--max-chunk", "2"])
 
@@ -192,7 +201,7 @@ def test_max_chunk_bounds_what_zstd_declares_in_a_bag(tmp_path: Path, kind: str)
 
 
 @pytest.mark.slow
-def test_a_log_packed_with_gzip_is_refused_and_not_unpacked(tmp_path: Path) -> None:
+def test_gzip_file_is_refused_without_decompression(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap.gz"
     with gzip.open(path, "wb", compresslevel=1) as file:
         for _ in range(BOMB_BYTES >> 20):
@@ -234,7 +243,7 @@ PICTURES = {".png": _png, ".jpg": _jpeg, ".webp": _webp}
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", PICTURES)
 @pytest.mark.parametrize("is_in_mcap", [False, True], ids=["folder", "mcap"])
-def test_a_picture_bomb_is_dropped_before_it_is_decoded(
+def test_image_bomb_is_dropped_before_decoding(
     tmp_path: Path, suffix: str, is_in_mcap: bool
 ) -> None:
     log = picture_folder(tmp_path / "cam", 5, "rate_hz: 10\n")

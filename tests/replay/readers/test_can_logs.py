@@ -13,7 +13,7 @@ from crosscue.replay.logs.opening import open_log
 from support.can_files import damaged, read_back
 from support.can_kinds import KINDS, Kind, judge
 
-EACH = pytest.mark.parametrize("kind", KINDS.values(), ids=list(KINDS))
+EVERY_KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=list(KINDS))
 
 
 def _file(folder: Path, kind: Kind, content: bytes) -> Path:
@@ -22,10 +22,10 @@ def _file(folder: Path, kind: Kind, content: bytes) -> Path:
     return path
 
 
-@EACH
+@EVERY_KIND
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=5, deadline=None)
-def test_what_was_sent_is_what_is_read(
+def test_frames_survive_write_and_read(
     tmp_path_factory: pytest.TempPathFactory, kind: Kind, seed: int
 ) -> None:
     frames = kind.frames(300, seed)
@@ -39,8 +39,8 @@ def test_what_was_sent_is_what_is_read(
 
 
 @pytest.mark.slow
-@EACH
-def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path, kind: Kind) -> None:
+@EVERY_KIND
+def test_truncation_is_reported_and_adds_no_frames(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(60)
     content = kind.spell(frames)
     path = tmp_path / f"x{kind.suffix}"
@@ -51,8 +51,8 @@ def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path, kind: Kind) -
 
 
 @pytest.mark.slow
-@EACH
-def test_no_damage_invents_frames_or_hides_their_loss(tmp_path: Path, kind: Kind) -> None:
+@EVERY_KIND
+def test_damage_adds_no_frames_and_hides_no_loss(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(60)
     content = kind.spell(frames)
     path = tmp_path / f"x{kind.suffix}"
@@ -62,8 +62,8 @@ def test_no_damage_invents_frames_or_hides_their_loss(tmp_path: Path, kind: Kind
         assert not verdict.is_fault, f"seed {seed}: {verdict}"
 
 
-@EACH
-def test_what_is_read_of_a_cut_log_is_its_beginning(tmp_path: Path, kind: Kind) -> None:
+@EVERY_KIND
+def test_truncated_log_yields_its_first_frames(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(60)
     content = kind.spell(frames)
     expected = kind.expected(frames)
@@ -74,8 +74,8 @@ def test_what_is_read_of_a_cut_log_is_its_beginning(tmp_path: Path, kind: Kind) 
     assert found == {name: expected[name][: len(rows)] for name, rows in found.items()}
 
 
-@EACH
-def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path, kind: Kind) -> None:
+@EVERY_KIND
+def test_unselected_frames_are_counted_but_not_read(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(200)
     expected = kind.expected(frames)
     path = _file(tmp_path, kind, kind.spell(frames))
@@ -89,7 +89,7 @@ def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path, k
     assert {n: ledger.topic(n).found for n in expected} == {n: len(f) for n, f in expected.items()}
 
 
-@EACH
+@EVERY_KIND
 def test_topics_are_known_before_reading(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(50)
 

@@ -50,7 +50,7 @@ FD_FRAME = Sent(HALF, "can/2", 0x300, b"\1\2", False, DATA, True)
         ("CANFD 5 Tx ErrorFrame Not Acknowledge", Sent(HALF, "can/5", 0, b"", False, ERROR, True)),
     ],
 )
-def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> None:
+def test_valid_line_is_read_as_expected_frame(tmp_path: Path, line: str, frame: Sent) -> None:
     for mark in ".,":
         found, ledger = read_back(_log(tmp_path, f"{HEAD}   0{mark}5 {line}\n"))
 
@@ -78,7 +78,7 @@ def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> Non
         "gibberish",
     ],
 )
-def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: str) -> None:
+def test_invalid_line_is_dropped_and_reported(tmp_path: Path, line: str) -> None:
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + line + "\n" + LINE))
 
     assert len(found["can/1"]) == 2
@@ -86,7 +86,7 @@ def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: 
     assert "line 4" in next(ledger.drops()).detail
 
 
-def test_relative_times_add_up_over_all_lines(tmp_path: Path) -> None:
+def test_relative_times_are_summed_over_all_lines(tmp_path: Path) -> None:
     head = HEAD.replace("absolute", "relative")
     event = "0.1 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
     text = head + LINE.replace("0.5", "0.1") + event + LINE.replace("0.5", "0.1")
@@ -97,7 +97,7 @@ def test_relative_times_add_up_over_all_lines(tmp_path: Path) -> None:
     assert ledger.topic("").skipped == {"event that is not a CAN frame": 1}
 
 
-def test_relative_times_say_so_when_a_line_is_missing(tmp_path: Path) -> None:
+def test_dropped_line_in_relative_log_is_reported_as_time_shift(tmp_path: Path) -> None:
     head = HEAD.replace("absolute", "relative")
 
     _, ledger = read_back(_log(tmp_path, head + LINE + "junk\n" + LINE))
@@ -125,7 +125,7 @@ def test_decimal_logs_are_read_as_decimal(tmp_path: Path) -> None:
         ("Fri Okt 9 12:00:00 2015", 7_862_400),
     ],
 )
-def test_dates_are_read_as_utc_on_every_machine(
+def test_dates_are_read_as_utc_in_every_time_zone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, date: str, seconds: float
 ) -> None:
     text = f"date {date}\nbase hex  timestamps absolute\n" + LINE.replace("0.5", "0.0")
@@ -142,7 +142,7 @@ def test_dates_are_read_as_utc_on_every_machine(
     time.tzset()
 
 
-def test_without_a_header_the_first_frame_is_not_lost(tmp_path: Path) -> None:
+def test_log_without_header_keeps_first_frame(tmp_path: Path) -> None:
     found, ledger = read_back(_log(tmp_path, LINE + LINE))
 
     assert [f.t_ns for f in found["can/1"]] == [500_000_000] * 2
@@ -150,7 +150,7 @@ def test_without_a_header_the_first_frame_is_not_lost(tmp_path: Path) -> None:
     assert any("no readable start date" in notice for notice in ledger.notices)
 
 
-def test_comments_in_any_encoding_are_no_frames(tmp_path: Path) -> None:
+def test_comments_in_any_encoding_are_ignored(tmp_path: Path) -> None:
     text = HEAD + "// Prüfstand größer\n" + LINE + "// nächster\n"
 
     found, ledger = read_back(_log(tmp_path, text, "latin-1"))
@@ -159,13 +159,13 @@ def test_comments_in_any_encoding_are_no_frames(tmp_path: Path) -> None:
     assert ledger.is_whole
 
 
-def test_a_frame_that_became_a_comment_is_counted(tmp_path: Path) -> None:
+def test_commented_out_frame_is_counted_as_skipped(tmp_path: Path) -> None:
     _, ledger = read_back(_log(tmp_path, HEAD + LINE + "// x" + LINE))
 
     assert ledger.topic("").skipped == {"comment that holds a frame": 1}
 
 
-def test_another_header_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
+def test_base_change_inside_file_ends_reading(tmp_path: Path) -> None:
     other = HEAD.replace("hex", "dec")
 
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + other + LINE))
@@ -174,7 +174,7 @@ def test_another_header_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
     assert ledger.topic("").dropped_unknown == ["a different 'base' line inside the file"]
 
 
-def test_two_logs_in_one_file_keep_their_dates(tmp_path: Path) -> None:
+def test_concatenated_logs_keep_their_dates(tmp_path: Path) -> None:
     later = HEAD.replace("Jul 10", "Jul 11")
 
     found, ledger = read_back(_log(tmp_path, HEAD + LINE + later + LINE))
@@ -183,7 +183,7 @@ def test_two_logs_in_one_file_keep_their_dates(tmp_path: Path) -> None:
     assert ledger.is_whole
 
 
-def test_a_missing_end_of_the_trigger_block_is_reported(tmp_path: Path) -> None:
+def test_missing_end_of_trigger_block_is_reported(tmp_path: Path) -> None:
     begin = "Begin Triggerblock Fri Jul 10 12:00:00.000 pm 2015\n"
 
     _, cut = read_back(_log(tmp_path, HEAD + begin + LINE))
@@ -193,7 +193,7 @@ def test_a_missing_end_of_the_trigger_block_is_reported(tmp_path: Path) -> None:
     assert whole.is_whole
 
 
-def test_an_empty_measurement_is_a_log_without_frames(tmp_path: Path) -> None:
+def test_log_with_header_only_has_no_topics(tmp_path: Path) -> None:
     with open_log(_log(tmp_path, HEAD)) as log:
         assert log.topics == ()
     with pytest.raises(LogFormatError, match="no frame of a Vector ASC log"):
@@ -201,9 +201,7 @@ def test_an_empty_measurement_is_a_log_without_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["issue_1256.asc", "logfile.asc"])
-def test_real_logs_read_as_python_can_reads_them(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_real_logs_match_python_can(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     path = shared("can", "python_can", name)
     monkeypatch.setenv("TZ", "UTC")
     time.tzset()

@@ -36,7 +36,7 @@ def _objects(frames: list[Sent]) -> bytes:
     return zlib.decompress(blf(frames, container=1 << 30)[144 + 32 :])
 
 
-def test_a_lost_container_costs_its_frames_and_no_more(tmp_path: Path) -> None:
+def test_damaged_container_drops_only_its_frames(tmp_path: Path) -> None:
     frames = made(400)
     content = bytearray(blf(frames, container=4000))
     hit = content.find(b"LOBJ", 3000) + 60
@@ -51,7 +51,7 @@ def test_a_lost_container_costs_its_frames_and_no_more(tmp_path: Path) -> None:
     assert "checksum" in next(ledger.drops()).detail
 
 
-def test_an_unclosed_log_gives_all_it_holds_and_says_so(tmp_path: Path) -> None:
+def test_unclosed_log_is_read_completely_and_reported(tmp_path: Path) -> None:
     frames = made(200)
 
     found, ledger = read_back(_log(tmp_path, blf(frames, is_closed=False)))
@@ -61,7 +61,7 @@ def test_an_unclosed_log_gives_all_it_holds_and_says_so(tmp_path: Path) -> None:
     assert any("no start time" in notice for notice in ledger.notices)
 
 
-def test_fewer_objects_than_declared_are_lost(tmp_path: Path) -> None:
+def test_missing_declared_objects_are_dropped(tmp_path: Path) -> None:
     frames = made(50)
     content = bytearray(blf(frames))
     content[32:36] = struct.pack("<L", 60)
@@ -80,7 +80,7 @@ def test_error_frames_are_kept(tmp_path: Path) -> None:
     assert found == by_bus([error])
 
 
-def test_other_objects_are_counted_as_no_frames(tmp_path: Path) -> None:
+def test_other_objects_are_counted_as_skipped(tmp_path: Path) -> None:
     objects = bytearray(_objects(made(3, fd=False)))
     objects[12:16] = struct.pack("<L", 96)
     header = blf(made(3))[:144]
@@ -101,7 +101,7 @@ def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
     assert ledger.topic("").dropped.total() == 0
 
 
-def test_a_payload_that_looks_like_an_object_is_a_payload(tmp_path: Path) -> None:
+def test_object_signature_inside_payload_is_ignored(tmp_path: Path) -> None:
     frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in made(20)]
 
     found, ledger = read_back(_log(tmp_path, blf(frames, container=333)))
@@ -112,9 +112,7 @@ def test_a_payload_that_looks_like_an_object_is_a_payload(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("size", [0, 1, 15, 1 << 20, 0xFFFFFFFF])
 @pytest.mark.parametrize("stored", [False, True])
-def test_an_object_of_impossible_size_does_not_stop_the_reading(
-    tmp_path: Path, size: int, stored: bool
-) -> None:
+def test_object_of_invalid_size_drops_one_frame(tmp_path: Path, size: int, stored: bool) -> None:
     frames = made(100, fd=False)
     objects = bytearray(_objects(frames))
     objects[10 * 48 + 8 : 10 * 48 + 12] = struct.pack("<L", size)
@@ -127,9 +125,7 @@ def test_an_object_of_impossible_size_does_not_stop_the_reading(
 
 
 @pytest.mark.parametrize("declared", [100, 50_000_000])
-def test_a_container_cannot_inflate_beyond_what_it_declares_or_the_limit(
-    tmp_path: Path, declared: int
-) -> None:
+def test_container_larger_than_declared_or_limit_is_refused(tmp_path: Path, declared: int) -> None:
     frames = made(30)
     bomb = _container(bytes(50_000_000), declared)
     path = _log(tmp_path, blf(frames) + bomb)
@@ -142,7 +138,7 @@ def test_a_container_cannot_inflate_beyond_what_it_declares_or_the_limit(
     assert not ledger.is_whole
 
 
-def test_a_file_of_nothing_but_false_containers_ends_soon(tmp_path: Path) -> None:
+def test_invalid_containers_after_frames_are_reported(tmp_path: Path) -> None:
     false = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 0xFFFF, 10, 2, 0xFFFF)
     nested = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 8, 10)
 
@@ -154,17 +150,15 @@ def test_a_file_of_nothing_but_false_containers_ends_soon(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "match"),
     [(b"", "empty"), (b"LOGG", "no BLF header"), (bytes(500), "no BLF header")],
 )
-def test_what_is_no_blf_log_is_refused_in_one_line(
-    tmp_path: Path, content: bytes, says: str
-) -> None:
-    with pytest.raises(LogFormatError, match=says):
+def test_unsupported_file_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
+    with pytest.raises(LogFormatError, match=match):
         open_log(_log(tmp_path, content))
 
 
-def _peer(path: Path) -> list[can.Message]:
+def _read_with_python_can(path: Path) -> list[can.Message]:
     """Read a log with python-can, which counts channels from 0."""
     peer = list(can.BLFReader(path))
     for message in peer:
@@ -173,7 +167,7 @@ def _peer(path: Path) -> list[can.Message]:
     return peer
 
 
-def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
+def test_log_written_by_python_can_matches_its_reader(tmp_path: Path) -> None:
     path = tmp_path / "x.blf"
     frames = made(3000)
     with can.BLFWriter(path) as writer:
@@ -191,16 +185,16 @@ def test_python_can_writes_what_we_read(tmp_path: Path) -> None:
                     channel=int(f.bus) - 1,
                 )
             )
-    same_as_python_can(path, _peer(path), "can/{}")
+    same_as_python_can(path, _read_with_python_can(path), "can/{}")
 
 
-def test_the_real_log_reads_as_python_can_reads_it() -> None:
+def test_real_log_matches_python_can() -> None:
     path = shared("can", "python_can", "issue_1905.blf")
-    same_as_python_can(path, _peer(path), "can/{}")
+    same_as_python_can(path, _read_with_python_can(path), "can/{}")
 
 
-MINUTE = [replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(made(6_000))]
-WHOLE = blf(MINUTE, container=4_000)
+MINUTE_FRAMES = [replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(made(6_000))]
+MINUTE_LOG = blf(MINUTE_FRAMES, container=4_000)
 
 
 @pytest.mark.slow
@@ -210,45 +204,46 @@ WHOLE = blf(MINUTE, container=4_000)
     stored=st.booleans(),
 )
 @settings(max_examples=20, deadline=None)
-def test_a_window_costs_the_containers_in_it_and_its_account_is_exact(
+def test_time_range_yields_exact_frames_and_account(
     tmp_path_factory: pytest.TempPathFactory, window: tuple[int, int], ends: str, stored: bool
 ) -> None:
     start_ns, end_ns = (START_NS + s * 10**9 for s in sorted(window))
-    asked = Selection(
+    selection = Selection(
         start_ns=None if ends == "to" else start_ns, end_ns=None if ends == "from" else end_ns
     )
-    content = blf(MINUTE, container=4_000, stored=stored) if stored else WHOLE
+    content = blf(MINUTE_FRAMES, container=4_000, stored=stored) if stored else MINUTE_LOG
 
-    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content), asked)
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content), selection)
 
     wanted = [
         f
-        for f in MINUTE
-        if (asked.start_ns or 0) <= f.t_ns and (asked.end_ns is None or f.t_ns < asked.end_ns)
+        for f in MINUTE_FRAMES
+        if (selection.start_ns or 0) <= f.t_ns
+        and (selection.end_ns is None or f.t_ns < selection.end_ns)
     ]
     assert found == by_bus(wanted)
     accounts = ledger.accounts.values()
-    assert sum(one.in_file for one in accounts) == len(MINUTE)
+    assert sum(one.in_file for one in accounts) == len(MINUTE_FRAMES)
     assert sum(one.used for one in accounts) == len(wanted)
     assert {reason for one in accounts for reason in one.skipped} <= {NOT_ASKED_TIME}
     assert ledger.is_whole
 
 
-def test_what_a_window_leaves_unread_is_said(tmp_path: Path) -> None:
+def test_bytes_outside_time_range_are_reported_as_unread(tmp_path: Path) -> None:
     window = Selection(start_ns=START_NS + 50 * 10**9, end_ns=START_NS + 52 * 10**9)
 
-    found, ledger = read_back(_log(tmp_path, WHOLE), window)
+    found, ledger = read_back(_log(tmp_path, MINUTE_LOG), window)
 
-    assert found == by_bus(MINUTE[5_000:5_200])
+    assert found == by_bus(MINUTE_FRAMES[5_000:5_200])
     assert "bytes outside --from/--to not read" in ledger.integrity
     unread = int(re.findall(r"(\d+) bytes outside", ledger.integrity)[0])
-    assert unread > 0.85 * len(WHOLE)
+    assert unread > 0.85 * len(MINUTE_LOG)
     assert sum(one.found for name, one in ledger.accounts.items() if name) < 700
 
 
-def test_a_log_whose_clock_goes_back_is_read_wherever_the_window_may_be(tmp_path: Path) -> None:
-    again = [replace(f, t_ns=f.t_ns - 59 * 10**9) for f in MINUTE[5_900:]]
-    frames = [*MINUTE[:3_000], *again, *MINUTE[3_000:]]
+def test_time_range_finds_frames_after_clock_goes_back(tmp_path: Path) -> None:
+    again = [replace(f, t_ns=f.t_ns - 59 * 10**9) for f in MINUTE_FRAMES[5_900:]]
+    frames = [*MINUTE_FRAMES[:3_000], *again, *MINUTE_FRAMES[3_000:]]
     window = Selection(start_ns=START_NS, end_ns=START_NS + 10**9)
 
     found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)), window)
@@ -257,8 +252,8 @@ def test_a_log_whose_clock_goes_back_is_read_wherever_the_window_may_be(tmp_path
     assert sum(one.in_file for one in ledger.accounts.values()) == len(frames)
 
 
-def test_damage_inside_the_window_is_reported(tmp_path: Path) -> None:
-    content = bytearray(WHOLE)
+def test_damage_inside_time_range_is_reported(tmp_path: Path) -> None:
+    content = bytearray(MINUTE_LOG)
     content[content.find(b"LOBJ", len(content) * 51 // 60) + 1_500] ^= 0xFF
     window = Selection(start_ns=START_NS + 45 * 10**9, end_ns=START_NS + 58 * 10**9)
 
@@ -269,7 +264,7 @@ def test_damage_inside_the_window_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", range(500, 548))
-def test_stretches_may_end_anywhere_in_an_object(
+def test_read_buffer_may_end_anywhere_in_object(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
     monkeypatch.setattr("crosscue.replay.readers.blf.reader.STREAM_BYTES", step)
@@ -283,7 +278,7 @@ def test_stretches_may_end_anywhere_in_an_object(
 
 @given(deleted=st.sets(st.integers(0, 79)))
 @settings(max_examples=25, deadline=None)
-def test_each_object_taken_out_is_reported_as_dropped(
+def test_every_deleted_object_is_reported_as_dropped(
     tmp_path_factory: pytest.TempPathFactory, deleted: set[int]
 ) -> None:
     frames = made(80)

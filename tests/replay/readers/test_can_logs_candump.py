@@ -18,7 +18,7 @@ from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, lines_
 from support.can_files import Sent, by_bus, candump, made, read_back, same_as_python_can
 from support.data import shared
 
-WHOLE = "(1.000000) can0 123#DEADBEEF\n"
+VALID_LINE = "(1.000000) can0 123#DEADBEEF\n"
 
 
 def _log(folder: Path, text: str | bytes, name: str = "x.log") -> Path:
@@ -29,7 +29,7 @@ def _log(folder: Path, text: str | bytes, name: str = "x.log") -> Path:
 
 @given(st.integers(0, 2**31), st.booleans())
 @settings(max_examples=15, deadline=None)
-def test_what_was_sent_is_what_is_read(
+def test_frames_survive_write_and_read(
     tmp_path_factory: pytest.TempPathFactory, seed: int, fd: bool
 ) -> None:
     frames = made(300, seed, fd=fd)
@@ -41,7 +41,9 @@ def test_what_was_sent_is_what_is_read(
     assert ledger.is_whole
 
 
-def test_chunk_borders_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunk_boundaries_do_not_change_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     frames = made(400)
     path = _log(tmp_path, candump(frames))
     monkeypatch.setattr(can_text, "lines_of", lambda p, _=0: lines_of(p, 400))
@@ -75,7 +77,7 @@ def test_chunk_borders_change_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
         ("(1.5) 0 123#AA\r", Sent(1_500_000_000, "can/0", 0x123, b"\xaa")),
     ],
 )
-def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> None:
+def test_valid_line_is_read_as_expected_frame(tmp_path: Path, line: str, frame: Sent) -> None:
     found, ledger = read_back(_log(tmp_path, line + "\n"))
 
     assert found == {frame.bus: [frame]}
@@ -107,31 +109,33 @@ def test_a_line_says_what_it_says(tmp_path: Path, line: str, frame: Sent) -> Non
         "(1.0) can0 123#" + "A" * 20_000,
     ],
 )
-def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: str) -> None:
-    found, ledger = read_back(_log(tmp_path, WHOLE + line + "\n" + WHOLE))
+def test_invalid_line_is_dropped_and_reported(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, VALID_LINE + line + "\n" + VALID_LINE))
 
     assert len(found["can0"]) == 2
     assert ledger.topic("").dropped.total() == 1
     assert "line 2" in next(ledger.drops()).detail
 
 
-def test_a_line_broken_in_two_is_not_read_as_a_shorter_frame(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, WHOLE + "(2.0) can0 123#DE\nADBEEF\n" + WHOLE))
+def test_line_broken_in_two_is_not_read_as_shorter_frame(tmp_path: Path) -> None:
+    found, ledger = read_back(
+        _log(tmp_path, VALID_LINE + "(2.0) can0 123#DE\nADBEEF\n" + VALID_LINE)
+    )
 
     assert [f.payload for f in found["can0"]] == [b"\xde\xad\xbe\xef"] * 2
     assert ledger.topic("can0").dropped.total() == 1
     assert ledger.topic("").dropped.total() == 1
 
 
-def test_a_last_line_without_end_is_not_trusted(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, WHOLE + WHOLE[:-3]))
+def test_last_line_without_line_end_is_dropped(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, VALID_LINE + VALID_LINE[:-3]))
 
     assert len(found["can0"]) == 1
     assert ledger.topic("").dropped == {"last line has no line end, may be cut": 1}
 
 
 @pytest.mark.slow
-def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path) -> None:
+def test_truncation_is_reported_and_adds_no_frames(tmp_path: Path) -> None:
     frames = made(14)
     text = candump(frames)
     ends = {0, *(k + 1 for k, c in enumerate(text) if c == 10)}
@@ -149,7 +153,7 @@ def test_no_cut_is_silent_and_none_invents_a_frame(tmp_path: Path) -> None:
         assert ledger.is_whole == (at in ends)
 
 
-def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path) -> None:
+def test_unselected_frames_are_counted_but_not_read(tmp_path: Path) -> None:
     frames = made(500)
     path = _log(tmp_path, candump(frames))
     lo, hi = frames[100].t_ns, frames[300].t_ns
@@ -163,8 +167,8 @@ def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path) -
     assert ledger.topic("can2").used == 0
 
 
-def test_a_bus_that_comes_late_becomes_a_topic(tmp_path: Path) -> None:
-    text = WHOLE * 5000 + WHOLE.replace("can0", "can7")
+def test_bus_first_seen_late_becomes_topic(tmp_path: Path) -> None:
+    text = VALID_LINE * 5000 + VALID_LINE.replace("can0", "can7")
     with open_log(_log(tmp_path, text)) as log:
         assert [t.name for t in log.topics] == ["can0"]
     found, _ = read_back(_log(tmp_path, text))
@@ -172,7 +176,7 @@ def test_a_bus_that_comes_late_becomes_a_topic(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "match"),
     [
         (b"", "empty"),
         (b"\x1f\x8b\x08abc", "gzip"),
@@ -183,16 +187,16 @@ def test_a_bus_that_comes_late_becomes_a_topic(tmp_path: Path) -> None:
         (bytes(200_000), "without a line end"),
     ],
 )
-def test_what_is_no_candump_log_is_refused_in_one_line(
-    tmp_path: Path, content: bytes, says: str
+def test_unsupported_file_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, match: str
 ) -> None:
-    with pytest.raises(LogFormatError, match=says) as refused:
+    with pytest.raises(LogFormatError, match=match) as refused:
         open_log(_log(tmp_path, content))
     assert "\n" not in str(refused.value)
 
 
-def test_zeros_in_the_middle_cost_the_lines_they_hit(tmp_path: Path) -> None:
-    text = WHOLE * 10 + "\0" * 3_000_000 + "\n" + WHOLE * 10
+def test_zeroed_span_drops_only_affected_lines(tmp_path: Path) -> None:
+    text = VALID_LINE * 10 + "\0" * 3_000_000 + "\n" + VALID_LINE * 10
 
     found, ledger = read_back(_log(tmp_path, text))
 
@@ -200,7 +204,7 @@ def test_zeros_in_the_middle_cost_the_lines_they_hit(tmp_path: Path) -> None:
     assert not ledger.is_whole
 
 
-def test_many_bus_names_are_damage_not_topics(tmp_path: Path) -> None:
+def test_frames_beyond_bus_limit_are_dropped(tmp_path: Path) -> None:
     text = "".join(f"(1.0) can{k} 123#AA\n" for k in range(1000))
 
     found, ledger = read_back(_log(tmp_path, text))
@@ -210,7 +214,7 @@ def test_many_bus_names_are_damage_not_topics(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [64, 100, 1000])
-def test_lines_come_whole_whatever_the_chunk(tmp_path: Path, size: int) -> None:
+def test_lines_are_complete_for_any_chunk_size(tmp_path: Path, size: int) -> None:
     lines = [b"x" * (k % 29) for k in range(300)]
     path = _log(tmp_path, b"\n".join(lines) + b"\r\nlast")
     got: list[bytes] = []
@@ -224,7 +228,7 @@ def test_lines_come_whole_whatever_the_chunk(tmp_path: Path, size: int) -> None:
     assert got == [*lines, b"last"]
 
 
-def test_a_line_longer_than_a_chunk_is_named_and_the_next_one_read(tmp_path: Path) -> None:
+def test_line_longer_than_chunk_is_reported_with_its_number(tmp_path: Path) -> None:
     path = _log(tmp_path, b"a\n" + b"x" * 1000 + b"\nb\nc\n")
 
     pieces = list(lines_of(path, 64))
@@ -233,7 +237,7 @@ def test_a_line_longer_than_a_chunk_is_named_and_the_next_one_read(tmp_path: Pat
 
 
 @pytest.mark.parametrize("byte", range(256))
-def test_only_digits_are_digits(byte: int) -> None:
+def test_digit_parsers_accept_only_digits(byte: int) -> None:
     buffer = np.full(digits.FRONT + digits.BACK, ord("1"), np.uint8)
     buffer[digits.FRONT + 1] = byte
     stop, count = np.array([digits.FRONT + 3]), np.array([3])
@@ -247,20 +251,20 @@ def test_only_digits_are_digits(byte: int) -> None:
             assert value[0] == int(f"1{chr(byte)}1", base)
 
 
-def test_ford_bus_reads_as_python_can_reads_it() -> None:
+def test_ford_log_matches_python_can() -> None:
     path = shared(
         "can", "ford_fusion_2017", "acc_on_speed_changing_from_30km_to_80km_per_hour.candump"
     )
     same_as_python_can(path, can.CanutilsLogReader(path))
 
 
-def test_savvycan_candump_reads_as_python_can_reads_it() -> None:
+def test_savvycan_log_matches_python_can() -> None:
     path = shared("can", "savvycan", "candump.log")
     same_as_python_can(path, can.CanutilsLogReader(path))
 
 
 @pytest.mark.slow
-def test_busmaster_log_holds_the_same_frames_as_the_candump_of_it() -> None:
+def test_busmaster_log_has_same_frames_as_candump_log() -> None:
     busmaster, ledger = read_back(shared("can", "savvycan", "BusMasterLog.log"))
     candump_, _ = read_back(shared("can", "savvycan", "candump.log"))
 

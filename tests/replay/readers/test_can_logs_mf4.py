@@ -91,7 +91,7 @@ def _tables(path: Path, selection: Selection = EVERYTHING) -> tuple[dict[str, li
 
 
 @pytest.mark.parametrize("compression", [0, 1, 2])
-def test_signals_come_as_tables_with_names_units_and_times(
+def test_signals_are_read_as_tables_with_names_units_and_times(
     tmp_path: Path, compression: int
 ) -> None:
     path = _signals(tmp_path / "x.mf4", compression=compression)
@@ -113,7 +113,7 @@ def test_signals_come_as_tables_with_names_units_and_times(
     assert ledger.is_whole
 
 
-def test_signals_equal_what_asammdf_gives_on_a_log_of_many_layouts(tmp_path: Path) -> None:
+def test_signals_of_all_data_types_match_asammdf_input(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     times = np.arange(500) * 1e-3
     path = tmp_path / "x.mf4"
@@ -131,8 +131,8 @@ def test_signals_equal_what_asammdf_gives_on_a_log_of_many_layouts(tmp_path: Pat
         np.testing.assert_array_equal(blocks[0].rows[name], expected)
 
 
-def _peer(path: Path) -> list[can.Message]:
-    """Read a log with python-can, which warns of omitted data."""
+def _read_with_python_can(path: Path) -> list[can.Message]:
+    """Read a log with python-can, whose warnings about omitted data are ignored."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with can.MF4Reader(path) as reader:
@@ -140,19 +140,19 @@ def _peer(path: Path) -> list[can.Message]:
 
 
 @pytest.mark.parametrize("compression", [0, 2])
-def test_bus_logs_read_as_python_can_reads_them(tmp_path: Path, compression: int) -> None:
+def test_bus_logs_match_python_can(tmp_path: Path, compression: int) -> None:
     frames = [f for f in made(500) if f.kind == 0]
     path = _bus_log(tmp_path / "x.mf4", frames, compression)
-    same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
+    same_as_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
 
 
 @pytest.mark.slow
-def test_the_real_log_reads_as_python_can_reads_it() -> None:
+def test_real_log_matches_python_can() -> None:
     path = shared(*REAL)
-    same_as_python_can(path, _peer(path), "can/{}", within_ns=2_000)
+    same_as_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
 
 
-def test_only_what_was_asked_for_comes_and_the_rest_is_counted(tmp_path: Path) -> None:
+def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
     path = _signals(tmp_path / "x.mf4")
     everything, _ = _tables(path)
     times = everything["drive"][0].log_ns
@@ -178,7 +178,7 @@ def _frames_of_cut(path: Path, content: bytes, at: int) -> tuple[int, bool] | No
 
 
 @pytest.mark.parametrize("compression", [0, 2])
-def test_no_cut_is_silent(tmp_path: Path, compression: int) -> None:
+def test_truncation_is_reported(tmp_path: Path, compression: int) -> None:
     frames = [f for f in made(300) if f.kind == 0]
     content = _bus_log(tmp_path / "whole.mf4", frames, compression).read_bytes()
     for at in range(0, len(content) - 1, len(content) // 150):
@@ -187,7 +187,7 @@ def test_no_cut_is_silent(tmp_path: Path, compression: int) -> None:
             assert not outcome[1], f"cut at {at}: {outcome[0]} frames, nothing said"
 
 
-def test_no_cut_of_the_real_log_is_silent(tmp_path: Path) -> None:
+def test_truncation_of_real_log_is_reported(tmp_path: Path) -> None:
     content = shared(*REAL).read_bytes()
     for at in range(5_000, len(content) - 1, len(content) // 12):
         outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
@@ -196,7 +196,7 @@ def test_no_cut_of_the_real_log_is_silent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", [0, 2])
-def test_damage_raises_nothing_but_our_own_errors(tmp_path: Path, compression: int) -> None:
+def test_damage_raises_only_crosscue_errors(tmp_path: Path, compression: int) -> None:
     content = _bus_log(tmp_path / "whole.mf4", made(200), compression).read_bytes()
     path = tmp_path / "x.mf4"
     for seed in range(150):
@@ -216,7 +216,7 @@ def test_damage_raises_nothing_but_our_own_errors(tmp_path: Path, compression: i
         assert "x.mf4" in message
 
 
-def test_a_damaged_compressed_block_costs_its_records_and_no_more(tmp_path: Path) -> None:
+def test_damaged_compressed_block_drops_only_its_records(tmp_path: Path) -> None:
     path = _signals(tmp_path / "x.mf4", count=200_000, compression=1)
     content = bytearray(path.read_bytes())
     hit = content.find(b"##DZ") + 200
@@ -233,7 +233,7 @@ def test_a_damaged_compressed_block_costs_its_records_and_no_more(tmp_path: Path
     assert last.rows["torque"][-1] == -199_999
 
 
-def test_blocks_that_run_in_a_circle_are_found_out(tmp_path: Path) -> None:
+def test_circular_block_links_are_reported(tmp_path: Path) -> None:
     path = _signals(tmp_path / "x.mf4")
     content = bytearray(path.read_bytes())
     at = content.find(b"##DG")
@@ -246,7 +246,7 @@ def test_blocks_that_run_in_a_circle_are_found_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "match"),
     [
         (b"", "empty file"),
         (b"PK\x03\x04" + bytes(100), "not an MDF file"),
@@ -254,21 +254,21 @@ def test_blocks_that_run_in_a_circle_are_found_out(tmp_path: Path) -> None:
         (b"MDF     4.10    " + bytes(100), "header damaged"),
     ],
 )
-def test_what_is_no_mdf_4_log_is_refused_in_one_line(
-    tmp_path: Path, content: bytes, says: str
+def test_unsupported_mdf_file_is_refused_and_closed(
+    tmp_path: Path, content: bytes, match: str
 ) -> None:
     path = tmp_path / "x.mf4"
     path.write_bytes(content)
     before = len(list(Path("/proc/self/fd").iterdir()))
 
-    with pytest.raises(LogFormatError, match=says):
+    with pytest.raises(LogFormatError, match=match):
         open_log(path)
 
     assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 @pytest.mark.parametrize("compression", [0, 2])
-def test_a_span_of_time_reads_the_blocks_that_overlap_and_no_other(
+def test_time_range_reads_only_overlapping_blocks(
     tmp_path: Path, compression: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(3)
@@ -309,7 +309,7 @@ def test_a_span_of_time_reads_the_blocks_that_overlap_and_no_other(
 
 
 @pytest.mark.slow
-def test_a_span_of_time_of_a_bus_gives_what_a_whole_pass_gives() -> None:
+def test_time_range_of_bus_log_equals_filtered_complete_pass() -> None:
     path = shared(*REAL)
     whole, _ = read_back(path)
     times = sorted(f.t_ns for frames in whole.values() for f in frames)

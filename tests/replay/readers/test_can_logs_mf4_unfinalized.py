@@ -21,7 +21,7 @@ asammdf = pytest.importorskip("asammdf")
 
 Key = tuple[int, int, bool, bool]
 Frames = dict[Key, list[tuple[float, int, bytes]]]
-"""Seconds, data lengths and payloads by bus, identifier, kind of identifier and direction."""
+"""Seconds, data lengths and payloads by bus, identifier, format of the identifier and direction."""
 
 REAL = [
     (("css_unfinalized", "00000000_00000048_00000001.MF4"), {1: 1_026}),
@@ -36,7 +36,7 @@ REAL = [
 ]
 
 
-def _peer(path: Path) -> Frames:
+def _read_with_asammdf(path: Path) -> Frames:
     """Read the data frames with asammdf after it has finalized the file."""
     found: Frames = {}
     with warnings.catch_warnings():
@@ -64,7 +64,7 @@ def _add_group(mdf: Any, group: int, names: set[str], found: Frames) -> None:
         found.setdefault(key, []).append((seconds[k], length[k], payload))
 
 
-def _ours(path: Path, start_ns: int) -> tuple[Frames, Ledger]:
+def _read_with_crosscue(path: Path, start_ns: int) -> tuple[Frames, Ledger]:
     ledger = Ledger(str(path))
     found: Frames = {}
     with open_log(path) as log:
@@ -87,7 +87,7 @@ def _ours(path: Path, start_ns: int) -> tuple[Frames, Ledger]:
     return found, ledger
 
 
-def _same(ours: Frames, theirs: Frames) -> None:
+def _assert_same_frames(ours: Frames, theirs: Frames) -> None:
     assert {key: len(rows) for key, rows in ours.items()} == {
         key: len(rows) for key, rows in theirs.items()
     }
@@ -103,22 +103,22 @@ def _start_ns(path: Path) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("where", "expected"), REAL, ids=[where[-1] for where, _ in REAL])
-def test_every_frame_of_a_real_log_is_as_asammdf_returns_it_after_finalizing(
+def test_real_unfinalized_log_matches_asammdf_after_finalizing(
     where: tuple[str, ...], expected: dict[int, int]
 ) -> None:
     path = shared("can", *where)
 
-    ours, ledger = _ours(path, _start_ns(path))
+    ours, ledger = _read_with_crosscue(path, _start_ns(path))
 
     by_number: dict[int, int] = {}
     for (bus, *_), rows in ours.items():
         by_number[bus] = by_number.get(bus, 0) + len(rows)
     assert by_number == expected
     assert ledger.is_whole
-    _same(ours, _peer(path))
+    _assert_same_frames(ours, _read_with_asammdf(path))
 
 
-def test_the_summary_says_that_the_logger_never_finalized_the_file() -> None:
+def test_unfinalized_log_is_reported_in_notices() -> None:
     path = shared("can", "css_unfinalized", "00000014.MF4")
 
     _, ledger = read_back(path)
@@ -157,14 +157,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def _frames(count: int, seed: int = 1, *, virtual: bool) -> list[Sent]:
-    """The older layout contains only data frames."""
+    """Return frames for a log; the older layout contains only data frames."""
     return [f for f in made(count, seed) if virtual or f.kind == 0]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_virtual_and_variable_length_channel_groups_keep_every_frame(
-    tmp_path: Path, variant: str
-) -> None:
+def test_all_layouts_of_channel_groups_yield_every_frame(tmp_path: Path, variant: str) -> None:
     options = VARIANTS[variant]
     frames = _frames(1_500, virtual=options["virtual"])
     path = tmp_path / "x.mf4"
@@ -179,23 +177,21 @@ def test_virtual_and_variable_length_channel_groups_keep_every_frame(
 
 
 @pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes", "finalized"])
-def test_made_logs_read_as_asammdf_reads_them(tmp_path: Path, variant: str) -> None:
+def test_synthetic_logs_match_asammdf(tmp_path: Path, variant: str) -> None:
     options = VARIANTS[variant]
     frames = [f for f in _frames(400, virtual=options["virtual"]) if f.kind == 0]
     path = tmp_path / "x.mf4"
     path.write_bytes(unsorted(frames, **options).content)
 
-    ours, _ = _ours(path, _start_ns(path))
+    ours, _ = _read_with_crosscue(path, _start_ns(path))
 
-    _same(ours, _peer(path))
+    _assert_same_frames(ours, _read_with_asammdf(path))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", ["after", "before", "last"])
 @pytest.mark.parametrize("virtual", [False, True])
-def test_a_cut_end_costs_the_frames_it_cuts_and_no_other(
-    tmp_path: Path, virtual: bool, order: str
-) -> None:
+def test_truncation_drops_only_frames_after_it(tmp_path: Path, virtual: bool, order: str) -> None:
     frames = _frames(120, seed=3, virtual=virtual)
     whole = unsorted(frames, virtual=virtual, order=order)
     path = tmp_path / "x.mf4"
@@ -213,7 +209,7 @@ def test_a_cut_end_costs_the_frames_it_cuts_and_no_other(
         assert known <= len(frames) - len(inside) + 1
 
 
-def test_an_end_in_the_middle_of_a_payload_costs_one_frame(tmp_path: Path) -> None:
+def test_end_inside_payload_drops_one_frame(tmp_path: Path) -> None:
     frames = _frames(50, virtual=False)
     whole = unsorted(frames, virtual=False)
     path = tmp_path / "x.mf4"
@@ -226,7 +222,7 @@ def test_an_end_in_the_middle_of_a_payload_costs_one_frame(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("virtual", [False, True])
-def test_records_of_an_unknown_identifier_are_reported_and_no_frame_invented(
+def test_unknown_record_identifier_is_reported_and_adds_no_frames(
     tmp_path: Path, virtual: bool
 ) -> None:
     frames = _frames(100, virtual=virtual)
@@ -245,7 +241,7 @@ def test_records_of_an_unknown_identifier_are_reported_and_no_frame_invented(
         assert any("unknown record identifier 238" in drop.detail for drop in ledger.drops())
 
 
-def test_bytes_after_the_last_declared_record_cost_nothing(tmp_path: Path) -> None:
+def test_bytes_after_last_declared_record_are_ignored(tmp_path: Path) -> None:
     frames = _frames(100, virtual=True)
     whole = unsorted(frames, virtual=True, is_finalized=True)
     path = tmp_path / "x.mf4"
@@ -262,7 +258,7 @@ def test_bytes_after_the_last_declared_record_cost_nothing(tmp_path: Path) -> No
     assert ledger.is_whole
 
 
-def test_frames_of_several_groups_come_in_the_order_of_the_log(tmp_path: Path) -> None:
+def test_frames_of_several_groups_are_in_time_order(tmp_path: Path) -> None:
     frames: Sequence[Sent] = _frames(2_000, virtual=True)
     path = tmp_path / "x.mf4"
     path.write_bytes(unsorted(frames, virtual=True).content)
@@ -272,7 +268,7 @@ def test_frames_of_several_groups_come_in_the_order_of_the_log(tmp_path: Path) -
             assert bool((np.diff(block.log_ns) >= 0).all())
 
 
-def test_sorted_groups_of_one_bus_come_in_time_order(tmp_path: Path) -> None:
+def test_sorted_groups_of_one_bus_are_merged_in_time_order(tmp_path: Path) -> None:
     frames = [f for f in _frames(3_000, virtual=True) if f.kind == 0 and not f.is_fd]
     mixed, path = tmp_path / "mixed.mf4", tmp_path / "sorted.mf4"
     mixed.write_bytes(unsorted(frames, virtual=True).content)
@@ -289,7 +285,7 @@ def test_sorted_groups_of_one_bus_come_in_time_order(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("virtual", [False, True])
-def test_long_runs_of_equal_frames_and_what_interrupts_them_keep_every_frame(
+def test_long_runs_of_equal_records_with_interruptions_yield_every_frame(
     tmp_path: Path, virtual: bool
 ) -> None:
     frames = []

@@ -18,11 +18,11 @@ from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD
 from support.can_files import Sent, made, read_back, same_as_python_can, trc
 from support.data import shared
 
-V1 = ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n"
-V2 = ";$FILEVERSION=2.1\n;$STARTTIME=25569.5\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
+HEAD_V1 = ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n"
+HEAD_V2 = ";$FILEVERSION=2.1\n;$STARTTIME=25569.5\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
 NOON_NS = 43_200_000_000_000
-LINE_1 = "     1)      1.6  Rx         0480  2  C2 08 \n"
-LINE_2 = "      1      1.600 DT 1      0300 Rx -  2    C2 08\n"
+LINE_V1 = "     1)      1.6  Rx         0480  2  C2 08 \n"
+LINE_V2 = "      1      1.600 DT 1      0300 Rx -  2    C2 08\n"
 
 
 def _log(folder: Path, text: str) -> Path:
@@ -37,26 +37,29 @@ T_NS = NOON_NS + 1_600_000
 @pytest.mark.parametrize(
     ("text", "frame"),
     [
-        (V1 + LINE_1, Sent(T_NS, "can/1", 0x480, b"\xc2\x08")),
-        (V1 + LINE_1.replace("0480", "00000480"), Sent(T_NS, "can/1", 0x480, b"\xc2\x08", True)),
-        (V1 + " 1) 1.6 Tx 0480 3 RTR\n", Sent(T_NS, "can/1", 0x480, b"", False, REMOTE)),
-        (V1 + " 1) 1.6 Error 0008 2 02 00\n", Sent(T_NS, "can/1", 8, b"\2\0", False, ERROR)),
-        (V1 + " 1) 1,6 Rx 0480 0\n", Sent(T_NS, "can/1", 0x480, b"")),
-        (V2 + LINE_2, Sent(T_NS, "can/1", 0x300, b"\xc2\x08")),
-        (V2 + " 1 1.6 RR 3 0300 Rx - 4\n", Sent(T_NS, "can/3", 0x300, b"", False, REMOTE)),
-        (V2 + " 1 1.6 ER 1 - Rx - 2 04 00\n", Sent(T_NS, "can/1", 0, b"\4\0", False, ERROR)),
+        (HEAD_V1 + LINE_V1, Sent(T_NS, "can/1", 0x480, b"\xc2\x08")),
         (
-            V2 + " 1 1.6 FB 1 0300 Rx - 9 " + "AB " * 12 + "\n",
+            HEAD_V1 + LINE_V1.replace("0480", "00000480"),
+            Sent(T_NS, "can/1", 0x480, b"\xc2\x08", True),
+        ),
+        (HEAD_V1 + " 1) 1.6 Tx 0480 3 RTR\n", Sent(T_NS, "can/1", 0x480, b"", False, REMOTE)),
+        (HEAD_V1 + " 1) 1.6 Error 0008 2 02 00\n", Sent(T_NS, "can/1", 8, b"\2\0", False, ERROR)),
+        (HEAD_V1 + " 1) 1,6 Rx 0480 0\n", Sent(T_NS, "can/1", 0x480, b"")),
+        (HEAD_V2 + LINE_V2, Sent(T_NS, "can/1", 0x300, b"\xc2\x08")),
+        (HEAD_V2 + " 1 1.6 RR 3 0300 Rx - 4\n", Sent(T_NS, "can/3", 0x300, b"", False, REMOTE)),
+        (HEAD_V2 + " 1 1.6 ER 1 - Rx - 2 04 00\n", Sent(T_NS, "can/1", 0, b"\4\0", False, ERROR)),
+        (
+            HEAD_V2 + " 1 1.6 FB 1 0300 Rx - 9 " + "AB " * 12 + "\n",
             Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True),
         ),
         (
-            V2.replace("R,L,D", "l,D") + " 1 1.6 FD 1 0300 Rx 12 " + "AB " * 12 + "\n",
+            HEAD_V2.replace("R,L,D", "l,D") + " 1 1.6 FD 1 0300 Rx 12 " + "AB " * 12 + "\n",
             Sent(T_NS, "can/1", 0x300, b"\xab" * 12, False, DATA, True),
         ),
         ("; no version\n 1)  1  0480 2 C2 08\n", Sent(1_000_000, "can/1", 0x480, b"\xc2\x08")),
     ],
 )
-def test_a_line_says_what_it_says(tmp_path: Path, text: str, frame: Sent) -> None:
+def test_valid_line_is_read_as_expected_frame(tmp_path: Path, text: str, frame: Sent) -> None:
     found, ledger = read_back(_log(tmp_path, text))
 
     assert found == {frame.bus: [frame]}
@@ -80,8 +83,8 @@ def test_a_line_says_what_it_says(tmp_path: Path, text: str, frame: Sent) -> Non
         "gibberish",
     ],
 )
-def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: str) -> None:
-    found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + line + "\n" + LINE_1))
+def test_invalid_line_is_dropped_and_reported(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, HEAD_V1 + LINE_V1 + line + "\n" + LINE_V1))
 
     assert len(found["can/1"]) == 2
     assert ledger.topic("").dropped.total() == 1
@@ -91,8 +94,8 @@ def test_a_line_that_can_be_no_frame_is_lost_and_reported(tmp_path: Path, line: 
 @pytest.mark.parametrize(
     "line", [" 1) 1.6 Warng FFFFFFFF 4 00 00 00 08 BUSHEAVY", " 1) 1.6 ErrCt 0000 2 00 00"]
 )
-def test_status_lines_are_counted_as_no_frames(tmp_path: Path, line: str) -> None:
-    found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + line + "\n"))
+def test_status_lines_are_counted_as_skipped(tmp_path: Path, line: str) -> None:
+    found, ledger = read_back(_log(tmp_path, HEAD_V1 + LINE_V1 + line + "\n"))
 
     assert len(found["can/1"]) == 1
     assert ledger.topic("").skipped == {"status line, no frame": 1}
@@ -109,44 +112,44 @@ def test_status_lines_are_counted_as_no_frames(tmp_path: Path, line: str) -> Non
     ],
 )
 def test_start_times_are_exact(tmp_path: Path, days: str, t_ns: int) -> None:
-    text = V1.replace("25569.5", days) + LINE_1.replace("1.6", "0.0")
+    text = HEAD_V1.replace("25569.5", days) + LINE_V1.replace("1.6", "0.0")
 
     found, _ = read_back(_log(tmp_path, text))
 
     assert found["can/1"][0].t_ns == t_ns
 
 
-def test_without_a_start_time_times_count_from_zero_and_it_is_said(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, ";$FILEVERSION=1.1\n" + LINE_1))
+def test_missing_start_time_yields_times_from_zero_and_notice(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, ";$FILEVERSION=1.1\n" + LINE_V1))
 
     assert found["can/1"][0].t_ns == 1_600_000
     assert any("no $STARTTIME" in notice for notice in ledger.notices)
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "match"),
     [
-        (";$FILEVERSION=3.0\n" + LINE_1, "version 3.0 unknown"),
-        (";$FILEVERSION=2.1\n" + LINE_2, "columns 'missing'"),
-        (V2.replace("N,O", "N,N") + LINE_2, "header is damaged"),
-        (V2.replace("L,D", "D,L") + LINE_2, "header is damaged"),
+        (";$FILEVERSION=3.0\n" + LINE_V1, "version 3.0 unknown"),
+        (";$FILEVERSION=2.1\n" + LINE_V2, "columns 'missing'"),
+        (HEAD_V2.replace("N,O", "N,N") + LINE_V2, "header is damaged"),
+        (HEAD_V2.replace("L,D", "D,L") + LINE_V2, "header is damaged"),
         ("once upon a time\n", "no frame of a PEAK TRC log"),
     ],
 )
-def test_a_header_that_cannot_be_followed_is_refused(tmp_path: Path, text: str, says: str) -> None:
-    with pytest.raises(LogFormatError, match=says):
+def test_unsupported_or_damaged_header_is_refused(tmp_path: Path, text: str, match: str) -> None:
+    with pytest.raises(LogFormatError, match=match):
         open_log(_log(tmp_path, text))
 
 
-def test_another_version_in_the_middle_ends_the_reading(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, V1 + LINE_1 + V2 + LINE_2))
+def test_version_change_inside_file_ends_reading(tmp_path: Path) -> None:
+    found, ledger = read_back(_log(tmp_path, HEAD_V1 + LINE_V1 + HEAD_V2 + LINE_V2))
 
     assert len(found["can/1"]) == 1
     assert ledger.topic("").dropped_unknown == ["a different version inside the file"]
 
 
-def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
-    text = V1 + LINE_1 + V1.replace("25569", "25570") + LINE_1
+def test_concatenated_logs_keep_their_start_times(tmp_path: Path) -> None:
+    text = HEAD_V1 + LINE_V1 + HEAD_V1.replace("25569", "25570") + LINE_V1
 
     found, ledger = read_back(_log(tmp_path, text))
 
@@ -163,7 +166,7 @@ def test_two_logs_in_one_file_keep_their_start_times(tmp_path: Path) -> None:
         ("test_motorola.trc", 99_976 - 2_863),
     ],
 )
-def test_real_logs_read_as_python_can_reads_them(name: str, missing: int) -> None:
+def test_real_logs_match_python_can(name: str, missing: int) -> None:
     path = shared("can", "rusefi_trc", name)
 
     # python-can rounds the start time to microseconds.
@@ -171,15 +174,18 @@ def test_real_logs_read_as_python_can_reads_them(name: str, missing: int) -> Non
 
 
 @dataclass(frozen=True)
-class Holes:
-    """A log without some of its rows."""
+class LogWithGaps:
+    """A log with some of its rows deleted, and the number of detectable deletions."""
 
     text: str
     missing: int
 
 
-def _without(version: str, count: int, deleted: set[int]) -> Holes:
-    """A log of ``count`` rows without those at ``deleted``; missing last rows are not detected."""
+def _log_without(version: str, count: int, deleted: set[int]) -> LogWithGaps:
+    """Return a log of ``count`` rows without those at ``deleted``.
+
+    Deleted rows at the end of the log cannot be detected and are not counted.
+    """
     is_old = version < "1.2"
     frames = [replace(f, bus="1") if is_old else f for f in made(count, fd=version > "2")]
     lines = trc(frames, version).decode().splitlines(keepends=True)
@@ -187,36 +193,36 @@ def _without(version: str, count: int, deleted: set[int]) -> Holes:
     kept = [k for k in range(count) if k not in deleted]
     last = kept[-1] if kept else -1
     text = "".join([*head, *(rows[k] for k in kept)])
-    return Holes(text, sum(k < last for k in deleted))
+    return LogWithGaps(text, sum(k < last for k in deleted))
 
 
 @pytest.mark.parametrize("version", ["1.0", "1.1", "1.2", "1.3", "2.1"])
 @given(deleted=st.sets(st.integers(0, 59)))
 @settings(max_examples=25, deadline=None)
-def test_each_row_taken_out_is_reported_as_dropped(
+def test_every_deleted_row_is_reported_as_dropped(
     tmp_path_factory: pytest.TempPathFactory, version: str, deleted: set[int]
 ) -> None:
-    holes = _without(version, 60, deleted)
+    log = _log_without(version, 60, deleted)
 
-    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), holes.text))
+    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), log.text))
 
     assert sum(map(len, found.values())) == 60 - len(deleted)
-    assert ledger.topic("").dropped == ({MISSING: holes.missing} if holes.missing else {})
-    assert ledger.is_whole == (not holes.missing)
+    assert ledger.topic("").dropped == ({MISSING: log.missing} if log.missing else {})
+    assert ledger.is_whole == (not log.missing)
 
 
-def test_rows_missing_where_chunks_of_the_file_meet_are_reported(tmp_path: Path) -> None:
+def test_rows_missing_at_chunk_boundaries_are_reported(tmp_path: Path) -> None:
     deleted = set(range(100, 40_000, 37))
-    holes = _without("2.1", 40_000, deleted)
+    log = _log_without("2.1", 40_000, deleted)
 
-    _, ledger = read_back(_log(tmp_path, holes.text))
+    _, ledger = read_back(_log(tmp_path, log.text))
 
-    assert len(holes.text) > 2 * CHUNK_BYTES
-    assert ledger.topic("").dropped == {MISSING: holes.missing}
+    assert len(log.text) > 2 * CHUNK_BYTES
+    assert ledger.topic("").dropped == {MISSING: log.missing}
     assert "line 105: 101; line 141: 138" in next(ledger.drops()).detail
 
 
-def _numbered(*numbers: int, head: str = V1) -> str:
+def _numbered(*numbers: int, head: str = HEAD_V1) -> str:
     rows = (f"{n:>6}) {k}.5  Rx  0480  2  C2 08\n" for k, n in enumerate(numbers))
     return head + "".join(rows)
 
@@ -255,7 +261,7 @@ def _numbered(*numbers: int, head: str = V1) -> str:
         ),
     ],
 )
-def test_numbers_that_do_not_follow_are_reported(
+def test_non_consecutive_message_numbers_are_reported(
     tmp_path: Path, text: str, lost: dict[str, int], unknown: list[str], rows: int
 ) -> None:
     found, ledger = read_back(_log(tmp_path, text))

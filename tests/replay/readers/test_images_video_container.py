@@ -28,9 +28,9 @@ S = 1_000_000_000
 N = 24
 NO_REORDERING = {"bf": "0"}
 REORDERING = {"bf": "3", "b-adapt": "0", "g": "12"}
-ODD_S = [100.0 + 0.05 * i + (0.3 if i > 9 else 0.0) for i in range(N)]
-ODD_NS = [round(t * 1000) * 1_000_000 for t in ODD_S]
-ODD_LINES = "\n".join(f"{t:.3f}" for t in ODD_S)
+TIMES_S = [100.0 + 0.05 * i + (0.3 if i > 9 else 0.0) for i in range(N)]
+TIMES_NS = [round(t * 1000) * 1_000_000 for t in TIMES_S]
+TIME_LINES = "\n".join(f"{t:.3f}" for t in TIMES_S)
 
 
 CASES = [
@@ -48,15 +48,15 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "codec", "options", "coding", "decoder"), CASES)
-def test_each_time_shows_the_picture_filmed_then(
+def test_each_picture_has_its_recording_time(
     tmp_path: Path, name: str, codec: str, options: dict[str, str], coding: str, decoder: str
 ) -> None:
     path = video(tmp_path / name, N, codec, options)
-    path.with_suffix(".txt").write_text(ODD_LINES)
+    path.with_suffix(".txt").write_text(TIME_LINES)
 
     blocks, ledger = read(path)
 
-    assert numbers_at_times(blocks, decoder) == {t: i for i, t in enumerate(ODD_NS)}
+    assert numbers_at_times(blocks, decoder) == {t: i for i, t in enumerate(TIMES_NS)}
     assert ledger.is_whole
     assert ledger.topic("a").declared == N
     for block in blocks:
@@ -76,7 +76,7 @@ def _number_in(block: Block) -> int:
     return number_of(np.frombuffer(rows.bytes_.payload(0), dtype=np.uint8))
 
 
-def _blank_packet(path: Path, which: int) -> None:
+def _zero_packet(path: Path, which: int) -> None:
     """Overwrite the bytes of one stored image with zeros."""
     with av.open(str(path)) as container:
         packet = [bytes(p) for p in container.demux(video=0) if p.size][which]
@@ -85,13 +85,13 @@ def _blank_packet(path: Path, which: int) -> None:
     path.write_bytes(data.replace(packet, bytes(len(packet))))
 
 
-def test_another_codec_is_decoded_here(tmp_path: Path) -> None:
+def test_unsupported_codec_is_decoded_by_reader(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", N, "mpeg4")
-    path.with_suffix(".csv").write_text(ODD_LINES)
+    path.with_suffix(".csv").write_text(TIME_LINES)
 
     blocks, ledger = read(path)
 
-    assert [int(b.log_ns[0]) for b in blocks] == ODD_NS
+    assert [int(b.log_ns[0]) for b in blocks] == TIMES_NS
     assert [_number_in(block) for block in blocks] == list(range(N))
     assert "codec mpeg4: decoded by the reader" in ledger.notices
     assert ledger.is_whole
@@ -99,25 +99,25 @@ def test_another_codec_is_decoded_here(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
 @pytest.mark.parametrize("which", [0, 7, N - 1])
-def test_a_picture_that_cannot_be_decoded_moves_no_other(
+def test_undecodable_picture_is_dropped_without_shifting_times(
     tmp_path: Path, name: str, which: int
 ) -> None:
     path = video(tmp_path / name, N, "mpeg4", {"g": "1"})
-    path.with_suffix(".txt").write_text(ODD_LINES)
-    _blank_packet(path, which)
+    path.with_suffix(".txt").write_text(TIME_LINES)
+    _zero_packet(path, which)
 
     blocks, ledger = read(path)
 
     shown = [int(b.log_ns[0]) for b in blocks]
-    assert shown == ODD_NS[:which] + ODD_NS[which + 1 :]
+    assert shown == TIMES_NS[:which] + TIMES_NS[which + 1 :]
     assert [_number_in(b) for b in blocks] == [i for i in range(N) if i != which]
     assert dict(ledger.topic("a").dropped) == {"picture cannot be decoded": 1}
     (loss,) = (d for d in ledger.details if d.is_dropped)
-    assert (loss.t_ns, loss.detail) == (ODD_NS[which], f"packet {which}")
+    assert (loss.t_ns, loss.detail) == (TIMES_NS[which], f"packet {which}")
 
 
 @pytest.mark.parametrize("options", [NO_REORDERING, REORDERING], ids=["plain", "reordered"])
-def test_without_a_time_file_its_own_times_are_used_and_reported(
+def test_missing_time_file_uses_video_times_with_notice(
     tmp_path: Path, options: dict[str, str]
 ) -> None:
     blocks, ledger = read(video(tmp_path / "a.mp4", N, "libx264", options))
@@ -126,7 +126,7 @@ def test_without_a_time_file_its_own_times_are_used_and_reported(
     assert ledger.notices[0].startswith("times are the video's own, starting at 0")
 
 
-def test_a_constant_rate_is_reported(tmp_path: Path) -> None:
+def test_constant_rate_is_reported(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
     path.with_suffix(".txt").write_text("rate_hz: 10")
 
@@ -137,7 +137,7 @@ def test_a_constant_rate_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("lines", "lost", "skipped"), [(N + 3, 3, 0), (N - 3, 3, 0)])
-def test_more_or_fewer_times_than_pictures_are_reported(
+def test_mismatched_counts_of_times_and_pictures_are_reported(
     tmp_path: Path, lines: int, lost: int, skipped: int
 ) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
@@ -153,14 +153,14 @@ def test_more_or_fewer_times_than_pictures_are_reported(
     )
 
 
-def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
+def test_selection_limits_pictures_and_counts_the_rest(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
-    path.with_suffix(".txt").write_text(ODD_LINES)
+    path.with_suffix(".txt").write_text(TIME_LINES)
 
-    blocks, ledger = read(path, Selection(start_ns=ODD_NS[4], end_ns=ODD_NS[8]))
+    blocks, ledger = read(path, Selection(start_ns=TIMES_NS[4], end_ns=TIMES_NS[8]))
     none, not_asked = read(path, Selection(topics=frozenset({"b"})))
 
-    assert [t for b in blocks for t in b.log_ns.tolist()] == ODD_NS[4:8]
+    assert [t for b in blocks for t in b.log_ns.tolist()] == TIMES_NS[4:8]
     assert ledger.topic("a").skipped == {NOT_ASKED_TIME: N - 4}
     assert none == []
     assert not_asked.topic("a").skipped == {NOT_ASKED_TOPIC: N}
@@ -179,7 +179,7 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
         ("a.mkv", "libx264", {}, "matroska"),
     ],
 )
-def test_a_video_cut_anywhere_is_refused_or_reported(
+def test_truncated_video_is_refused_or_reported(
     tmp_path: Path, name: str, codec: str, container: dict[str, str], tail: str, fraction: float
 ) -> None:
     whole = tmp_path / name
@@ -204,7 +204,7 @@ def test_a_video_cut_anywhere_is_refused_or_reported(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(at=st.integers(0, 10**6), junk=st.binary(min_size=1, max_size=16))
-def test_a_damaged_video_never_ends_in_a_traceback(tmp_path: Path, at: int, junk: bytes) -> None:
+def test_damaged_video_is_read_or_refused_in_one_line(tmp_path: Path, at: int, junk: bytes) -> None:
     whole = tmp_path / "a.mp4"
     if not whole.exists():
         video(whole, N, "libx264", NO_REORDERING)
@@ -222,14 +222,14 @@ def test_a_damaged_video_never_ends_in_a_traceback(tmp_path: Path, at: int, junk
     assert sum(len(b) for b in blocks) <= 2 * N
 
 
-def test_a_raw_stream_needs_a_time_file(tmp_path: Path) -> None:
+def test_raw_stream_without_time_file_is_refused(tmp_path: Path) -> None:
     path = video(tmp_path / "a.h264", 3)
 
     with pytest.raises(LogFormatError, match=r"a raw stream has no times; write a.h264.txt"):
         open_log(path)
 
 
-def test_a_time_file_that_names_pictures_is_refused(tmp_path: Path) -> None:
+def test_time_file_with_picture_names_is_refused_for_video(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", 3)
     path.with_suffix(".txt").write_text("a.png,0.5")
 
@@ -238,14 +238,14 @@ def test_a_time_file_that_names_pictures_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.mov"])
-def test_other_bytes_under_a_video_name_are_refused(tmp_path: Path, name: str) -> None:
+def test_unsupported_content_with_video_suffix_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"#EXTM3U\nhttp://127.0.0.1:9/a.ts\n" * 20)
 
     with pytest.raises(LogFormatError, match="cut or damaged, no video can be found"):
         open_log(tmp_path / name)
 
 
-def test_a_name_that_is_no_text_is_opened(tmp_path: Path) -> None:
+def test_non_utf8_file_name_is_opened(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", 3, "libx264", NO_REORDERING)
     odd = path.rename(tmp_path / "a\udcff.mp4")
 
@@ -254,9 +254,9 @@ def test_a_name_that_is_no_text_is_opened(tmp_path: Path) -> None:
     assert sum(len(b) for b in blocks) == 3
 
 
-def test_info_on_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_reports_gaps_of_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
-    path.with_suffix(".txt").write_text(ODD_LINES)
+    path.with_suffix(".txt").write_text(TIME_LINES)
 
     assert run(["info", str(path)]) == 0
     assert "a: 1 gap over 250 ms (5 periods), the longest 350 ms at 0.45 s" in (

@@ -30,7 +30,7 @@ def read(folder: Path, text: str) -> TimeFile:
 
 @quick
 @given(moments)
-def test_seconds_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
+def test_seconds_are_parsed_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
     lines = "\n".join(f"{Decimal(t) / S:.9f}" for t in t_ns)
 
     assert read(tmp_path, lines).t_ns.tolist() == t_ns
@@ -38,7 +38,7 @@ def test_seconds_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) ->
 
 @quick
 @given(st.lists(st.integers(0, 2**31 * S), min_size=1, max_size=20, unique=True))
-def test_date_times_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
+def test_date_times_are_parsed_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
     dates = [f"{np.datetime_as_string(np.datetime64(t, 'ns')).replace('T', ' ')}" for t in t_ns]
 
     assert read(tmp_path, "\n".join(dates)).t_ns.tolist() == t_ns
@@ -68,7 +68,7 @@ def test_date_times_come_back_to_the_nanosecond(tmp_path: Path, t_ns: list[int])
         ('"name","time"\n"a b.jpg","0.5"', [S // 2], ("a b.jpg",)),
     ],
 )
-def test_ways_of_writing(
+def test_supported_notations_are_parsed(
     tmp_path: Path, text: str, t_ns: list[int], names: tuple[str, ...] | None
 ) -> None:
     times = read(tmp_path, text)
@@ -77,7 +77,7 @@ def test_ways_of_writing(
     assert times.names == names
 
 
-def test_a_constant_rate_gives_times_without_drift(tmp_path: Path) -> None:
+def test_constant_rate_yields_times_without_drift(tmp_path: Path) -> None:
     times = read(tmp_path, "rate_hz: 29.97\n")
 
     at = times.times_at(np.array([0, 1, 2997]))
@@ -109,19 +109,19 @@ def test_a_constant_rate_gives_times_without_drift(tmp_path: Path) -> None:
         ("a,b,c\n1,2,3", "line 1: 'a,b,c': expected a time"),
     ],
 )
-def test_a_bad_line_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_line_is_refused_with_its_number(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(LogFormatError, match=message):
         read(tmp_path, text)
 
 
-def test_bytes_that_are_no_text_are_named_by_line(tmp_path: Path) -> None:
+def test_non_utf8_bytes_are_refused_with_line_number(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_bytes(b"0.1\n0.2\n\xff\xfe\n")
 
     with pytest.raises(LogFormatError, match="line 3: not UTF-8 text"):
         read_time_file(tmp_path / "times.txt", DEFAULT_LIMITS)
 
 
-def test_a_time_file_over_the_limit_is_not_read(tmp_path: Path) -> None:
+def test_time_file_over_size_limit_is_refused(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_text("0.5\n" * 100)
 
     with pytest.raises(LogTooLargeError, match="over 100 bytes"):
@@ -130,7 +130,7 @@ def test_a_time_file_over_the_limit_is_not_read(tmp_path: Path) -> None:
 
 @quick
 @given(st.binary(max_size=200))
-def test_any_bytes_are_read_or_refused_in_our_words(tmp_path: Path, raw: bytes) -> None:
+def test_any_bytes_are_read_or_refused_in_one_line(tmp_path: Path, raw: bytes) -> None:
     path = tmp_path / "times.txt"
     path.write_bytes(raw)
     refusal, count = "", 1
@@ -144,7 +144,7 @@ def test_any_bytes_are_read_or_refused_in_our_words(tmp_path: Path, raw: bytes) 
     assert "\n" not in refusal
 
 
-def test_the_time_file_is_found_inside_or_beside(tmp_path: Path) -> None:
+def test_time_file_is_found_in_folder_or_next_to_it(tmp_path: Path) -> None:
     folder = tmp_path / "cam" / "data"
     folder.mkdir(parents=True)
     assert find_time_file(folder) is None
@@ -161,7 +161,7 @@ def test_the_time_file_is_found_inside_or_beside(tmp_path: Path) -> None:
     assert find_time_file(folder) == folder / "times.txt"
 
 
-def test_the_time_file_of_a_video_lies_next_to_it(tmp_path: Path) -> None:
+def test_time_file_of_video_is_found_next_to_it(tmp_path: Path) -> None:
     video = tmp_path / "drive.mp4"
     assert time_file_of_video(video) is None
     (tmp_path / "drive.csv").touch()

@@ -22,7 +22,7 @@ from support.mcap_files import (
     schema,
 )
 
-DEFINED = [schema(1), channel(1, 1, "/a"), channel(2, 1, "/b")]
+DEFINITIONS = [schema(1), channel(1, 1, "/a"), channel(2, 1, "/b")]
 
 
 def stored(path: Path, file: McapFile | bytes) -> Path:
@@ -30,14 +30,14 @@ def stored(path: Path, file: McapFile | bytes) -> Path:
     return path
 
 
-def same(log: int, payload: bytes) -> Message:
+def message_read(log: int, payload: bytes) -> Message:
     return (log, log, payload)
 
 
-def test_messages_outside_chunks_come_with_those_inside(tmp_path: Path) -> None:
+def test_messages_outside_chunks_are_read(tmp_path: Path) -> None:
     inside = [message(1, 10 + i, b"in") for i in range(5)]
     outside = [message(2, 100 + i, b"out") for i in range(7)]
-    path = stored(tmp_path / "x.mcap", McapFile([ChunkOf([*DEFINED, *inside]), *outside]))
+    path = stored(tmp_path / "x.mcap", McapFile([ChunkOf([*DEFINITIONS, *inside]), *outside]))
 
     reading = read_back(path)
 
@@ -45,13 +45,13 @@ def test_messages_outside_chunks_come_with_those_inside(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
 
 
-def test_two_recordings_in_a_row_are_both_read(tmp_path: Path) -> None:
-    one = McapFile([ChunkOf([*DEFINED, message(1, 1, b"first")], "zstd")]).coded()
-    two = McapFile([ChunkOf([*DEFINED, message(1, 2, b"second")], "lz4")]).coded()
+def test_consecutive_recordings_are_both_read(tmp_path: Path) -> None:
+    one = McapFile([ChunkOf([*DEFINITIONS, message(1, 1, b"first")], "zstd")]).coded()
+    two = McapFile([ChunkOf([*DEFINITIONS, message(1, 2, b"second")], "lz4")]).coded()
 
     reading = read_back(stored(tmp_path / "x.mcap", one + two))
 
-    assert reading.messages == {"/a": [same(1, b"first"), same(2, b"second")]}
+    assert reading.messages == {"/a": [message_read(1, b"first"), message_read(2, b"second")]}
     assert any("2 consecutive recordings" in notice for notice in reading.ledger.notices)
     assert reading.ledger.is_whole
     assert reading.ledger.accounts["/a"].declared == 2
@@ -59,11 +59,11 @@ def test_two_recordings_in_a_row_are_both_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("is_chunked", [True, False])
 @pytest.mark.parametrize("summary", [True, False])
-def test_a_message_belongs_to_the_channel_valid_where_it_stands(
+def test_message_uses_latest_preceding_channel_definition(
     tmp_path: Path, is_chunked: bool, summary: bool
 ) -> None:
     records = [
-        *DEFINED,
+        *DEFINITIONS,
         message(1, 1, b"p"),
         channel(1, 1, "/other"),
         message(1, 2, b"q"),
@@ -77,14 +77,14 @@ def test_a_message_belongs_to_the_channel_valid_where_it_stands(
     reading = read_back(path)
 
     assert reading.messages == {
-        "/a": [same(1, b"p"), same(4, b"s")],
-        "/other": [same(2, b"q")],
-        "/b": [same(3, b"r")],
+        "/a": [message_read(1, b"p"), message_read(4, b"s")],
+        "/other": [message_read(2, b"q")],
+        "/b": [message_read(3, b"r")],
     }
     assert reading.ledger.is_whole
 
 
-def test_one_name_with_two_types_becomes_two_topics_with_a_notice(tmp_path: Path) -> None:
+def test_one_name_with_two_types_becomes_separate_topics_with_notice(tmp_path: Path) -> None:
     records = [
         schema(1, "a/B"),
         schema(2, "c/D"),
@@ -105,7 +105,7 @@ def test_one_name_with_two_types_becomes_two_topics_with_a_notice(tmp_path: Path
     assert any("/x#2" in notice for notice in reading.ledger.notices)
 
 
-def test_names_that_are_not_utf8_can_be_printed(tmp_path: Path) -> None:
+def test_non_utf8_topic_name_is_escaped(tmp_path: Path) -> None:
     records = [schema(1, b"a/\xff"), channel(1, 1, b"/caf\xe9"), message(1, 1, b"x")]
 
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)])))
@@ -113,7 +113,7 @@ def test_names_that_are_not_utf8_can_be_printed(tmp_path: Path) -> None:
     assert list(reading.messages) == ["/caf\\xe9"]
 
 
-def test_a_channel_without_schema_has_no_type(tmp_path: Path) -> None:
+def test_channel_without_schema_has_no_type(tmp_path: Path) -> None:
     records = [channel(1, 0, "/a", "json"), message(1, 1, b"{}")]
     path = stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)]))
 
@@ -124,17 +124,22 @@ def test_a_channel_without_schema_has_no_type(tmp_path: Path) -> None:
     assert read_back(path).count() == 1
 
 
-def test_times_may_go_backwards_and_repeat(tmp_path: Path) -> None:
+def test_times_may_decrease_and_repeat(tmp_path: Path) -> None:
     logs = [5, 6, 7, 1, 1, 9]
-    records = [*DEFINED, *(message(1, log) for log in logs)]
+    records = [*DEFINITIONS, *(message(1, log) for log in logs)]
 
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)])))
 
     assert [log for log, *_ in reading.messages["/a"]] == logs
 
 
-def test_a_log_time_that_no_int64_holds_is_skipped_with_its_reason(tmp_path: Path) -> None:
-    records = [*DEFINED, message(1, 7), message(1, (1 << 63) - 1), message(1, 1 << 63, publish=1)]
+def test_log_time_beyond_int64_is_skipped_with_reason(tmp_path: Path) -> None:
+    records = [
+        *DEFINITIONS,
+        message(1, 7),
+        message(1, (1 << 63) - 1),
+        message(1, 1 << 63, publish=1),
+    ]
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)])))
 
     assert [log for log, *_ in reading.messages["/a"]] == [7, (1 << 63) - 1]
@@ -142,31 +147,34 @@ def test_a_log_time_that_no_int64_holds_is_skipped_with_its_reason(tmp_path: Pat
     assert reading.ledger.is_whole
 
 
-def test_a_publish_time_that_no_int64_holds_counts_as_not_available(tmp_path: Path) -> None:
-    records = [*DEFINED, message(1, 7, b"x", publish=(1 << 64) - 1)]
+def test_publish_time_beyond_int64_counts_as_unavailable(tmp_path: Path) -> None:
+    records = [*DEFINITIONS, message(1, 7, b"x", publish=(1 << 64) - 1)]
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)])))
 
-    assert reading.messages == {"/a": [same(7, b"x")]}
+    assert reading.messages == {"/a": [message_read(7, b"x")]}
     assert any("publish times" in notice for notice in reading.ledger.notices)
 
 
-def test_private_and_future_records_are_passed_over(tmp_path: Path) -> None:
+def test_unknown_record_kinds_are_ignored_with_notice(tmp_path: Path) -> None:
     odd = [record(0x99, b"private"), record(0x42, bytes(50))]
-    chunk = ChunkOf([*DEFINED, message(1, 1, b"x"), *odd, message(1, 2, b"y")])
+    chunk = ChunkOf([*DEFINITIONS, message(1, 1, b"x"), *odd, message(1, 2, b"y")])
     path = stored(tmp_path / "x.mcap", McapFile([*odd, chunk, *odd, message(2, 3, b"z")]))
 
     reading = read_back(path)
 
-    assert reading.messages == {"/a": [same(1, b"x"), same(2, b"y")], "/b": [same(3, b"z")]}
+    assert reading.messages == {
+        "/a": [message_read(1, b"x"), message_read(2, b"y")],
+        "/b": [message_read(3, b"z")],
+    }
     assert any("unknown kinds" in notice for notice in reading.ledger.notices)
     assert reading.ledger.is_whole
 
 
-def test_an_index_that_lies_is_not_believed(tmp_path: Path) -> None:
-    chunk = ChunkOf([*DEFINED, *(message(1, i, b"%d" % i) for i in range(20))])
+def test_wrong_message_index_is_ignored_with_notice(tmp_path: Path) -> None:
+    chunk = ChunkOf([*DEFINITIONS, *(message(1, i, b"%d" % i) for i in range(20))])
     coded = bytearray(McapFile([chunk]).coded())
     at = coded.index(record(7, struct.pack("<H", 1) + struct.pack("<I", 320))[:1] + b"\x46\x01")
-    coded[at + 9 + 6 + 8] ^= 4  # the offset of the first message
+    coded[at + 9 + 6 + 8] ^= 4  # The offset of the first message.
 
     reading = read_back(stored(tmp_path / "x.mcap", bytes(coded)))
 
@@ -175,8 +183,8 @@ def test_an_index_that_lies_is_not_believed(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
 
 
-def test_messages_of_an_undeclared_channel_are_reported_as_lost(tmp_path: Path) -> None:
-    chunk = ChunkOf([*DEFINED, message(9, 1), message(9, 2), message(1, 3)])
+def test_messages_of_undeclared_channel_are_dropped(tmp_path: Path) -> None:
+    chunk = ChunkOf([*DEFINITIONS, message(9, 1), message(9, 2), message(1, 3)])
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([chunk])))
 
     assert reading.count() == 1
@@ -184,8 +192,8 @@ def test_messages_of_an_undeclared_channel_are_reported_as_lost(tmp_path: Path) 
     assert not reading.ledger.is_whole
 
 
-def test_statistics_that_say_more_than_there_is_are_a_loss(tmp_path: Path) -> None:
-    chunks = [ChunkOf([*DEFINED, message(1, i)]) for i in range(3)]
+def test_messages_missing_from_statistics_count_are_dropped(tmp_path: Path) -> None:
+    chunks = [ChunkOf([*DEFINITIONS, message(1, i)]) for i in range(3)]
     full = McapFile(chunks).coded()
     short = McapFile(chunks[:2]).coded()
     summary_of_full = full[struct.unpack_from("<Q", full, len(full) - 28)[0] :]
@@ -199,9 +207,9 @@ def test_statistics_that_say_more_than_there_is_are_a_loss(tmp_path: Path) -> No
     assert reading.ledger.accounts["/a"].dropped.total() == 1
 
 
-def test_attachments_and_their_checksums_are_looked_at(tmp_path: Path) -> None:
+def test_attachment_checksums_are_verified(tmp_path: Path) -> None:
     good, bad = attachment("a.txt", b"text"), attachment("b.txt", b"text", crc=7)
-    file = McapFile([good, ChunkOf([*DEFINED, message(1, 1)]), bad])
+    file = McapFile([good, ChunkOf([*DEFINITIONS, message(1, 1)]), bad])
 
     reading = read_back(stored(tmp_path / "x.mcap", file))
 
@@ -210,16 +218,16 @@ def test_attachments_and_their_checksums_are_looked_at(tmp_path: Path) -> None:
     assert reading.count() == 1
 
 
-def test_a_chunk_without_checksum_among_others_is_noticed(tmp_path: Path) -> None:
-    chunks = [ChunkOf([*DEFINED, message(1, 1)]), ChunkOf([message(1, 2)], crc=0)]
+def test_chunk_without_checksum_among_others_is_reported(tmp_path: Path) -> None:
+    chunks = [ChunkOf([*DEFINITIONS, message(1, 1)]), ChunkOf([message(1, 2)], crc=0)]
     reading = read_back(stored(tmp_path / "x.mcap", McapFile(chunks)))
 
     assert reading.count() == 2
     assert any("1 of 2 chunks have no checksum" in notice for notice in reading.ledger.notices)
 
 
-def test_a_file_without_any_checksum_says_so(tmp_path: Path) -> None:
-    file = McapFile([ChunkOf([*DEFINED, message(1, 1)], crc=0)], summary_crc=False)
+def test_file_without_checksums_reports_it(tmp_path: Path) -> None:
+    file = McapFile([ChunkOf([*DEFINITIONS, message(1, 1)], crc=0)], summary_crc=False)
 
     reading = read_back(stored(tmp_path / "x.mcap", file))
 
@@ -227,12 +235,12 @@ def test_a_file_without_any_checksum_says_so(tmp_path: Path) -> None:
     assert reading.ledger.integrity == "no checksum covers 1 chunk"
 
 
-def selected(tmp_path: Path, is_indexed: bool) -> Path:
+def indexed_file(tmp_path: Path, is_indexed: bool) -> Path:
     chunks = [
         ChunkOf(
-            [*DEFINED, *(message(1 + (k + i) % 2, 100 * k + i, b"%d" % i) for i in range(10))]
+            [*DEFINITIONS, *(message(1 + (k + i) % 2, 100 * k + i, b"%d" % i) for i in range(10))]
             if k % 3
-            else [*DEFINED, *(message(1, 100 * k + i, b"%d" % i) for i in range(10))],
+            else [*DEFINITIONS, *(message(1, 100 * k + i, b"%d" % i) for i in range(10))],
             "zstd",
             is_indexed=is_indexed,
         )
@@ -251,10 +259,8 @@ def selected(tmp_path: Path, is_indexed: bool) -> Path:
         Selection(topics=frozenset({"/b", "/nowhere"}), end_ns=1 << 70),
     ],
 )
-def test_a_selection_gives_the_same_with_an_index_as_without(
-    tmp_path: Path, selection: Selection
-) -> None:
-    everything = read_back(selected(tmp_path, True))
+def test_selection_is_same_with_and_without_index(tmp_path: Path, selection: Selection) -> None:
+    everything = read_back(indexed_file(tmp_path, True))
     wanted = {
         topic: kept
         for topic, messages in everything.messages.items()
@@ -268,8 +274,8 @@ def test_a_selection_gives_the_same_with_an_index_as_without(
             ]
         )
     }
-    with_index = read_back(selected(tmp_path, True), selection)
-    without = read_back(selected(tmp_path, False), selection)
+    with_index = read_back(indexed_file(tmp_path, True), selection)
+    without = read_back(indexed_file(tmp_path, False), selection)
 
     assert with_index.messages == without.messages == wanted
     assert with_index.ledger.accounts == without.ledger.accounts
@@ -280,7 +286,7 @@ def test_a_selection_gives_the_same_with_an_index_as_without(
     assert reasons <= {NOT_ASKED_TIME, NOT_ASKED_TOPIC}
 
 
-def test_reading_twice_gives_the_same(tmp_path: Path) -> None:
-    path = selected(tmp_path, True)
+def test_reading_twice_yields_same_result(tmp_path: Path) -> None:
+    path = indexed_file(tmp_path, True)
 
     assert read_back(path) == read_back(path)

@@ -29,13 +29,13 @@ def without_summary(coded: bytes) -> bytes:
     return coded[:summary_at] + record(2, struct.pack("<QQI", 0, 0, 0)) + MAGIC
 
 
-def test_the_files_are_those_of_the_suite(suite: list[Conformance]) -> None:
+def test_suite_has_all_files(suite: list[Conformance]) -> None:
     assert len(suite) == SUITE_SIZE
     assert all(file.is_exact for file in suite)
 
 
 @pytest.mark.parametrize("has_summary", [True, False], ids=["as it is", "without summary"])
-def test_every_file_gives_its_very_messages(
+def test_every_file_yields_exactly_its_messages(
     suite: list[Conformance], has_summary: bool, tmp_path: Path
 ) -> None:
     path = tmp_path / "file.mcap"

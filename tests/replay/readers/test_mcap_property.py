@@ -39,7 +39,7 @@ MESSAGES = st.lists(
     statistics=st.booleans(),
     data_crc=st.booleans(),
 )
-def test_ours_and_the_mcap_package_agree(
+def test_messages_match_mcap_package(
     messages: list[tuple[int, int, int, bytes]],
     compression: CompressionType,
     index: IndexType,
@@ -90,7 +90,7 @@ def test_ours_and_the_mcap_package_agree(
     stop=st.integers(1, 12),
     max_count=st.integers(0, 60),
 )
-def test_a_scan_gives_the_records_up_to_the_first_it_must_stop_at(
+def test_scan_yields_records_before_first_stop_record(
     records: list[tuple[int, int]], tail: bytes, stop: int, max_count: int
 ) -> None:
     coded = b"".join(struct.pack("<BQ", kind, size) + bytes(size) for kind, size in records)

@@ -28,7 +28,7 @@ def write(path: Path, compression: CompressionType, **options: object) -> None:
     writer.finish()  # type: ignore[no-untyped-call]
 
 
-def by_mcap(path: Path) -> dict[str, list[Message]]:
+def read_with_mcap_package(path: Path) -> dict[str, list[Message]]:
     found: dict[str, list[Message]] = {}
     with path.open("rb") as stream:
         for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
@@ -38,7 +38,7 @@ def by_mcap(path: Path) -> dict[str, list[Message]]:
     return found
 
 
-SHAPES = [
+STRUCTURES = [
     {
         "use_chunking": chunked,
         "index_types": index,
@@ -59,27 +59,27 @@ SHAPES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compression", list(CompressionType), ids=lambda c: c.name.lower())
-def test_every_shape_of_file_gives_the_same_messages(
+def test_all_file_structures_yield_same_messages_as_mcap_package(
     tmp_path: Path, compression: CompressionType
 ) -> None:
     path = tmp_path / "log.mcap"
-    for shape in SHAPES:
+    for shape in STRUCTURES:
         write(path, compression, **shape)
         reading = read_back(path)
 
-        assert reading.messages == by_mcap(path), shape
+        assert reading.messages == read_with_mcap_package(path), shape
         assert reading.ledger.is_whole, shape
         assert reading.adds_up(), shape
         assert reading.names == ("/t0", "/t1", "/t2"), shape
 
 
 @pytest.mark.slow
-def test_a_real_recording_gives_the_messages_that_mcap_gives() -> None:
+def test_real_recordings_match_mcap_package() -> None:
     recordings = sorted(shared("bags").rglob("*.mcap"))
     assert recordings
     for path in recordings:
         reading = read_back(path)
 
-        assert reading.messages == by_mcap(path)
+        assert reading.messages == read_with_mcap_package(path)
         assert reading.ledger.is_whole
         assert reading.adds_up()

@@ -28,14 +28,14 @@ from support.mcap_files import (
 )
 
 TOPICS = 4
-DEFINED = [schema(1), *(channel(i, 1, f"/t{i}") for i in range(TOPICS))]
-LATE = 1 << 63
-TIMES = st.integers(0, 60) | st.sampled_from([LATE - 1, LATE, (1 << 64) - 1])
+DEFINITIONS = [schema(1), *(channel(i, 1, f"/t{i}") for i in range(TOPICS))]
+BEYOND_INT64 = 1 << 63
+TIMES = st.integers(0, 60) | st.sampled_from([BEYOND_INT64 - 1, BEYOND_INT64, (1 << 64) - 1])
 ROWS = st.lists(st.tuples(st.integers(0, TOPICS - 1), TIMES, st.binary(max_size=20)), max_size=8)
-BOUND = st.none() | st.integers(-5, 70) | st.just(LATE)
+BOUND = st.none() | st.integers(-5, 70) | st.just(BEYOND_INT64)
 
 
-def walked(path: Path, selection: Selection) -> Reading:
+def read_by_complete_pass(path: Path, selection: Selection) -> Reading:
     """Read the part by a complete pass over all chunks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mcap_pass, "find_window", lambda *_: "a test")
@@ -44,8 +44,8 @@ def walked(path: Path, selection: Selection) -> Reading:
 
 @st.composite
 def files(draw: st.DrawFn) -> McapFile:
-    """Write chunks that overlap in time, some without message index, and messages between them."""
-    parts: list[bytes | ChunkOf] = [*DEFINED]
+    """Draw chunks that overlap in time, some without message index, and messages between them."""
+    parts: list[bytes | ChunkOf] = [*DEFINITIONS]
     for _ in range(draw(st.integers(0, 8))):
         rows = [message(*row) for row in draw(ROWS)]
         kind = draw(st.sampled_from(["chunk", "chunk", "chunk", "bare", "attachment"]))
@@ -67,14 +67,14 @@ def files(draw: st.DrawFn) -> McapFile:
     start_ns=BOUND,
     end_ns=BOUND,
 )
-def test_a_window_is_what_the_walk_gives(
+def test_selection_yields_same_rows_as_complete_pass(
     file: McapFile, topics: frozenset[str] | None, start_ns: int | None, end_ns: int | None
 ) -> None:
     selection = Selection(topics, start_ns, end_ns)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.mcap"
         path.write_bytes(file.coded())
-        ours, whole = read_back(path, selection), walked(path, selection)
+        ours, whole = read_back(path, selection), read_by_complete_pass(path, selection)
 
     assert ours.messages == whole.messages
     assert ours.ledger.accounts == whole.ledger.accounts
@@ -87,9 +87,11 @@ def chunk(k: int, topic: int = 0, times: tuple[int, int] | None = None) -> Chunk
     return ChunkOf(rows, "zstd", times=times)
 
 
-def spoilt(path: Path, is_kept: Callable[[int], bool], chunks: list[ChunkOf]) -> None:
-    """Overwrite all chunks and message indexes except those kept."""
-    coded = bytearray(McapFile([*DEFINED, *chunks]).coded())
+def write_with_destroyed_chunks(
+    path: Path, is_kept: Callable[[int], bool], chunks: list[ChunkOf]
+) -> None:
+    """Write ``chunks`` to a file, with all except those kept overwritten."""
+    coded = bytearray(McapFile([*DEFINITIONS, *chunks]).coded())
     for k, one in enumerate(chunks):
         if not is_kept(k):
             body = one.coded()
@@ -98,8 +100,10 @@ def spoilt(path: Path, is_kept: Callable[[int], bool], chunks: list[ChunkOf]) ->
     path.write_bytes(coded)
 
 
-def test_chunks_outside_the_time_are_not_looked_at(tmp_path: Path) -> None:
-    spoilt(tmp_path / "x.mcap", lambda k: k in (3, 4), [chunk(k) for k in range(9)])
+def test_chunks_outside_time_range_are_not_read(tmp_path: Path) -> None:
+    write_with_destroyed_chunks(
+        tmp_path / "x.mcap", lambda k: k in (3, 4), [chunk(k) for k in range(9)]
+    )
 
     reading = read_back(tmp_path / "x.mcap", Selection(None, 305, 405))
 
@@ -111,9 +115,9 @@ def test_chunks_outside_the_time_are_not_looked_at(tmp_path: Path) -> None:
     )
 
 
-def test_chunks_without_the_topic_are_not_looked_at(tmp_path: Path) -> None:
+def test_chunks_without_selected_topic_are_not_read(tmp_path: Path) -> None:
     chunks = [chunk(k, topic=k % 3) for k in range(9)]
-    spoilt(tmp_path / "x.mcap", lambda k: k % 3 == 1, chunks)
+    write_with_destroyed_chunks(tmp_path / "x.mcap", lambda k: k % 3 == 1, chunks)
 
     reading = read_back(tmp_path / "x.mcap", Selection(frozenset({"/t1"})))
 
@@ -122,10 +126,10 @@ def test_chunks_without_the_topic_are_not_looked_at(tmp_path: Path) -> None:
     assert reading.ledger.accounts["/t2"].skipped == {"topic not selected": 30}
 
 
-def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:
-    coded = bytearray(McapFile([*DEFINED, *map(chunk, range(9))]).coded())
+def test_index_contradicting_chunk_header_is_ignored(tmp_path: Path) -> None:
+    coded = bytearray(McapFile([*DEFINITIONS, *map(chunk, range(9))]).coded())
     at = coded.index(chunk(4).coded()) + PREFIX.size
-    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # its header now states another start
+    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # Its header now states another start.
     path = tmp_path / "x.mcap"
     path.write_bytes(coded)
 
@@ -133,11 +137,14 @@ def test_an_index_that_contradicts_a_chunk_is_given_up(tmp_path: Path) -> None:
 
     assert len(reading.messages["/t0"]) == 5
     assert any("every chunk was examined" in notice for notice in reading.ledger.notices)
-    assert reading.ledger.accounts == walked(path, Selection(None, 400, 405)).ledger.accounts
+    assert (
+        reading.ledger.accounts
+        == read_by_complete_pass(path, Selection(None, 400, 405)).ledger.accounts
+    )
 
 
-def test_counts_that_do_not_add_up_are_not_trusted(tmp_path: Path) -> None:
-    file = McapFile([*DEFINED, *map(chunk, range(9))], summary_crc=False)
+def test_inconsistent_message_counts_are_reported(tmp_path: Path) -> None:
+    file = McapFile([*DEFINITIONS, *map(chunk, range(9))], summary_crc=False)
     counts = struct.pack("<HQ", 0, 90)
     before, _, after = file.coded().rpartition(counts)
     coded = before + struct.pack("<HQ", 0, 91) + after
@@ -150,8 +157,8 @@ def test_counts_that_do_not_add_up_are_not_trusted(tmp_path: Path) -> None:
     assert reading.ledger.accounts["/t0"].dropped.total() == 1
 
 
-def test_a_wrong_time_in_an_index_without_checksum_is_found_out(tmp_path: Path) -> None:
-    coded = McapFile([*DEFINED, *map(chunk, range(9))], summary_crc=False).coded()
+def test_wrong_time_in_index_without_checksum_is_detected(tmp_path: Path) -> None:
+    coded = McapFile([*DEFINITIONS, *map(chunk, range(9))], summary_crc=False).coded()
     at = coded.rindex(struct.pack("<QQ", 400, 409))
     coded = coded[:at] + struct.pack("<QQ", 400, 404) + coded[at + 16 :]
     path = tmp_path / "x.mcap"
@@ -165,7 +172,7 @@ def test_a_wrong_time_in_an_index_without_checksum_is_found_out(tmp_path: Path) 
 
 @settings(max_examples=100, deadline=None)
 @given(sizes=st.lists(st.integers(0, 3), min_size=1, max_size=200))
-def test_runs_of_equal_records_are_counted_right(sizes: list[int]) -> None:
+def test_run_length_never_exceeds_equal_records(sizes: list[int]) -> None:
     records = b"".join(record(8, bytes(size)) for size in sizes) + b"tail"
     at = 0
     while at < len(records) - 4:
@@ -179,5 +186,5 @@ def test_runs_of_equal_records_are_counted_right(sizes: list[int]) -> None:
     assert at == len(records) - 4
 
 
-def test_an_empty_index_is_an_empty_table() -> None:
+def test_empty_index_yields_empty_table() -> None:
     assert len(table_of(b"", (), (), 0)) == 0

@@ -81,7 +81,7 @@ def bag(path: Path, *records: bytes, **header: bytes) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("parts", [("plotjuggler", "tilt_laser.bag"), ("sail_il", "run1.bag")])
-def test_a_real_bag_reads_as_rosbags_reads_it(parts: tuple[str, str]) -> None:
+def test_real_bags_match_rosbags(parts: tuple[str, str]) -> None:
     path = shared("bags", *parts)
     reading = read_rows(path)
     with Reader(path) as reader:
@@ -95,7 +95,7 @@ def test_a_real_bag_reads_as_rosbags_reads_it(parts: tuple[str, str]) -> None:
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_every_message_comes_back_in_stored_order(tmp_path: Path, compression: str) -> None:
+def test_every_message_is_read_in_stored_order(tmp_path: Path, compression: str) -> None:
     rows = rows_of(2000)
     reading = read_rows(write_bag(tmp_path / "a.bag", rows, compression))
 
@@ -120,21 +120,21 @@ def test_every_message_comes_back_in_stored_order(tmp_path: Path, compression: s
         ("lz4 checked", "lz4 checksums verified in"),
     ],
 )
-def test_the_ledger_says_what_was_checked(tmp_path: Path, compression: str, says: str) -> None:
+def test_ledger_reports_verified_checksums(tmp_path: Path, compression: str, says: str) -> None:
     path = write_bag(tmp_path / "a.bag", rows_of(100), compression)
 
     assert says in read_rows(path).ledger.integrity
 
 
 @pytest.mark.parametrize("name", ["run%41.bag", "a#b.bag", "q?x=1.bag", "-rf.bag", "ü\n.bag"])
-def test_an_odd_file_name_opens_itself(tmp_path: Path, name: str) -> None:
+def test_unusual_file_name_opens_that_file(tmp_path: Path, name: str) -> None:
     write_bag(tmp_path / "runA.bag", rows_of(10, seed=1))
     rows = rows_of(20, seed=2)
 
     assert by_topic(read_rows(write_bag(tmp_path / name, rows)).rows) == by_topic(rows)
 
 
-def test_a_name_that_is_not_utf8_opens(tmp_path: Path) -> None:
+def test_non_utf8_file_name_is_opened(tmp_path: Path) -> None:
     rows = rows_of(20)
     path = tmp_path / os.fsdecode(b"caf\xe9.bag")
     write_bag(tmp_path / "plain.bag", rows).rename(path)
@@ -143,7 +143,7 @@ def test_a_name_that_is_not_utf8_opens(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".bag.active"])
-def test_a_bag_of_a_killed_recorder_reads_whole(tmp_path: Path, suffix: str) -> None:
+def test_bag_of_killed_recorder_is_read_completely(tmp_path: Path, suffix: str) -> None:
     rows = rows_of(800)
     content = unclosed(write_bag(tmp_path / "a.bag", rows).read_bytes())
     path = tmp_path / f"killed{suffix}"
@@ -157,7 +157,7 @@ def test_a_bag_of_a_killed_recorder_reads_whole(tmp_path: Path, suffix: str) -> 
 
 
 @pytest.mark.parametrize(("field", "wrong"), [(b"chunk_count", 0), (b"chunk_count", -3)])
-def test_a_wrong_chunk_count_costs_nothing(tmp_path: Path, field: bytes, wrong: int) -> None:
+def test_wrong_chunk_count_drops_no_message(tmp_path: Path, field: bytes, wrong: int) -> None:
     rows = rows_of(800)
     path = write_bag(tmp_path / "a.bag", rows)
     content = bytearray(path.read_bytes())
@@ -171,7 +171,7 @@ def test_a_wrong_chunk_count_costs_nothing(tmp_path: Path, field: bytes, wrong: 
     assert any("chunk_count" in sentence for sentence in reading.ledger.notices)
 
 
-def test_a_wrong_index_position_costs_nothing(tmp_path: Path) -> None:
+def test_wrong_index_position_drops_no_message(tmp_path: Path) -> None:
     rows = rows_of(300)
     path = write_bag(tmp_path / "a.bag", rows)
     content = bytearray(path.read_bytes())
@@ -188,7 +188,7 @@ def test_a_wrong_index_position_costs_nothing(tmp_path: Path) -> None:
 @pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(fraction=st.floats(0.0, 1.0), compression=st.sampled_from(COMPRESSIONS))
-def test_a_cut_bag_gives_what_was_before_the_cut(
+def test_truncated_bag_yields_messages_before_cut(
     tmp_path_factory: pytest.TempPathFactory, fraction: float, compression: str
 ) -> None:
     rows = rows_of(300)
@@ -208,7 +208,7 @@ def test_a_cut_bag_gives_what_was_before_the_cut(
         assert not reading.ledger.is_whole
 
 
-def test_a_cut_keeps_all_whole_chunks_and_the_prefix_of_the_last(tmp_path: Path) -> None:
+def test_bag_cut_in_half_yields_about_half_of_messages(tmp_path: Path) -> None:
     rows = rows_of(800)
     content = write_bag(tmp_path / "a.bag", rows).read_bytes()
     path = tmp_path / "cut.bag"
@@ -219,7 +219,7 @@ def test_a_cut_keeps_all_whole_chunks_and_the_prefix_of_the_last(tmp_path: Path)
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4 checked"])
-def test_a_damaged_chunk_is_counted_topic_by_topic(tmp_path: Path, compression: str) -> None:
+def test_messages_of_damaged_chunk_are_counted_by_topic(tmp_path: Path, compression: str) -> None:
     rows = rows_of(600)
     path = write_bag(tmp_path / "a.bag", rows, compression)
     content = bytearray(path.read_bytes())
@@ -237,7 +237,7 @@ def test_a_damaged_chunk_is_counted_topic_by_topic(tmp_path: Path, compression: 
         assert account.in_file == Counter(row.topic for row in rows)[name]
 
 
-def test_a_damaged_record_header_costs_one_message(tmp_path: Path) -> None:
+def test_damaged_record_header_drops_one_message(tmp_path: Path) -> None:
     rows = rows_of(600)
     path = write_bag(tmp_path / "a.bag", rows)
     content = bytearray(path.read_bytes())
@@ -253,7 +253,7 @@ def test_a_damaged_record_header_costs_one_message(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [b"\xff\xff\xff\xff", b"\0\0\0\0"])
 @pytest.mark.parametrize("of_body", [False, True])
-def test_without_an_index_a_damaged_length_costs_two_messages(
+def test_damaged_length_without_index_drops_at_most_two_messages(
     tmp_path: Path, damage: bytes, of_body: bool
 ) -> None:
     payloads = [b"%03d" % i * (3 + i % 5) for i in range(80)]
@@ -269,7 +269,7 @@ def test_without_an_index_a_damaged_length_costs_two_messages(
     assert not reading.ledger.is_whole
 
 
-def test_a_swapped_connection_number_is_caught_by_the_index(tmp_path: Path) -> None:
+def test_changed_connection_number_is_detected_by_index(tmp_path: Path) -> None:
     rows = rows_of(200)
     path = write_bag(tmp_path / "a.bag", rows)
     content = bytearray(path.read_bytes())
@@ -300,7 +300,7 @@ def test_messages_outside_chunks_are_read(tmp_path: Path) -> None:
 
 
 def _loose(count: int, begin: int) -> list[tuple[Row, bytes]]:
-    """Messages outside chunks, of two connections and several lengths."""
+    """Return messages outside chunks, of two connections and several lengths."""
     made = []
     for i in range(begin, begin + count):
         conn, t_ns = i % 2, START_NS + 10_000_000 * i
@@ -333,7 +333,7 @@ def _unindexed(path: Path) -> tuple[Path, list[tuple[int, int, Row]]]:
 
 
 @pytest.mark.parametrize("part", range(0, 32, 8))
-def test_a_flipped_byte_anywhere_in_an_unindexed_bag_costs_what_is_reported(
+def test_flipped_byte_in_unindexed_bag_loses_only_reported_messages(
     tmp_path: Path, part: int
 ) -> None:
     path, places = _unindexed(tmp_path / "a.bag")
@@ -366,7 +366,7 @@ def test_a_flipped_byte_anywhere_in_an_unindexed_bag_costs_what_is_reported(
         assert missing <= (8 if len(hit) == 8 else 3), (at, missing, details)
 
 
-def test_header_fields_may_stand_in_any_order(tmp_path: Path) -> None:
+def test_header_fields_may_be_in_any_order(tmp_path: Path) -> None:
     t_ns = START_NS
     orders = [("op", "conn", "time"), ("time", "conn", "op"), ("conn", "time", "op")]
     values = {"op": b"\x02", "conn": u32(0), "time": stamp(t_ns)}
@@ -395,7 +395,7 @@ def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     assert reading.ledger.topic("/a").skipped == {"another message type on the same topic": 1}
 
 
-def test_a_renamed_topic_keeps_its_stored_name_and_is_reported(tmp_path: Path) -> None:
+def test_renamed_topic_keeps_stored_name_with_notice(tmp_path: Path) -> None:
     renamed = connection(0, b"/old").replace(b"topic=/old", b"topic=/new", 1)
     path = bag(tmp_path / "a.bag", chunk(renamed + message(0, START_NS, b"x")))
     reading = read_rows(path)
@@ -404,7 +404,7 @@ def test_a_renamed_topic_keeps_its_stored_name_and_is_reported(tmp_path: Path) -
     assert any("published as /old" in sentence for sentence in reading.ledger.notices)
 
 
-def test_messages_without_a_connection_are_lost_with_a_word(tmp_path: Path) -> None:
+def test_message_of_unknown_connection_is_dropped(tmp_path: Path) -> None:
     path = bag(tmp_path / "a.bag", chunk(connection(0, b"/a") + message(9, START_NS, b"x")))
     ledger = read_rows(path).ledger
 
@@ -420,7 +420,7 @@ def test_messages_without_a_connection_are_lost_with_a_word(tmp_path: Path) -> N
         (b"PK\x03\x04", "format 2.0"),
     ],
 )
-def test_what_is_no_bag_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
+def test_unsupported_file_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
     path = tmp_path / "a.bag"
     path.write_bytes(content)
 
@@ -428,19 +428,19 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, content: bytes, match: str) -
         open_log(path)
 
 
-def test_an_encrypted_bag_says_so(tmp_path: Path) -> None:
+def test_encrypted_bag_is_refused_with_instructions(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"encrypted by 'rosbag/AesCbcEncryptor'.*rosbag decrypt"):
         open_log(bag(tmp_path / "a.bag", encryptor=b"rosbag/AesCbcEncryptor"))
 
 
-def test_an_empty_bag_is_a_bag(tmp_path: Path) -> None:
+def test_empty_bag_is_read_without_losses(tmp_path: Path) -> None:
     reading = read_rows(write_bag(tmp_path / "a.bag", []))
 
     assert reading.rows == ()
     assert reading.ledger.is_whole
 
 
-def test_a_chunk_that_declares_gigabytes_is_refused_by_its_word(tmp_path: Path) -> None:
+def test_chunk_with_declared_size_over_limit_is_dropped(tmp_path: Path) -> None:
     good = chunk(connection(0, b"/a") + message(0, START_NS, b"x"))
     bomb = chunk(bz2.compress(bytes(1000)), b"bz2", size=2**32 - 1)
     reading = read_rows(bag(tmp_path / "a.bag", good, bomb, good))
@@ -449,7 +449,7 @@ def test_a_chunk_that_declares_gigabytes_is_refused_by_its_word(tmp_path: Path) 
     assert [d.reason for d in reading.ledger.drops()] == ["chunk over the size limit"]
 
 
-def test_a_chunk_that_grows_beyond_its_word_is_dropped(tmp_path: Path) -> None:
+def test_chunk_larger_than_declared_is_dropped(tmp_path: Path) -> None:
     body = connection(0, b"/a") + message(0, START_NS, bytes(5_000_000))
     reading = read_rows(bag(tmp_path / "a.bag", chunk(bz2.compress(body), b"bz2", size=500)))
 
@@ -458,7 +458,7 @@ def test_a_chunk_that_grows_beyond_its_word_is_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_chunk_of_too_many_records_is_stopped(tmp_path: Path) -> None:
+def test_chunk_with_too_many_records_is_not_read_completely(tmp_path: Path) -> None:
     body = connection(0, b"/a") + message(0, START_NS, b"") * 70_000
     path = bag(tmp_path / "a.bag", chunk(bz2.compress(body), b"bz2", size=len(body)))
     limits = Limits(records_per_chunk=1000)
@@ -472,7 +472,7 @@ def test_a_chunk_of_too_many_records_is_stopped(tmp_path: Path) -> None:
     assert not ledger.is_whole
 
 
-def test_a_time_range_is_read_alone_and_the_rest_counted(tmp_path: Path) -> None:
+def test_time_range_is_read_and_other_messages_are_counted(tmp_path: Path) -> None:
     rows = rows_of(1000)
     path = write_bag(tmp_path / "a.bag", rows)
     start, end = rows[400].log_ns, rows[450].log_ns
@@ -486,7 +486,7 @@ def test_a_time_range_is_read_alone_and_the_rest_counted(tmp_path: Path) -> None
     assert reading.ledger.integrity.startswith(("1 chunk", "2 chunk"))
 
 
-def test_topics_not_asked_for_are_counted(tmp_path: Path) -> None:
+def test_unselected_topics_are_counted_as_skipped(tmp_path: Path) -> None:
     rows = rows_of(500)
     path = write_bag(tmp_path / "a.bag", rows)
     reading = read_rows(path, Selection(topics=frozenset({"/gps/fix"})))
@@ -499,7 +499,7 @@ def test_topics_not_asked_for_are_counted(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*COMPRESSIONS, "unclosed"])
-def test_no_damage_goes_unseen(tmp_path: Path, kind: str) -> None:
+def test_any_damage_is_reported(tmp_path: Path, kind: str) -> None:
     rows = rows_of(250)
     path = write_bag(tmp_path / "a.bag", rows, "none" if kind == "unclosed" else kind)
     content = path.read_bytes()

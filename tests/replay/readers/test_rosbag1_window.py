@@ -25,7 +25,7 @@ def stamp(t_ns: int) -> bytes:
     return struct.pack("<II", t_ns // 10**9, t_ns % 10**9)
 
 
-def walked(path: Path, selection: Selection) -> Reading:
+def read_by_complete_pass(path: Path, selection: Selection) -> Reading:
     """Read the range by a complete pass over all chunks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rosbag1_pass, "find_bag_window", lambda *_: "a test")
@@ -42,7 +42,7 @@ def walked(path: Path, selection: Selection) -> Reading:
     start_ns=BOUND,
     end_ns=BOUND,
 )
-def test_a_span_is_what_the_walk_gives(
+def test_time_range_yields_same_rows_as_complete_pass(
     seed: int,
     mixed: int,
     compression: str,
@@ -57,7 +57,7 @@ def test_a_span_is_what_the_walk_gives(
     selection = Selection(topics, start_ns, end_ns)
     with TemporaryDirectory() as folder:
         path = write_bag(Path(folder) / "a.bag", rows, compression, chunk_bytes=2000)
-        ours, whole = read_rows(path, selection), walked(path, selection)
+        ours, whole = read_rows(path, selection), read_by_complete_pass(path, selection)
 
     kept = [
         row
@@ -71,7 +71,7 @@ def test_a_span_is_what_the_walk_gives(
     assert ours.ledger.is_whole
 
 
-def test_chunks_outside_the_span_are_not_looked_at(tmp_path: Path) -> None:
+def test_chunks_outside_time_range_are_not_read(tmp_path: Path) -> None:
     rows = rows_of(1000)
     path = write_bag(tmp_path / "a.bag", rows)
     content = bytearray(path.read_bytes())
@@ -87,7 +87,7 @@ def test_chunks_outside_the_span_are_not_looked_at(tmp_path: Path) -> None:
     assert reading.ledger.integrity.endswith("the rest was not")
 
 
-def test_the_index_is_read_in_large_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_index_is_read_in_large_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_bag(tmp_path / "a.bag", rows_of(2000), chunk_bytes=500)
     sizes: list[int] = []
     pread = os.pread
@@ -104,7 +104,7 @@ def test_the_index_is_read_in_large_pieces(tmp_path: Path, monkeypatch: pytest.M
     assert sum(sizes) <= path.stat().st_size
 
 
-def test_a_wrong_time_in_the_index_is_found_out(tmp_path: Path) -> None:
+def test_wrong_time_in_index_is_detected(tmp_path: Path) -> None:
     rows = rows_of(400)
     path = write_bag(tmp_path / "a.bag", rows, chunk_bytes=2000)
     content = path.read_bytes()

@@ -67,7 +67,7 @@ os._exit(9)
 """
 
 
-def make(path: Path, *rows: tuple[object, ...], tables: str = TABLES) -> Path:
+def write_database(path: Path, *rows: tuple[object, ...], tables: str = TABLES) -> Path:
     """Write a database with ``rows`` of topic id, timestamp and payload."""
     with sqlite3.connect(path) as db:
         db.executescript(tables)
@@ -89,7 +89,7 @@ def db3_of(folder: Path, rows: list[Row]) -> Path:
     return next(write_folder(folder, rows).glob("*.db3"))
 
 
-def test_a_real_database_reads_as_rosbags_reads_it() -> None:
+def test_real_database_matches_rosbags() -> None:
     path = shared("bags", "evo", "tf_example", "tf_example.db3")
     reading = read_rows(path)
     with Reader(path.parent) as reader:
@@ -106,7 +106,7 @@ def test_a_real_database_reads_as_rosbags_reads_it() -> None:
     assert "finds no fault" in reading.ledger.integrity
 
 
-def test_every_message_comes_back_in_stored_order(tmp_path: Path) -> None:
+def test_every_message_is_read_in_stored_order(tmp_path: Path) -> None:
     rows = rows_of(3000)
     reading = read_rows(db3_of(tmp_path / "bag", rows))
 
@@ -116,23 +116,23 @@ def test_every_message_comes_back_in_stored_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["run%41.db3", "a#b.db3", "q?x=1.db3", "-rf.db3", "ü\n.db3"])
-def test_an_odd_file_name_opens_itself(tmp_path: Path, name: str) -> None:
+def test_unusual_file_name_opens_that_file(tmp_path: Path, name: str) -> None:
     for neighbour in ("runA.db3", "a", "q"):
-        make(tmp_path / neighbour, (1, 0, b"wrong"))
-    make(tmp_path / name, (1, 0, b"right"))
+        write_database(tmp_path / neighbour, (1, 0, b"wrong"))
+    write_database(tmp_path / name, (1, 0, b"right"))
 
     assert [row.payload for row in read_rows(tmp_path / name).rows] == [b"right"]
 
 
-def test_a_name_that_is_not_utf8_opens(tmp_path: Path) -> None:
+def test_non_utf8_file_name_is_opened(tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"caf\xe9.db3")
-    make(tmp_path / "plain.db3", (1, 0, b"x")).rename(path)
+    write_database(tmp_path / "plain.db3", (1, 0, b"x")).rename(path)
 
     assert len(read_rows(path).rows) == 1
 
 
 @pytest.mark.parametrize("has_shm", [True, False])
-def test_a_write_ahead_log_is_read_and_nothing_touched(tmp_path: Path, has_shm: bool) -> None:
+def test_write_ahead_log_is_read_and_files_are_unchanged(tmp_path: Path, has_shm: bool) -> None:
     path = tmp_path / "a.db3"
     killed_recorder(path, "wal", 600, 1000)
     if not has_shm:
@@ -166,7 +166,7 @@ def wal_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_sound_write_ahead_log_is_reported_sound(wal_folder: Path) -> None:
+def test_valid_write_ahead_log_is_reported_as_valid(wal_folder: Path) -> None:
     state = check_wal(wal_folder / "a.db3-wal")
 
     assert state is not None
@@ -175,9 +175,7 @@ def test_a_sound_write_ahead_log_is_reported_sound(wal_folder: Path) -> None:
     assert len(read_rows(wal_folder / "a.db3").rows) == 40
 
 
-def test_a_damaged_write_ahead_log_is_never_dropped_in_silence(
-    wal_folder: Path, tmp_path: Path
-) -> None:
+def test_losses_of_damaged_write_ahead_log_are_reported(wal_folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     path.write_bytes((wal_folder / "a.db3").read_bytes())
     truth = read_rows(wal_folder / "a.db3").rows
@@ -193,19 +191,19 @@ def test_a_damaged_write_ahead_log_is_never_dropped_in_silence(
     assert not silent
 
 
-def test_a_closed_wal_database_leaves_no_file_behind(tmp_path: Path) -> None:
+def test_closed_wal_database_leaves_files_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     db = sqlite3.connect(path)
     db.execute("PRAGMA journal_mode=wal")
     db.close()
-    make(path, (1, 0, b"x"))
+    write_database(path, (1, 0, b"x"))
     before = contents(tmp_path)
 
     assert len(read_rows(path).rows) == 1
     assert contents(tmp_path) == before
 
 
-def test_a_hot_journal_is_undone_in_a_copy(tmp_path: Path) -> None:
+def test_hot_journal_is_rolled_back_in_copy(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     killed_recorder(path, "delete", 600, 1000)
     before = contents(tmp_path)
@@ -217,8 +215,8 @@ def test_a_hot_journal_is_undone_in_a_copy(tmp_path: Path) -> None:
     assert any("undone in a temporary copy" in sentence for sentence in reading.ledger.notices)
 
 
-def test_rows_of_wrong_types_are_skipped_by_reason(tmp_path: Path) -> None:
-    path = make(
+def test_rows_of_wrong_types_are_skipped_with_reason(tmp_path: Path) -> None:
+    path = write_database(
         tmp_path / "a.db3",
         (1, 5, b"good"),
         (1, "not a time", b"x"),
@@ -242,7 +240,9 @@ def test_rows_of_wrong_types_are_skipped_by_reason(tmp_path: Path) -> None:
 
 
 def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
-    path = make(tmp_path / "a.db3", (1, 5, b"text"), (2, 6, b"number"), (3, 7, b"more text"))
+    path = write_database(
+        tmp_path / "a.db3", (1, 5, b"text"), (2, 6, b"number"), (3, 7, b"more text")
+    )
     with sqlite3.connect(path) as db:
         db.execute("INSERT INTO topics VALUES(2, '/a', 'std_msgs/msg/Int8', 'cdr')")
         db.execute("INSERT INTO topics VALUES(3, '/a', 'std_msgs/msg/String', 'cdr')")
@@ -253,8 +253,8 @@ def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     assert reading.ledger.topic("/a").skipped == {"another message type on the same topic": 1}
 
 
-def test_a_file_without_definitions_gets_the_known_ones(tmp_path: Path) -> None:
-    reading = read_rows(make(tmp_path / "a.db3", (1, 5, b"x")))
+def test_file_without_definitions_uses_known_ones(tmp_path: Path) -> None:
+    reading = read_rows(write_database(tmp_path / "a.db3", (1, 5, b"x")))
     (topic,) = reading.log.topics
 
     assert topic.schema.startswith(b"string data")
@@ -263,7 +263,7 @@ def test_a_file_without_definitions_gets_the_known_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("has_index", [True, False])
-def test_a_time_range_is_read_alone_and_the_rest_counted(tmp_path: Path, has_index: bool) -> None:
+def test_time_range_is_read_and_other_messages_are_counted(tmp_path: Path, has_index: bool) -> None:
     rows = rows_of(1000)
     path = db3_of(tmp_path / "bag", rows)
     if not has_index:
@@ -281,7 +281,7 @@ def test_a_time_range_is_read_alone_and_the_rest_counted(tmp_path: Path, has_ind
     assert ("a part was read" in reading.ledger.integrity) == has_index
 
 
-def test_topics_not_asked_for_are_counted(tmp_path: Path) -> None:
+def test_unselected_topics_are_counted_as_skipped(tmp_path: Path) -> None:
     rows = rows_of(500)
     path = db3_of(tmp_path / "bag", rows)
     reading = read_rows(path, Selection(topics=frozenset({"/gps/fix"})))
@@ -295,7 +295,7 @@ def test_topics_not_asked_for_are_counted(tmp_path: Path) -> None:
     ("content", "match"),
     [(b"", "begins with b''"), (b"SQLite format 2", "SQLite format 3"), (b"\0" * 999, "SQLite")],
 )
-def test_what_is_no_database_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
+def test_unsupported_file_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
     path = tmp_path / "a.db3"
     path.write_bytes(content)
 
@@ -312,7 +312,9 @@ def test_what_is_no_database_is_refused(tmp_path: Path, content: bytes, match: s
         "timestamp, data) AS (SELECT 1, 1, 1 UNION ALL SELECT 1, 1, 1 FROM n) SELECT * FROM n;",
     ],
 )
-def test_a_database_without_the_tables_says_what_it_holds(tmp_path: Path, tables: str) -> None:
+def test_database_without_bag_tables_is_refused_with_its_tables(
+    tmp_path: Path, tables: str
+) -> None:
     path = tmp_path / "a.db3"
     db = sqlite3.connect(path)
     db.executescript(tables)
@@ -323,8 +325,8 @@ def test_a_database_without_the_tables_says_what_it_holds(tmp_path: Path, tables
 
 
 @pytest.mark.slow
-def test_a_locked_database_says_so(tmp_path: Path) -> None:
-    path = make(tmp_path / "a.db3", (1, 5, b"x"))
+def test_locked_database_is_refused(tmp_path: Path) -> None:
+    path = write_database(tmp_path / "a.db3", (1, 5, b"x"))
     writer = sqlite3.connect(path, isolation_level=None)
     writer.execute("BEGIN EXCLUSIVE")
     try:
@@ -334,7 +336,7 @@ def test_a_locked_database_says_so(tmp_path: Path) -> None:
         writer.close()
 
 
-def test_a_zeroed_page_costs_its_own_rows_only(tmp_path: Path) -> None:
+def test_zeroed_page_drops_only_its_rows(tmp_path: Path) -> None:
     rows = rows_of(2000)
     path = db3_of(tmp_path / "bag", rows)
     content = bytearray(path.read_bytes())
@@ -349,7 +351,7 @@ def test_a_zeroed_page_costs_its_own_rows_only(tmp_path: Path) -> None:
     assert lost == len(rows) - len(reading.rows)
 
 
-def test_a_row_whose_time_the_index_disputes_is_not_given(tmp_path: Path) -> None:
+def test_row_whose_time_contradicts_index_is_dropped(tmp_path: Path) -> None:
     rows = rows_of(300)
     path = db3_of(tmp_path / "bag", rows)
     content = path.read_bytes()
@@ -367,7 +369,7 @@ def test_a_row_whose_time_the_index_disputes_is_not_given(tmp_path: Path) -> Non
 @pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(fraction=st.floats(0.0, 1.0))
-def test_a_cut_database_gives_only_true_rows_and_says_it_is_cut(
+def test_truncated_database_yields_only_stored_rows_and_is_reported(
     tmp_path_factory: pytest.TempPathFactory, fraction: float
 ) -> None:
     rows = rows_of(150)
@@ -383,9 +385,9 @@ def test_a_cut_database_gives_only_true_rows_and_says_it_is_cut(
     assert int(fraction * len(content)) == len(content) or not reading.ledger.is_whole
 
 
-def test_large_messages_come_in_blocks_of_bounded_size(tmp_path: Path) -> None:
+def test_large_messages_are_read_in_blocks_of_bounded_size(tmp_path: Path) -> None:
     rows = [(1, i, bytes([i]) * 3_000_000 if i % 3 == 0 else b"small") for i in range(24)]
-    path = make(tmp_path / "a.db3", *rows)
+    path = write_database(tmp_path / "a.db3", *rows)
     with open_db3(path) as log:
         blocks = list(log.read(Ledger("a")))
 
@@ -394,7 +396,7 @@ def test_large_messages_come_in_blocks_of_bounded_size(tmp_path: Path) -> None:
         assert block.rows.stop.max() <= 12_000_000  # type: ignore[union-attr]
 
 
-def test_compressed_messages_are_given_plain(tmp_path: Path) -> None:
+def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:
     rows = rows_of(400)
     folder = write_folder(tmp_path / "bag", rows, compression="message")
     reading = read_rows(next(folder.glob("*.db3")))
@@ -403,13 +405,13 @@ def test_compressed_messages_are_given_plain(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
 
 
-def test_a_damaged_compressed_message_is_lost_alone(tmp_path: Path) -> None:
+def test_damaged_compressed_message_is_dropped_and_others_are_read(tmp_path: Path) -> None:
     import zstandard
 
     tool = zstandard.ZstdCompressor(write_checksum=True)
     packed = [tool.compress(bytes([i]) * 500) for i in range(5)]
     packed[2] = packed[2][:-1] + bytes([packed[2][-1] ^ 1])
-    path = make(tmp_path / "a.db3", *((1, i, blob) for i, blob in enumerate(packed)))
+    path = write_database(tmp_path / "a.db3", *((1, i, blob) for i, blob in enumerate(packed)))
     reading = read_rows(path)
 
     assert [row.log_ns for row in reading.rows] == [0, 1, 3, 4]
@@ -417,26 +419,26 @@ def test_a_damaged_compressed_message_is_lost_alone(tmp_path: Path) -> None:
     assert reading.ledger.topic("/a").in_file == 5
 
 
-def test_a_compressed_message_that_grows_without_bound_is_lost(tmp_path: Path) -> None:
+def test_compressed_message_over_size_limit_is_dropped(tmp_path: Path) -> None:
     import zstandard
 
     bomb = zstandard.ZstdCompressor().compress(bytes(100 << 20))
-    reading = read_rows(make(tmp_path / "a.db3", (1, 5, bomb), (1, 6, b"\0\1\0\0")))
+    reading = read_rows(write_database(tmp_path / "a.db3", (1, 5, bomb), (1, 6, b"\0\1\0\0")))
 
     assert [row.log_ns for row in reading.rows] == [6]
     assert reading.ledger.topic("/a").dropped == {"damaged compressed message": 1}
 
 
-def test_messages_may_go_back_in_time(tmp_path: Path) -> None:
+def test_messages_may_be_out_of_time_order(tmp_path: Path) -> None:
     times = [START_NS + t for t in (5, 6, 7, 8, 9, 0, 1, 2, 3, 4)]
-    path = make(tmp_path / "a.db3", *((1, t, b"x") for t in times))
+    path = write_database(tmp_path / "a.db3", *((1, t, b"x") for t in times))
 
     assert [row.log_ns for row in read_rows(path).rows] == times
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compression", ["none", "message"])
-def test_no_damage_goes_unseen(tmp_path: Path, compression: str) -> None:
+def test_any_damage_is_reported(tmp_path: Path, compression: str) -> None:
     rows = rows_of(250)
     is_packed = compression == "message"
     folder = write_folder(tmp_path / "bag", rows, compression="message" if is_packed else "none")
@@ -451,8 +453,10 @@ def test_no_damage_goes_unseen(tmp_path: Path, compression: str) -> None:
     assert not silent
 
 
-def test_a_sound_file_is_gone_through_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = make(tmp_path / "a.db3", *[(1, i, b"x" * i) for i in range(50)])
+def test_undamaged_file_is_read_in_one_pass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_database(tmp_path / "a.db3", *[(1, i, b"x" * i) for i in range(50)])
 
     def counted(*_: object) -> None:
         raise AssertionError("the table was gone through again")
@@ -464,8 +468,8 @@ def test_a_sound_file_is_gone_through_once(tmp_path: Path, monkeypatch: pytest.M
     assert len(reading.rows) == 50
 
 
-def test_payloads_of_topics_not_asked_for_are_not_fetched(tmp_path: Path) -> None:
-    path = make(
+def test_payloads_of_unselected_topics_are_not_checked(tmp_path: Path) -> None:
+    path = write_database(
         tmp_path / "a.db3",
         (1, 1, b"wanted"),
         (2, 2, "no blob"),

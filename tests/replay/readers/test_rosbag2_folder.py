@@ -23,7 +23,7 @@ Storage = Literal["sqlite3", "mcap"]
 STORAGES: tuple[Storage, ...] = ("sqlite3", "mcap")
 
 
-def joined(folder: Path, *parts: list[Row], storage: Storage = "sqlite3") -> Path:
+def folder_of_parts(folder: Path, *parts: list[Row], storage: Storage = "sqlite3") -> Path:
     """Write a folder whose storage files ``part_0``, ``part_1``, ... have the rows of each part."""
     folder.mkdir()
     suffix = "db3" if storage == "sqlite3" else "mcap"
@@ -33,7 +33,7 @@ def joined(folder: Path, *parts: list[Row], storage: Storage = "sqlite3") -> Pat
     return folder
 
 
-def listing(folder: Path, *names: str, counts: dict[str, int] | None = None) -> None:
+def write_metadata(folder: Path, *names: str, counts: dict[str, int] | None = None) -> None:
     """Write a metadata.yaml that lists ``names``, with message counts by topic."""
     files = "".join(f"  - {name}\n" for name in names)
     topics = "".join(
@@ -51,7 +51,7 @@ def count_by_topic(rows: list[Row]) -> dict[str, int]:
     return dict(Counter(row.topic for row in rows))
 
 
-def test_a_real_folder_reads_as_rosbags_reads_it() -> None:
+def test_real_folder_matches_rosbags() -> None:
     path = shared("bags", "evo", "tf_example")
     reading = read_rows(path)
     with Reader(path) as reader:
@@ -64,7 +64,7 @@ def test_a_real_folder_reads_as_rosbags_reads_it() -> None:
 
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("compression", ["none", "file", "message"])
-def test_every_kind_of_folder_comes_back_whole(
+def test_every_kind_of_folder_is_read_completely(
     tmp_path: Path, storage: Storage, compression: Literal["none", "file", "message"]
 ) -> None:
     rows = rows_of(600)
@@ -81,10 +81,10 @@ def test_every_kind_of_folder_comes_back_whole(
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_files_are_read_in_the_order_of_time_not_of_names(tmp_path: Path, storage: Storage) -> None:
+def test_files_are_read_in_order_of_time_not_name(tmp_path: Path, storage: Storage) -> None:
     rows = rows_of(400)
-    folder = joined(tmp_path / "bag", rows[200:], rows[:200], storage=storage)
-    listing(folder, *(path.name for path in sorted(folder.iterdir())))
+    folder = folder_of_parts(tmp_path / "bag", rows[200:], rows[:200], storage=storage)
+    write_metadata(folder, *(path.name for path in sorted(folder.iterdir())))
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows)
@@ -93,7 +93,7 @@ def test_files_are_read_in_the_order_of_time_not_of_names(tmp_path: Path, storag
 @pytest.mark.parametrize("storage", STORAGES)
 def test_overlapping_files_are_merged_by_time(tmp_path: Path, storage: Storage) -> None:
     rows = rows_of(900)
-    folder = joined(tmp_path / "bag", rows[0::3], rows[1::3], rows[2::3], storage=storage)
+    folder = folder_of_parts(tmp_path / "bag", rows[0::3], rows[1::3], rows[2::3], storage=storage)
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows)
@@ -103,22 +103,24 @@ def test_overlapping_files_are_merged_by_time(tmp_path: Path, storage: Storage) 
 @pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(cuts=st.lists(st.integers(0, 300), min_size=2, max_size=4), seed=st.integers(0, 99))
-def test_however_rows_are_split_they_come_back_in_order(
+def test_rows_split_over_files_are_read_in_order(
     tmp_path_factory: pytest.TempPathFactory, cuts: list[int], seed: int
 ) -> None:
     rows = rows_of(300, seed)
     edges = sorted({0, 300, *cuts})
     parts = [rows[a:b] for a, b in pairwise(edges)]
     overlapping = [part[i::2] for part in parts for i in (0, 1)]
-    folder = joined(tmp_path_factory.mktemp("split") / "bag", *[p for p in overlapping if p])
+    folder = folder_of_parts(
+        tmp_path_factory.mktemp("split") / "bag", *[p for p in overlapping if p]
+    )
 
     assert by_topic(read_rows(folder).rows) == by_topic(rows)
 
 
-def test_a_file_that_is_not_listed_is_read_and_reported(tmp_path: Path) -> None:
+def test_unlisted_file_is_read_with_notice(tmp_path: Path) -> None:
     rows = rows_of(300)
-    folder = joined(tmp_path / "bag", rows[:100], rows[100:])
-    listing(folder, "part_0.db3", counts=count_by_topic(rows))
+    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
+    write_metadata(folder, "part_0.db3", counts=count_by_topic(rows))
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows)
@@ -126,10 +128,10 @@ def test_a_file_that_is_not_listed_is_read_and_reported(tmp_path: Path) -> None:
     assert "part_1.db3 is not listed in metadata.yaml; it was read" in reading.ledger.notices
 
 
-def test_a_listed_file_that_is_missing_is_lost_by_topic(tmp_path: Path) -> None:
+def test_messages_of_missing_listed_file_are_dropped_by_topic(tmp_path: Path) -> None:
     rows = rows_of(300)
-    folder = joined(tmp_path / "bag", rows[:100], rows[100:])
-    listing(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
+    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
+    write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
     (folder / "part_1.db3").unlink()
     ledger = read_rows(folder).ledger
     lost = {name: a.dropped["storage file is missing"] for name, a in ledger.accounts.items()}
@@ -139,19 +141,19 @@ def test_a_listed_file_that_is_missing_is_lost_by_topic(tmp_path: Path) -> None:
         assert ledger.topic(name).in_file == count
 
 
-def test_a_missing_file_without_counts_is_still_reported(tmp_path: Path) -> None:
-    folder = joined(tmp_path / "bag", rows_of(50))
-    listing(folder, "part_0.db3", "part_1.db3")
+def test_missing_file_without_counts_is_reported(tmp_path: Path) -> None:
+    folder = folder_of_parts(tmp_path / "bag", rows_of(50))
+    write_metadata(folder, "part_0.db3", "part_1.db3")
     ledger = read_rows(folder).ledger
 
     assert not ledger.is_whole
     assert [d.detail for d in ledger.drops()] == ["part_1.db3"]
 
 
-def test_a_listed_file_that_does_not_open_is_lost_and_named(tmp_path: Path) -> None:
+def test_messages_of_unreadable_listed_file_are_dropped(tmp_path: Path) -> None:
     rows = rows_of(300)
-    folder = joined(tmp_path / "bag", rows[:100], rows[100:])
-    listing(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
+    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
+    write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
     (folder / "part_1.db3").write_bytes(b"nothing of the kind")
     reading = read_rows(folder)
 
@@ -162,10 +164,10 @@ def test_a_listed_file_that_does_not_open_is_lost_and_named(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("declared", [0, 1])
-def test_wrong_counts_in_the_metadata_are_a_notice(tmp_path: Path, declared: int) -> None:
+def test_too_low_counts_in_metadata_yield_notice(tmp_path: Path, declared: int) -> None:
     rows = rows_of(200)
-    folder = joined(tmp_path / "bag", rows)
-    listing(folder, "part_0.db3", counts={"/can": declared})
+    folder = folder_of_parts(tmp_path / "bag", rows)
+    write_metadata(folder, "part_0.db3", counts={"/can": declared})
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows)
@@ -173,10 +175,10 @@ def test_wrong_counts_in_the_metadata_are_a_notice(tmp_path: Path, declared: int
     assert any(f"counts {declared} messages" in said for said in reading.ledger.notices)
 
 
-def test_what_the_metadata_counts_beyond_the_rows_is_dropped(tmp_path: Path) -> None:
+def test_messages_missing_from_metadata_count_are_dropped(tmp_path: Path) -> None:
     rows = rows_of(200)
-    folder = joined(tmp_path / "bag", rows)
-    listing(folder, "part_0.db3", counts={"/can": 10_000})
+    folder = folder_of_parts(tmp_path / "bag", rows)
+    write_metadata(folder, "part_0.db3", counts={"/can": 10_000})
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows)
@@ -184,7 +186,7 @@ def test_what_the_metadata_counts_beyond_the_rows_is_dropped(tmp_path: Path) -> 
     assert reading.ledger.topic("/can").dropped == {"metadata.yaml counts more": missing}
 
 
-def test_topics_that_the_metadata_leaves_out_or_describes_otherwise_are_read(
+def test_topics_missing_from_metadata_are_read(
     tmp_path: Path,
 ) -> None:
     rows = rows_of(300)
@@ -214,9 +216,9 @@ def test_topics_that_the_metadata_leaves_out_or_describes_otherwise_are_read(
         "x" * 2_000_000,
     ],
 )
-def test_metadata_of_any_kind_never_stops_the_reading(tmp_path: Path, text: str) -> None:
+def test_invalid_metadata_does_not_stop_reading(tmp_path: Path, text: str) -> None:
     rows = rows_of(60)
-    folder = joined(tmp_path / "bag", rows)
+    folder = folder_of_parts(tmp_path / "bag", rows)
     (folder / "metadata.yaml").write_text(text)
     reading = read_rows(folder)
 
@@ -224,7 +226,7 @@ def test_metadata_of_any_kind_never_stops_the_reading(tmp_path: Path, text: str)
     assert reading.ledger.notices
 
 
-def test_a_packed_file_and_its_unpacked_twin_are_read_once(tmp_path: Path) -> None:
+def test_compressed_file_and_its_decompressed_copy_are_read_once(tmp_path: Path) -> None:
     rows = rows_of(100)
     folder = write_folder(tmp_path / "bag", rows, compression="file")
     plain = write_folder(tmp_path / "plain", rows)
@@ -235,12 +237,12 @@ def test_a_packed_file_and_its_unpacked_twin_are_read_once(tmp_path: Path) -> No
     assert any("it was not read" in sentence for sentence in reading.ledger.notices)
 
 
-def test_the_same_recording_in_two_formats_is_read_once(tmp_path: Path) -> None:
+def test_same_recording_in_two_formats_is_read_once(tmp_path: Path) -> None:
     rows = rows_of(100)
-    folder = joined(tmp_path / "bag", rows)
+    folder = folder_of_parts(tmp_path / "bag", rows)
     other = write_folder(tmp_path / "other", rows, "mcap")
     shutil.copy(next(other.glob("*.mcap")), folder / "part_0.mcap")
-    listing(folder, "part_0.db3")
+    write_metadata(folder, "part_0.db3")
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows)
@@ -248,7 +250,7 @@ def test_the_same_recording_in_two_formats_is_read_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_a_cut_packed_file_gives_its_readable_part(tmp_path: Path, storage: Storage) -> None:
+def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage: Storage) -> None:
     rows = rows_of(4000)
     folder = write_folder(tmp_path / "bag", rows, storage, compression="file")
     path = next(folder.glob("*.zstd"))
@@ -262,7 +264,7 @@ def test_a_cut_packed_file_gives_its_readable_part(tmp_path: Path, storage: Stor
     assert lost == len(rows) - len(reading.rows)
 
 
-def test_a_packed_file_cut_at_its_start_is_refused_by_its_own_name(tmp_path: Path) -> None:
+def test_compressed_file_cut_near_start_is_refused_with_its_name(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "bag", rows_of(100), compression="file")
     path = next(folder.glob("*.zstd"))
     path.write_bytes(path.read_bytes()[:50])
@@ -271,7 +273,7 @@ def test_a_packed_file_cut_at_its_start_is_refused_by_its_own_name(tmp_path: Pat
         open_log(folder)
 
 
-def test_a_packed_file_that_grows_without_bound_is_stopped(tmp_path: Path) -> None:
+def test_decompression_stops_at_size_limit(tmp_path: Path) -> None:
     import zstandard
 
     from crosscue.replay.base import Limits
@@ -286,9 +288,9 @@ def test_a_packed_file_that_grows_without_bound_is_stopped(tmp_path: Path) -> No
     assert (tmp_path / "a.db3").stat().st_size < 80 << 20
 
 
-def test_topics_of_two_types_are_not_mixed(tmp_path: Path) -> None:
+def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     rows = rows_of(100)
-    folder = joined(tmp_path / "bag", rows[:50], rows[50:])
+    folder = folder_of_parts(tmp_path / "bag", rows[:50], rows[50:])
     with sqlite3.connect(folder / "part_1.db3") as db:
         db.execute("UPDATE topics SET type = 'std_msgs/msg/Int8' WHERE name = '/can'")
     db.close()
@@ -298,9 +300,9 @@ def test_topics_of_two_types_are_not_mixed(tmp_path: Path) -> None:
     assert reading.ledger.topic("/can").skipped == {"another message type on the same topic": odd}
 
 
-def test_a_time_range_reaches_over_files(tmp_path: Path) -> None:
+def test_time_range_spans_files(tmp_path: Path) -> None:
     rows = rows_of(400)
-    folder = joined(tmp_path / "bag", rows[:200], rows[200:])
+    folder = folder_of_parts(tmp_path / "bag", rows[:200], rows[200:])
     selection = Selection(start_ns=rows[150].log_ns, end_ns=rows[250].log_ns)
     reading = read_rows(folder, selection)
 
@@ -309,9 +311,7 @@ def test_a_time_range_reaches_over_files(tmp_path: Path) -> None:
     assert skipped == 300
 
 
-def test_nothing_is_left_behind_in_the_temporary_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_temporary_files_are_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_folder(tmp_path / "bag", rows_of(100), compression="file")
     scratch = tmp_path / "scratch"
     scratch.mkdir()
@@ -327,8 +327,8 @@ def test_nothing_is_left_behind_in_the_temporary_folder(
     assert not list(scratch.iterdir())
 
 
-def test_a_folder_without_a_file_that_opens_is_refused(tmp_path: Path) -> None:
-    folder = joined(tmp_path / "bag", rows_of(10))
+def test_folder_without_readable_storage_file_is_refused(tmp_path: Path) -> None:
+    folder = folder_of_parts(tmp_path / "bag", rows_of(10))
     (folder / "part_0.db3").write_bytes(b"")
     (folder / "metadata.yaml").write_text("")
 

@@ -59,7 +59,7 @@ def plain(lot: PageRows) -> Iterator[Stored]:
 
 
 def empty(path: Path, page_bytes: int, reserved: int, auto_vacuum: int = 0) -> sqlite3.Connection:
-    """Create a database without tables whose pages have ``reserved`` bytes at their ends."""
+    """Create a database without tables and with ``reserved`` bytes at the end of each page."""
     db = sqlite3.connect(path, isolation_level=None)
     db.execute(f"PRAGMA page_size={page_bytes}")
     db.execute(f"PRAGMA auto_vacuum={auto_vacuum}")
@@ -74,7 +74,7 @@ def empty(path: Path, page_bytes: int, reserved: int, auto_vacuum: int = 0) -> s
 
 
 def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index: bool) -> None:
-    """Return rows of all kinds that a table can have, some of them deleted."""
+    """Insert rows of all kinds that a table can have, and delete some of them."""
     db.executescript(TOPICS + MESSAGES + (INDEX if has_index else ""))
     chance = random.Random(seed)
     db.execute("BEGIN")
@@ -103,7 +103,7 @@ def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index:
     largest=st.sampled_from([10, 5000, 200_000]),
     seed=st.integers(0, 1 << 30),
 )
-def test_every_row_is_the_one_that_sqlite_gives(
+def test_rows_read_from_pages_equal_sqlite_rows(
     tmp_path_factory: pytest.TempPathFactory,
     page_bytes: int,
     reserved: int,
@@ -119,14 +119,14 @@ def test_every_row_is_the_one_that_sqlite_gives(
     assert rows_in_pages(path) == stored_rows(path)
 
 
-def test_the_rows_of_a_real_database_come_out_of_its_pages() -> None:
+def test_rows_of_real_database_equal_sqlite_rows() -> None:
     path = shared("bags", "evo", "tf_example", "tf_example.db3")
 
     assert rows_in_pages(path) == stored_rows(path)
     assert len(stored_rows(path)) == 518
 
 
-def test_long_payloads_in_pages_out_of_order_come_whole_and_in_bounded_lots(tmp_path: Path) -> None:
+def test_long_payloads_in_scattered_pages_are_complete_and_batches_bounded(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     db = empty(path, 512, 0)
     db.executescript(TOPICS + MESSAGES + INDEX + "BEGIN;")
@@ -147,7 +147,7 @@ def test_long_payloads_in_pages_out_of_order_come_whole_and_in_bounded_lots(tmp_
     assert max(len(lot.messages.buffer) for lot in lots) <= 8 << 20
 
 
-def test_payloads_of_topics_not_asked_for_stay_where_they_are(tmp_path: Path) -> None:
+def test_payloads_of_unselected_topics_are_not_read(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     fill(empty(path, 1024, 0), 3, 200, 9000, has_index=True)
     rows = [(*row[:3], row[3] if row[1] == 1 else b"") for row in stored_rows(path)]
@@ -159,7 +159,7 @@ def test_payloads_of_topics_not_asked_for_stay_where_they_are(tmp_path: Path) ->
     "odd",
     [(1, 5, None), (1, 5, "text"), (1, 5, 7), (1, 2.5, b"x"), (1, "x", b"x"), (b"1", 5, b"x")],
 )
-def test_reading_ends_before_a_value_of_another_type(
+def test_page_reading_stops_before_value_of_unexpected_type(
     tmp_path: Path, odd: tuple[object, ...]
 ) -> None:
     path = tmp_path / "a.db3"
@@ -184,7 +184,7 @@ def test_reading_ends_before_a_value_of_another_type(
         ("id INTEGER PRIMARY KEY", "id TEXT PRIMARY KEY"),
     ],
 )
-def test_another_table_is_left_to_sqlite(tmp_path: Path, old: str, new: str) -> None:
+def test_unsupported_table_definition_is_left_to_sqlite(tmp_path: Path, old: str, new: str) -> None:
     db = empty(tmp_path / "a.db3", 4096, 0)
     db.executescript(TOPICS + MESSAGES.replace(old, new))
     db.execute("INSERT INTO messages(id, topic_id, timestamp, data) VALUES(1, 1, 5, x'01')")
@@ -193,7 +193,7 @@ def test_another_table_is_left_to_sqlite(tmp_path: Path, old: str, new: str) -> 
     assert rows_in_pages(tmp_path / "a.db3") == []
 
 
-def test_a_row_with_fewer_values_than_columns_is_left_to_sqlite(tmp_path: Path) -> None:
+def test_row_with_fewer_values_than_columns_is_left_to_sqlite(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     db = empty(path, 4096, 0)
     db.executescript(
@@ -207,7 +207,7 @@ def test_a_row_with_fewer_values_than_columns_is_left_to_sqlite(tmp_path: Path) 
     assert [row.payload for row in read_rows(path).rows] == [b"\1\2"]
 
 
-def test_a_write_ahead_log_is_left_to_sqlite(tmp_path: Path) -> None:
+def test_write_ahead_log_is_left_to_sqlite(tmp_path: Path) -> None:
     db = sqlite3.connect(tmp_path / "a.db3", isolation_level=None)
     db.execute("PRAGMA journal_mode=wal")
     db.executescript(TOPICS + MESSAGES + "INSERT INTO messages VALUES(1, 1, 5, x'01');")
@@ -229,7 +229,7 @@ def outcome(path: Path, selection: Selection = EVERYTHING) -> object:
 
 
 @pytest.mark.slow
-def test_damaged_copies_read_as_sqlite_alone_reads_them(
+def test_damaged_copies_read_like_sqlite_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = next(write_folder(tmp_path / "bag", rows_of(250)).glob("*.db3"))
@@ -252,7 +252,7 @@ def test_damaged_copies_read_as_sqlite_alone_reads_them(
 
 
 @pytest.mark.slow
-def test_hostile_pages_end_the_reading_without_an_error(tmp_path: Path) -> None:
+def test_malformed_pages_end_reading_without_duplicates(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     fill(empty(path, 512, 0), 9, 150, 3000, has_index=False)
     whole, truth = path.read_bytes(), stored_rows(path)
@@ -275,7 +275,7 @@ def test_hostile_pages_end_the_reading_without_an_error(tmp_path: Path) -> None:
     assert len(counts) > 5
 
 
-def test_a_file_cut_while_it_is_read_is_said_to_have_changed(tmp_path: Path) -> None:
+def test_file_truncated_during_reading_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     fill(empty(path, 512, 0), 9, 150, 3000, has_index=True)
     ledger = Ledger("a")
@@ -288,7 +288,7 @@ def test_a_file_cut_while_it_is_read_is_said_to_have_changed(tmp_path: Path) -> 
     assert not ledger.is_whole
 
 
-def test_nobody_writes_while_the_pages_are_read(tmp_path: Path) -> None:
+def test_database_is_locked_for_writing_while_pages_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     fill(empty(path, 4096, 0), 9, 150, 3000, has_index=True)
     writer = sqlite3.connect(path, isolation_level=None, timeout=0)

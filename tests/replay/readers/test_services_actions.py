@@ -47,14 +47,14 @@ FEEDBACK_TEXT = (
     f"{END}MSG: example_interfaces/action/Fibonacci_Feedback\nint32[] sequence\n{UUID}"
 )
 SERVICE_TEXTS = {
-    "whole": EVENT_TEXT,
-    "that of the service": "int64 a\nint64 b\n---\nint64 sum\n",
+    "complete": EVENT_TEXT,
+    "service definition": "int64 a\nint64 b\n---\nint64 sum\n",
     "types missing": EVENT_TEXT.partition(END)[0],
     "none": "",
 }
 FEEDBACK_TEXTS = {
-    "whole": FEEDBACK_TEXT,
-    "that of the action": "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
+    "complete": FEEDBACK_TEXT,
+    "action definition": "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n",
     "types missing": FEEDBACK_TEXT.partition(END)[0],
     "none": "",
 }
@@ -64,7 +64,7 @@ Storage = Literal["sqlite3", "mcap"]
 def payload(topic: str, i: int) -> bytes:
     """Return a message as a recorder stores it."""
     head = b"\x00\x01\x00\x00"
-    if topic == SERVICE:  # event, stamp, client, number; one request; no response
+    if topic == SERVICE:  # Event, stamp, client, number; one request; no response.
         fixed = struct.pack("<B3xiI16sq", 1, i, 0, bytes(range(16)), i)
         return head + fixed + struct.pack("<I4xqqI", 1, i, 2 * i, 0)
     if topic == FEEDBACK:
@@ -105,14 +105,14 @@ def opened(folder: Path, as_folder: bool) -> Path:
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("as_folder", [True, False])
 @pytest.mark.parametrize("service", list(SERVICE_TEXTS))
-def test_service_events_are_skipped_as_what_they_are(
+def test_service_events_are_skipped_with_their_reason(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     storage: Storage,
     service: str,
     as_folder: bool,
 ) -> None:
-    path = opened(bag(tmp_path / "bag", storage, texts(service, "whole")), as_folder)
+    path = opened(bag(tmp_path / "bag", storage, texts(service, "complete")), as_folder)
 
     status = cli.run(["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--json"])
     said = capsys.readouterr()
@@ -132,30 +132,30 @@ def test_service_events_are_skipped_as_what_they_are(
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("feedback", list(FEEDBACK_TEXTS))
-def test_action_feedback_is_read_where_its_definition_is_stored(
+def test_action_feedback_is_read_if_its_definition_is_stored(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], storage: Storage, feedback: str
 ) -> None:
-    path = bag(tmp_path / "bag", storage, texts("whole", feedback))
+    path = bag(tmp_path / "bag", storage, texts("complete", feedback))
 
     cli.run(["decode", str(path), "-o", str(tmp_path / "tables"), "--json"])
     said = capsys.readouterr()
 
     accounts = json.loads((tmp_path / "tables" / "manifest.json").read_text())["account"]["reading"]
     topics = accounts[0]["topics"]
-    whole = feedback in ("whole", "that of the action")
-    skipped = {} if whole else {"action feedback without a complete definition": ROWS}
+    is_complete = feedback in ("complete", "action definition")
+    skipped = {} if is_complete else {"action feedback without a complete definition": ROWS}
     assert topics[FEEDBACK]["skipped"] == skipped
     assert topics[STATUS]["skipped"] == {}
     assert topics[SERVICE]["skipped"] == {"service event": ROWS}
     assert "damaged" not in said.out + said.err
-    if whole:
+    if is_complete:
         table = pq.read_table(tmp_path / "tables" / "fibonacci__action_feedback.parquet")
         assert table.num_rows == ROWS
     with open_log(path) as log:
         assert {topic.name for topic in log.topics} == set(TYPES)
 
 
-def test_a_message_type_that_only_ends_like_an_event_is_data(
+def test_message_type_with_event_suffix_is_read_as_data(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:

@@ -20,7 +20,7 @@ def row_of(line: str) -> Row:
     "line",
     ["not a number", "5 1.0", "5 1.0 2.0 3.0", f"{1 << 64} 1.0 2.0", "5 1.0 " + "2" * MAX_LINE],
 )
-def test_a_line_that_is_no_row_is_dropped_alone(line: str, tmp_path: Path) -> None:
+def test_invalid_line_is_dropped_and_others_are_read(line: str, tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_text(f"1 2.0 3.0\n{line}\n9 4.0 5.0\n")
     ledger = Ledger("log.txt")
@@ -38,7 +38,7 @@ def test_a_line_that_is_no_row_is_dropped_alone(line: str, tmp_path: Path) -> No
     assert (account.found, sum(account.dropped.values())) == (2, 1)
 
 
-def test_empty_lines_are_no_rows(tmp_path: Path) -> None:
+def test_empty_lines_are_ignored(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_text("1 2.0\n\n9 4.0\n  \n")
     ledger = Ledger("log.txt")
