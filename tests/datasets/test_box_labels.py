@@ -62,7 +62,7 @@ def read(path: Path) -> BoxLabels:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_holds_the_same_box(name: str, tmp_path: Path) -> None:
+def test_every_format_yields_same_box(name: str, tmp_path: Path) -> None:
     found = read(FORMATS[name](tmp_path))
 
     (picture,) = found.pictures
@@ -75,7 +75,7 @@ def test_every_format_holds_the_same_box(name: str, tmp_path: Path) -> None:
     assert car.range_m == 12.5 if name in ("coco", "kitti") else math.isnan(car.range_m)
 
 
-def test_what_is_outside_is_cut_or_counted(tmp_path: Path) -> None:
+def test_boxes_outside_picture_are_clipped_or_counted(tmp_path: Path) -> None:
     (tmp_path / "classes.txt").write_text("car\n")
     (tmp_path / "7.txt").write_text("0 0.95 0.5 0.4 0.5\n0 1.5 0.5 0.4 0.5\n0 0.5 0.5 0 0.5\n")
     left_out: Counter[str] = Counter()
@@ -90,7 +90,7 @@ def test_what_is_outside_is_cut_or_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("files", "error", "said"),
+    ("files", "error", "message"),
     [
         ({"7.txt": "0 .5 .5 .1 .1"}, UsageError, "--class-names FILE"),
         ({"7.txt": "car 0 0 0 1 2"}, AnnotationError, "7.txt:1: 6 columns; expected KITTI"),
@@ -129,8 +129,8 @@ def test_what_is_outside_is_cut_or_counted(tmp_path: Path) -> None:
         ({}, AnnotationError, "no labels of boxes"),
     ],
 )
-def test_what_cannot_be_read_is_one_line(
-    files: dict[str, str], error: type[CrosscueError], said: str, tmp_path: Path
+def test_unreadable_labels_are_refused_in_one_line(
+    files: dict[str, str], error: type[CrosscueError], message: str, tmp_path: Path
 ) -> None:
     for name, text in files.items():
         (tmp_path / name).write_text(text)
@@ -138,11 +138,11 @@ def test_what_cannot_be_read_is_one_line(
     with pytest.raises(error) as raised:
         read(tmp_path)
 
-    assert said in str(raised.value)
+    assert message in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
-def test_empty_labels_are_an_answer_and_no_labels_are_none(tmp_path: Path) -> None:
+def test_empty_label_file_is_valid_but_no_images_are_refused(tmp_path: Path) -> None:
     (tmp_path / "classes.txt").write_text("car\n")
     (tmp_path / "7.txt").write_text("")
     assert read(tmp_path).pictures[0].boxes == ()

@@ -44,7 +44,7 @@ def test_every_row_of_the_real_segment_is_accounted_for() -> None:
     assert damaged == {"imu/magnetometer_uncalibrated": 64}
 
 
-def test_axes_become_forward_left_up() -> None:
+def test_gyro_axes_are_converted_to_forward_left_up() -> None:
     path = shared(*SEGMENT)
     raw = np.load(path / "processed_log/IMU/gyro/value", allow_pickle=False)
     with open_log(path) as log:
@@ -56,7 +56,7 @@ def test_axes_become_forward_left_up() -> None:
     np.testing.assert_array_equal(yaw, -raw[:, 2])
 
 
-def test_can_bytes_are_those_of_the_file_with_trailing_zeros() -> None:
+def test_can_payloads_equal_stored_bytes_with_trailing_zeros() -> None:
     path = shared(*SEGMENT)
     raw = np.load(path / "processed_log/CAN/raw_can/data", allow_pickle=False)
     source = np.load(path / "processed_log/CAN/raw_can/src", allow_pickle=False)
@@ -70,7 +70,7 @@ def test_can_bytes_are_those_of_the_file_with_trailing_zeros() -> None:
 
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("cut_bytes", [0, 1, 8, 100, 700, 10_000])
-def test_a_cut_array_gives_exactly_its_whole_rows(
+def test_truncated_array_yields_exactly_its_complete_rows(
     tmp_path: Path, order: str, cut_bytes: int
 ) -> None:
     rows = np.arange(90.0).reshape(30, 3)
@@ -88,14 +88,14 @@ def test_a_cut_array_gives_exactly_its_whole_rows(
     assert len(column.rows) == whole
 
 
-def test_arrays_of_objects_are_refused(tmp_path: Path) -> None:
+def test_object_arrays_are_refused(tmp_path: Path) -> None:
     path = _save(tmp_path / "value", np.array([{"a": 1}], dtype=object))
 
     with pytest.raises(LogFormatError, match="plain numbers"):
         read_column(path)
 
 
-def test_one_unreadable_array_does_not_take_the_others_along(tmp_path: Path) -> None:
+def test_unreadable_array_does_not_affect_other_streams(tmp_path: Path) -> None:
     imu = tmp_path / "processed_log" / "IMU"
     for name in ("gyro", "accelerometer"):
         _save(imu / name / "t", np.arange(5.0))
@@ -111,19 +111,19 @@ def test_one_unreadable_array_does_not_take_the_others_along(tmp_path: Path) -> 
     assert "accelerometer" in ledger.details[0].detail
 
 
-def test_a_folder_without_a_recording_is_no_log(tmp_path: Path) -> None:
+def test_folder_without_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
 
     with pytest.raises(UnknownFormatError, match="comma2k19"):
         open_log(tmp_path)
 
 
-def test_rows_outside_the_wanted_span_are_counted() -> None:
+def test_rows_outside_time_range_are_counted() -> None:
     with open_log(shared(*SEGMENT)) as log:
         ledger = Ledger("")
         start_ns = 46_420_000_000_000
-        wanted = Selection(frozenset({"car/speed"}), start_ns, start_ns + 10**10)
-        times = np.concatenate([block.log_ns for block in log.read(ledger, wanted)])
+        selection = Selection(frozenset({"car/speed"}), start_ns, start_ns + 10**10)
+        times = np.concatenate([block.log_ns for block in log.read(ledger, selection)])
 
     account = ledger.topic("car/speed")
     assert ((times >= start_ns) & (times < start_ns + 10**10)).all()
@@ -132,9 +132,7 @@ def test_rows_outside_the_wanted_span_are_counted() -> None:
 
 
 @pytest.mark.parametrize("damaged", [np.nan, np.inf, -1e300, 5e8, -5e8])
-def test_a_time_that_damage_made_impossible_or_far_costs_its_row_alone(
-    tmp_path: Path, damaged: float
-) -> None:
+def test_invalid_time_drops_only_its_row(tmp_path: Path, damaged: float) -> None:
     times = np.arange(50) * 0.01
     times[0] = damaged
     folder = tmp_path / "processed_log" / "IMU" / "gyro"
@@ -151,7 +149,7 @@ def test_a_time_that_damage_made_impossible_or_far_costs_its_row_alone(
     assert dropped == ({} if is_time else {"a row without a valid time": 1})
 
 
-OTHERS: dict[str, NDArray[np.generic]] = {
+UNEXPECTED_ARRAYS: dict[str, NDArray[np.generic]] = {
     "no columns": np.zeros(40),
     "two columns": np.zeros((40, 2)),
     "a third dimension": np.zeros((40, 3, 2)),
@@ -159,11 +157,11 @@ OTHERS: dict[str, NDArray[np.generic]] = {
     "complex": np.zeros((40, 3), np.complex128),
     "no row": np.zeros((0, 3)),
 }
-"""Arrays that another stream or another writer might have stored under a file's name."""
+"""Arrays of unexpected type or shape that a file might contain."""
 
 
 def _segment(folder: Path) -> Path:
-    """Every array that a segment may have, of 40 rows."""
+    """Write every array that a segment may have, with 40 rows each."""
     for stream in STREAMS.values():
         place = folder / "processed_log" / stream.folder
         _save(place / "t", np.arange(40) * 0.1)
@@ -180,15 +178,13 @@ def _segment(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", OTHERS)
-def test_an_array_of_another_kind_is_reported_whichever_it_replaces(
-    kind: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("kind", UNEXPECTED_ARRAYS)
+def test_array_of_unexpected_type_is_reported(kind: str, tmp_path: Path) -> None:
     log = _segment(tmp_path / "segment")
     rows, _ = read(log)
     for file in [one for one in sorted(log.rglob("*")) if one.is_file()]:
         whole = file.read_bytes()
-        _save(file, OTHERS[kind])
+        _save(file, UNEXPECTED_ARRAYS[kind])
 
         blocks, ledger = read(log)
 

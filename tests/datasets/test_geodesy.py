@@ -21,7 +21,7 @@ places = st.tuples(
 )
 
 
-def test_the_axes_of_the_earth_pierce_the_ellipsoid_at_its_radii() -> None:
+def test_points_on_earth_axes_have_ellipsoid_radii() -> None:
     xyz_m = geodetic_to_ecef([0.0, 0.0, 90.0, -90.0], [0.0, 90.0, 0.0, 0.0], np.zeros(4))
 
     expected = [
@@ -34,7 +34,7 @@ def test_the_axes_of_the_earth_pierce_the_ellipsoid_at_its_radii() -> None:
     assert pytest.approx(6_356_752.314_245, abs=1e-6) == SEMI_MINOR_M
 
 
-def test_the_worked_example_of_epsg_guidance_note_7_2() -> None:
+def test_geodetic_to_ecef_matches_epsg_guidance_note_7_2() -> None:
     lat_deg = 53 + 48 / 60 + 33.820 / 3600
     lon_deg = 2 + 7 / 60 + 46.380 / 3600
 
@@ -45,7 +45,7 @@ def test_the_worked_example_of_epsg_guidance_note_7_2() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(places)
-def test_there_and_back_is_the_same_place(place: tuple[float, float, float]) -> None:
+def test_geodetic_and_ecef_conversions_are_inverse(place: tuple[float, float, float]) -> None:
     xyz_m = geodetic_to_ecef(*place)
 
     again_m = geodetic_to_ecef(*ecef_to_geodetic(xyz_m))
@@ -55,7 +55,7 @@ def test_there_and_back_is_the_same_place(place: tuple[float, float, float]) -> 
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(-1.57, 1.57), st.floats(-3.14, 3.14))
-def test_the_local_frame_is_a_rotation_whose_up_leaves_the_ellipsoid(
+def test_enu_matrix_is_rotation_with_up_along_ellipsoid_normal(
     lat_rad: float, lon_rad: float
 ) -> None:
     matrix = ecef_to_enu_matrix(lat_rad, lon_rad)
@@ -67,7 +67,7 @@ def test_the_local_frame_is_a_rotation_whose_up_leaves_the_ellipsoid(
     np.testing.assert_allclose(matrix @ up_m[0], [0.0, 0.0, 100.0], atol=1e-7)
 
 
-def test_one_second_of_arc_is_about_thirty_one_metres_north_and_less_east() -> None:
+def test_one_arc_second_has_expected_length_in_enu() -> None:
     origin = (49.0, 8.4, 110.0)
     north_m = geodetic_to_enu(49.0 + 1 / 3600, 8.4, 110.0, origin)[0]
     east_m = geodetic_to_enu(49.0, 8.4 + 1 / 3600, 110.0, origin)[0]
@@ -78,6 +78,6 @@ def test_one_second_of_arc_is_about_thirty_one_metres_north_and_less_east() -> N
     assert abs(east_m[1]) < 1e-3
 
 
-def test_another_shape_is_refused() -> None:
+def test_array_of_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"expected \(N, 3\), got \(2,\)"):
         ecef_to_geodetic([1.0, 2.0])

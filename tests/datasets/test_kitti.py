@@ -74,7 +74,7 @@ def times(blocks: list[Block]) -> list[int]:
     return [t for block in blocks for t in block.log_ns.tolist()]
 
 
-def test_a_raw_drive_gives_cameras_and_the_box_with_times_to_the_nanosecond(
+def test_raw_drive_yields_all_streams_with_nanosecond_times(
     tmp_path: Path,
 ) -> None:
     by_topic, ledger = read(raw_drive(tmp_path / "drive", 230, ("image_00", "image_02")))
@@ -86,7 +86,7 @@ def test_a_raw_drive_gives_cameras_and_the_box_with_times_to_the_nanosecond(
     assert "PNG: every chunk's CRC verified; OXTS text has no checksum" in ledger.integrity
 
 
-def test_columns_carry_what_was_driven(tmp_path: Path) -> None:
+def test_columns_match_simulated_motion(tmp_path: Path) -> None:
     by_topic, _ = read(raw_drive(tmp_path / "drive", 60))
 
     assert set(column(by_topic["oxts/imu"], "gyro_z_radps")) == {YAW_RATE_RADPS}
@@ -98,7 +98,7 @@ def test_columns_carry_what_was_driven(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.cos(course - yaw), 1.0)
 
 
-def test_roles_are_known_and_the_ins_speed_is_no_wheel(tmp_path: Path) -> None:
+def test_topic_roles_are_known_and_ins_speed_has_none(tmp_path: Path) -> None:
     with open_log(raw_drive(tmp_path / "drive", 3)) as log:
         roles = {topic.name: role_of(topic) for topic in log.topics}
 
@@ -110,14 +110,14 @@ def test_roles_are_known_and_the_ins_speed_is_no_wheel(tmp_path: Path) -> None:
     }
 
 
-def test_streams_come_side_by_side_in_time(tmp_path: Path) -> None:
+def test_streams_are_interleaved_in_time_order(tmp_path: Path) -> None:
     with open_log(raw_drive(tmp_path / "drive", 350)) as log:
         firsts = [int(b.log_ns[0]) for b in log.read(Ledger("drive"))]
 
     assert firsts == sorted(firsts)
 
 
-def test_the_tracking_layout_gives_made_up_times_and_says_so(tmp_path: Path) -> None:
+def test_tracking_layout_computes_times_with_notice(tmp_path: Path) -> None:
     drive = tracking_drive(tmp_path / "drive")
     (drive / "image_02" / "0003" / "000004.png").unlink()
     (drive / "image_02" / "0003" / "cover.png").write_bytes(picture(1))
@@ -134,7 +134,7 @@ def test_the_tracking_layout_gives_made_up_times_and_says_so(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("period_ms", [103.5, 96.0])
-def test_the_tracking_layouts_period_is_what_its_speeds_and_positions_show(
+def test_tracking_period_is_estimated_from_speeds_and_positions(
     period_ms: float, tmp_path: Path
 ) -> None:
     drive = tracking_drive(tmp_path / "drive")
@@ -153,7 +153,7 @@ def test_the_tracking_layouts_period_is_what_its_speeds_and_positions_show(
 
 
 @pytest.mark.parametrize("make", [raw_drive, tracking_drive])
-def test_truth_is_the_path_that_was_driven(make: Callable[[Path], Path], tmp_path: Path) -> None:
+def test_truth_equals_simulated_path(make: Callable[[Path], Path], tmp_path: Path) -> None:
     drive = make(tmp_path / "drive")
 
     truth_file = write_truth(drive, tmp_path / "truth")
@@ -188,7 +188,7 @@ def test_attitude_is_yaw_then_pitch_then_roll(roll: float, pitch: float, yaw: fl
     np.testing.assert_allclose(up, expected[:, 2], atol=1e-12)
 
 
-def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
+def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 30)
     part = Selection(frozenset({"oxts/imu"}), FIRST_NS + S, FIRST_NS + 2 * S)
 
@@ -211,7 +211,7 @@ def test_only_the_part_asked_for_is_given(tmp_path: Path) -> None:
         (packet_lines(1)[0].replace("49", "149", 1), "out of range"),
     ],
 )
-def test_a_damaged_packet_is_lost_with_place_and_reason(
+def test_damaged_packet_is_dropped_with_file_and_reason(
     tmp_path: Path, text: str, why: str
 ) -> None:
     drive = raw_drive(tmp_path / "drive", 5)
@@ -224,7 +224,7 @@ def test_a_damaged_packet_is_lost_with_place_and_reason(
     assert any(why in loss.detail and "0000000003" in loss.detail for loss in ledger.drops())
 
 
-def test_a_packet_that_is_missing_leaves_a_gap(tmp_path: Path) -> None:
+def test_missing_packet_or_picture_leaves_gap(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 5)
     (drive / "oxts" / "data" / "0000000002.txt").unlink()
     (drive / "image_02" / "data" / "0000000001.png").unlink()
@@ -236,7 +236,7 @@ def test_a_packet_that_is_missing_leaves_a_gap(tmp_path: Path) -> None:
     assert ledger.topic("image_02").dropped == {"a time without its picture": 1}
 
 
-def test_a_stream_without_timestamps_is_lost_and_the_rest_is_read(tmp_path: Path) -> None:
+def test_stream_without_timestamps_is_dropped_and_others_are_read(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 5)
     (drive / "image_02" / "timestamps.txt").unlink()
 
@@ -248,7 +248,7 @@ def test_a_stream_without_timestamps_is_lost_and_the_rest_is_read(tmp_path: Path
     assert run(["info", str(drive)]) == 3
 
 
-def test_oxts_without_timestamps_is_lost_and_carries_no_truth(tmp_path: Path) -> None:
+def test_oxts_without_timestamps_is_dropped_and_yields_no_truth(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 5)
     (drive / "oxts" / "timestamps.txt").unlink()
 
@@ -262,7 +262,7 @@ def test_oxts_without_timestamps_is_lost_and_carries_no_truth(tmp_path: Path) ->
         write_truth(drive, tmp_path / "truth")
 
 
-def test_a_bad_line_in_timestamps_is_named(tmp_path: Path) -> None:
+def test_invalid_line_in_timestamps_is_refused_with_its_number(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 5, cameras=())
     (drive / "oxts" / "timestamps.txt").write_text("2011-09-26 13:02:00.5\nnoon\n")
 
@@ -270,7 +270,7 @@ def test_a_bad_line_in_timestamps_is_named(tmp_path: Path) -> None:
         open_log(drive)
 
 
-def test_timestamps_alone_are_refused(tmp_path: Path) -> None:
+def test_drive_with_timestamps_only_is_refused(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 2, cameras=())
     for path in (drive / "oxts" / "data").iterdir():
         path.unlink()
@@ -291,7 +291,7 @@ def test_several_sequences_in_one_folder_are_refused(tmp_path: Path) -> None:
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(fraction=st.floats(0.0, 1.0))
-def test_a_tracking_file_cut_anywhere_gives_whole_lines_only(
+def test_truncated_tracking_file_yields_only_complete_lines(
     tmp_path: Path, fraction: float
 ) -> None:
     text = "\n".join(packet_lines(6)) + "\n"
@@ -315,13 +315,13 @@ def test_a_tracking_file_cut_anywhere_gives_whole_lines_only(
 
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400))
-def test_any_bytes_are_a_packet_or_a_reason(raw: bytes) -> None:
+def test_any_bytes_parse_to_packet_or_reason(raw: bytes) -> None:
     parsed = parse(raw)
 
     assert isinstance(parsed, str) or (len(parsed) == 30 and np.isfinite(parsed).all())
 
 
-def test_the_real_sequence_turns_74_degrees_and_its_speeds_fit_its_positions(
+def test_real_sequence_has_known_heading_change_distance_and_frame_rate(
     tmp_path: Path,
 ) -> None:
     drive = shared("odometry", "kitti_tracking_0001")
@@ -347,7 +347,7 @@ def test_the_real_sequence_turns_74_degrees_and_its_speeds_fit_its_positions(
     assert np.degrees(np.abs(np.median(off))) < 1.0
 
 
-def test_labels_of_the_tracking_set_are_objects_of_its_truth(tmp_path: Path) -> None:
+def test_tracking_labels_become_objects_of_truth(tmp_path: Path) -> None:
     drive = tracking_drive(tmp_path / "drive")
     (drive / "label_02").mkdir()
     (drive / "label_02" / "0003.txt").write_text(
@@ -368,7 +368,7 @@ def test_labels_of_the_tracking_set_are_objects_of_its_truth(tmp_path: Path) -> 
     assert van.box_px == (10.0, 2.0, 20.5, 14.0)
 
 
-def test_intrinsics_are_those_of_the_rectified_camera(tmp_path: Path) -> None:
+def test_intrinsics_are_read_from_rectified_calibration(tmp_path: Path) -> None:
     drive = tracking_drive(tmp_path / "drive")
     (drive / "calib").mkdir()
     line = "721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003\n"
@@ -383,7 +383,7 @@ def test_intrinsics_are_those_of_the_rectified_camera(tmp_path: Path) -> None:
             assert log.intrinsics("image_03") is None
 
 
-def test_the_truth_is_of_the_box_and_says_where_that_sits(tmp_path: Path) -> None:
+def test_truth_pose_is_of_imu_with_known_mounting(tmp_path: Path) -> None:
     truth = load_truth(write_truth(raw_drive(tmp_path / "drive"), tmp_path / "truth"))
 
     assert truth.pose_point == "imu"

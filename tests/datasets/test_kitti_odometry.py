@@ -1,4 +1,4 @@
-"""KITTI odometry: the camera's track in a map that is level and points ahead, and its pictures."""
+"""KITTI odometry: the camera's track in a level map frame, and its pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from support.kitti_odometry_drive import (
 )
 
 
-def test_a_left_turn_is_a_left_turn(tmp_path: Path) -> None:
+def test_left_turn_has_positive_yaw_rate_and_heading(tmp_path: Path) -> None:
     folder = kitti_odometry_drive(tmp_path)
 
     odometry = read_poses(folder).odometry()
@@ -42,7 +42,7 @@ def test_a_left_turn_is_a_left_turn(tmp_path: Path) -> None:
     np.testing.assert_allclose(track.xyz_m[:, 2], 0.0, atol=1e-9)
 
 
-def test_a_damaged_pose_costs_one_row(tmp_path: Path) -> None:
+def test_damaged_pose_drops_one_row(tmp_path: Path) -> None:
     folder = kitti_odometry_drive(tmp_path)
     file = tmp_path / "poses" / "04.txt"
     lines = file.read_text().splitlines()
@@ -58,7 +58,7 @@ def test_a_damaged_pose_costs_one_row(tmp_path: Path) -> None:
     assert not ledger.topic("odometry").dropped_unknown
 
 
-def test_without_poses_pictures_are_a_log_and_no_truth_exists(tmp_path: Path) -> None:
+def test_sequence_without_poses_has_pictures_but_no_truth(tmp_path: Path) -> None:
     folder = kitti_odometry_drive(tmp_path)
     (tmp_path / "poses" / "04.txt").unlink()
 
@@ -68,7 +68,7 @@ def test_without_poses_pictures_are_a_log_and_no_truth_exists(tmp_path: Path) ->
         write_truth(folder, tmp_path / "truth")
 
 
-def test_a_draft_has_the_published_intrinsics(tmp_path: Path) -> None:
+def test_drafted_vehicle_has_published_intrinsics(tmp_path: Path) -> None:
     camera = crosscue.draft_vehicle(kitti_odometry_drive(tmp_path)).vehicle.camera
 
     assert camera.focal_px == FOCAL_PX

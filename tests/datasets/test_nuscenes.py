@@ -36,7 +36,7 @@ def columns(path: Path, topic: str) -> tuple[dict[str, Floats], Ledger]:
     return {name: np.concatenate(parts) for name, parts in found.items()}, ledger
 
 
-def test_wheels_steering_and_imu_turn_left_in_si_units(tmp_path: Path) -> None:
+def test_wheels_steering_and_imu_report_left_turn_in_si_units(tmp_path: Path) -> None:
     drive = nuscenes_drive(tmp_path / "root")
 
     wheels, _ = columns(drive, "can/wheel_speed")
@@ -51,7 +51,7 @@ def test_wheels_steering_and_imu_turn_left_in_si_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(imu["gyro_z_radps"], YAW_RATE_RADPS)
 
 
-def test_without_the_can_expansion_odometry_is_by_the_poses(tmp_path: Path) -> None:
+def test_odometry_is_derived_from_poses_without_can_expansion(tmp_path: Path) -> None:
     drive = nuscenes_drive(tmp_path / "root", with_can=False)
 
     found, _ = columns(drive, "odometry")
@@ -62,7 +62,7 @@ def test_without_the_can_expansion_odometry_is_by_the_poses(tmp_path: Path) -> N
         assert "odometry" not in {topic.name for topic in log.topics}
 
 
-def test_one_of_several_scenes_is_named_by_a_file(tmp_path: Path) -> None:
+def test_scene_is_selected_by_empty_file(tmp_path: Path) -> None:
     drive = nuscenes_drive(tmp_path / "root", scenes=3)
     with pytest.raises(LogFormatError, match=r"3 scenes; name one by an empty file: touch .*0061"):
         open_log(drive)
@@ -75,7 +75,7 @@ def test_one_of_several_scenes_is_named_by_a_file(tmp_path: Path) -> None:
         open_log(drive / "scene-0999.nuscenes")
 
 
-def test_the_truth_is_the_rear_axle_and_the_boxes_it_sees(tmp_path: Path) -> None:
+def test_truth_has_rear_axle_pose_and_visible_boxes(tmp_path: Path) -> None:
     truth = load(write(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
 
     assert truth.pose_point == "rear_axle"
@@ -96,7 +96,7 @@ def test_the_truth_is_the_rear_axle_and_the_boxes_it_sees(tmp_path: Path) -> Non
     assert first["visible"] == 0.9
 
 
-def test_a_box_is_where_a_pinhole_camera_sees_it(tmp_path: Path) -> None:
+def test_box_matches_pinhole_projection(tmp_path: Path) -> None:
     truth = load(write(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
 
     assert truth.objects is not None
@@ -113,7 +113,7 @@ def test_a_box_is_where_a_pinhole_camera_sees_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["value", "opening brace", "closing brace"])
-def test_a_damaged_row_of_a_table_costs_itself_and_is_counted(tmp_path: Path, what: str) -> None:
+def test_damaged_table_row_is_dropped_and_counted(tmp_path: Path, what: str) -> None:
     drive = nuscenes_drive(tmp_path / "root")
     table = drive / "v1.0-mini" / "sample_data.json"
     text = table.read_text()
@@ -137,7 +137,7 @@ def test_a_damaged_row_of_a_table_costs_itself_and_is_counted(tmp_path: Path, wh
     assert "sample_data.json" in next(iter(ledger.topic("").dropped))
 
 
-def test_a_damaged_can_row_is_one_row_of_its_topic(tmp_path: Path) -> None:
+def test_damaged_can_row_is_dropped_from_its_topic(tmp_path: Path) -> None:
     drive = nuscenes_drive(tmp_path / "root")
     file = drive / "can_bus" / "scene-0061_zoe_veh_info.json"
     rows = json.loads(file.read_text())
@@ -151,7 +151,7 @@ def test_a_damaged_can_row_is_one_row_of_its_topic(tmp_path: Path) -> None:
     assert ledger.topic("can/wheel_speed").declared == 120
 
 
-def test_a_cut_table_is_reported(tmp_path: Path) -> None:
+def test_truncated_table_is_reported(tmp_path: Path) -> None:
     drive = nuscenes_drive(tmp_path / "root")
     file = drive / "v1.0-mini" / "sample_data.json"
     text = file.read_text()
@@ -166,7 +166,7 @@ def test_a_cut_table_is_reported(tmp_path: Path) -> None:
     assert any("is cut" in why for why in ledger.topic("").dropped_unknown)
 
 
-def test_a_table_is_read_a_piece_at_a_time(tmp_path: Path) -> None:
+def test_table_larger_than_buffer_is_read_completely(tmp_path: Path) -> None:
     rows = [{"token": f"t{i}", "text": "x{y" * 40} for i in range(40_000)]
     file = tmp_path / "big.json"
     file.write_text(json.dumps(rows, indent=0))

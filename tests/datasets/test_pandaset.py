@@ -38,7 +38,7 @@ def test_every_stream_is_read(tmp_path: Path) -> None:
     assert ledger.is_whole
 
 
-def test_odometry_is_what_was_driven(tmp_path: Path) -> None:
+def test_odometry_matches_simulated_motion(tmp_path: Path) -> None:
     table = read_poses(pandaset_drive(tmp_path / "002")).odometry()
 
     # A chord of 0.2 s at 0.2 rad/s is 0.007 % shorter than its arc.
@@ -48,7 +48,7 @@ def test_odometry_is_what_was_driven(tmp_path: Path) -> None:
     )
 
 
-def test_truth_is_the_camera_s_track(tmp_path: Path) -> None:
+def test_truth_equals_camera_track(tmp_path: Path) -> None:
     truth = load(write_carried("pandaset", pandaset_drive(tmp_path / "002"), tmp_path / "truth"))
     track = read_tum(tmp_path / "truth" / str(truth.pose))
 
@@ -60,7 +60,7 @@ def test_truth_is_the_camera_s_track(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 7, COUNT - 1])
-def test_a_picture_that_is_gone_is_dropped_at_its_time(tmp_path: Path, number: int) -> None:
+def test_missing_picture_is_dropped(tmp_path: Path, number: int) -> None:
     path = pandaset_drive(tmp_path / "002")
     (path / CAMERA / f"{number:02d}.jpg").unlink()
 
@@ -72,7 +72,7 @@ def test_a_picture_that_is_gone_is_dropped_at_its_time(tmp_path: Path, number: i
 
 @pytest.mark.parametrize("name", ["poses.json", "timestamps.json"])
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '["a"]', "null", "[" * 9999])
-def test_a_damaged_file_is_a_loss(tmp_path: Path, name: str, text: str) -> None:
+def test_damaged_json_file_is_reported_as_loss(tmp_path: Path, name: str, text: str) -> None:
     path = pandaset_drive(tmp_path / "002")
     (path / CAMERA / name).write_text(text)
 
@@ -92,8 +92,8 @@ def test_poses_out_of_order_are_refused(tmp_path: Path) -> None:
         read_poses(path)
 
 
-def test_the_real_sequence(tmp_path: Path) -> None:
-    """80 pictures in 8 s; the car is stationary at first and has moved 21.5 m in the end."""
+def test_real_sequence_is_read_with_known_speed_and_distance(tmp_path: Path) -> None:
+    """The sequence has 80 pictures in 8 s; the car starts at rest and travels 21.5 m."""
     path = shared("sequences", "pandaset_002")
 
     found, ledger = rows(path)
@@ -105,8 +105,8 @@ def test_the_real_sequence(tmp_path: Path) -> None:
     assert float(speed.sum()) * 0.1 == pytest.approx(21.5, abs=0.3)
 
 
-def test_boxes_that_are_still_pickles_are_never_opened(tmp_path: Path) -> None:
-    """A pickle runs code when it is read; the line says where the conversion is described."""
+def test_pickled_boxes_are_refused_without_opening(tmp_path: Path) -> None:
+    """A pickle can run code when it is read, so the file is refused."""
     folder = pandaset_drive(tmp_path / "002", 2)
     (folder / "camera" / "front_camera" / "intrinsics.json").write_text(
         '{"fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 8.0}'

@@ -24,14 +24,14 @@ def tables_of(path: Path) -> dict[str, tuple[np.ndarray, Table]]:
     return found
 
 
-def test_the_yaw_rate_is_about_the_vertical_however_the_phone_lies(tmp_path: Path) -> None:
+def test_yaw_rate_is_about_vertical_for_tilted_phone(tmp_path: Path) -> None:
     _, rows = tables_of(phone_drive(tmp_path / "drive"))["phone/gyro"]
 
     np.testing.assert_allclose(rows["yaw_rate_radps"][-1], YAW_RATE_RADPS, atol=1e-8)
     assert rows["yaw_rate_radps"][0] == 0.0
 
 
-def test_a_position_has_the_time_it_is_of_on_the_wall_clock(tmp_path: Path) -> None:
+def test_position_time_is_time_of_fix_on_wall_clock(tmp_path: Path) -> None:
     found = tables_of(phone_drive(tmp_path / "drive"))
     t_ns, rows = found["phone/gnss"]
 
@@ -41,14 +41,14 @@ def test_a_position_has_the_time_it_is_of_on_the_wall_clock(tmp_path: Path) -> N
     assert rows["course_rad"][0] == pytest.approx(-math.pi / 2)
 
 
-def test_speeds_are_metres_and_fields_are_tesla(tmp_path: Path) -> None:
+def test_speed_and_magnetic_field_have_si_units(tmp_path: Path) -> None:
     found = tables_of(phone_drive(tmp_path / "drive"))
 
     assert found["car/speed"][1]["speed_mps"][0] == pytest.approx(20.0 * 1609.344 / 3600.0)
     assert found["phone/magnetometer"][1]["mag_z_t"][0] == pytest.approx(40e-6)
 
 
-def test_a_damaged_line_of_the_phone_is_lost_from_each_of_its_topics(tmp_path: Path) -> None:
+def test_damaged_phone_line_is_dropped_from_each_of_its_topics(tmp_path: Path) -> None:
     drive = phone_drive(tmp_path / "drive")
     file = drive / "made_phone.csv"
     lines = file.read_text(encoding="utf-8").splitlines()
@@ -66,15 +66,15 @@ def test_a_damaged_line_of_the_phone_is_lost_from_each_of_its_topics(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("kind", "change", "says"),
+    ("kind", "change", "message"),
     [
         ("car", None, "expected one file *_car.csv, found none"),
         ("car", ("Speed (MPH)", "Speed"), "no column 'Speed (MPH)'"),
         ("phone", ("motionGravityX", "gravity"), "no column 'motionGravityX(G)'"),
     ],
 )
-def test_a_missing_file_or_column_is_named(
-    kind: str, change: tuple[str, str] | None, says: str, tmp_path: Path
+def test_missing_file_or_column_is_refused_with_its_name(
+    kind: str, change: tuple[str, str] | None, message: str, tmp_path: Path
 ) -> None:
     drive = phone_drive(tmp_path / "drive")
     file = drive / f"made_{kind}.csv"
@@ -85,4 +85,4 @@ def test_a_missing_file_or_column_is_named(
 
     with pytest.raises(LogFormatError) as caught:
         open_log(drive)
-    assert says in str(caught.value)
+    assert message in str(caught.value)

@@ -1,4 +1,4 @@
-"""A plug-in's function that writes truth is named when it fails."""
+"""Failures of a plug-in's function that writes truth."""
 
 import sys
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def _install(monkeypatch: pytest.MonkeyPatch, function: Callable[[Path, Path], o
         (KeyError("t_ns"), "KeyError: 't_ns'"),
     ],
 )
-def test_the_function_that_failed_is_named(
+def test_failing_plugin_function_is_named(
     error: Exception, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def truth(log: Path, folder: Path) -> Path:
@@ -45,9 +45,7 @@ def test_the_function_that_failed_is_named(
     assert caught.value.__cause__ is error
 
 
-def test_a_function_that_does_not_exist_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_plugin_function_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _install(monkeypatch, lambda log, folder: folder)
     del vars(sys.modules["dummy_lines"])["truth"]
 
@@ -55,7 +53,9 @@ def test_a_function_that_does_not_exist_is_named(
         truth_file.write_carried(NAME, tmp_path, tmp_path / "out")
 
 
-def test_its_message_about_the_log_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plugin_error_about_log_is_unchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def truth(log: Path, folder: Path) -> Path:
         raise AnnotationError(f"{log}: no times; record it again")
 

@@ -1,4 +1,4 @@
-"""The real drives of the documentation: their vehicle files and annotations fit their logs."""
+"""The real drives of the documentation: their vehicle files and annotations match their logs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from support.data import shared
 DRIVES = ("comma2k19", "pandaset_002", "us_dashcam")
 
 
-def test_the_list_of_this_test_is_whole() -> None:
+def test_list_of_drives_is_complete() -> None:
     assert sorted(path.parent.name for path in FOLDER.glob("*/vehicle.toml")) == sorted(DRIVES)
 
 
 @pytest.mark.parametrize("name", DRIVES)
-def test_settings_and_annotations_can_be_read_and_say_where_they_are_from(name: str) -> None:
+def test_vehicle_files_and_annotations_load_with_their_source(name: str) -> None:
     vehicle = load_vehicle(FOLDER / name / "vehicle.toml")
     truth = load_truth(FOLDER / name)
 
@@ -35,7 +35,7 @@ def test_settings_and_annotations_can_be_read_and_say_where_they_are_from(name: 
     assert not present["stop_sign"]
 
 
-def test_the_dashcam_s_truth_fits_its_frames(tmp_path: Path) -> None:
+def test_dashcam_truth_passes_check_against_frames(tmp_path: Path) -> None:
     frames = shared("sequences", "us_signalized_intersection_dashcam")
     folder = tmp_path / "dashcam"
     folder.mkdir()
@@ -47,10 +47,10 @@ def test_the_dashcam_s_truth_fits_its_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_minute_and_its_one_picture_are_one_drive(
+def test_can_segment_and_single_picture_are_replayed_as_one_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The commands of the documentation, up to the traffic light in the picture."""
+    """Run the commands of the documentation, up to the traffic light in the picture."""
     (segment,) = shared("comma2k19", "Example_1").glob("*/40")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(places.VARIABLE, str(tmp_path / "models"))

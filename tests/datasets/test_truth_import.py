@@ -24,7 +24,7 @@ FRAMES = 6
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six pictures at 10 Hz."""
+    """Write six pictures at 10 Hz."""
     folder = tmp_path_factory.mktemp("log")
     for number in range(FRAMES):
         cv2.imwrite(str(folder / f"{number:06d}.png"), np.zeros((HIGH, WIDE, 3), np.uint8))
@@ -34,7 +34,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def coco(**changes: Any) -> dict[str, Any]:
-    """Frames 1 and 3; a stop sign in 1, a car in each."""
+    """Return annotations of frames 1 and 3: a stop sign in frame 1 and a car in each."""
     tree: dict[str, Any] = {
         "images": [
             {"id": n, "file_name": f"{n:06d}.png", "width": WIDE, "height": HIGH} for n in (1, 3)
@@ -59,14 +59,14 @@ def _import(source: Path, log: Path, output: Path, *more: str) -> int:
     return cli.run(argv)
 
 
-def _refused(capsys: pytest.CaptureFixture[str]) -> str:
+def _error_line(capsys: pytest.CaptureFixture[str]) -> str:
     line = capsys.readouterr().err
     assert line.startswith("crosscue: ")
     assert line.count("\n") == 1
     return line
 
 
-def test_a_coco_file_says_what_is_there_and_what_is_not(tmp_path: Path, log: Path) -> None:
+def test_coco_import_writes_present_and_absent_cues(tmp_path: Path, log: Path) -> None:
     assert _import(_write(tmp_path / "coco.json", coco()), log, tmp_path / "truth.json") == 0
 
     truth = load(tmp_path / "truth.json")
@@ -80,7 +80,7 @@ def test_a_coco_file_says_what_is_there_and_what_is_not(tmp_path: Path, log: Pat
     assert cli.run(["truth", "check", str(tmp_path), "--log", str(log), "-q"]) == 0
 
 
-def test_what_was_imported_can_be_imported_again(tmp_path: Path, log: Path) -> None:
+def test_imported_objects_can_be_imported_again(tmp_path: Path, log: Path) -> None:
     assert _import(_write(tmp_path / "coco.json", coco()), log, tmp_path / "truth.json") == 0
     (tmp_path / "again").mkdir()
     assert _import(tmp_path / "objects.json", log, tmp_path / "again") == 0
@@ -94,7 +94,7 @@ def test_what_was_imported_can_be_imported_again(tmp_path: Path, log: Path) -> N
     assert before["annotations"] == after["annotations"]
 
 
-def test_adding_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) -> None:
+def test_add_option_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) -> None:
     path = tmp_path / "truth.json"
     source = _write(tmp_path / "coco.json", coco())
     assert _import(source, log, path) == 0
@@ -127,7 +127,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             {
@@ -208,16 +208,20 @@ DAMAGED = {
         ),
     ],
 )
-def test_annotations_that_do_not_fit_are_refused_in_one_line(
-    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], said: str
+def test_invalid_or_mismatched_annotations_are_refused_in_one_line(
+    tmp_path: Path,
+    log: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: dict[str, Any],
+    message: str,
 ) -> None:
     if change.get("categories") and change["categories"][0]["name"] == "a":
         change = change | {"annotations": []}
     source = _write(tmp_path / "coco.json", coco(**change))
 
-    is_damaged = said in DAMAGED
+    is_damaged = message in DAMAGED
     assert _import(source, log, tmp_path / "truth.json") == (4 if is_damaged else 1)
-    assert said in _refused(capsys)
+    assert message in _error_line(capsys)
     assert not (tmp_path / "truth.json").exists()
 
 
@@ -229,7 +233,7 @@ def test_nan_in_a_box_is_refused(tmp_path: Path) -> None:
         read_coco(tmp_path / "coco.json")
 
 
-def test_labels_mean_what_the_user_says(
+def test_map_option_assigns_labels_to_cues(
     tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = coco(categories=[{"id": 13, "name": "halt = stop"}, {"id": 3, "name": "dog"}])
@@ -238,16 +242,16 @@ def test_labels_mean_what_the_user_says(
     assert _import(source, log, tmp_path / "t.json", "--map", "halt = stop=stop_sign", "dog=") == 0
     assert {one.cue for one in load(tmp_path / "t.json").cues} == {"stop_sign"}
     assert cli.run(["truth", "check", str(tmp_path / "t.json"), "--log", str(log), "-q"]) == 0
-    for own, said in (
+    for own, message in (
         ("cat=stop_sign", "no such label"),
         ("dog=sing", "no such cue"),
         ("dog", "expected LABEL=NAME"),
     ):
         assert _import(source, log, tmp_path / "u.json", "--map", own) == 2
-        assert said in _refused(capsys)
+        assert message in _error_line(capsys)
 
 
-def test_a_cue_of_ones_own_is_reported_as_the_vehicle_file_names_it(
+def test_custom_cue_of_vehicle_file_is_imported(
     tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = coco(categories=[{"id": 13, "name": "zebra crossing"}, {"id": 3, "name": "car"}])
@@ -257,7 +261,7 @@ def test_a_cue_of_ones_own_is_reported_as_the_vehicle_file_names_it(
     path = tmp_path / "t.json"
 
     assert _import(source, log, path) in (1, 4)
-    assert "neither a cue" in _refused(capsys)
+    assert "neither a cue" in _error_line(capsys)
     assert _import(source, log, path, "--vehicle", str(vehicle)) == 0
     truth = load(path)
     assert truth.own_cues == ("zebra_crossing",)
@@ -288,7 +292,9 @@ IMAGES_XML = f"""<?xml version="1.0" encoding="utf-8"?>
 </annotations>"""
 
 
-def test_cvat_for_images(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cvat_for_images_is_imported(
+    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a.xml").write_text(IMAGES_XML)
 
     argv = ["truth", "import", str(tmp_path / "a.xml"), "--log", str(log), "-o", str(tmp_path)]
@@ -327,7 +333,7 @@ def _track_box(frame: int, outside: int = 0) -> str:
     )
 
 
-def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path) -> None:
+def test_cvat_for_video_covers_every_frame_of_its_task(tmp_path: Path, log: Path) -> None:
     (tmp_path / "a.xml").write_text(_video(_track_box(1) + _track_box(3) + _track_box(5, 1)))
 
     assert _import(tmp_path / "a.xml", log, tmp_path / "truth.json") == 0
@@ -342,7 +348,7 @@ def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "not XML"),
         ("<annotations>", "not XML"),
@@ -358,10 +364,10 @@ def test_cvat_for_video_counts_every_frame_of_its_task(tmp_path: Path, log: Path
         (_video(_track_box(1), "<stop_frame>999999999</stop_frame>"), "over 10000000"),
     ],
 )
-def test_xml_that_is_not_cvats_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_invalid_cvat_xml_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "a.xml").write_text(text)
 
-    with pytest.raises(SchemaError, match=said):
+    with pytest.raises(SchemaError, match=message):
         read_cvat(tmp_path / "a.xml")
 
 
@@ -373,7 +379,7 @@ def test_xml_that_is_not_cvats_is_refused(tmp_path: Path, text: str, said: str) 
         '<!DOCTYPE a SYSTEM "http://127.0.0.1:9/a.dtd">',
     ],
 )
-def test_entities_are_refused_before_they_are_read(tmp_path: Path, doctype: str) -> None:
+def test_document_type_declaration_is_refused(tmp_path: Path, doctype: str) -> None:
     body = IMAGES_XML.split("\n", 1)[1].replace("<name>t</name>", "<name>&z;&x;</name>")
     (tmp_path / "a.xml").write_text(f"{doctype}\n{body}")
 
@@ -381,7 +387,7 @@ def test_entities_are_refused_before_they_are_read(tmp_path: Path, doctype: str)
         read_cvat(tmp_path / "a.xml")
 
 
-def test_pictures_go_to_the_frame_nearest_in_time(tmp_path: Path) -> None:
+def test_pictures_are_matched_to_nearest_frame_in_time(tmp_path: Path) -> None:
     tree = coco(annotations=[])
     for image, off in zip(tree["images"], (3_000_000, -7_000_000), strict=True):
         image["t_ns"] = START_NS + STEP_NS * image["id"] + off
@@ -409,17 +415,20 @@ def _approach(first_s: float, last_s: float, number: int = 0) -> dict[str, Any]:
     }
 
 
-LATE = {"end_ns": START_NS + 10**12}
+LONG_DRIVE = {"end_ns": START_NS + 10**12}
 
 
 @pytest.mark.parametrize(
-    ("tree", "said"),
+    ("tree", "message"),
     [
         (_truth(start_ns=5, end_ns=9), "give the truth of this log"),
-        (_truth(**LATE, approaches=[_approach(100, 200)]), "approach 0 from"),
+        (_truth(**LONG_DRIVE, approaches=[_approach(100, 200)]), "approach 0 from"),
         (_truth(approaches=[_approach(0, 0.3), _approach(0.2, 0.4, 1)]), "0 and 1 overlap"),
         (
-            _truth(**LATE, cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}]),
+            _truth(
+                **LONG_DRIVE,
+                cues=[{"cue": "stop_sign", "present": True, "t_ns": START_NS + 10**11}],
+            ),
             "cues.0 \\(stop_sign\\)",
         ),
         (
@@ -436,18 +445,22 @@ LATE = {"end_ns": START_NS + 10**12}
         (_truth(objects="gone.json"), "gone.json"),
     ],
 )
-def test_truth_that_does_not_fit_its_log_is_refused(
-    tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str], tree: dict[str, Any], said: str
+def test_truth_that_contradicts_its_log_is_refused(
+    tmp_path: Path,
+    log: Path,
+    capsys: pytest.CaptureFixture[str],
+    tree: dict[str, Any],
+    message: str,
 ) -> None:
     import re
 
     path = _write(tmp_path / "truth.json", tree)
 
     assert cli.run(["truth", "check", str(path), "--log", str(log)]) in (1, 4)
-    assert re.search(said, _refused(capsys))
+    assert re.search(message, _error_line(capsys))
 
 
-def test_the_schema_is_printed_and_names_every_cue(capsys: pytest.CaptureFixture[str]) -> None:
+def test_printed_schema_lists_every_cue(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["truth", "schema"]) == 0
     schema = json.loads(capsys.readouterr().out)
 

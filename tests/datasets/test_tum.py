@@ -23,7 +23,7 @@ from crosscue.replay.base import Limits, LogError, LogFormatError, LogTooLargeEr
 POSE = "1.5 1 2 3 0 0 0 1"
 
 
-def some(seed: int, n: int) -> Trajectory:
+def random_trajectory(seed: int, n: int) -> Trajectory:
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
@@ -33,17 +33,17 @@ def some(seed: int, n: int) -> Trajectory:
 
 @given(t_ns=st.integers(-(10**18), 9 * 10**18))
 @settings(max_examples=200, deadline=None)
-def test_every_nanosecond_survives_the_text(t_ns: int) -> None:
+def test_nanoseconds_survive_conversion_to_text(t_ns: int) -> None:
     assert nanoseconds(seconds_text(t_ns)) == t_ns
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(0, 20))
 @settings(max_examples=30, deadline=None)
-def test_written_is_read_number_for_number(
+def test_trajectory_is_read_back_exactly(
     seed: int, n: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("tum") / "poses.tum"
-    trajectory = some(seed, n)
+    trajectory = random_trajectory(seed, n)
     write_tum(path, trajectory, comment="two\nlines")
     found = read_tum(path)
 
@@ -63,11 +63,11 @@ def test_written_is_read_number_for_number(
         ("0.00000000249", 2),
     ],
 )
-def test_other_spellings_of_a_time(text: str, t_ns: int) -> None:
+def test_supported_notations_of_time_are_parsed(text: str, t_ns: int) -> None:
     assert nanoseconds(text) == t_ns
 
 
-def test_comments_blank_lines_commas_and_a_byte_order_mark_are_fine(tmp_path: Path) -> None:
+def test_comments_blank_lines_commas_and_byte_order_mark_are_accepted(tmp_path: Path) -> None:
     path = tmp_path / "a.tum"
     long_comment = "# " + "x" * 10_000
     text = f"\ufeff# head\n\n{long_comment}\n1.5, 1, 2, 3, 0, 0, 0, 1\r\n  2.5 1 2 3 0 0 0 -1"
@@ -77,7 +77,7 @@ def test_comments_blank_lines_commas_and_a_byte_order_mark_are_fine(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("line", "says"),
+    ("line", "match"),
     [
         ("1.6 1 2 3 0 0 0", "line 3: 7 numbers instead of 8; expected timestamp"),
         ("1.6 1 2 3 0 0 0 1 9", "line 3: 9 numbers"),
@@ -94,15 +94,15 @@ def test_comments_blank_lines_commas_and_a_byte_order_mark_are_fine(tmp_path: Pa
         ("1.6 1 2 3 0 0 0 1" * 1000, "line 3: "),
     ],
 )
-def test_a_bad_line_is_refused_with_its_number(tmp_path: Path, line: str, says: str) -> None:
+def test_invalid_line_is_refused_with_its_number(tmp_path: Path, line: str, match: str) -> None:
     path = tmp_path / "bad.tum"
     path.write_text(f"# head\n{POSE}\n{line}\n3 1 2 3 0 0 0 1\n")
 
-    with pytest.raises(LogFormatError, match=says):
+    with pytest.raises(LogFormatError, match=match):
         read_tum(path)
 
 
-def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+def test_unreadable_file_is_refused(tmp_path: Path) -> None:
     binary = tmp_path / "binary"
     binary.write_bytes(b"\xff\xfe\x00\x01" * 10)
     with pytest.raises(LogFormatError, match="not text"):
@@ -116,7 +116,7 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
         read_tum(binary, Limits(chunk_bytes=10))
 
 
-def test_a_quaternion_rounded_by_others_is_made_whole(tmp_path: Path) -> None:
+def test_rounded_quaternion_is_normalised(tmp_path: Path) -> None:
     path = tmp_path / "a.tum"
     path.write_text("1 0 0 0 0.0 0.0 0.7071 0.7071\n")
 
@@ -125,7 +125,7 @@ def test_a_quaternion_rounded_by_others_is_made_whole(tmp_path: Path) -> None:
 
 @given(heading=st.floats(-3.14, 3.14))
 @settings(max_examples=30, deadline=None)
-def test_a_planar_pose_keeps_its_heading(heading: float) -> None:
+def test_planar_pose_keeps_heading(heading: float) -> None:
     one = planar(np.array([1]), np.array([2.0]), np.array([3.0]), np.array([heading]))
 
     assert heading_rad(one)[0] == pytest.approx(heading)
@@ -133,7 +133,7 @@ def test_a_planar_pose_keeps_its_heading(heading: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("t_ns", "xyz", "quat", "says"),
+    ("t_ns", "xyz", "quat", "match"),
     [
         ([1, 2], np.zeros((1, 3)), np.eye(4)[[0, 0]], r"xyz_m: expected \(2, 3\), got \(1, 3\)"),
         ([1, 2], np.zeros((2, 3)), np.eye(4)[[0]], r"quat_wxyz: expected \(2, 4\), got \(1, 4\)"),
@@ -142,14 +142,14 @@ def test_a_planar_pose_keeps_its_heading(heading: float) -> None:
         ([1, 2], np.zeros((2, 3)), np.ones((2, 4)), "expected unit quaternions"),
     ],
 )
-def test_columns_that_are_no_poses_are_refused(
-    t_ns: list[int], xyz: np.ndarray, quat: np.ndarray, says: str
+def test_invalid_trajectory_columns_are_refused(
+    t_ns: list[int], xyz: np.ndarray, quat: np.ndarray, match: str
 ) -> None:
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=match):
         Trajectory(np.array(t_ns), xyz, quat)
 
 
-def test_evo_reads_what_we_write(tmp_path: Path) -> None:
+def test_written_file_is_read_by_evo_and_back(tmp_path: Path) -> None:
     import warnings
 
     with warnings.catch_warnings():
@@ -157,7 +157,7 @@ def test_evo_reads_what_we_write(tmp_path: Path) -> None:
         from evo.tools import file_interface
 
     path = tmp_path / "ours.tum"
-    trajectory = some(1, 12)
+    trajectory = random_trajectory(1, 12)
     write_tum(path, trajectory)
     theirs = file_interface.read_tum_trajectory_file(str(path))
 

@@ -10,7 +10,7 @@ from crosscue.detectors.label_images import objects, road
 from support.scenes import SMALL, when_at, world
 
 
-def test_without_faults_all_that_can_be_seen_is_found_and_nothing_else() -> None:
+def test_detector_without_faults_finds_exactly_visible_objects() -> None:
     there = world("A")
     settings = SceneSettings(layout="A", camera=SMALL)
     picture = FaultyLabels(there, settings, NO_FAULTS).picture(when_at(there, -20.0))

@@ -23,7 +23,7 @@ FEATURES = ("intersection", "left", "right", "straight")
 
 @pytest.mark.parametrize("first", [0, 13, 5, 1000])
 @pytest.mark.parametrize("feature", FEATURES)
-def test_any_thirteen_in_a_row_have_every_feature_with_both_values(
+def test_any_thirteen_consecutive_layouts_have_every_feature_present_and_absent(
     first: int, feature: str
 ) -> None:
     known = [mixed_layout(first + i).features.get(feature) for i in range(len(KINDS))]
@@ -31,7 +31,7 @@ def test_any_thirteen_in_a_row_have_every_feature_with_both_values(
     assert {True, False} <= set(known)
 
 
-def test_a_road_without_an_intersection_has_no_control_and_no_sign_of_one() -> None:
+def test_road_without_intersection_has_no_control_or_signs() -> None:
     roads = [mixed_layout(seed) for seed in range(120) if not mixed_layout(seed).is_intersection]
 
     kinds = {mixed_kind(int(road.name[1:])) for road in roads}
@@ -45,14 +45,14 @@ def test_published_and_training_layouts_are_all_intersections() -> None:
     assert all(any_layout(seed).is_intersection for seed in range(200))
 
 
-def test_a_name_stands_for_the_same_layout_every_time_and_no_two_are_alike() -> None:
+def test_layout_names_are_reproducible_and_layouts_distinct() -> None:
     layouts = [layout_named(f"M{seed}") for seed in range(120)]
 
     assert layouts == [mixed_layout(seed) for seed in range(120)]
     assert len({layout.half_width_m for layout in layouts}) == 120
 
 
-def test_a_car_keeps_to_its_lane_through_a_gentle_curve_and_things_stand_beside_it() -> None:
+def test_curved_layout_moves_car_and_objects_with_lane() -> None:
     curved = mixed_layout(12)
     straight = replace(curved, curve_per_m=0.0)
     one, other = (
@@ -70,7 +70,7 @@ def test_a_car_keeps_to_its_lane_through_a_gentle_curve_and_things_stand_beside_
     assert one.ground.road.sum() == pytest.approx(other.ground.road.sum(), rel=0.02)
 
 
-def test_two_runs_of_a_layout_differ_in_light_or_weather_traffic_and_speed() -> None:
+def test_two_runs_of_layout_differ_in_light_traffic_and_speed() -> None:
     first, second = (conditions_of(mixed_layout(3), run) for run in (1, 2))
 
     assert first.light != second.light

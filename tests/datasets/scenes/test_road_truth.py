@@ -20,7 +20,7 @@ def picture(layout: str, x_m: float) -> Picture:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("layout", "x_m"), [("D", -30.0), ("D", -8.0), ("A", -15.0)])
-def test_a_point_of_the_ground_is_road_where_the_map_says_so(layout: str, x_m: float) -> None:
+def test_road_mask_agrees_with_map(layout: str, x_m: float) -> None:
     of, shown = world(layout), picture(layout, x_m)
     assert shown.road is not None
     rng = np.random.default_rng(3)
@@ -48,7 +48,7 @@ def test_a_point_of_the_ground_is_road_where_the_map_says_so(layout: str, x_m: f
     assert not on_road.all()
 
 
-def test_objects_are_no_road_and_the_sky_is_none() -> None:
+def test_objects_and_sky_are_not_road() -> None:
     shown = picture("D", -20.0)
     assert shown.road is not None
 
@@ -57,7 +57,7 @@ def test_objects_are_no_road_and_the_sky_is_none() -> None:
     assert shown.road[-1, shown.road.shape[1] // 2]
 
 
-def test_asking_for_road_changes_no_pixel() -> None:
+def test_road_option_does_not_change_pixels() -> None:
     of = world("D")
     plain = renderer(of).picture(when_at(of, -20.0))
 

@@ -20,13 +20,13 @@ def vehicle(width_px: int) -> Vehicle:
     return parse(text, "vehicle.toml")
 
 
-def test_both_kinds_of_simulated_drives_bear_the_mark_of_a_simulated_log() -> None:
+def test_both_kinds_of_simulated_drives_have_simulated_car_name() -> None:
     plain = parse(drive_vehicle_text(DriveSettings(), "simulated_car.dbc"), "vehicle.toml")
 
     assert vehicle(640).name == plain.name == SIMULATED_CAR
 
 
-def test_a_sign_half_as_high_in_half_the_picture_is_as_far_away() -> None:
+def test_range_from_height_scales_with_picture_size() -> None:
     large, small = vehicle(1280).ranges, vehicle(640).ranges
     assert large.stop_sign is not None
     assert small.stop_sign is not None
@@ -38,7 +38,7 @@ def test_a_sign_half_as_high_in_half_the_picture_is_as_far_away() -> None:
 
 
 @pytest.mark.parametrize("x_m", [-12.0, -22.0, -35.0])
-def test_a_stop_sign_measures_the_way_to_the_start(x_m: float) -> None:
+def test_range_from_stop_sign_equals_distance_to_start(x_m: float) -> None:
     camera = Camera(width_px=1280, height_px=720)
     picture = picture_at(world("L204"), x_m, camera)
     curve = vehicle(1280).ranges.stop_sign
@@ -46,5 +46,5 @@ def test_a_stop_sign_measures_the_way_to_the_start(x_m: float) -> None:
     assert curve is not None
     height = np.array([float(sign.box_px[3] - sign.box_px[1])])
 
-    # The curve is fitted to detections of a network, from which a true outline may differ.
+    # The curve is fitted to detections of a network, which may differ from the true outline.
     assert range_of(height, curve)[0] == pytest.approx(-x_m, abs=2.0 * curve.residual_sd_m)

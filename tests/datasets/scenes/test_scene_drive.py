@@ -1,4 +1,4 @@
-"""A simulated drive as files: the readers of real drives read it, and its truth fits."""
+"""A simulated drive as files: the readers of real drives read it, and its truth matches."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SceneFiles:
 
 
 def blocks(path: Path, topic: str) -> Iterator[Block]:
-    """Decoded blocks of one topic."""
+    """Yield the decoded blocks of one topic."""
     ledger = Ledger(str(path))
     with open_log(path) as log:
         (one,) = [t for t in log.topics if t.name == topic]
@@ -63,14 +63,14 @@ def truth_of(files: SceneFiles) -> Any:
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes(files: SceneFiles, tmp_path: Path) -> None:
+def test_same_seed_yields_same_bytes(files: SceneFiles, tmp_path: Path) -> None:
     again = write_scene(tmp_path / "again", settings())
 
     for one in ("drive.mcap", "truth.json", "objects.json", "pose.tum", "ranges.csv"):
         assert (again.log.parent / one).read_bytes() == (files.log.parent / one).read_bytes()
 
 
-def test_the_other_sensors_rows_do_not_depend_on_how_far_pictures_are_apart(
+def test_picture_spacing_does_not_change_times_of_other_sensors(
     files: SceneFiles, tmp_path: Path
 ) -> None:
     sparse = write_scene(tmp_path / "sparse", settings(), imager=SPARSE_PHOTOGRAPHS)
@@ -83,7 +83,7 @@ def test_the_other_sensors_rows_do_not_depend_on_how_far_pictures_are_apart(
         np.testing.assert_array_equal(found_ns, all_ns)
 
 
-def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) -> None:
+def test_every_picture_is_read_back_with_its_size(files: SceneFiles) -> None:
     import cv2
 
     ledger = Ledger(str(files.log))
@@ -104,7 +104,7 @@ def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) 
     assert count == files.pictures
 
 
-def test_the_camera_is_the_one_that_the_vehicle_file_reports(files: SceneFiles) -> None:
+def test_vehicle_file_and_camera_info_match_camera(files: SceneFiles) -> None:
     vehicle = load_vehicle(files.vehicle)
     (block, *_) = blocks(files.log, CALIBRATION)
 
@@ -115,7 +115,7 @@ def test_the_camera_is_the_one_that_the_vehicle_file_reports(files: SceneFiles) 
     assert np.allclose(k[0], [105.6, 0, 96, 0, 105.6, 54, 0, 0, 1])
 
 
-def test_range_falls_as_the_car_drives_and_is_zero_when_it_enters(files: SceneFiles) -> None:
+def test_true_range_decreases_by_travelled_distance_to_zero_at_entry(files: SceneFiles) -> None:
     rows = np.loadtxt(files.log.parent / "ranges.csv", delimiter=",", skiprows=1)
     track = read_tum(files.log.parent / "pose.tum")
     (approach,) = load(files.truth).approaches
@@ -129,7 +129,7 @@ def test_range_falls_as_the_car_drives_and_is_zero_when_it_enters(files: SceneFi
     assert 0.0 < rows[-1, 2] < 0.11 * max(speed_mps, 1.0)
 
 
-def test_wheels_say_how_fast_the_trajectory_goes(files: SceneFiles) -> None:
+def test_wheel_speed_matches_trajectory(files: SceneFiles) -> None:
     database = CanDatabase.load([files.log.parent / "simulated_car.dbc"])
     track = read_tum(files.log.parent / "pose.tum")
     decoder = BusDecoder(database, CAR_BUS, Ledger("test"))
@@ -149,7 +149,7 @@ def test_wheels_say_how_fast_the_trajectory_goes(files: SceneFiles) -> None:
     assert np.sqrt(np.mean((wheel - true_mps)[straight] ** 2)) < 0.25
 
 
-def test_the_mobileye_reports_vehicles_that_are_there(files: SceneFiles) -> None:
+def test_mobileye_obstacles_match_true_vehicles(files: SceneFiles) -> None:
     decoder = MobileyeDecoder(MOBILEYE_BUS, Ledger("test"), SETTINGS)
     tables: list[Block] = []
     for block in blocks(files.log, MOBILEYE_BUS):
@@ -176,15 +176,14 @@ def test_the_mobileye_reports_vehicles_that_are_there(files: SceneFiles) -> None
             # The field of view refers to the vehicle's centre, the position to its near end.
             assert abs(np.arctan2(y_m, middle_m - 3.75)) < Faults().half_view_rad + 0.15
             true_m = cars[int(grabbed[np.argmin(np.abs(grabbed - t_ns))])].get(number - 1)
-            if (
-                true_m is not None
-            ):  # otherwise there are too few pixels for an annotation at this size
+            # Vehicles with too few pixels at this picture size have no annotation.
+            if true_m is not None:
                 assert abs(middle_m - true_m) < 1.5 + 0.12 * x_m
                 found += 1
     assert found > 20
 
 
-def test_truth_is_whole_and_cues_are_there_only_while_they_can_be_seen(files: SceneFiles) -> None:
+def test_truth_is_complete_and_cues_match_visible_objects(files: SceneFiles) -> None:
     truth = load(files.truth)
     (approach,) = truth.approaches
     objects = truth_of(files)
@@ -210,7 +209,7 @@ def test_truth_is_whole_and_cues_are_there_only_while_they_can_be_seen(files: Sc
     assert not any(one.cue in ("traffic_light", "do_not_enter") for one in present)
 
 
-def test_annotations_lie_in_their_pictures_and_masks_in_their_boxes(files: SceneFiles) -> None:
+def test_annotation_masks_match_boxes_and_areas(files: SceneFiles) -> None:
     objects = truth_of(files)
     size = {image["id"]: (image["width"], image["height"]) for image in objects["images"]}
 
@@ -225,13 +224,13 @@ def test_annotations_lie_in_their_pictures_and_masks_in_their_boxes(files: Scene
         assert mask.sum() == one["area"]
 
 
-def test_a_drive_is_not_overwritten_unasked(files: SceneFiles) -> None:
+def test_existing_drive_is_not_overwritten(files: SceneFiles) -> None:
     with pytest.raises(OutputError, match=r"drive\.mcap"):
         write_scene(files.log.parent, settings())
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (["simulate", "-o", "x"], "or --all"),
         (["simulate", "J", "-o", "x"], "there are: A to H"),
@@ -243,15 +242,15 @@ def test_a_drive_is_not_overwritten_unasked(files: SceneFiles) -> None:
         (["simulate", "A", "--seed", "-1", "-o", "x"], "seed -1"),
     ],
 )
-def test_wrong_usage_is_reported(
-    argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_arguments_are_refused(
+    argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(argv) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-BASE: dict[str, Any] = {"version": 1, "start_ns": 0, "end_ns": 100}
-ONE: dict[str, Any] = {
+MINIMAL_TRUTH: dict[str, Any] = {"version": 1, "start_ns": 0, "end_ns": 100}
+APPROACH: dict[str, Any] = {
     "id": 0,
     "intersection": "A",
     "start_ns": 0,
@@ -263,12 +262,15 @@ CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
-        ({"approaches": [ONE, ONE | {"id": 1, "start_ns": 30, "enter_ns": 60}]}, "overlap"),
-        ({"approaches": [ONE, ONE | {"start_ns": 50, "enter_ns": 60}]}, "duplicate id"),
-        ({"approaches": [ONE | {"enter_ns": 101}]}, "from 0 to 100"),
-        ({"approaches": [ONE | {"control": "yield"}]}, "approaches.0.control"),
+        (
+            {"approaches": [APPROACH, APPROACH | {"id": 1, "start_ns": 30, "enter_ns": 60}]},
+            "overlap",
+        ),
+        ({"approaches": [APPROACH, APPROACH | {"start_ns": 50, "enter_ns": 60}]}, "duplicate id"),
+        ({"approaches": [APPROACH | {"enter_ns": 101}]}, "from 0 to 100"),
+        ({"approaches": [APPROACH | {"control": "yield"}]}, "approaches.0.control"),
         ({"cues": [CUE | {"t_ns": 100}]}, "from 0 to 100"),
         ({"cues": [CUE | {"cue": "zebra", "t_ns": 5}]}, "no such cue"),
         ({"cues": [CUE]}, "either t_ns"),
@@ -277,9 +279,9 @@ CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
         ({"cues": [CUE | {"t_ns": 5, "approach": 3}]}, "no approach 3"),
     ],
 )
-def test_truth_that_cannot_be_is_refused(tmp_path: Path, more: dict[str, Any], said: str) -> None:
+def test_inconsistent_truth_is_refused(tmp_path: Path, more: dict[str, Any], message: str) -> None:
     path = tmp_path / "truth.json"
-    path.write_text(json.dumps(BASE | more))
+    path.write_text(json.dumps(MINIMAL_TRUTH | more))
 
-    with pytest.raises(SchemaError, match=said):
+    with pytest.raises(SchemaError, match=message):
         load(path)

@@ -1,4 +1,4 @@
-"""Laws of the simulated pictures: geometry, masks, visibility, symmetry, determinism."""
+"""Properties of the simulated pictures: geometry, masks, visibility, symmetry, determinism."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def only(picture: Picture, category: str) -> Seen:
     return found
 
 
-def test_the_same_seed_gives_the_same_pixels() -> None:
+def test_same_seed_yields_same_pixels() -> None:
     plan = layout_named("D")
     again = build(plan, conditions_of(plan, 1))
 
@@ -47,7 +47,7 @@ def test_pixels_do_not_depend_on_the_number_of_threads() -> None:
     assert np.array_equal(one.rgb, other.rgb)
 
 
-def test_a_picture_does_not_depend_on_those_before_it() -> None:
+def test_picture_does_not_depend_on_previous_pictures() -> None:
     draw = renderer(world("D"))
     t_s = when_at(world("D"), -20.0)
     alone = renderer(world("D")).picture(t_s, 7)
@@ -57,20 +57,20 @@ def test_a_picture_does_not_depend_on_those_before_it() -> None:
     assert np.array_equal(draw.picture(t_s, 7).rgb, alone.rgb)
 
 
-def test_another_run_is_another_picture() -> None:
+def test_different_seed_yields_different_picture() -> None:
     one, other = picture_at(world("D", 1), -20.0), picture_at(world("D", 1, seed=5), -20.0)
 
     assert not np.array_equal(one.rgb, other.rgb)
 
 
 @pytest.mark.parametrize("x_m", [-45.0, -30.0, -15.0, -8.0])
-def test_a_sign_is_as_large_and_where_a_pinhole_camera_shows_it(x_m: float) -> None:
+def test_sign_box_matches_pinhole_projection(x_m: float) -> None:
     camera = Camera()
     sign = only(picture_at(world("D"), x_m, camera), "stop_sign")
     view = view_at(camera, world("D").approach, when_at(world("D"), x_m))
     x0, y0, x1, y1 = sign.box_px
     _, y_m, z_m = sign.thing.at
-    pitch = float(np.arcsin(-view.eye_axes[2, 2]))  # the body pitches when it brakes
+    pitch = float(np.arcsin(-view.eye_axes[2, 2]))  # The body pitches when it brakes.
     depth_m = -view.at_m[0] * np.cos(pitch) - (z_m - view.at_m[2]) * np.sin(pitch)
 
     assert y1 - y0 == pytest.approx(camera.focal * 0.76 / depth_m, abs=1.6)
@@ -81,7 +81,7 @@ def test_a_sign_is_as_large_and_where_a_pinhole_camera_shows_it(x_m: float) -> N
 
 
 @pytest.mark.parametrize("layout", ["D", "E", "F"])
-def test_masks_fill_their_boxes_and_say_who_owns_each_pixel(layout: str) -> None:
+def test_masks_fill_their_boxes_and_match_owner_image(layout: str) -> None:
     picture = picture_at(world(layout), -25.0)
 
     assert picture.seen
@@ -97,7 +97,7 @@ def test_masks_fill_their_boxes_and_say_who_owns_each_pixel(layout: str) -> None
 
 
 @pytest.mark.slow
-def test_the_mirror_image_of_a_world_is_the_mirror_image_of_its_picture() -> None:
+def test_mirrored_world_yields_mirrored_picture() -> None:
     plain = world("F", 2)
     one, other = picture_at(plain, -22.0), picture_at(mirrored(plain), -22.0)
 
@@ -106,11 +106,11 @@ def test_the_mirror_image_of_a_world_is_the_mirror_image_of_its_picture() -> Non
     not_mirrored = np.abs(one.rgb.astype(int) - other.rgb).mean()
 
     assert same > 0.999
-    assert away < 4.0  # noise and the road's fine grain are not mirrored
+    assert away < 4.0  # Noise and the road's fine texture are not mirrored.
     assert not_mirrored > 3 * away
 
 
-def test_vegetation_hides_the_stop_sign_from_afar_and_not_from_near() -> None:
+def test_vegetation_hides_stop_sign_only_at_distance() -> None:
     camera = Camera()
     far = picture_at(world("G"), -55.0, camera)
     hidden = max((s.visible for s in far.seen if s.thing.category == "stop_sign"), default=0.0)
@@ -120,7 +120,7 @@ def test_vegetation_hides_the_stop_sign_from_afar_and_not_from_near() -> None:
     assert only(picture_at(world("G"), -12.0, camera), "stop_sign").visible > 0.9
 
 
-def test_what_is_beside_the_camera_is_not_seen() -> None:
+def test_object_beside_camera_is_not_visible() -> None:
     scene = world("D")
     picture = picture_at(scene, 1.0)
 
@@ -128,7 +128,7 @@ def test_what_is_beside_the_camera_is_not_seen() -> None:
 
 
 @pytest.mark.slow
-def test_dusk_is_darker_than_noon_and_glare_brighter_at_the_sun() -> None:
+def test_dusk_is_darker_than_noon_and_glare_saturates_sky() -> None:
     noon, dusk = picture_at(world("D", 1), -30.0), picture_at(world("D", 10), -30.0)
     glare = picture_at(world("D", 4), -30.0)
     top = glare.rgb[: SMALL.height_px // 3]
@@ -139,7 +139,7 @@ def test_dusk_is_darker_than_noon_and_glare_brighter_at_the_sun() -> None:
 
 @pytest.mark.parametrize("kind", sorted(SHAPES))
 @pytest.mark.parametrize("nose_left", [False, True])
-def test_the_nose_is_the_end_with_the_smaller_height(kind: str, nose_left: bool) -> None:
+def test_front_of_car_is_lower_than_rear(kind: str, nose_left: bool) -> None:
     mask = _side_view(kind, nose_left=nose_left)
     columns = np.flatnonzero(mask.any(axis=0))
     width = len(columns)
@@ -151,7 +151,7 @@ def test_the_nose_is_the_end_with_the_smaller_height(kind: str, nose_left: bool)
 
 
 def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
-    """A car 15 m ahead, seen from the side."""
+    """Return the mask of a car 15 m ahead, seen from the side."""
     mesh = car(Look(kind, (0.5, 0.5, 0.5)), lamps_on=False, brakes_on=False)
     placed = mesh.placed(15.0, 0.0, np.pi / 2 if nose_left else -np.pi / 2)
     covered = np.zeros((216, 384), np.uint8)
@@ -171,7 +171,7 @@ def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
     return covered.astype(np.bool_)
 
 
-def test_layouts_from_seeds_are_none_of_the_scored_ones() -> None:
+def test_seeded_layouts_differ_from_scored_layouts() -> None:
     others = [any_layout(seed) for seed in range(60)]
 
     assert len({one.name for one in others}) == 60
@@ -189,7 +189,7 @@ def test_unknown_layouts_are_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("layout", ["D", "F", "L12"])
-def test_cars_that_drive_stay_on_the_road(layout: str) -> None:
+def test_moving_cars_stay_on_road(layout: str) -> None:
     scene = world(layout)
     moving = [one for one in scene.things if one.velocity != (0.0, 0.0)]
     for thing in moving:
@@ -200,7 +200,7 @@ def test_cars_that_drive_stay_on_the_road(layout: str) -> None:
                 assert scene.ground.road[place], f"{thing.role} at {x:.1f}, {y:.1f}"
 
 
-def test_our_car_stays_on_the_road_and_turns_only_where_it_may() -> None:
+def test_ego_vehicle_stays_on_road_and_makes_only_allowed_turns() -> None:
     for layout in ("D", "F"):
         scene = world(layout)
         motion, plan = scene.approach.motion, scene.layout
