@@ -17,9 +17,9 @@ from crosscue.replay.files import checksum
 @settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=9000), st.binary(max_size=300))
 def test_crc32_equals_zlib_in_one_or_two_pieces(first: bytes, second: bytes) -> None:
-    whole = zlib.crc32(first + second)
-    assert checksum.crc32(first + second) == whole
-    assert checksum.crc32(memoryview(second), checksum.crc32(first)) == whole
+    expected = zlib.crc32(first + second)
+    assert checksum.crc32(first + second) == expected
+    assert checksum.crc32(memoryview(second), checksum.crc32(first)) == expected
     assert checksum.crc32(np.frombuffer(first, np.uint8)) == zlib.crc32(first)
 
 

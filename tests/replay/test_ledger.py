@@ -76,12 +76,12 @@ class _Rows:
 def _read_through(ledger: Ledger, found: int, yielded: int, skipped: int) -> None:
     def blocks() -> Iterator[_Rows]:
         ledger.find("/t", found)
-        ledger.skip("/t", "not wanted", skipped)
+        ledger.skip("/t", "not selected", skipped)
         yield _Rows("/t", yielded)
 
     for _ in ledger.handing_on(blocks()):
-        ledger.skip("/t", "not understood", 1)
-        ledger.skip_more("/t", "not understood", 1)
+        ledger.skip("/t", "not decodable", 1)
+        ledger.skip_more("/t", "not decodable", 1)
         ledger.spoil("/t", "damaged", 1)
 
 
@@ -93,7 +93,7 @@ def test_account_is_checked_against_yielded_rows() -> None:
 
     account = ledger.topic("/t")
     assert (account.in_file, account.used) == (10, 4)
-    assert account.skipped == {"not wanted": 3, "not understood": 2}
+    assert account.skipped == {"not selected": 3, "not decodable": 2}
     assert account.dropped == {"damaged": 1}
     with pytest.raises(AccountError, match="please report"):
         ledger.check({"/t": 5})

@@ -54,9 +54,9 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
             pixels = [rng.integers(0, 256, (100, 130, 3), np.uint8) for _ in t_ns]
             coded = [cv2.imencode(".png", one)[1].tobytes() for one in pixels]
             stop = np.cumsum([len(one) for one in coded])
-            whole = np.frombuffer(b"".join(coded), np.uint8)
+            joined = np.frombuffer(b"".join(coded), np.uint8)
             start = np.concatenate([[0], stop[:-1]])
-            images = Images(Messages(whole, start, stop), ("png",) * 10)
+            images = Images(Messages(joined, start, stop), ("png",) * 10)
             writer.write(Block("camera", np.array(t_ns, np.int64), images))
     with path.open("rb") as source, (folder / "drive.mcap").open("wb") as target:
         copy = Writer(target, chunk_size=100_000)
@@ -92,7 +92,7 @@ def max_transfer_bytes(path: Path, start_ns: int, end_ns: int) -> int:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     chunks = sorted(summary.chunk_indexes, key=lambda one: one.chunk_start_offset)
-    wanted = [
+    selected = [
         one
         for i, one in enumerate(chunks)
         if i == 0 or (one.message_end_time >= start_ns and one.message_start_time < end_ns)
@@ -100,7 +100,7 @@ def max_transfer_bytes(path: Path, start_ns: int, end_ns: int) -> int:
     last = chunks[-1]
     begin = last.chunk_start_offset + last.chunk_length + last.message_index_length
     return int(
-        1.5 * sum(one.chunk_length + one.message_index_length for one in wanted)
+        1.5 * sum(one.chunk_length + one.message_index_length for one in selected)
         + path.stat().st_size
         - begin
     )

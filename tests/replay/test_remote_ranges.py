@@ -67,14 +67,14 @@ def test_window_of_remote_mcap_transfers_only_its_chunks(tmp_path: Path, web: Se
     window = Selection(None, 20_000 * MS, 24_000 * MS)
     here, there = Ledger("here"), Ledger("there")
     with open_log(path) as log:
-        wanted = times(log.read(here, window))
+        expected = times(log.read(here, window))
 
     with open_log(f"{web.base}/drives/log.mcap") as log:
         assert isinstance(log, RangedLog)
         opened = web.sent
         found = times(log.read(there, window))
 
-    assert found == wanted
+    assert found == expected
     assert there.accounts == here.accounts
     assert there.integrity == here.integrity
     assert opened < 80_000
@@ -102,14 +102,14 @@ def test_window_of_remote_bag_transfers_only_its_chunks(tmp_path: Path, web: Ser
     web.files["a.bag"] = path.read_bytes()
     window = Selection(None, rows[8_000].log_ns, rows[10_000].log_ns)
     with open_log(path) as log:
-        wanted = times(log.read(Ledger("here"), window))
+        expected = times(log.read(Ledger("here"), window))
 
     with open_log(f"{web.base}/a.bag") as log:
         assert isinstance(log, RangedLog)
         opened = web.sent
         found = times(log.read(Ledger("there"), window))
 
-    assert found == wanted
+    assert found == expected
     assert web.sent - opened < 1.5 * (2_000 / 20_000) * path.stat().st_size + 2 * 64_000
     assert opened < 0.1 * path.stat().st_size
 

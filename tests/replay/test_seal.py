@@ -333,19 +333,19 @@ def test_damaged_seal_is_refused_in_one_line(
 
 def test_damaged_seal_never_reports_a_different_log(tmp_path: Path) -> None:
     log = _sealed(tmp_path, "candump")
-    whole, sound = seal_path(log).read_bytes(), read_seal(seal_path(log))
+    original, original_seal = seal_path(log).read_bytes(), read_seal(seal_path(log))
     refused = 0
-    for at in range(0, len(whole) - 1, 7):
-        text = bytearray(whole)
+    for at in range(0, len(original) - 1, 7):
+        text = bytearray(original)
         text[at] ^= 1
         seal_path(log).write_bytes(text)
         try:
-            assert read_seal(seal_path(log)) == sound
+            assert read_seal(seal_path(log)) == original_seal
         except LogError:
             refused += 1
 
     # Only a change of white space between tokens is harmless.
-    assert refused > 0.6 * len(whole) / 7
+    assert refused > 0.6 * len(original) / 7
 
 
 @pytest.mark.parametrize(

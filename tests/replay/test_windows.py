@@ -56,8 +56,8 @@ def test_every_sample_is_returned_once_in_order(
     assert [w.start_ns for w in found] == sorted({t // SECOND * SECOND for t in [*wheels, *gyro]})
     for signal, times in ((Signal.WHEEL_SPEEDS, wheels), (Signal.YAW_RATE, gyro)):
         parts = [w.samples[signal] for w in found if signal in w.samples]
-        got = [int(t) for part in parts for t in part.t_ns]
-        assert got == times
+        found_times = [int(t) for part in parts for t in part.t_ns]
+        assert found_times == times
     for window in found:
         for part in window.samples.values():
             assert ((part.t_ns >= window.start_ns) & (part.t_ns < window.end_ns)).all()

@@ -168,7 +168,7 @@ def test_excessive_signal_and_message_sizes_are_refused(
 @pytest.mark.slow
 def test_truncated_dbc_file_is_refused_or_reported(tmp_path: Path) -> None:
     text = dbc_text([YAW, WHEEL]).rstrip()
-    whole = CanDatabase.load([write_file(tmp_path, text)])
+    complete = CanDatabase.load([write_file(tmp_path, text)])
     reported = 0
     for cut in range(len(text)):
         try:
@@ -178,7 +178,7 @@ def test_truncated_dbc_file_is_refused_or_reported(tmp_path: Path) -> None:
         reported += 1
         # A truncation after a complete line of the closing section cannot be detected.
         is_hidden = text[:cut].endswith(";\n")
-        assert is_hidden or database.messages == whole.messages or database.notices
+        assert is_hidden or database.messages == complete.messages or database.notices
     assert reported > 10
 
 

@@ -222,8 +222,8 @@ def test_encoding_refuses_missing_and_unknown_signals() -> None:
 
 
 def test_extractor_of_a_message_is_shared(tmp_path: Path) -> None:
-    whole = CanSignal("speed", 0, 16), CanSignal("mode", 16, 4)
-    message = CanMessage("drive", 0x123, False, 8, whole)
+    speed_and_mode = CanSignal("speed", 0, 16), CanSignal("mode", 16, 4)
+    message = CanMessage("drive", 0x123, False, 8, speed_and_mode)
     database, _ = parsed_by_both(message, tmp_path)
     (known,) = database.messages
     assert database.extractor(known) is database.extractor(known)

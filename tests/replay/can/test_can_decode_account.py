@@ -48,11 +48,11 @@ ENGINES: list[EngineName] = ["numpy", "numba"]
 
 
 def decoder(
-    engine: EngineName = "numpy", allow_longer: bool = False, wanted: list[str] | None = None
+    engine: EngineName = "numpy", allow_longer: bool = False, selected: list[str] | None = None
 ) -> tuple[BusDecoder, Ledger]:
     ledger = Ledger("made up")
     return BusDecoder(
-        DATABASE, "can0", ledger, wanted, DecodeSettings(allow_longer, engine)
+        DATABASE, "can0", ledger, selected, DecodeSettings(allow_longer, engine)
     ), ledger
 
 
@@ -173,7 +173,7 @@ def test_signals_of_inactive_branches_are_nan(engine: EngineName) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_unselected_messages_are_counted_as_skipped(engine: EngineName) -> None:
-    decode, ledger = decoder(engine, wanted=["Speed"])
+    decode, ledger = decoder(engine, selected=["Speed"])
     plain_and_extended = frames_of(np.zeros((4, 2), np.uint8), 0x100)
     plain_and_extended = replace(
         plain_and_extended, is_extended=np.array([False, True, False, True])

@@ -121,13 +121,13 @@ def test_extended_multiplexing_floats_and_can_fd_equal_cantools() -> None:
 
 @pytest.mark.parametrize("text", [EXTENDED, "savvycan/bms.dbc", "savvycan/LeafPowertrainBus.dbc"])
 def test_layouts_of_damaged_files_equal_cantools(text: str) -> None:
-    whole = text if "\n" in text else shared("can", *text.split("/")).read_text()
+    intact = text if "\n" in text else shared("can", *text.split("/")).read_text()
     chance = random.Random(7)
     compared = 0
     for _ in range(150):
-        at, count = chance.randrange(len(whole)), chance.randrange(1, 9)
-        patch = chance.choice(["", whole[at : at + count] * 2, chance.choice(' ;:"|@M0-_\n\\')])
-        source = DatabaseText(Path("x.dbc"), whole[:at] + patch + whole[at + count :])
+        at, count = chance.randrange(len(intact)), chance.randrange(1, 9)
+        patch = chance.choice(["", intact[at : at + count] * 2, chance.choice(' ;:"|@M0-_\n\\')])
+        source = DatabaseText(Path("x.dbc"), intact[:at] + patch + intact[at + count :])
         quick = read_dbc(source.text)
         if quick is None:
             continue
@@ -146,8 +146,8 @@ def test_layouts_of_damaged_files_equal_cantools(text: str) -> None:
         ("SG_ other :", 'SG_ real : 0|8@1+ (1,0) [0|0] "" ECU\n SG_ real :'),
         ("BO_ 100 Fd", "BO_ 2147484000 Fd"),
         ("BO_ 100 Fd", "BO_ 4000 Fd"),
-        ("VAL_ 2147484000 other", "VAL_ 2147484000 nobody"),
-        ("SIG_VALTYPE_ 100 real", "SIG_VALTYPE_ 100 nobody"),
+        ("VAL_ 2147484000 other", "VAL_ 2147484000 unknown"),
+        ("SIG_VALTYPE_ 100 real", "SIG_VALTYPE_ 100 unknown"),
         ("deep inner 3-3", "inner inner 3-3"),
         ("0|32@1-", "0|0@1-"),
         ("(2.0,1.0)", "(.5,1.0)"),
@@ -258,7 +258,7 @@ def test_damaged_cache_entry_is_parsed_again(
     tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = _dbc_file(tmp_path)
-    whole = CanDatabase.load([path])
+    intact = CanDatabase.load([path])
     (entry,) = cache_dir.iterdir()
     stored = entry.read_bytes()
     parsed = _record_parses(monkeypatch)
@@ -271,7 +271,7 @@ def test_damaged_cache_entry_is_parsed_again(
         )
     for copy in copies:
         entry.write_bytes(copy)
-        assert _are_same(CanDatabase.load([path]), whole)
+        assert _are_same(CanDatabase.load([path]), intact)
         assert entry.read_bytes() == stored
 
     assert len(parsed) == len(copies)

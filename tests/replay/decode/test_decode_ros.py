@@ -43,7 +43,7 @@ def generic_decoder(topic: Topic) -> RosDecoder:
     return replace(decoder, kind=Kind((), generic))
 
 
-def serialised(store: Typestore, message: object, name: str, *, little: bool = True) -> bytes:
+def serialized(store: Typestore, message: object, name: str, *, little: bool = True) -> bytes:
     if store is ros1_store():
         return bytes(store.serialize_ros1(message, name))
     return bytes(store.serialize_cdr(message, name, little_endian=little))
@@ -88,7 +88,7 @@ def test_standard_types_decode_like_rosbags(
         if "/msg/" not in name or name.startswith(("rcl_interfaces/", "builtin_")):
             continue
         messages = [random_message(rng, store, name) for _ in range(4)]
-        payloads = [serialised(store, each, name) for each in messages]
+        payloads = [serialized(store, each, name) for each in messages]
         ledger = Ledger("made")
         table = generic_decoder(topic_of("/t", name))(block_of("/t", payloads), ledger).rows
         assert not ledger.details, name
@@ -187,7 +187,7 @@ def test_damaged_messages_are_dropped_like_rosbags(seed: int, is_cdr: bool) -> N
     store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
     payloads, accepted = [], []
     for _ in range(24):
-        raw = bytearray(serialised(store, random_message(rng, store, name), name))
+        raw = bytearray(serialized(store, random_message(rng, store, name), name))
         match int(rng.integers(0, 5)):
             case 0:
                 raw = raw[: int(rng.integers(0, len(raw)))]
@@ -223,7 +223,7 @@ def _decode_with_rosbags(store: Typestore, raw: bytes, name: str, is_cdr: bool) 
 def test_message_with_wrong_length_is_dropped_with_field_and_time() -> None:
     store = ros2_store()
     good = store.types["std_msgs/msg/String"]("abc")
-    raw = serialised(store, good, "std_msgs/msg/String")
+    raw = serialized(store, good, "std_msgs/msg/String")
     wrong_length = raw[:4] + b"\x32" + raw[5:]
     ledger = Ledger("made")
 
@@ -240,7 +240,7 @@ def test_message_with_wrong_length_is_dropped_with_field_and_time() -> None:
 @pytest.mark.parametrize("head", [b"\x00\x06", b"\x00\x07", b"\x00\x03", b"\x01\x00", b"\xff\xff"])
 def test_unsupported_encapsulation_is_skipped_and_damaged_one_dropped(head: bytes) -> None:
     store = ros2_store()
-    raw = serialised(store, store.types["std_msgs/msg/Float64"](1.5), "std_msgs/msg/Float64")
+    raw = serialized(store, store.types["std_msgs/msg/Float64"](1.5), "std_msgs/msg/Float64")
     ledger = Ledger("made")
 
     decoded = must_decode(ros2_topic("/f", "std_msgs/msg/Float64"))(
@@ -259,7 +259,7 @@ def test_block_with_both_byte_orders_keeps_row_order() -> None:
     store, name = ros2_store(), "geometry_msgs/msg/PointStamped"
     rng = np.random.default_rng(3)
     messages = [random_message(rng, store, name) for _ in range(9)]
-    payloads = [serialised(store, m, name, little=i % 3 != 1) for i, m in enumerate(messages)]
+    payloads = [serialized(store, m, name, little=i % 3 != 1) for i, m in enumerate(messages)]
     ledger = Ledger("made")
 
     decoded = must_decode(ros2_topic("/p", name))(block_of("/p", payloads), ledger)
@@ -272,7 +272,7 @@ def test_block_with_both_byte_orders_keeps_row_order() -> None:
 
 def test_taking_rows_of_both_byte_orders_keeps_values() -> None:
     store, name = ros2_store(), "std_msgs/msg/Int32"
-    payloads = [serialised(store, store.types[name](i), name, little=i % 2 == 0) for i in range(10)]
+    payloads = [serialized(store, store.types[name](i), name, little=i % 2 == 0) for i in range(10)]
     keep = np.array([i % 3 == 0 for i in range(10)])
 
     decoder = generic_decoder(ros2_topic("/i", name))
@@ -298,7 +298,7 @@ def test_can_frames_are_decoded_to_columns() -> None:
             dlc,
             np.arange(1, 9, dtype=np.uint8),
         )
-        return serialised(store, message, name)
+        return serialized(store, message, name)
 
     payloads = [
         frame(0x123, 3),
@@ -335,7 +335,7 @@ def test_compressed_images_share_memory_with_the_log() -> None:
         store.types["builtin_interfaces/msg/Time"](1, 0), "cam"
     )
     payloads = [
-        serialised(store, store.types[name](header, label, np.frombuffer(p, np.uint8)), name)
+        serialized(store, store.types[name](header, label, np.frombuffer(p, np.uint8)), name)
         for label, p in zip(labels, pictures, strict=True)
     ]
     block, ledger = block_of("/cam", payloads), Ledger("made")
@@ -399,7 +399,7 @@ def test_raw_image_with_too_few_bytes_is_dropped() -> None:
 
     def image(size: int) -> bytes:
         pixels = np.zeros(size, np.uint8)
-        return serialised(store, store.types[name](header, 2, 3, "rgb8", 0, 9, pixels), name)
+        return serialized(store, store.types[name](header, 2, 3, "rgb8", 0, 9, pixels), name)
 
     ledger = Ledger("made")
     images = must_decode(ros2_topic("/cam", name))(block_of("/cam", [image(18), image(17)]), ledger)
@@ -439,7 +439,7 @@ def test_standard_columns_contain_the_matching_fields(name: str, is_cdr: bool) -
     rng = np.random.default_rng(11)
     store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
     messages = [random_message(rng, store, name) for _ in range(5)]
-    payloads = [serialised(store, each, name) for each in messages]
+    payloads = [serialized(store, each, name) for each in messages]
 
     table = must_decode(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
 
@@ -457,7 +457,7 @@ def test_camera_info_keeps_matrices_and_distortion(is_cdr: bool) -> None:
     message = random_message(np.random.default_rng(1), store, name)
     lens = "d" if is_cdr else "D"
     setattr(message, lens, np.arange(5.0))
-    payloads = [serialised(store, message, name)]
+    payloads = [serialized(store, message, name)]
 
     table = must_decode(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
 
@@ -470,7 +470,7 @@ def test_camera_info_keeps_matrices_and_distortion(is_cdr: bool) -> None:
 def test_missing_definition_falls_back_to_standard_type() -> None:
     store, name = ros2_store(), "sensor_msgs/msg/MagneticField"
     message = random_message(np.random.default_rng(2), store, name)
-    payloads = [serialised(store, message, name)]
+    payloads = [serialized(store, message, name)]
 
     table = must_decode(Topic("/mag", name, "cdr"))(block_of("/mag", payloads), Ledger("x")).rows
 
@@ -585,7 +585,7 @@ def test_damaged_definition_is_used_or_refused_in_one_line(seed: int, is_cdr: bo
             text[at] = int(rng.choice(list(b"[]<=019 \n/@zZ\xff")))
         else:
             del text[at : at + int(rng.integers(1, 30))]
-    payloads = [serialised(store, random_message(rng, store, name), name) for _ in range(4)]
+    payloads = [serialized(store, random_message(rng, store, name), name) for _ in range(4)]
     ledger = Ledger("made")
     ledger.find("/t", 4)
 
@@ -619,7 +619,7 @@ def test_idl_definition_decodes_like_msg_definition() -> None:
     name = "geometry_msgs/msg/Made"
     store.register(get_types_from_msg("Vector3 at\nint16[] counts\nfloat32[3] w\nstring s\n", name))
     rng = np.random.default_rng(4)
-    payloads = [serialised(store, random_message(rng, store, name), name) for _ in range(5)]
+    payloads = [serialized(store, random_message(rng, store, name), name) for _ in range(5)]
     tables = []
     for schema, encoding in ((idl, "ros2idl"), (text, "ros2msg")):
         topic = Topic("/m", name, "cdr", schema.encode(), encoding)

@@ -38,9 +38,9 @@ def decode(
     for block in decoded_blocks:
         assert isinstance(block.rows, Table)
         tables.setdefault(block.topic.removeprefix("can1/mobileye/"), []).append(block.rows)
-    whole = {name: stack(parts) for name, parts in tables.items()}
-    assert ledger.topic("can1").used == frames_in(whole)
-    return whole, ledger
+    complete = {name: stack(parts) for name, parts in tables.items()}
+    assert ledger.topic("can1").used == frames_in(complete)
+    return complete, ledger
 
 
 def stack(parts: list[Table]) -> Table:
@@ -74,9 +74,9 @@ def test_complete_burst_yields_one_row_per_obstacle() -> None:
 
 
 def test_order_of_frames_within_a_burst_does_not_matter() -> None:
-    whole = [*triple(0, 7), *triple(1, 9)]
-    straight, _ = decode(frames([status(2, 0), *whole]))
-    mixed, ledger = decode(frames([status(2, 0), *whole[::-1]]))
+    complete = [*triple(0, 7), *triple(1, 9)]
+    straight, _ = decode(frames([status(2, 0), *complete]))
+    mixed, ledger = decode(frames([status(2, 0), *complete[::-1]]))
 
     for name in straight["obstacles"].columns:
         np.testing.assert_array_equal(straight["obstacles"][name], mixed["obstacles"][name])
@@ -418,13 +418,13 @@ def test_tables_do_not_depend_on_block_division(seed: int, cuts: list[int]) -> N
     drive = random_drive(8, rng)
     index = np.sort(rng.choice(len(drive), size=len(drive), replace=True))
     drive = drive.take(index)
-    whole, ledger = decode(drive)
+    complete, ledger = decode(drive)
     places = sorted({min(c, len(drive)) for c in cuts})
     parts = [drive.take(np.s_[a:b]) for a, b in pairwise([0, *places, len(drive)])]
     from_parts, ledger_of_parts = decode(parts)
 
-    assert whole.keys() == from_parts.keys()
-    for name, table in whole.items():
+    assert complete.keys() == from_parts.keys()
+    for name, table in complete.items():
         for column in table.columns:
             np.testing.assert_array_equal(table[column], from_parts[name][column])
     assert skipped(ledger) == skipped(ledger_of_parts)
@@ -437,12 +437,12 @@ def test_tables_do_not_depend_on_block_division(seed: int, cuts: list[int]) -> N
 def test_lost_frames_never_add_a_row(seed: int) -> None:
     rng = np.random.default_rng(seed)
     drive = random_drive(10, rng)
-    whole, _ = decode(drive)
+    complete, _ = decode(drive)
     remaining, ledger = decode(drive.take(rng.random(len(drive)) > 0.2))
 
-    all_obstacles = rows_of(whole.get("obstacles"))
+    all_obstacles = rows_of(complete.get("obstacles"))
     assert rows_of(remaining.get("obstacles")) <= all_obstacles
-    assert rows_of(remaining.get("lanes")) <= rows_of(whole.get("lanes"))
+    assert rows_of(remaining.get("lanes")) <= rows_of(complete.get("lanes"))
     if len(rows_of(remaining.get("obstacles"))) < len(all_obstacles):
         assert skipped(ledger) or ledger.topic("can1").dropped
 

@@ -242,7 +242,7 @@ def write_source(path: Path, compression: CompressionType = CompressionType.ZSTD
             channels.append((writer.register_channel(name, "cdr", schema), type_name))
         broken = writer.register_schema("made_msgs/msg/Bad", "ros2msg", b"not a definition ~~\n")
         bad = writer.register_channel("/bad", "cdr", broken)
-        unsupported = writer.register_channel("/foreign", "flatbuffer", 0)
+        unsupported = writer.register_channel("/unsupported", "flatbuffer", 0)
         for i in range(60):
             for channel, type_name in channels:
                 raw = bytes(store.serialize_cdr(random_message(rng, store, type_name), type_name))
@@ -267,7 +267,7 @@ def test_ros2_messages_are_copied_exactly_and_others_counted(
     assert status == 3
     assert report["is_whole"] is False
     assert report["topics"]["/bad"]["skipped"] == {BAD_SCHEMA: 3}
-    assert report["topics"]["/foreign"]["skipped"] == {NO_TYPE: 3}
+    assert report["topics"]["/unsupported"]["skipped"] == {NO_TYPE: 3}
     for name in ("/imu", "/s"):
         assert report["topics"][name]["found"] == report["topics"][name]["written"] == 60
     with AnyReader([out]) as reader:
