@@ -40,8 +40,8 @@ def frames_of(
 
 def max_deviation(steps: Sequence[Step]) -> float:
     """Return the largest deviation of any feature's probability from 0.5."""
-    said = [abs(p - 0.5) for step in steps for p in step.probabilities.values()]
-    return max(said, default=0.0)
+    deviations = [abs(p - 0.5) for step in steps for p in step.probabilities.values()]
+    return max(deviations, default=0.0)
 
 
 @pytest.mark.parametrize("cue", [name for name in CUES if name in NONE_SEEN])
@@ -83,11 +83,11 @@ def test_copies_of_frame_send_zero_messages(copies: int, seconds: float, cue: st
     first = situation({cue: 3}, passed_s=seconds)
     copy = situation({cue: 3}, new_picture=False, passed_s=seconds)
 
-    said = once(first)
+    messages = once(first)
 
-    assert again(first) == said
+    assert again(first) == messages
     for _ in range(copies):
-        assert again(copy) == [0.0] * len(said)
+        assert again(copy) == [0.0] * len(messages)
 
 
 @given(copies=st.integers(1, 20))
@@ -96,10 +96,10 @@ def test_copies_of_frame_do_not_confirm_cue(copies: int) -> None:
 
     persistence({"stop_sign": 1})
     for _ in range(copies):
-        heard = persistence({"stop_sign": 1}, is_new_picture=False)
+        observed = persistence({"stop_sign": 1}, is_new_picture=False)
 
-    assert heard.silent == {"stop_sign": "seen in 1 of 3 frames needed"}
-    assert heard.counts == {}
+    assert observed.silent == {"stop_sign": "seen in 1 of 3 frames needed"}
+    assert observed.counts == {}
 
 
 @given(frames=st.integers(2, 400), way_m=st.floats(0.0, 80.0))

@@ -88,10 +88,10 @@ def test_bomb_is_refused_with_size_and_limit_in_bounded_memory(tmp_path: Path, c
     path = tmp_path / f"bomb{suffix}"
     path.write_bytes((mcap if suffix == ".mcap" else bag)(body(), compression, declared))
 
-    status, said, peak_mb = measured(["info", str(path)])
+    status, output, peak_mb = measured(["info", str(path)])
 
     assert status == 3
     assert peak_mb < MAX_MB
-    assert str(declared) in said
+    assert str(declared) in output
     other = str(DEFAULT_LIMITS.chunk_bytes) if "limit" in case else "more"
-    assert re.search(rf"\b{other}\b", said)
+    assert re.search(rf"\b{other}\b", output)

@@ -168,21 +168,21 @@ def test_bomb_in_log_is_refused_with_size_and_limit(tmp_path: Path, case: str) -
     make, wanted, numbers = LOGS[case]
     path = make(tmp_path)
 
-    status, said, peak_mb = measured(["info", str(path)])
+    status, output, peak_mb = measured(["info", str(path)])
 
-    assert status == wanted, said
+    assert status == wanted, output
     assert peak_mb < MAX_MB
     for number in numbers:
-        assert re.search(number, said), (number, said)
+        assert re.search(number, output), (number, output)
 
 
 @pytest.mark.slow
 def test_max_chunk_option_sets_limit(tmp_path: Path) -> None:
     path = _blf(3 * MIB)(tmp_path)
 
-    _, said, _ = measured(["info", str(path), "--max-chunk", "2"])
+    _, output, _ = measured(["info", str(path), "--max-chunk", "2"])
 
-    assert f"the limit is {2 * MIB} (--max-chunk)" in said
+    assert f"the limit is {2 * MIB} (--max-chunk)" in output
 
 
 @pytest.mark.slow
@@ -194,10 +194,10 @@ def test_max_chunk_option_limits_zstd_size_in_bag(tmp_path: Path, kind: str) -> 
         else _bag_with_zstd_file_of_declared_size(tmp_path)
     )
 
-    status, said, _ = measured(["info", str(path), "--max-chunk", "2"])
+    status, output, _ = measured(["info", str(path), "--max-chunk", "2"])
 
     assert status == (3 if kind == "message" else 4)
-    assert f"declares {BOMB_BYTES} bytes, the limit is {2 * MIB} (--max-chunk)" in said
+    assert f"declares {BOMB_BYTES} bytes, the limit is {2 * MIB} (--max-chunk)" in output
 
 
 @pytest.mark.slow
@@ -207,11 +207,11 @@ def test_gzip_file_is_refused_without_decompression(tmp_path: Path) -> None:
         for _ in range(BOMB_BYTES >> 20):
             file.write(PIECE)
 
-    status, said, peak_mb = measured(["info", str(path)])
+    status, output, peak_mb = measured(["info", str(path)])
 
-    assert status == 4, said
+    assert status == 4, output
     assert peak_mb < MAX_MB
-    assert "gzip" in said
+    assert "gzip" in output
 
 
 def _png() -> bytes:
@@ -251,14 +251,14 @@ def test_image_bomb_is_dropped_before_decoding(
     (log / f"frame_2{suffix}").write_bytes(PICTURES[suffix]())
     if is_in_mcap:
         converted = tmp_path / "cam.mcap"
-        status, said, _ = measured(["convert", str(log), "-o", str(converted)])
-        assert status == 0, said
+        status, output, _ = measured(["convert", str(log), "-o", str(converted)])
+        assert status == 0, output
         log = converted
     argv = ["detect", str(log), "--detectors", "support.detecting:build", "--no-cache"]
 
-    status, said, peak_mb = measured([*argv, "-o", str(tmp_path / "run")])
+    status, output, peak_mb = measured([*argv, "-o", str(tmp_path / "run")])
 
-    assert status == 3, said
+    assert status == 3, output
     assert peak_mb < MAX_WITH_DETECTOR_MB
-    assert f"{SIDE_PX} x {SIDE_PX}" in said
-    assert f"{MAX_PIXELS:,}" in said
+    assert f"{SIDE_PX} x {SIDE_PX}" in output
+    assert f"{MAX_PIXELS:,}" in output

@@ -184,7 +184,7 @@ def test_truncation_is_reported(tmp_path: Path, compression: int) -> None:
     for at in range(0, len(content) - 1, len(content) // 150):
         outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
         if outcome is not None and outcome[0] < len(frames):
-            assert not outcome[1], f"cut at {at}: {outcome[0]} frames, nothing said"
+            assert not outcome[1], f"cut at {at}: {outcome[0]} frames, no loss reported"
 
 
 def test_truncation_of_real_log_is_reported(tmp_path: Path) -> None:

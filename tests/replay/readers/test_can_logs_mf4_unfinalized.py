@@ -123,8 +123,8 @@ def test_unfinalized_log_is_reported_in_notices() -> None:
 
     _, ledger = read_back(path)
 
-    said = "not finalized by the logger; 28721 records recovered from the data block"
-    assert said in ledger.notices
+    notice = "not finalized by the logger; 28721 records recovered from the data block"
+    assert notice in ledger.notices
     assert {name: one.used for name, one in ledger.accounts.items() if name} == {
         "can/1": 14_360,
         "can/2": 14_361,
@@ -172,8 +172,8 @@ def test_all_layouts_of_channel_groups_yield_every_frame(tmp_path: Path, variant
 
     assert found == by_bus(frames, "can/{}")
     assert ledger.is_whole
-    said = f"not finalized by the logger; {len(frames)} records recovered from the data block"
-    assert (said in ledger.notices) != options.get("is_finalized", False)
+    notice = f"not finalized by the logger; {len(frames)} records recovered from the data block"
+    assert (notice in ledger.notices) != options.get("is_finalized", False)
 
 
 @pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes", "finalized"])
@@ -204,7 +204,7 @@ def test_truncation_drops_only_frames_after_it(tmp_path: Path, virtual: bool, or
 
         assert found == by_bus(inside, "can/{}"), f"cut at {cut}"
         if cut not in whole.starts:
-            assert not ledger.is_whole, f"cut at {cut}: nothing said"
+            assert not ledger.is_whole, f"cut at {cut}: no loss reported"
         known = sum(account.dropped.total() for account in ledger.accounts.values())
         assert known <= len(frames) - len(inside) + 1
 

@@ -228,7 +228,7 @@ def _numbered(*numbers: int, head: str = HEAD_V1) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "lost", "unknown", "rows"),
+    ("text", "dropped", "unknown", "rows"),
     [
         (_numbered(1, 3, 2, 4), {}, [], 4),
         (_numbered(0, 1, 2), {}, [], 3),
@@ -262,10 +262,10 @@ def _numbered(*numbers: int, head: str = HEAD_V1) -> str:
     ],
 )
 def test_non_consecutive_message_numbers_are_reported(
-    tmp_path: Path, text: str, lost: dict[str, int], unknown: list[str], rows: int
+    tmp_path: Path, text: str, dropped: dict[str, int], unknown: list[str], rows: int
 ) -> None:
     found, ledger = read_back(_log(tmp_path, text))
 
     assert sum(map(len, found.values())) == rows
-    assert ledger.topic("").dropped == lost
+    assert ledger.topic("").dropped == dropped
     assert ledger.topic("").dropped_unknown == unknown

@@ -136,9 +136,9 @@ def test_constant_rate_is_reported(tmp_path: Path) -> None:
     assert "times are computed from a constant rate of 10 Hz, from 0 on" in ledger.notices
 
 
-@pytest.mark.parametrize(("lines", "lost", "skipped"), [(N + 3, 3, 0), (N - 3, 3, 0)])
+@pytest.mark.parametrize(("lines", "dropped", "skipped"), [(N + 3, 3, 0), (N - 3, 3, 0)])
 def test_mismatched_counts_of_times_and_pictures_are_reported(
-    tmp_path: Path, lines: int, lost: int, skipped: int
+    tmp_path: Path, lines: int, dropped: int, skipped: int
 ) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
     path.with_suffix(".txt").write_text("\n".join(f"{i}.5" for i in range(lines)))
@@ -146,7 +146,7 @@ def test_mismatched_counts_of_times_and_pictures_are_reported(
     _, ledger = read(path)
 
     account = ledger.topic("a")
-    assert sum(account.dropped.values()) == lost
+    assert sum(account.dropped.values()) == dropped
     assert sum(account.skipped.values()) == skipped
     assert f"{N} pictures and {lines} times (a.txt): paired in order from the first" in (
         ledger.notices

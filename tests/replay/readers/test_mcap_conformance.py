@@ -34,7 +34,7 @@ def test_suite_has_all_files(suite: list[Conformance]) -> None:
     assert all(file.is_exact for file in suite)
 
 
-@pytest.mark.parametrize("has_summary", [True, False], ids=["as it is", "without summary"])
+@pytest.mark.parametrize("has_summary", [True, False], ids=["with summary", "without summary"])
 def test_every_file_yields_exactly_its_messages(
     suite: list[Conformance], has_summary: bool, tmp_path: Path
 ) -> None:

@@ -125,8 +125,8 @@ def test_flipped_byte_drops_only_its_chunk_and_reports_it(tmp_path: Path, compre
 
     reading = read_back(path)
 
-    lost = {name: account.dropped.total() for name, account in reading.ledger.accounts.items()}
-    assert lost == {"/imu": 9, "/can": 8, "/camera": 8}
+    dropped = {name: account.dropped.total() for name, account in reading.ledger.accounts.items()}
+    assert dropped == {"/imu": 9, "/can": 8, "/camera": 8}
     assert reading.count() == 600 - 25
     for loss in reading.ledger.drops():
         assert loss.reason == "damaged chunk"
@@ -186,7 +186,7 @@ def test_damaged_chunk_header_is_repaired_from_index(
 
         assert messages_of(reading) == messages_of(truth), at
         assert reading.adds_up(), at
-        assert any(f"chunk at byte {begin}" in said for said in reading.ledger.notices), at
+        assert any(f"chunk at byte {begin}" in notice for notice in reading.ledger.notices), at
 
 
 def test_damaged_header_with_damaged_records_is_not_repaired(tmp_path: Path) -> None:
@@ -422,8 +422,8 @@ def test_record_length_spanning_next_records_drops_one_message(tmp_path: Path) -
 
     reading = read_back(path)
 
-    lost = {10**9 + i for i in range(40)} - {log for log, *_ in reading.messages["/a"]}
-    assert lost == {10**9 + 7}
+    dropped = {10**9 + i for i in range(40)} - {log for log, *_ in reading.messages["/a"]}
+    assert dropped == {10**9 + 7}
     assert (at, at + len(records[10])) in spans(reading)
 
 

@@ -1,4 +1,4 @@
-"""ROS 1 bags: every message of the file is read or reported as lost."""
+"""ROS 1 bags: every message of the file is read or reported as dropped."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_every_message_is_read_in_stored_order(tmp_path: Path, compression: str)
 
 
 @pytest.mark.parametrize(
-    ("compression", "says"),
+    ("compression", "expected"),
     [
         ("none", "have no checksum"),
         ("bz2", "bz2 checksums verified in"),
@@ -120,10 +120,10 @@ def test_every_message_is_read_in_stored_order(tmp_path: Path, compression: str)
         ("lz4 checked", "lz4 checksums verified in"),
     ],
 )
-def test_ledger_reports_verified_checksums(tmp_path: Path, compression: str, says: str) -> None:
+def test_ledger_reports_verified_checksums(tmp_path: Path, compression: str, expected: str) -> None:
     path = write_bag(tmp_path / "a.bag", rows_of(100), compression)
 
-    assert says in read_rows(path).ledger.integrity
+    assert expected in read_rows(path).ledger.integrity
 
 
 @pytest.mark.parametrize("name", ["run%41.bag", "a#b.bag", "q?x=1.bag", "-rf.bag", "ü\n.bag"])
@@ -229,10 +229,10 @@ def test_messages_of_damaged_chunk_are_counted_by_topic(tmp_path: Path, compress
     missing = Counter(row.topic for row in rows) - Counter(row.topic for row in reading.rows)
 
     assert missing
-    lost = {
+    dropped = {
         name: a.dropped.total() for name, a in reading.ledger.accounts.items() if a.dropped.total()
     }
-    assert lost == dict(missing)
+    assert dropped == dict(missing)
     for name, account in reading.ledger.accounts.items():
         assert account.in_file == Counter(row.topic for row in rows)[name]
 
@@ -356,10 +356,10 @@ def test_flipped_byte_in_unindexed_bag_loses_only_reported_messages(
                 continue
             assert any(a < stop and start < b for a, b in spans), (at, details)
         # No checksum shows a changed payload, time or connection, of one message at most.
-        strange = given - Counter(row for *_, row in places)
-        assert strange.total() <= 1, at
+        altered = given - Counter(row for *_, row in places)
+        assert altered.total() <= 1, at
         missing = sum(not given[row] for *_, row in places)
-        if missing > strange.total():
+        if missing > altered.total():
             assert not reading.ledger.is_whole, at
             assert spans or "chunk at byte" in " ".join(details), (at, details)
             assert all(a - 200 <= at for a, _ in spans), (at, spans)
@@ -507,11 +507,11 @@ def test_any_damage_is_reported(tmp_path: Path, kind: str) -> None:
         content = unclosed(content)
         path.write_bytes(content)
     whole = read_rows(path)
-    calm = frozenset(whole.ledger.notices)
+    known_notices = frozenset(whole.ledger.notices)
     silent = []
     for how, copy in damaged_copies(content, cuts=60, flips=140, seed=20):
         path.write_bytes(copy)
-        verdict = judge(path, whole.rows, calm)
+        verdict = judge(path, whole.rows, known_notices)
         if verdict.startswith("SILENT"):
             silent.append((how, verdict))
 

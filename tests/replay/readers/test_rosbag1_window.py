@@ -119,5 +119,5 @@ def test_wrong_time_in_index_is_detected(tmp_path: Path) -> None:
     reading = read_rows(path, Selection(start_ns=last.log_ns))
 
     assert by_topic(reading.rows) == by_topic(rows[middle + 1 :])
-    assert any("every chunk was examined" in said for said in reading.ledger.notices)
+    assert any("every chunk was examined" in notice for notice in reading.ledger.notices)
     assert reading.ledger.is_whole

@@ -1,4 +1,4 @@
-"""ROS 2 SQLite bags: every row is read or reported as lost."""
+"""ROS 2 SQLite bags: every row is read or reported as dropped."""
 
 from __future__ import annotations
 
@@ -344,11 +344,11 @@ def test_zeroed_page_drops_only_its_rows(tmp_path: Path) -> None:
     content[middle : middle + 4096] = bytes(4096)
     path.write_bytes(content)
     reading = read_rows(path)
-    lost = sum(account.dropped.total() for account in reading.ledger.accounts.values())
+    dropped = sum(account.dropped.total() for account in reading.ledger.accounts.values())
 
     assert len(rows) - 100 < len(reading.rows) < len(rows)
     assert not Counter(reading.rows) - Counter(rows)
-    assert lost == len(rows) - len(reading.rows)
+    assert dropped == len(rows) - len(reading.rows)
 
 
 def test_row_whose_time_contradicts_index_is_dropped(tmp_path: Path) -> None:

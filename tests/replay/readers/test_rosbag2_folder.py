@@ -75,7 +75,7 @@ def test_every_kind_of_folder_is_read_completely(
     # SQLite counts nothing by itself, and opening reads the topics only.
     declared = dict.fromkeys(count_by_topic(rows)) if storage == "sqlite3" else count_by_topic(rows)
     assert {t.name: t.declared for t in reading.log.topics} == declared
-    assert any("decompressed to" in said for said in reading.ledger.notices) == (
+    assert any("decompressed to" in notice for notice in reading.ledger.notices) == (
         compression == "file"
     )
 
@@ -134,9 +134,9 @@ def test_messages_of_missing_listed_file_are_dropped_by_topic(tmp_path: Path) ->
     write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
     (folder / "part_1.db3").unlink()
     ledger = read_rows(folder).ledger
-    lost = {name: a.dropped["storage file is missing"] for name, a in ledger.accounts.items()}
+    dropped = {name: a.dropped["storage file is missing"] for name, a in ledger.accounts.items()}
 
-    assert {name: count for name, count in lost.items() if count} == count_by_topic(rows[100:])
+    assert {name: count for name, count in dropped.items() if count} == count_by_topic(rows[100:])
     for name, count in count_by_topic(rows).items():
         assert ledger.topic(name).in_file == count
 
@@ -158,8 +158,8 @@ def test_messages_of_unreadable_listed_file_are_dropped(tmp_path: Path) -> None:
     reading = read_rows(folder)
 
     assert by_topic(reading.rows) == by_topic(rows[:100])
-    lost = sum(account.dropped.total() for account in reading.ledger.accounts.values())
-    assert lost == 200
+    dropped = sum(account.dropped.total() for account in reading.ledger.accounts.values())
+    assert dropped == 200
     assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)
 
 
@@ -172,7 +172,7 @@ def test_too_low_counts_in_metadata_yield_notice(tmp_path: Path, declared: int) 
 
     assert by_topic(reading.rows) == by_topic(rows)
     assert reading.ledger.is_whole
-    assert any(f"counts {declared} messages" in said for said in reading.ledger.notices)
+    assert any(f"counts {declared} messages" in notice for notice in reading.ledger.notices)
 
 
 def test_messages_missing_from_metadata_count_are_dropped(tmp_path: Path) -> None:
@@ -260,8 +260,8 @@ def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage:
     assert len(reading.rows) > 1000 or storage == "mcap"
     assert not Counter(reading.rows) - Counter(rows)
     assert not reading.ledger.is_whole
-    lost = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
-    assert lost == len(rows) - len(reading.rows)
+    dropped = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
+    assert dropped == len(rows) - len(reading.rows)
 
 
 def test_compressed_file_cut_near_start_is_refused_with_its_name(tmp_path: Path) -> None:

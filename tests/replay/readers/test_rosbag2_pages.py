@@ -224,8 +224,8 @@ def outcome(path: Path, selection: Selection = EVERYTHING) -> object:
     except CrosscueError as error:
         return str(error)
     ledger = reading.ledger
-    said = ledger.accounts, ledger.notices, ledger.integrity, ledger.is_whole
-    return by_topic(reading.rows), *said
+    account = ledger.accounts, ledger.notices, ledger.integrity, ledger.is_whole
+    return by_topic(reading.rows), *account
 
 
 @pytest.mark.slow

@@ -115,14 +115,14 @@ def test_service_events_are_skipped_with_their_reason(
     path = opened(bag(tmp_path / "bag", storage, texts(service, "complete")), as_folder)
 
     status = cli.run(["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--json"])
-    said = capsys.readouterr()
+    output = capsys.readouterr()
 
-    account = json.loads(said.out)["topics"]
+    account = json.loads(output.out)["topics"]
     assert account[SERVICE]["skipped"] == {"service event": ROWS}
     assert account[SERVICE]["found"] == ROWS
     assert not any(topic["skipped"] for name, topic in account.items() if name != SERVICE)
     assert status == 3
-    assert "damaged" not in said.out + said.err
+    assert "damaged" not in output.out + output.err
 
     cli.run(["info", str(path)])
     shown = capsys.readouterr()
@@ -138,7 +138,7 @@ def test_action_feedback_is_read_if_its_definition_is_stored(
     path = bag(tmp_path / "bag", storage, texts("complete", feedback))
 
     cli.run(["decode", str(path), "-o", str(tmp_path / "tables"), "--json"])
-    said = capsys.readouterr()
+    output = capsys.readouterr()
 
     accounts = json.loads((tmp_path / "tables" / "manifest.json").read_text())["account"]["reading"]
     topics = accounts[0]["topics"]
@@ -147,7 +147,7 @@ def test_action_feedback_is_read_if_its_definition_is_stored(
     assert topics[FEEDBACK]["skipped"] == skipped
     assert topics[STATUS]["skipped"] == {}
     assert topics[SERVICE]["skipped"] == {"service event": ROWS}
-    assert "damaged" not in said.out + said.err
+    assert "damaged" not in output.out + output.err
     if is_complete:
         table = pq.read_table(tmp_path / "tables" / "fibonacci__action_feedback.parquet")
         assert table.num_rows == ROWS
