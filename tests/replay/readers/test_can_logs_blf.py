@@ -153,9 +153,12 @@ def test_invalid_containers_after_frames_are_reported(tmp_path: Path) -> None:
     ("content", "match"),
     [(b"", "empty"), (b"LOGG", "no BLF header"), (bytes(500), "no BLF header")],
 )
-def test_unsupported_file_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
-    with pytest.raises(LogFormatError, match=match):
+def test_unsupported_file_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, match: str
+) -> None:
+    with pytest.raises(LogFormatError, match=match) as refused:
         open_log(_log(tmp_path, content))
+    assert "\n" not in str(refused.value)
 
 
 def _read_with_python_can(path: Path) -> list[can.Message]:

@@ -254,16 +254,17 @@ def test_circular_block_links_are_reported(tmp_path: Path) -> None:
         (b"MDF     4.10    " + bytes(100), "header damaged"),
     ],
 )
-def test_unsupported_mdf_file_is_refused_and_closed(
+def test_unsupported_mdf_file_is_refused_in_one_line_and_closed(
     tmp_path: Path, content: bytes, match: str
 ) -> None:
     path = tmp_path / "x.mf4"
     path.write_bytes(content)
     before = len(list(Path("/proc/self/fd").iterdir()))
 
-    with pytest.raises(LogFormatError, match=match):
+    with pytest.raises(LogFormatError, match=match) as refused:
         open_log(path)
 
+    assert "\n" not in str(refused.value)
     assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 

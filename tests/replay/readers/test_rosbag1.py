@@ -420,12 +420,15 @@ def test_message_of_unknown_connection_is_dropped(tmp_path: Path) -> None:
         (b"PK\x03\x04", "format 2.0"),
     ],
 )
-def test_unsupported_file_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
+def test_unsupported_file_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, match: str
+) -> None:
     path = tmp_path / "a.bag"
     path.write_bytes(content)
 
-    with pytest.raises(LogFormatError, match=match):
+    with pytest.raises(LogFormatError, match=match) as refused:
         open_log(path)
+    assert "\n" not in str(refused.value)
 
 
 def test_encrypted_bag_is_refused_with_instructions(tmp_path: Path) -> None:

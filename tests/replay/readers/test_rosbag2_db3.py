@@ -295,12 +295,15 @@ def test_unselected_topics_are_counted_as_skipped(tmp_path: Path) -> None:
     ("content", "match"),
     [(b"", "begins with b''"), (b"SQLite format 2", "SQLite format 3"), (b"\0" * 999, "SQLite")],
 )
-def test_unsupported_file_is_refused(tmp_path: Path, content: bytes, match: str) -> None:
+def test_unsupported_file_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, match: str
+) -> None:
     path = tmp_path / "a.db3"
     path.write_bytes(content)
 
-    with pytest.raises(LogFormatError, match=match):
+    with pytest.raises(LogFormatError, match=match) as refused:
         open_log(path)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
