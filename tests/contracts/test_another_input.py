@@ -97,10 +97,10 @@ def test_changed_settings_are_refused_and_files_are_unchanged(
 
     assert cli.run([*argv, flag, *other.split()]) == 2
 
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "seed: 0 there, 3 here" in said
-    assert f"{flag} would destroy it" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "seed: 0 there, 3 here" in message
+    assert f"{flag} would destroy it" in message
     assert tree(tmp_path) == before
 
 
@@ -119,9 +119,9 @@ def test_changed_pictures_are_refused_with_both_identities(
 
     assert cli.run([*argv, "--resume"]) == 2
 
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert said.count(" bytes)") == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert message.count(" bytes)") == 2
     assert tree(tmp_path) == before
 
 

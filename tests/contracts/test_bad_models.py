@@ -120,10 +120,10 @@ def test_model_init_writes_no_card_for_network_with_nan_output(
     argv = ["model", "init", net, "--class-names", tmp_path / "names.txt", "--kind", "end-to-end"]
     status = cli.run([str(one) for one in argv])
 
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert status == 2
-    assert said.count("\n") == 1
-    assert "net.toml: not written, the network does not run with it: output: 1 of 1" in said
+    assert message.count("\n") == 1
+    assert "net.toml: not written, the network does not run with it: output: 1 of 1" in message
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -144,8 +144,8 @@ def test_labels_of_other_pictures_are_refused_without_scores(
     for command in ("score detector", "fit detector"):
         argv = [*command.split(), out, "--labels", labels]
         assert cli.run([str(one) for one in argv]) == 1
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
-        assert "none of its 1 images is in" in said
+        message = capsys.readouterr().err
+        assert message.count("\n") == 1
+        assert "none of its 1 images is in" in message
     assert not (out / "score").exists()
     shutil.rmtree(out)

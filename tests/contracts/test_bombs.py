@@ -138,11 +138,11 @@ def test_max_chunk_option_limits_every_command_that_opens_log(
 
     status = cli.run([*command.split(), *argv, "--max-chunk", str(LIMIT_MIB)])
 
-    said = " ".join("".join(capsys.readouterr()).split())
-    assert status in (1, 3, 4), said
+    output = " ".join("".join(capsys.readouterr()).split())
+    assert status in (1, 3, 4), output
     if command not in REPORTS_THE_RUN:
         expected = rf"declares \d{{7}} bytes, the limit is {LIMIT_MIB * MIB} \(--max-chunk\)"
-        assert re.search(expected, said), said
+        assert re.search(expected, output), output
 
 
 def _png() -> bytes:
@@ -246,10 +246,10 @@ def test_oversized_camera_picture_is_reported_with_size_and_limit(
 
 
 def _assert_reports_size_and_limit(status: int, capsys: pytest.CaptureFixture[str]) -> None:
-    said = " ".join("".join(capsys.readouterr()).split())
-    assert status in (1, 3, 4), said
-    assert f"{SIDE_PX} x {SIDE_PX}" in said
-    assert f"{MAX_PIXELS:,}" in said
+    output = " ".join("".join(capsys.readouterr()).split())
+    assert status in (1, 3, 4), output
+    assert f"{SIDE_PX} x {SIDE_PX}" in output
+    assert f"{MAX_PIXELS:,}" in output
 
 
 READS_FILES: dict[str, str] = {
@@ -315,13 +315,13 @@ SIZES: dict[str, tuple[tuple[int | str, ...], dict[str, str], str]] = {
 def test_network_with_oversized_input_is_refused(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    shape, metadata, said = SIZES[case]
+    shape, metadata, expected = SIZES[case]
     (tmp_path / "net.onnx").write_bytes(open_model(shape, metadata))
 
     status = cli.run(["model", "init", str(tmp_path / "net.onnx")])
 
     assert status == 2
-    assert said in capsys.readouterr().err
+    assert expected in capsys.readouterr().err
     assert not list(tmp_path.glob("*.toml"))
 
 

@@ -129,8 +129,8 @@ def test_every_command_has_missing_input_case_or_reads_nothing() -> None:
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_help_contains_example_of_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run([*name.split(), "--help"]) == 0
-    said = capsys.readouterr().out
-    assert f"\n  crosscue {name}" in said.partition("example")[2]
+    message = capsys.readouterr().out
+    assert f"\n  crosscue {name}" in message.partition("example")[2]
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
@@ -215,9 +215,9 @@ def test_misspelt_option_is_refused_with_suggestion(
 
     # Required arguments are missing, too: the misspelt option is reported first.
     assert cli.run([*name.split(), misspelt]) == 2
-    said = capsys.readouterr().err
-    _assert_one_line(said)
-    assert f"no option {misspelt}; did you mean {option}?" in said
+    message = capsys.readouterr().err
+    _assert_one_line(message)
+    assert f"no option {misspelt}; did you mean {option}?" in message
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
@@ -228,9 +228,9 @@ def test_misspelt_command_is_refused_with_suggestion(
     misspelt = [first[1] + first[0] + first[2:], *second.split()]
 
     assert cli.run(misspelt) == 2
-    said = capsys.readouterr().err
-    _assert_one_line(said)
-    assert f"did you mean {name!r}?" in said
+    message = capsys.readouterr().err
+    _assert_one_line(message)
+    assert f"did you mean {name!r}?" in message
 
 
 def test_command_group_alone_lists_its_commands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -138,8 +138,8 @@ def test_rows_without_time_stamp_are_dropped(
 
     path.write_bytes(raw[: len(raw) // 2])
     assert cli.run(["info", str(log)]) == 3
-    said = " ".join(capsys.readouterr().out.split())
-    assert any(reason in said for reason in seen)
+    message = " ".join(capsys.readouterr().out.split())
+    assert any(reason in message for reason in seen)
 
 
 @pytest.mark.parametrize(
@@ -180,9 +180,9 @@ def test_commands_suggest_salvage_for_damaged_log(
     argv = f"-{rest}".format(out=tmp_path / "out", car=drive.vehicle).split()
 
     assert cli.run([command, str(log), *argv]) == 3
-    said = " ".join("".join(capsys.readouterr()).split())
-    assert "crosscue convert" in said
-    assert "--salvage" in said
+    message = " ".join("".join(capsys.readouterr()).split())
+    assert "crosscue convert" in message
+    assert "--salvage" in message
 
 
 def test_topic_missing_from_complete_log_is_wrong_usage(

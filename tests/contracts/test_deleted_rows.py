@@ -63,9 +63,9 @@ def _bag(folder: Path) -> Path:
     def number(value: int) -> bytes:
         return struct.pack("<I", value)
 
-    said = {b"topic": b"/a", b"type": b"std_msgs/String", b"md5sum": b"x" * 32}
-    said[b"message_definition"] = b"string data\n"
-    body = b"".join(header_field(name, value) for name, value in said.items())
+    fields = {b"topic": b"/a", b"type": b"std_msgs/String", b"md5sum": b"x" * 32}
+    fields[b"message_definition"] = b"string data\n"
+    body = b"".join(header_field(name, value) for name, value in fields.items())
     link = record(body, op=b"\x07", conn=number(0), topic=b"/a")
     rows = [
         record(b"message", op=b"\x02", conn=number(0), time=stamp(START_NS + k)) for k in range(10)

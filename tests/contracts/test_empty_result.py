@@ -38,13 +38,13 @@ def test_part_after_end_of_log_reports_topics_without_rows(
 ) -> None:
     out = tmp_path / "out"
 
-    said = _fails(
+    message = _fails(
         capsys, out, command, drive.log, "--vehicle", drive.vehicle, "-o", out, "--from", "100000"
     )
 
-    assert "wheel speeds" in said if command == "replay" else "no topic yielded a row" in said
-    assert "/can (" in said
-    assert "--from" in said
+    assert "wheel speeds" in message if command == "replay" else "no topic yielded a row" in message
+    assert "/can (" in message
+    assert "--from" in message
 
 
 def test_convert_of_part_after_end_writes_no_file(
@@ -76,9 +76,11 @@ def test_replay_with_vehicle_file_of_another_car_is_refused(
     (tmp_path / "car.toml").write_text(text.replace(name, "other.dbc"))
     out = tmp_path / "out"
 
-    said = _fails(capsys, out, "replay", drive.log, "--vehicle", tmp_path / "car.toml", "-o", out)
+    message = _fails(
+        capsys, out, "replay", drive.log, "--vehicle", tmp_path / "car.toml", "-o", out
+    )
 
-    assert "the wheel speeds, planned from /can, found no rows" in said
+    assert "the wheel speeds, planned from /can, found no rows" in message
 
 
 def test_replay_of_log_without_wheel_speeds_is_refused(
@@ -99,9 +101,9 @@ def test_detect_without_usable_pictures_is_refused(
     for picture in log.glob("*.png"):
         damage(picture)
 
-    said = _fails(capsys, out, "detect", log, "--detectors", "signs", "-o", out)
+    message = _fails(capsys, out, "detect", log, "--detectors", "signs", "-o", out)
 
-    assert "found no frames" in said
+    assert "found no frames" in message
 
 
 def _content(folder: Path) -> dict[str, bytes]:
@@ -149,9 +151,9 @@ def test_overwritten_run_contains_only_new_files(
     capsys.readouterr()
     (out / "old.parquet").write_bytes(b"")
     assert cli.run([*argv, "-o", str(out), "--overwrite", "--to", "5", "--json"]) == 0
-    said = capsys.readouterr().out
+    message = capsys.readouterr().out
     assert cli.run([*argv, "-o", str(fresh), "--to", "5"]) == 0
 
-    assert json.loads(said)["run"] == str(out)
+    assert json.loads(message)["run"] == str(out)
     kept = {name: data for name, data in _content(out).items() if name != MANIFEST}
     assert kept == {name: data for name, data in _content(fresh).items() if name != MANIFEST}

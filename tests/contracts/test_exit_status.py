@@ -236,9 +236,9 @@ def test_commands_return_documented_exit_status(
 
     for number, (status, line) in enumerate(cases):
         argv = line.format(**names, out=tmp_path / f"out{number}").split()
-        got, said = cli.run(argv), capsys.readouterr().err
-        if got != status or "bug" in said or (got != 3 and said.count("\n") > 1):
-            found[line] = (got, said)
+        got, error = cli.run(argv), capsys.readouterr().err
+        if got != status or "bug" in error or (got != 3 and error.count("\n") > 1):
+            found[line] = (got, error)
 
     assert not found
     assert stated <= {status for status, _ in cases}

@@ -104,8 +104,8 @@ def judge(path: Path, truth: Reading) -> Verdict:
         return Verdict(Kind.UNBALANCED, kept)
     strange = _of_all(reading) - _of_all(truth)
     if strange:
-        is_said = any(said in reading.ledger.integrity for said in UNCOVERED)
-        only_changed = is_said and _are_changed(strange, _of_all(truth) - _of_all(reading))
+        is_uncovered = any(one in reading.ledger.integrity for one in UNCOVERED)
+        only_changed = is_uncovered and _are_changed(strange, _of_all(truth) - _of_all(reading))
         return Verdict(Kind.CHANGED if only_changed else Kind.WRONG, kept)
     if reading.count() < truth.count():
         accounts = reading.ledger.accounts.values()
@@ -113,8 +113,8 @@ def judge(path: Path, truth: Reading) -> Verdict:
         return Verdict(Kind.TOLD if is_annotated else Kind.SILENT, kept)
     if not reading.ledger.is_whole:
         return Verdict(Kind.TOLD, kept)
-    said = reading.ledger.notices != truth.ledger.notices
-    return Verdict(Kind.NOTICED if said else Kind.SAME, kept)
+    has_notice = reading.ledger.notices != truth.ledger.notices
+    return Verdict(Kind.NOTICED if has_notice else Kind.SAME, kept)
 
 
 def _of_all(reading: Reading) -> Counter[tuple[str, Message]]:

@@ -27,5 +27,5 @@ def measured(argv: list[str]) -> tuple[int, str, float]:
         check=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
-    *said, status, peak_mb = child.stdout.split()
-    return int(status), " ".join(said), int(peak_mb)
+    *output, status, peak_mb = child.stdout.split()
+    return int(status), " ".join(output), int(peak_mb)

@@ -97,7 +97,7 @@ def test_custom_detector_writes_detections_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("counted", "said"),
+    ("counted", "message"),
     [
         ('[cars]\nlabels = ["bright"]', "its cars do not count as parked"),
         (
@@ -109,7 +109,7 @@ def test_custom_detector_writes_detections_table(tmp_path: Path) -> None:
     ids=("cars", "lights", "not counted"),
 )
 def test_notice_names_rules_that_use_boxes_instead_of_masks(
-    tmp_path: Path, counted: str, said: str | None
+    tmp_path: Path, counted: str, message: str | None
 ) -> None:
     """If a detector returns boxes only, eq. 15 uses boxes and eq. 16 is not evaluated."""
     log, out, vehicle = _folder(tmp_path, 1), tmp_path / "run", tmp_path / "car.toml"
@@ -119,8 +119,8 @@ def test_notice_names_rules_that_use_boxes_instead_of_masks(
     assert run(["detect", str(log), "-o", str(out), *args]) == 0
 
     notices = [one for one in open_run(out).drive_manifest().notices if "no masks" in one]
-    assert [said in one for one in notices if said] == [True] * (said is not None)
-    assert len(notices) == (said is not None)
+    assert [message in one for one in notices if message] == [True] * (message is not None)
+    assert len(notices) == (message is not None)
 
 
 def test_detector_of_installed_package_is_selected_by_entry_point_name(
@@ -219,9 +219,9 @@ def test_intrinsics_for_another_image_size_are_refused(
         argv = [command, str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache"]
         assert run([*argv, "--detectors", BRIGHT]) == 2
 
-        said = capsys.readouterr().err
-        assert OTHER_SIZES[camera] in said
-        assert said.count("\n") == 1
+        message = capsys.readouterr().err
+        assert OTHER_SIZES[camera] in message
+        assert message.count("\n") == 1
         assert not out.exists()
 
 
@@ -264,7 +264,7 @@ def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("detector", "said"),
+    ("detector", "message"),
     [
         ("nonsense", "detector 'nonsense': no such name"),
         ("no.such.module:make", "detector no.such.module:make: No module named"),
@@ -275,7 +275,7 @@ def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> Non
     ],
 )
 def test_invalid_detector_is_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], detector: str, said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], detector: str, message: str
 ) -> None:
     log = _folder(tmp_path)
     args = ["-o", str(tmp_path / "run"), "--detectors", detector, "--no-cache"]
@@ -283,7 +283,7 @@ def test_invalid_detector_is_reported_in_one_line(
     assert run(["detect", str(log), *args]) in (1, 2)
 
     reported = capsys.readouterr().err
-    assert said in reported
+    assert message in reported
     assert reported.count("\n") == 1
 
 
@@ -302,7 +302,7 @@ def test_unknown_detector_setting_is_refused_with_suggestion(
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"sha256": '"' + "0" * 64 + '"'}, "the card's sha256 is 0000"),
         (
@@ -314,7 +314,7 @@ def test_unknown_detector_setting_is_refused_with_suggestion(
     ],
 )
 def test_card_not_matching_weights_is_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], message: str
 ) -> None:
     card = yolox_card(tmp_path, **changes)
     args = ["-o", str(tmp_path / "run"), "--detectors", str(card), "--no-cache"]
@@ -322,7 +322,7 @@ def test_card_not_matching_weights_is_reported_in_one_line(
     assert run(["detect", str(_folder(tmp_path)), *args]) == 2
 
     reported = capsys.readouterr().err
-    assert said in reported
+    assert message in reported
     assert reported.count("\n") == 1
 
 

@@ -36,11 +36,13 @@ def test_fit_recovers_curve_and_residual_of_generated_pairs(family: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("heights", "ranges", "said"),
+    ("heights", "ranges", "message"),
     [([10.0, 20.0, -1.0], [5.0, 4.0, 3.0], "row 3"), ([10.0] * 3, [5.0] * 3, "different heights")],
 )
-def test_degenerate_pairs_are_refused(heights: list[float], ranges: list[float], said: str) -> None:
-    with pytest.raises(CrosscueError, match=said):
+def test_degenerate_pairs_are_refused(
+    heights: list[float], ranges: list[float], message: str
+) -> None:
+    with pytest.raises(CrosscueError, match=message):
         fit_range(np.array(heights), np.array(ranges), "pinhole")
 
 
@@ -76,11 +78,11 @@ def test_missing_or_binary_table_is_reported_with_path_once(
 ) -> None:
     (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
 
-    for name, said in (("none.csv", "No such file"), ("wild.csv", "is not text")):
+    for name, message in (("none.csv", "No such file"), ("wild.csv", "is not text")):
         path = tmp_path / name
         assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 4
         reported = capsys.readouterr().err
-        assert f"{path}: {said}" in reported
+        assert f"{path}: {message}" in reported
         assert reported.count(name) == 1
 
 

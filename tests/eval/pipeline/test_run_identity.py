@@ -56,10 +56,10 @@ def test_resume_with_another_log_or_setting_is_refused_and_changes_nothing(
     theirs = of_row(json.loads((keep / "input.json").read_text())["identity"])
 
     assert _replay(drives / "D-1", keep, "--resume") == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert theirs.short in said
-    assert "drive.mcap" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert theirs.short in message
+    assert "drive.mcap" in message
     assert _bytes(keep) == before
 
     assert _replay(drives / "D-0", keep, "--resume", "--to", "2") == 2

@@ -139,10 +139,10 @@ def test_estimate_refuses_settings_that_split_frames_differently(
 
     assert cli.run(["estimate", str(run.path), "--vehicle", str(other)]) == 2
 
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert f"time.{line.split()[0]}" in said
-    assert "run crosscue replay again" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert f"time.{line.split()[0]}" in message
+    assert "run crosscue replay again" in message
     assert run.file("manifest.json").read_bytes() == before
     assert cli.run(["estimate", str(run.path), "--vehicle", str(tmp_path / "car.toml")]) == 3
 
@@ -166,11 +166,11 @@ def test_estimate_refuses_frames_segmented_without_odometry(
 
     assert cli.run(["estimate", str(run), "--vehicle", str(tmp_path / "car.toml")]) == 2
 
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
     first_ns = BEGIN + 80 * ROW
-    assert f"its frame at {first_ns} ns is in segment 0, the odometry then in 1" in said
-    assert "run crosscue replay again" in said
+    assert f"its frame at {first_ns} ns is in segment 0, the odometry then in 1" in message
+    assert "run crosscue replay again" in message
     assert tree(run) == before
 
 

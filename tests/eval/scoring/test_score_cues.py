@@ -199,12 +199,12 @@ def test_cue_scores_equal_count_frame_by_frame(
 
     positives = rights = theres = hits = 0
     for frame, count in found.items():
-        said = [there for first, length, there in spans if first <= frame < first + length]
-        if said:
+        truths = [there for first, length, there in spans if first <= frame < first + length]
+        if truths:
             positives += count > 0
-            rights += count > 0 and any(said)
-            theres += any(said)
-            hits += any(said) and count > 0
+            rights += count > 0 and any(truths)
+            theres += any(truths)
+            hits += any(truths) and count > 0
     objects = score.readings["object"]
     assert objects.recall is not None
     assert (objects.positives, objects.precision.right) == (positives, rights)

@@ -172,7 +172,7 @@ def test_truth_on_another_clock_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("{", "not readable as JSON"),
         ('{"version": 1, "version": 1}', "duplicate key"),
@@ -181,10 +181,10 @@ def test_truth_on_another_clock_is_refused(tmp_path: Path) -> None:
         ('{"version": 1, "start_ns": 5, "end_ns": 9}', "pose: missing"),
     ],
 )
-def test_malformed_truth_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_malformed_truth_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "truth.json").write_text(text)
 
-    with pytest.raises(SchemaError, match=said):
+    with pytest.raises(SchemaError, match=message):
         load_truth(tmp_path / "truth.json")
 
 

@@ -137,7 +137,7 @@ def test_gates_set_exit_status_and_write_junit_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gate", "said"),
+    ("gate", "message"),
     [
         ('metric = "cues.stop_sing.precision"\nmin = 0.9', "did you mean cues.stop_sign.precision"),
         ('metric = "cues.stop_sign.precision"', "expected min, max or both"),
@@ -155,11 +155,11 @@ def test_gates_set_exit_status_and_write_junit_file(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_gate_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], gate: str, said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gate: str, message: str
 ) -> None:
     line = _fails(capsys, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
 
-    assert said in line
+    assert message in line
 
 
 def test_gate_fails_for_metric_that_was_not_scored(tmp_path: Path) -> None:
@@ -275,7 +275,7 @@ def test_approach_outside_log_is_refused_unless_run_is_partial(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"approaches": "twice"}, "overlap"),
         (
@@ -291,7 +291,7 @@ def test_approach_outside_log_is_refused_unless_run_is_partial(
     ],
 )
 def test_invalid_truth_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], message: str
 ) -> None:
     run = _one(tmp_path)
     path = tmp_path / "one" / "truth.json"
@@ -300,7 +300,7 @@ def test_invalid_truth_is_refused(
         change = {"approaches": [*tree["approaches"], tree["approaches"][0] | {"id": 1}]}
     path.write_text(json.dumps(tree | change))
 
-    assert said in _fails(capsys, "score", run)
+    assert message in _fails(capsys, "score", run)
 
 
 @pytest.mark.parametrize(
@@ -355,9 +355,9 @@ def test_invalid_tables_are_refused_with_reason(
         "expected integers": {"belief": belief.set_column(0, "t_ns", belief["intersection"])},
         "count -1": {"cues": cue_table({"stop_sign": {3: -1}})},
     }
-    for i, (said, tables) in enumerate(broken.items()):
+    for i, (message, tables) in enumerate(broken.items()):
         run = run_folder(tmp_path / f"run{i}", tables)
-        assert said in _fails(capsys, "score", run.path)
+        assert message in _fails(capsys, "score", run.path)
 
 
 def test_run_with_nothing_to_score_reports_reasons(

@@ -57,7 +57,7 @@ def test_every_table_row_has_one_entry_per_column() -> None:
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "said"),
+    ("low", "high", "expected"),
     [
         (-0.2, -0.1, "better"),
         (0.1, 0.2, "worse"),
@@ -65,8 +65,8 @@ def test_every_table_row_has_one_entry_per_column() -> None:
         (math.nan, math.nan, "undecided"),
     ],
 )
-def test_verdict_requires_interval_without_zero(low: float, high: float, said: str) -> None:
-    assert verdict(Mean((low + high) / 2.0, low, high, 10, 5)) == said
+def test_verdict_requires_interval_without_zero(low: float, high: float, expected: str) -> None:
+    assert verdict(Mean((low + high) / 2.0, low, high, 10, 5)) == expected
 
 
 def test_files_state_that_study_is_simulated_and_command_to_repeat_it(tmp_path: Path) -> None:

@@ -99,9 +99,11 @@ def test_incomplete_or_outdated_drive_is_simulated_again(
 
 def test_drives_become_outdated_by_code_changes_but_not_by_comments() -> None:
     plain = "def height(x):\n    return 2 * x\n"
-    said = '"""Heights."""\n\n\ndef height(x):\n    """Twice as high."""\n    return 2 * x  # m\n'
+    documented = (
+        '"""Heights."""\n\n\ndef height(x):\n    """Twice as high."""\n    return 2 * x  # m\n'
+    )
 
-    assert simulated_drives.meaning_of(said) == simulated_drives.meaning_of(plain)
+    assert simulated_drives.meaning_of(documented) == simulated_drives.meaning_of(plain)
     assert simulated_drives.meaning_of(plain.replace("2", "3")) != simulated_drives.meaning_of(
         plain
     )
@@ -127,10 +129,12 @@ def belief(
     silent: int = 0,
 ) -> DriveBelief:
     n = 10
-    said = np.tile([p.get(name, 0.5) for name in FEATURES], (n, 1))
+    probabilities = np.tile([p.get(name, 0.5) for name in FEATURES], (n, 1))
     is_silent = np.arange(n) < silent
     start_m = np.linspace(60.0, 6.0, n) if features["intersection"] else np.full(n, np.nan)
-    return DriveBelief(layout, layout, features, start_m, said, said[:, 0] > 0.9, is_silent)
+    return DriveBelief(
+        layout, layout, features, start_m, probabilities, probabilities[:, 0] > 0.9, is_silent
+    )
 
 
 CONFIDENT = {"intersection": 0.99, "left": 0.99, "right": 0.01, "straight": 0.99}
