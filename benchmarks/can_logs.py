@@ -22,7 +22,7 @@ from crosscue.replay.logs.opening import open_log
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from support.can_files import candump, made
+from support.can_files import candump, random_frames
 
 FORD = "can/ford_fusion_2017/acc_on_speed_changing_from_30km_to_80km_per_hour.candump"
 
@@ -46,7 +46,7 @@ def theirs(path: Path) -> int:
 def originals(folder: Path, data: Path, repeat: int) -> list[Path]:
     """One file of each format, all with the same frames."""
     ford = data / FORD
-    content = ford.read_bytes() if ford.exists() else candump(made(41_250, fd=False))
+    content = ford.read_bytes() if ford.exists() else candump(random_frames(41_250, fd=False))
     if not ford.exists():
         print(f"no {ford}: simulated frames instead")
     log = folder / "drive.log"

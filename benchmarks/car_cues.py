@@ -29,7 +29,7 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.scoring.truth import cue_at
 from crosscue.replay.vehicle.vehicle import Vehicle
-from support.perfect_boxes import true_cars, what_is_at
+from support.perfect_boxes import role_at, true_cars
 
 
 def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, float]]:
@@ -76,7 +76,7 @@ def main() -> None:
             if verdict:
                 right[kind] += 1
             elif verdict is False:
-                wrong.setdefault(kind, Counter())[what_is_at(cars.get(t_ns, []), x, y)] += 1
+                wrong.setdefault(kind, Counter())[role_at(cars.get(t_ns, []), x, y)] += 1
     print(f"{len(runs)} simulated drives; cars that counted, one by one")
     for kind in sorted(wrong):
         total = right[kind] + wrong[kind].total()

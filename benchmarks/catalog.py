@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 import crosscue
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support.catalog_runs import scene, seen
+from support.catalog_runs import approach_row, scene
 from support.manifests import estimated
 
 SQL = (
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def _make(folder: Path, runs: int, approaches: int) -> None:
-    seen_there = scene(*(seen(number, 20.125) for number in range(approaches)))
+    seen_there = scene(*(approach_row(number, 20.125) for number in range(approaches)))
     manifest = estimated(scene=seen_there).model_dump_json(by_alias=True)
     parts = manifest.split("20.125")
     ranges_m = np.random.default_rng(0).uniform(5.0, 80.0, (runs, approaches))

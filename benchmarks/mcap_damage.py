@@ -22,7 +22,7 @@ from support.mcap_damage import Kind, copies, judge, sound_files
 from support.mcap_files import read_back
 
 NEVER = (Kind.SILENT, Kind.WRONG, Kind.UNBALANCED)
-SHOWN = (Kind.REFUSED, Kind.SAME, Kind.NOTICED, Kind.TOLD, Kind.CHANGED, *NEVER)
+SHOWN = (Kind.REFUSED, Kind.SAME, Kind.NOTICED, Kind.REPORTED, Kind.CHANGED, *NEVER)
 
 
 def main(number: int, seed: int) -> int:

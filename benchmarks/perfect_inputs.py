@@ -50,7 +50,7 @@ from crosscue.eval.scoring.runs import tables_of
 from crosscue.eval.scoring.truth import load as load_truth
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
-from support.perfect_boxes import frames, is_there, true_cars, what_is_at
+from support.perfect_boxes import frames, is_there, role_at, true_cars
 
 VISIBLE = (0.3, 0.5, 0.7, 0.9)
 SHOWN = 0.7
@@ -108,7 +108,7 @@ def true_kinds(drives: list[Path], min_visible: float) -> dict[str, Counter[str]
                 one = replace(pairs, step_px=pairs.step_px[part], nose=pairs.nose[part])
                 for cue, rule in RULES.items():
                     if any(rule(one, rules)):
-                        kinds[cue][what_is_at(cars[now.t_ns], x, y)] += 1
+                        kinds[cue][role_at(cars[now.t_ns], x, y)] += 1
     return kinds
 
 

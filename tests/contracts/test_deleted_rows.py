@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from crosscue.eval import cli
 from crosscue.replay.formats import FORMATS
 from support.accounted import read
-from support.can_files import blf, made, trc
+from support.can_files import blf, random_frames, trc
 from support.every_format import EVERY_FORMAT, FRAMES
 from support.pictures import picture_folder
 from support.rosbag_files import START_NS, header_field, record
@@ -118,7 +118,7 @@ def _rosbag2(folder: Path) -> Path:
 
 
 def _blf(folder: Path) -> Path:
-    frames = made(FRAMES)
+    frames = random_frames(FRAMES)
     raw = bytearray(blf(frames[:150] + frames[151:]))
     (objects,) = struct.unpack_from("<L", raw, 32)
     assert objects == FRAMES - 1
@@ -129,7 +129,7 @@ def _blf(folder: Path) -> Path:
 
 
 def _trc(folder: Path) -> Path:
-    lines = trc(made(FRAMES)).splitlines(keepends=True)
+    lines = trc(random_frames(FRAMES)).splitlines(keepends=True)
     del lines[len(lines) // 2]
     path = folder / "can.trc"
     path.write_bytes(b"".join(lines))
@@ -180,12 +180,12 @@ def _images(folder: Path) -> Path:
 
 
 def _without_a_picture(name: str) -> Callable[[Path], Path]:
-    def made(folder: Path) -> Path:
+    def write(folder: Path) -> Path:
         log = EVERY_FORMAT[name](folder)
         sorted(log.rglob("*.png"))[7].unlink()
         return log
 
-    return made
+    return write
 
 
 def _pandaset(folder: Path) -> Path:

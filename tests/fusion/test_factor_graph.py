@@ -30,7 +30,7 @@ from crosscue.fusion.factor_graph import (
 )
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.fusion import Fusion, usual_cues
-from support.fusion import graphs, graphs_heard, other_side, situation
+from support.fusion import graphs, graphs_with_counts, other_side, situation
 
 FEW_EXAMPLES = settings(max_examples=60, deadline=None)
 DEFAULT_GRAPH = graph_of(Fusion())
@@ -79,7 +79,7 @@ def sent_messages(
 
 
 @FEW_EXAMPLES
-@given(graphs_heard())
+@given(graphs_with_counts())
 def test_marginals_equal_enumeration_of_all_assignments(
     case: tuple[FactorGraph, list[dict[str, int]]],
 ) -> None:
@@ -91,7 +91,7 @@ def test_marginals_equal_enumeration_of_all_assignments(
 
 
 @FEW_EXAMPLES
-@given(graphs_heard())
+@given(graphs_with_counts())
 def test_marginals_equal_gtsam_discrete_factor_graph(
     case: tuple[FactorGraph, list[dict[str, int]]],
 ) -> None:
@@ -112,7 +112,7 @@ def test_marginals_equal_gtsam_discrete_factor_graph(
 
 
 @FEW_EXAMPLES
-@given(graphs_heard(), st.randoms(use_true_random=False))
+@given(graphs_with_counts(), st.randoms(use_true_random=False))
 def test_order_of_frames_does_not_matter(
     case: tuple[FactorGraph, list[dict[str, int]]],
     random: Random,
@@ -143,7 +143,7 @@ def test_order_of_frames_does_not_matter_at_saturation() -> None:
 
 
 @FEW_EXAMPLES
-@given(graphs_heard(), st.integers(0, 5))
+@given(graphs_with_counts(), st.integers(0, 5))
 def test_unobserved_or_absent_cues_change_nothing_far_from_intersection(
     case: tuple[FactorGraph, list[dict[str, int]]], idle: int
 ) -> None:

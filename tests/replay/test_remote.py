@@ -20,7 +20,7 @@ from crosscue.replay.files.identity import SHARE_BYTES, identity_of
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote.logs import Store, fetch, matches, version_of
-from support.can_files import candump, made
+from support.can_files import candump, random_frames
 from support.can_files import read_back as read_file
 
 
@@ -42,7 +42,7 @@ def _put(url: str, content: bytes) -> str:
 
 
 def test_remote_log_reads_like_local_log(bucket: str, tmp_path: Path) -> None:
-    frames = made(300)
+    frames = random_frames(300)
     here = tmp_path / "can.log"
     here.write_bytes(candump(frames))
     url = _put(f"{bucket}/drives/can.log", candump(frames))
@@ -196,7 +196,7 @@ def test_object_name_outside_store_is_refused() -> None:
 
 def test_file_url_is_read_in_place(tmp_path: Path) -> None:
     path = tmp_path / "can.log"
-    path.write_bytes(candump(made(3)))
+    path.write_bytes(candump(random_frames(3)))
 
     with open_log(path.as_uri()) as log:
         assert log.path == path

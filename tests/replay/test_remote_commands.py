@@ -19,7 +19,7 @@ from crosscue.replay.files.identity import SHARE_BYTES, identity_of
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.write.convert import LogWriter
-from support.can_files import candump, made
+from support.can_files import candump, random_frames
 from support.memory_log import GYRO, WHEELS, gyro_block, wheel_block
 from support.range_server import Served, serving
 from support.rosbag_files import rows_of, write_bag
@@ -188,7 +188,7 @@ def test_remote_identity_equals_local_identity(
         path = write_bag(tmp_path / "a.bag", rows_of(60_000), chunk_bytes=64_000)
     elif kind == "log":
         path = tmp_path / "can.log"
-        path.write_bytes(candump(made(300)))
+        path.write_bytes(candump(random_frames(300)))
     web.files[f"deep/{path.name}"] = path.read_bytes()
 
     there = identity_of(f"{web.base}/deep/{path.name}")

@@ -23,7 +23,7 @@ from crosscue.replay.losses import losses_heard
 from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
-from support.can_files import blf, candump, made
+from support.can_files import blf, candump, random_frames
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_bag, write_folder
@@ -63,7 +63,7 @@ def _losses_text(log: Path) -> str:
 def long_log(tmp_path: Path) -> Path:
     """Write and seal a candump log of more than three blocks."""
     log = tmp_path / "can.log"
-    log.write_bytes(candump(made(300)) * 300)
+    log.write_bytes(candump(random_frames(300)) * 300)
     assert log.stat().st_size > 3 * MIB
     assert run(["seal", str(log)]) == 0
     return log
@@ -193,7 +193,7 @@ def test_changed_size_is_reported_in_one_line(long_log: Path, is_cut: bool) -> N
             file.truncate(2 * MIB)
         else:
             file.seek(size)
-            file.write(candump(made(3)))
+            file.write(candump(random_frames(3)))
 
     losses = [drop for drop in read(long_log)[1].drops() if drop.reason == CHANGED]
 
@@ -383,7 +383,7 @@ def test_convert_does_not_overwrite_a_sealed_log(
 
 def test_log_with_longest_file_name_is_read(tmp_path: Path) -> None:
     log = tmp_path / ("x" * 251 + ".log")
-    log.write_bytes(candump(made(30)))
+    log.write_bytes(candump(random_frames(30)))
 
     assert read(log)[1].is_whole
 
@@ -455,7 +455,7 @@ def _window_case(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bo
         return log, window, {early: True, late: False}
     if kind == "blf":
         log = folder / "can.blf"
-        frames = made(60_000, step_ns=1_000_000)
+        frames = random_frames(60_000, step_ns=1_000_000)
         log.write_bytes(blf(frames, stored=True, container=60_000))
     else:
         log = folder / "x.mf4"
@@ -534,7 +534,7 @@ def test_log_added_to_sealed_folder_is_not_sealed(tmp_path: Path) -> None:
     place = write_folder(tmp_path / "bag", rows_of(50))
     assert run(["seal", str(place)]) == 0
     late = place / "can.log"
-    late.write_bytes(candump(made(30)))
+    late.write_bytes(candump(random_frames(30)))
 
     assert read(late)[1].is_whole
     assert "sealed" not in read(late)[1].integrity

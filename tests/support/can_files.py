@@ -32,7 +32,9 @@ class Sent:
     is_fd: bool = False
 
 
-def made(count: int, seed: int = 1, *, fd: bool = True, step_ns: int = 1_000) -> list[Sent]:
+def random_frames(
+    count: int, seed: int = 1, *, fd: bool = True, step_ns: int = 1_000
+) -> list[Sent]:
     """Generate ``count`` random frames of all kinds on two buses, in time order."""
     rng = random.Random(seed)
     frames, t_ns = [], START_NS
@@ -290,7 +292,7 @@ def damaged(whole: bytes, seed: int) -> bytes:
     return whole[:at] + patch + whole[at + len(patch) :]
 
 
-def same_as_python_can(
+def assert_equal_to_python_can(
     path: Path,
     peer: Iterable[can.Message],
     bus: str = "{}",

@@ -9,7 +9,17 @@ from pathlib import Path
 
 from crosscue.replay.base import CrosscueError
 from crosscue.replay.logs.opening import open_log
-from support.can_files import START_NS, Sent, asc, blf, by_bus, candump, made, read_back, trc
+from support.can_files import (
+    START_NS,
+    Sent,
+    asc,
+    blf,
+    by_bus,
+    candump,
+    random_frames,
+    read_back,
+    trc,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +46,7 @@ class Kind:
 
     def frames(self, count: int, seed: int = 1) -> list[Sent]:
         """Generate frames that the format supports."""
-        frames = made(count, seed, fd=self.fd, step_ns=self.step_ns)
+        frames = random_frames(count, seed, fd=self.fd, step_ns=self.step_ns)
         return frames if self.buses else [replace(f, bus="1") for f in frames]
 
     def expected(self, frames: Sequence[Sent]) -> dict[str, list[Sent]]:

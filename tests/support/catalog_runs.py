@@ -18,7 +18,7 @@ ESTABLISHED: Final = {"a": 0.9, "b": 0.3}
 """Threshold ``fusion.established`` of the runs in each folder."""
 
 
-def seen(number: int, detected_m: float | None) -> ApproachRow:
+def approach_row(number: int, detected_m: float | None) -> ApproachRow:
     """Summary of an approach in a run."""
     return ApproachRow(
         number=number,
@@ -60,7 +60,7 @@ def add_run(path: Path, drive: str, established: float = 0.9, **changes: Any) ->
     content: dict[str, Any] = {
         "logs": (log,),
         "settings": Vehicle(version=1, name="car", fusion=Fusion(established=established)),
-        "scene": scene(seen(7, 30.0)),
+        "scene": scene(approach_row(7, 30.0)),
     }
     return run_folder(path, **(content | changes))
 

@@ -35,7 +35,7 @@ class Letters:
     threads: str
 
 
-def made_jobs(folder: Path, says: Sequence[str], runs: str = "runs") -> list[Job]:
+def write_jobs(folder: Path, says: Sequence[str], runs: str = "runs") -> list[Job]:
     """Write one log for each word, and return their jobs."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []

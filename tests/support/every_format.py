@@ -11,7 +11,7 @@ from typing import Final
 import can
 import numpy as np
 
-from support.can_files import Sent, asc, blf, candump, made, trc
+from support.can_files import Sent, asc, blf, candump, random_frames, trc
 from support.kitti_drive import raw_drive
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.nuscenes_drive import nuscenes_drive
@@ -80,11 +80,11 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "rosbag1": lambda folder: write_bag(folder / "log.bag", rows_of(400)),
     "rosbag2-sqlite3": _db3,
     "rosbag2": lambda folder: write_folder(folder / "bag", rows_of(400)),
-    "candump": lambda folder: _bytes(folder / "can.log", candump(made(FRAMES))),
-    "asc": lambda folder: _bytes(folder / "can.asc", asc(made(FRAMES))),
-    "blf": lambda folder: _bytes(folder / "can.blf", blf(made(FRAMES))),
-    "trc": lambda folder: _bytes(folder / "can.trc", trc(made(FRAMES))),
-    "mf4": lambda folder: _mf4(folder / "can.mf4", made(FRAMES)),
+    "candump": lambda folder: _bytes(folder / "can.log", candump(random_frames(FRAMES))),
+    "asc": lambda folder: _bytes(folder / "can.asc", asc(random_frames(FRAMES))),
+    "blf": lambda folder: _bytes(folder / "can.blf", blf(random_frames(FRAMES))),
+    "trc": lambda folder: _bytes(folder / "can.trc", trc(random_frames(FRAMES))),
+    "mf4": lambda folder: _mf4(folder / "can.mf4", random_frames(FRAMES)),
     "comma2k19": lambda folder: _comma2k19(folder / "segment"),
     "kitti-raw": lambda folder: raw_drive(folder / "drive"),
     "kitti-odometry": kitti_odometry_drive,

@@ -46,7 +46,7 @@ def graphs(draw: st.DrawFn) -> FactorGraph:
 
 
 @st.composite
-def graphs_heard(draw: st.DrawFn) -> tuple[FactorGraph, list[dict[str, int]]]:
+def graphs_with_counts(draw: st.DrawFn) -> tuple[FactorGraph, list[dict[str, int]]]:
     """A graph and counts of its cues in several frames; a cue can be missing in a frame."""
     graph = draw(graphs())
     names = st.sampled_from([cue.name for cue in graph.cues])
@@ -106,7 +106,9 @@ def drive(
         yield FrameEvidence(begin_ns + i * SECOND_NS // 10, step_m, 1e-4, signs, counts)
 
 
-def chain(rng: np.random.Generator, way_m: Floats, rate: float, fade_m: float) -> NDArray[np.int64]:
+def correlated_positives(
+    rng: np.random.Generator, way_m: Floats, rate: float, fade_m: float
+) -> NDArray[np.int64]:
     """Simulate a cue along a path: positive at ``rate``, correlated over ``fade_m``."""
     out = [int(rng.random() < rate)]
     for step_m in np.diff(way_m).tolist():
@@ -133,7 +135,7 @@ def annotated(seed: int, many: int, frames: int = 60) -> list[AnnotatedApproach]
         has_left, has_straight = bool(rng.random() < 0.6), bool(rng.random() < 0.6)
         is_there = {"road_left": has_left, "parked_left": has_left, "road_straight": has_straight}
         counts = {
-            cue: chain(rng, way_m, RATES[cue][0 if there else 1], FADE_M)
+            cue: correlated_positives(rng, way_m, RATES[cue][0 if there else 1], FADE_M)
             for cue, there in is_there.items()
         }
         features = {"intersection": True, "left": has_left, "straight": has_straight}

@@ -10,7 +10,7 @@ from crosscue.localization.landmarks.features import CameraGeometry, Features
 from crosscue.replay.base import Bytes
 
 from .gap_drive import ROW, SECOND, SPEED_MPS
-from .landmark_drive import NearnessMatcher, there
+from .landmark_drive import NearnessMatcher, features_at
 
 STEP_M: Final = SPEED_MPS * ROW / SECOND
 """Distance between rows."""
@@ -21,7 +21,7 @@ class PlaceByNumber(NearnessMatcher):
 
     def describe(self, grey: Bytes, /) -> Features:
         """Return the position as features."""
-        return there(np.array([STEP_M * float(np.median(grey)), 0.0]))
+        return features_at(np.array([STEP_M * float(np.median(grey)), 0.0]))
 
 
 def matcher(_camera: CameraGeometry) -> PlaceByNumber:

@@ -16,7 +16,7 @@ from crosscue.replay.base import Bytes, Floats
 from support.simulated_drive import Truth
 
 
-def there(xy_m: Floats) -> Features:
+def features_at(xy_m: Floats) -> Features:
     """Features of the picture at a position, which encode the position itself."""
     where = np.ascontiguousarray(xy_m, np.float64).view(np.uint8).reshape(1, 16)
     return Features(640, 480, np.zeros((1, 2), np.float32), where)
@@ -66,7 +66,7 @@ def landmarks_along(
         for i, row in enumerate(at):
             xy = camera_m[row]
             off = rng.multivariate_normal([0.0, 0.0], cov_m2)
-            writer.add(Place(str(i), xy + off, cov_m2, float(truth.xyh[row, 2])), there(xy))
+            writer.add(Place(str(i), xy + off, cov_m2, float(truth.xyh[row, 2])), features_at(xy))
     return path
 
 
@@ -89,7 +89,7 @@ class PlaceMeasurements:
         """Match the picture at the true position."""
         row = int(np.searchsorted(self.truth.t_ns, belief.t_ns))
         camera_m = camera_path(self.truth, self.lever_m)[row]
-        found = self.search.process(belief, travelled_m, lambda: there(camera_m))
+        found = self.search.process(belief, travelled_m, lambda: features_at(camera_m))
         if found is not None:
             self.times.append(belief.t_ns)
         return found

@@ -77,7 +77,7 @@ class Kind(Enum):
 
     REFUSED = "refused with one line"
     SAME = "everything read, nothing to report"
-    TOLD = "loss reported"
+    REPORTED = "loss reported"
     NOTICED = "everything read, with a notice"
     SILENT = "SILENT LOSS"
     CHANGED = "a message changed where no checksum can say which"
@@ -110,9 +110,9 @@ def judge(path: Path, truth: Reading) -> Verdict:
     if reading.count() < truth.count():
         accounts = reading.ledger.accounts.values()
         is_annotated = not reading.ledger.is_whole or any(one.skipped for one in accounts)
-        return Verdict(Kind.TOLD if is_annotated else Kind.SILENT, kept)
+        return Verdict(Kind.REPORTED if is_annotated else Kind.SILENT, kept)
     if not reading.ledger.is_whole:
-        return Verdict(Kind.TOLD, kept)
+        return Verdict(Kind.REPORTED, kept)
     has_notice = reading.ledger.notices != truth.ledger.notices
     return Verdict(Kind.NOTICED if has_notice else Kind.SAME, kept)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from support.can_files import blf, made
+from support.can_files import blf, random_frames
 from support.every_format import EVERY_FORMAT
 from support.mcap_files import McapFile, channel, message, schema
 from support.rosbag_files import TOPICS, rows_of, write_bag
@@ -73,7 +73,7 @@ def _unknown_channel(path: Path) -> None:
 
 def _blf(folder: Path) -> Path:
     path = folder / "can.blf"
-    path.write_bytes(blf(made(60, fd=False), stored=True, container=1 << 20))
+    path.write_bytes(blf(random_frames(60, fd=False), stored=True, container=1 << 20))
     return path
 
 

@@ -37,7 +37,7 @@ def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:
     return cars
 
 
-def what_is_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
+def role_at(cars: list[dict[str, Any]], x: float, y: float) -> str:
     """Return the role of the nearest true car, or ``no car``."""
     best, nearest = "no car", MIN_NEAR
     for one in cars:

@@ -192,7 +192,7 @@ def ros1_topic(name: str, type_name: str, text: str | None = None) -> Topic:
     return Topic(name, type_name, "ros1", text.encode(), "ros1msg")
 
 
-def must_decode(topic: Topic) -> Decoder:
+def decoder_of(topic: Topic) -> Decoder:
     """Return the decoder of a topic, which must have one."""
     decoder = decoder_for(topic)
     assert decoder is not None

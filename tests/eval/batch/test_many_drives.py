@@ -27,7 +27,7 @@ from crosscue.eval.batch.jobs import (
 from crosscue.eval.batch.processes import Processes
 from crosscue.replay.base import UsageError
 from crosscue.replay.losses import losses_heard
-from support.drive_work import Letters, letters, made_jobs
+from support.drive_work import Letters, letters, write_jobs
 from support.trees import tree
 
 TWO = Processes(2)
@@ -36,7 +36,7 @@ TWO = Processes(2)
 @pytest.mark.slow
 def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
     words = ["plain", "damaged", "dies", "bug", "loss", "memory", "leaves", "dies once", "last"]
-    jobs = made_jobs(tmp_path, words)
+    jobs = write_jobs(tmp_path, words)
 
     results = run_many(jobs, letters, TWO)
 
@@ -62,7 +62,7 @@ def test_one_failing_drive_does_not_stop_the_rest(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", [in_turn, TWO])
 def test_losses_in_a_worker_are_reported_to_the_caller(tmp_path: Path, engine: Engine) -> None:
-    jobs = made_jobs(tmp_path, ["plain", "warns"])
+    jobs = write_jobs(tmp_path, ["plain", "warns"])
 
     with losses_heard() as heard:
         results = run_many(jobs, letters, engine)
@@ -75,7 +75,7 @@ def test_losses_in_a_worker_are_reported_to_the_caller(tmp_path: Path, engine: E
 
 
 def test_second_start_processes_only_missing_drives(tmp_path: Path) -> None:
-    jobs = made_jobs(tmp_path, ["plain", "damaged", "loss", "last"])
+    jobs = write_jobs(tmp_path, ["plain", "damaged", "loss", "last"])
     first = run_many(jobs, letters, in_turn)
     before = {job.name: tree(job.run) for job in jobs}
     Path(jobs[1].logs[0]).write_text("healed")
@@ -91,7 +91,7 @@ def test_second_start_processes_only_missing_drives(tmp_path: Path) -> None:
 
 
 def test_run_of_changed_log_or_settings_needs_overwrite(tmp_path: Path) -> None:
-    jobs = made_jobs(tmp_path, ["plain", "other"])
+    jobs = write_jobs(tmp_path, ["plain", "other"])
     run_many(jobs, letters, in_turn)
     Path(jobs[0].logs[0]).write_text("longer")
     changed = [jobs[0], Job("drive1", jobs[1].logs, jobs[1].run, "settings 2")]
@@ -106,7 +106,7 @@ def test_run_of_changed_log_or_settings_needs_overwrite(tmp_path: Path) -> None:
 
 
 def test_incomplete_run_folder_is_processed_again(tmp_path: Path) -> None:
-    jobs = made_jobs(tmp_path, ["plain"])
+    jobs = write_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
     complete = tree(jobs[0].run)
     (jobs[0].run / "manifest.json").unlink()
@@ -119,7 +119,7 @@ def test_incomplete_run_folder_is_processed_again(tmp_path: Path) -> None:
 
 
 def test_run_with_edited_manifest_is_not_done(tmp_path: Path) -> None:
-    jobs = made_jobs(tmp_path, ["plain"])
+    jobs = write_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
     manifest = jobs[0].run / "manifest.json"
     manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "notices": ["by hand"]}))
@@ -129,7 +129,7 @@ def test_run_with_edited_manifest_is_not_done(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("torn", ["", "{", "[]", '{"format_version": 1}', '{"format_version": 9}'])
 def test_run_with_invalid_journal_entry_is_not_done(tmp_path: Path, torn: str) -> None:
-    jobs = made_jobs(tmp_path, ["plain"])
+    jobs = write_jobs(tmp_path, ["plain"])
     run_many(jobs, letters, in_turn)
     (tmp_path / "runs" / ".drives" / "drive0.json").write_text(torn)
 
@@ -137,7 +137,7 @@ def test_run_with_invalid_journal_entry_is_not_done(tmp_path: Path, torn: str) -
 
 
 def test_missing_log_fails_only_its_drive(tmp_path: Path) -> None:
-    jobs = made_jobs(tmp_path, ["plain", "gone"])
+    jobs = write_jobs(tmp_path, ["plain", "gone"])
     Path(jobs[1].logs[0]).unlink()
 
     results = run_many(jobs, letters, in_turn)
@@ -151,7 +151,7 @@ def test_one_and_two_workers_write_equal_bytes(tmp_path: Path) -> None:
     words = ["plain", "loss", "some", "more"]
     engines: dict[str, Engine] = {"one": in_turn, "two": Processes(2, threads=1)}
     found = [
-        run_many(made_jobs(tmp_path, words, name), letters, engine)
+        run_many(write_jobs(tmp_path, words, name), letters, engine)
         for name, engine in engines.items()
     ]
 
@@ -162,7 +162,7 @@ def test_one_and_two_workers_write_equal_bytes(tmp_path: Path) -> None:
 
 
 def test_duplicate_job_names_and_zero_workers_are_refused(tmp_path: Path) -> None:
-    job = made_jobs(tmp_path, ["plain"])[0]
+    job = write_jobs(tmp_path, ["plain"])[0]
 
     with pytest.raises(UsageError, match="drive0: two drives have this name"):
         run_many([job, job], letters, TWO)
@@ -172,7 +172,7 @@ def test_duplicate_job_names_and_zero_workers_are_refused(tmp_path: Path) -> Non
 
 def test_progress_counts_earlier_done_and_failed_drives(tmp_path: Path) -> None:
     seen: list[Progress] = []
-    jobs = made_jobs(tmp_path, ["plain", "damaged", "more"])
+    jobs = write_jobs(tmp_path, ["plain", "damaged", "more"])
     run_many(jobs[:1], letters, in_turn)
 
     run_many(jobs, letters, in_turn, on_progress=seen.append)
@@ -253,7 +253,7 @@ def test_signal_to_the_parent_stops_all_workers(
 
     for log in (tmp_path / "drives").glob("*.txt"):
         log.write_text("healed")
-    again = run_many(made_jobs(tmp_path / "drives", ["healed"] * 3), letters, in_turn)
+    again = run_many(write_jobs(tmp_path / "drives", ["healed"] * 3), letters, in_turn)
     assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
 
 

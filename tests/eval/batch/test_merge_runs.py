@@ -12,13 +12,13 @@ from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifes
 from crosscue.eval.runs.manifest import MergedManifest
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.replay.base import RunError
-from support.drive_work import letters, made_jobs
+from support.drive_work import letters, write_jobs
 from support.manifests import estimated
 from support.trees import tree
 
 
 def _merged(folder: Path, words: list[str], out: str = "merged") -> RunFolder:
-    jobs = made_jobs(folder, words)
+    jobs = write_jobs(folder, words)
     results = run_many(jobs, letters, in_turn)
     runs = {one.job.name: open_run(one.job.run) for one in results if one.error is None}
     failures = {one.job.name: one.error for one in results if one.error is not None}

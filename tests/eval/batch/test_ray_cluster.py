@@ -22,7 +22,7 @@ from crosscue.eval.studies.town.settings import LandmarkStudy
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.settings import City, Drive
 from crosscue.replay.base import CrosscueError, UsageError, WorkerError
-from support.drive_work import letters, made_jobs
+from support.drive_work import letters, write_jobs
 from support.trees import tree
 
 pytestmark = [
@@ -94,7 +94,7 @@ def test_cluster_is_joined_once_without_usage_statistics(cluster: Any) -> None:
 def test_drives_on_ray_equal_one_process_despite_dead_workers(
     cluster: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    jobs = made_jobs(tmp_path, WORDS, "ray")
+    jobs = write_jobs(tmp_path, WORDS, "ray")
 
     results = run_many(jobs, letters, OnRay(LOCAL, workers=2, attempts=2))
 
@@ -109,7 +109,7 @@ def test_drives_on_ray_equal_one_process_despite_dead_workers(
     assert os.getpid() not in pids
     assert {done.result.threads for done in results if done.result is not None} == {"1"}
 
-    here = [job for job in made_jobs(tmp_path, WORDS, "here") if job.name != "drive4"]
+    here = [job for job in write_jobs(tmp_path, WORDS, "here") if job.name != "drive4"]
     run_many(here, letters, in_turn)
     there = [job for job in jobs if job.name != "drive4"]
     assert [tree(job.run) for job in there] == [tree(job.run) for job in here]

@@ -15,7 +15,7 @@ import pytest
 from crosscue.eval.batch.jobs import Done, in_turn, run_many
 from crosscue.eval.batch.ray_jobs import OnRay
 from crosscue.replay.base import CrosscueError
-from support.drive_work import Letters, letters, made_jobs
+from support.drive_work import Letters, letters, write_jobs
 from support.trees import tree
 
 MIB = 1 << 20
@@ -56,7 +56,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def test_lost_node_repeats_only_its_running_drives(cluster: Any, tmp_path: Path) -> None:
     words = ["plain", "waits once", "loss", "waits once", "last"]
-    jobs = made_jobs(tmp_path, words, "ray")
+    jobs = write_jobs(tmp_path, words, "ray")
     engine = OnRay(cluster.address, memory_bytes=512 * MIB)
     begun = [tmp_path / f"drive{i}.begun" for i in (1, 3)]
     lost = ""
@@ -82,7 +82,7 @@ def test_lost_node_repeats_only_its_running_drives(cluster: Any, tmp_path: Path)
     # Drives that ran on it were started twice, all others once.
     assert [attempts[i] for i in (0, 2, 4)].count(1) >= 2
     assert sum(attempts) == 6
-    here = made_jobs(tmp_path, words, "here")
+    here = write_jobs(tmp_path, words, "here")
     run_many(here, letters, in_turn)
     assert [tree(job.run) for job in jobs] == [tree(job.run) for job in here]
 

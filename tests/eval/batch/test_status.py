@@ -19,7 +19,7 @@ from crosscue.eval.batch.status import DriveState, drives_of_folder, pace_of
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import FAILURE, LOCK, signature
 from crosscue.replay.base import UnreadableRunError
-from support.drive_work import letters, made_jobs
+from support.drive_work import letters, write_jobs
 
 WORDS = ("plain", "damaged", "bug", "loss")
 
@@ -27,7 +27,7 @@ WORDS = ("plain", "damaged", "bug", "loss")
 @pytest.fixture
 def batch(tmp_path: Path) -> list[Job]:
     """Four processed drives, two of which failed, and one planned drive."""
-    jobs = made_jobs(tmp_path, WORDS)
+    jobs = write_jobs(tmp_path, WORDS)
     write_plan(tmp_path / "runs", [*(job.name for job in jobs), "later"], "all")
     run_many(jobs, letters, in_turn)
     return jobs
@@ -97,7 +97,7 @@ def test_drive_of_a_dead_worker_is_stale(
 
 
 def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> None:
-    (job,) = made_jobs(tmp_path, ["plain"])
+    (job,) = write_jobs(tmp_path, ["plain"])
     dead = "4711 another-machine boot 99"
     job.run.mkdir(parents=True)
 
@@ -118,7 +118,7 @@ def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> No
 
 
 def test_damaged_entry_and_lock_do_not_block_a_drive_permanently(tmp_path: Path) -> None:
-    (job,) = made_jobs(tmp_path, ["plain"])
+    (job,) = write_jobs(tmp_path, ["plain"])
     job.run.mkdir(parents=True)
     write_entry(job.run, {"inputs": None, "worker": "damaged"})
     job.run.joinpath(LOCK).write_bytes(b"\xff\xfe")

@@ -10,7 +10,7 @@ from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.runs.account import Account, Line
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, create
 from crosscue.replay.base import UnreadableRunError, UsageError
-from support.catalog_runs import add_run, runs_below, scene, seen
+from support.catalog_runs import add_run, approach_row, runs_below, scene
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def _is(table: str) -> object:
 
 
 def test_approaches_of_all_runs_are_listed(tmp_path: Path) -> None:
-    add_run(tmp_path / "one", "one", scene=scene(seen(1, 12.5), seen(2, None)))
+    add_run(tmp_path / "one", "one", scene=scene(approach_row(1, 12.5), approach_row(2, None)))
     add_run(tmp_path / "two", "two", scene=None)
 
     rows = crosscue.catalog(tmp_path).query(

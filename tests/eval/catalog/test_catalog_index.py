@@ -16,7 +16,7 @@ from crosscue.eval.catalog.query.index import NAME
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.base import UnreadableRunError
 from crosscue.replay.files.partial_file import PartialFile
-from support.catalog_runs import add_run, change, runs_below, scene, seen
+from support.catalog_runs import add_run, approach_row, change, runs_below, scene
 
 ALL = "select run, vehicle, approaches, settings_sha256 from runs order by run"
 
@@ -53,7 +53,7 @@ def test_second_opening_reads_no_manifest(runs: Path, manifests_read: list[str])
 def test_only_changed_and_new_runs_are_read_again(runs: Path, manifests_read: list[str]) -> None:
     crosscue.catalog(runs)
     manifests_read.clear()
-    change(RunFolder(runs / "a/monday"), scene=scene(seen(1, 9.0), seen(2, None)))
+    change(RunFolder(runs / "a/monday"), scene=scene(approach_row(1, 9.0), approach_row(2, None)))
     add_run(runs / "a/wednesday", "wednesday")
 
     rows = crosscue.catalog(runs).query("select run, approaches as n from runs order by run")

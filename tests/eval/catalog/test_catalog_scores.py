@@ -7,7 +7,7 @@ import pytest
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
-from support.catalog_runs import add_run, change, scene, seen
+from support.catalog_runs import add_run, approach_row, change, scene
 from support.scoring import truth_folder
 
 
@@ -17,7 +17,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fleet")
     truth = truth_folder(folder / "truth")
     scored = add_run(folder / "runs/scored", "scored")
-    change(scored, scene=scene(seen(7, 30.0), seen(9, None)))
+    change(scored, scene=scene(approach_row(7, 30.0), approach_row(9, None)))
     add_run(folder / "runs/plain", "plain")
     assert cli.run(["score", str(scored.path), "--truth", str(truth), "-q"]) == 0
     return folder / "runs"

@@ -33,7 +33,7 @@ from support.gap_drive import (
     write_drive,
 )
 from support.gap_landmarks import STEP_M, PlaceByNumber
-from support.landmark_drive import there
+from support.landmark_drive import features_at
 
 PAUSE: Final = Clock(pause_s=(4.0, 10.0))
 """Longer than ``time.restart_after_s``: the pose stays at its last estimate."""
@@ -195,7 +195,7 @@ def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
     with LandmarkWriter(path, PlaceByNumber.kind) as writer:
         for x_m in np.arange(2.0, 90.0, 4.0):
             xy = np.array([x_m, 0.0])
-            writer.add(Place(f"{x_m:g}", xy, 0.25 * np.eye(2), 0.0), there(xy))
+            writer.add(Place(f"{x_m:g}", xy, 0.25 * np.eye(2), 0.0), features_at(xy))
     vehicle = load(folder / "car.toml")
     with open_log(log) as opened, LandmarkDatabase(path) as database:
         into = create(folder / "run", overwrite=True)

@@ -28,7 +28,7 @@ from crosscue.localization.pose_track import (
     start_belief,
 )
 from crosscue.replay.base import Floats
-from support.landmark_drive import PlaceMeasurements, landmarks_along, search_in, there
+from support.landmark_drive import PlaceMeasurements, features_at, landmarks_along, search_in
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 
 ODOMETRY = OdometrySettings(
@@ -220,7 +220,7 @@ def follow(
     if not path.exists():
         with LandmarkWriter(path, "nearness") as writer:
             for name, xy in marks.items():
-                writer.add(Place(name, xy, np.eye(2)), there(xy))
+                writer.add(Place(name, xy, np.eye(2)), features_at(xy))
     exact = OdometrySettings(track_width_m=TRACK_M)
     made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
     first = start_belief(
@@ -298,10 +298,10 @@ def test_only_landmarks_inside_the_ellipse_are_matched(tmp_path: Path) -> None:
     place = np.array([100.0, 0.0])
     path = tmp_path / "twins.sqlite"
     with LandmarkWriter(path, "nearness") as writer:
-        writer.add(Place("right", place, np.eye(2)), there(place))
+        writer.add(Place("right", place, np.eye(2)), features_at(place))
         writer.add(
             Place("twin", place + np.array([0.0, 100.0]), np.eye(2)),
-            there(place + np.array([0.0, 0.01])),
+            features_at(place + np.array([0.0, 0.01])),
         )
 
     narrow = LandmarkSettings(min_score=70.0, interval_m=0.2)

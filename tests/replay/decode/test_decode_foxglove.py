@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from crosscue.replay.base import Block, Images, Ledger, SchemaError, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
-from support.ros_messages import block_of, must_decode
+from support.ros_messages import block_of, decoder_of
 
 F = descriptor_pb2.FieldDescriptorProto
 QUICK = settings(max_examples=60, deadline=None)
@@ -102,7 +102,7 @@ def test_compressed_images_are_byte_ranges_of_payloads() -> None:
         payloads.append(message.SerializeToString())
     ledger = Ledger("made")
 
-    block = must_decode(topic)(block_of("/t", [payloads[0], payloads[1], b""]), ledger)
+    block = decoder_of(topic)(block_of("/t", [payloads[0], payloads[1], b""]), ledger)
 
     assert isinstance(block.rows, Images)
     assert block.rows.coding == ("jpeg", "png")
@@ -122,7 +122,7 @@ def test_video_packets_of_unknown_coding_are_skipped() -> None:
         payloads.append(message.SerializeToString())
     ledger = Ledger("made")
 
-    images = must_decode(topic)(block_of("/t", payloads), ledger).rows
+    images = decoder_of(topic)(block_of("/t", payloads), ledger).rows
 
     assert isinstance(images, Images)
     assert images.coding == ("h264", "h265")
@@ -140,7 +140,7 @@ def test_raw_images_keep_size_and_pixel_format() -> None:
     short.data = bytes(23)
     ledger = Ledger("made")
 
-    images = must_decode(topic)(
+    images = decoder_of(topic)(
         block_of("/t", [message.SerializeToString(), short.SerializeToString()]), ledger
     ).rows
 
@@ -163,7 +163,7 @@ def test_location_fix_has_columns_of_navsatfix() -> None:
     wrong.position_covariance.extend([1.0, 2.0])
     ledger = Ledger("made")
 
-    block = must_decode(topic)(
+    block = decoder_of(topic)(
         block_of("/t", [each.SerializeToString() for each in (message, wrong, bare)]), ledger
     )
 
@@ -193,7 +193,7 @@ def test_unknown_protobuf_type_has_dotted_columns() -> None:
     message.again.count = 5
     ledger = Ledger("made")
 
-    block = must_decode(topic)(block_of("/t", [message.SerializeToString()]), ledger)
+    block = decoder_of(topic)(block_of("/t", [message.SerializeToString()]), ledger)
 
     assert isinstance(block.rows, Table)
     assert {name: column.tolist() for name, column in block.rows.columns.items()} == {
@@ -246,7 +246,7 @@ def test_arbitrary_bytes_are_decoded_or_dropped(raw: bytes, name: str) -> None:
     ledger = Ledger("made")
     ledger.find("/t", 1)
 
-    block = must_decode(topic)(block_of("/t", [raw]), ledger)
+    block = decoder_of(topic)(block_of("/t", [raw]), ledger)
 
     assert len(block) == ledger.topic("/t").used
     if isinstance(block.rows, Images):
@@ -271,10 +271,10 @@ def test_json_images_and_fixes_are_decoded() -> None:
         "position_covariance_type": 2,
     }
     ledger = Ledger("made")
-    images = must_decode(Topic("/t", "foxglove.CompressedImage", "json"))(
+    images = decoder_of(Topic("/t", "foxglove.CompressedImage", "json"))(
         json_block(image, image | {"data": "not base64!"}), ledger
     )
-    fixes = must_decode(Topic("/t", "foxglove.LocationFix", "json"))(
+    fixes = decoder_of(Topic("/t", "foxglove.LocationFix", "json"))(
         json_block(fix, fix | {"latitude": "north"}, {"timestamp": when}), ledger
     )
 
@@ -306,7 +306,7 @@ def test_json_images_and_fixes_are_decoded() -> None:
 def test_invalid_json_message_is_dropped_alone(raw: bytes) -> None:
     ledger = Ledger("made")
 
-    block = must_decode(Topic("/t", "made.Thing", "json"))(json_block({"a": 1}, raw), ledger)
+    block = decoder_of(Topic("/t", "made.Thing", "json"))(json_block({"a": 1}, raw), ledger)
 
     assert len(block) == 1
     assert ledger.topic("/t").dropped == {MISFIT: 1}
@@ -317,7 +317,7 @@ def test_json_values_keep_dtype_and_missing_values_are_nan() -> None:
         {"n": 2**53 + 1, "b": True, "in": {"x": 1}},
         {"n": 2, "b": False, "in": {"x": 0.5, "y": 2}, "s": "text", "l": [1, 2]},
     ]
-    table = must_decode(Topic("/t", "made.Thing", "json"))(json_block(*rows), Ledger("x")).rows
+    table = decoder_of(Topic("/t", "made.Thing", "json"))(json_block(*rows), Ledger("x")).rows
 
     assert isinstance(table, Table)
     assert table["n"].tolist() == [2**53 + 1, 2]

@@ -21,8 +21,8 @@ from crosscue.replay.decode.ros.fields import WalkedFields
 from crosscue.replay.decode.ros.standard import Kind, generic
 from support.ros_messages import (
     block_of,
+    decoder_of,
     messages_of,
-    must_decode,
     numbers_in,
     random_definition,
     random_message,
@@ -38,7 +38,7 @@ QUICK = settings(max_examples=40, deadline=None)
 
 def generic_decoder(topic: Topic) -> RosDecoder:
     """Return the generic decoder, even for a type with standard columns."""
-    decoder = must_decode(topic)
+    decoder = decoder_of(topic)
     assert isinstance(decoder, RosDecoder)
     return replace(decoder, kind=Kind((), generic))
 
@@ -94,7 +94,7 @@ def test_standard_types_decode_like_rosbags(
         assert not ledger.details, name
         assert isinstance(table, Table)
         assert_same_values(table, messages, store, name)
-        decoder = must_decode(topic_of("/t", name))
+        decoder = decoder_of(topic_of("/t", name))
         decoded_twice = [
             decoder(block_of("/t", payloads[-1:] * 2), Ledger("made")) for _ in range(2)
         ]
@@ -227,7 +227,7 @@ def test_message_with_wrong_length_is_dropped_with_field_and_time() -> None:
     wrong_length = raw[:4] + b"\x32" + raw[5:]
     ledger = Ledger("made")
 
-    decoded = must_decode(ros2_topic("/s", "std_msgs/msg/String"))(
+    decoded = decoder_of(ros2_topic("/s", "std_msgs/msg/String"))(
         block_of("/s", [raw, wrong_length, raw]), ledger
     )
 
@@ -243,7 +243,7 @@ def test_unsupported_encapsulation_is_skipped_and_damaged_one_dropped(head: byte
     raw = serialized(store, store.types["std_msgs/msg/Float64"](1.5), "std_msgs/msg/Float64")
     ledger = Ledger("made")
 
-    decoded = must_decode(ros2_topic("/f", "std_msgs/msg/Float64"))(
+    decoded = decoder_of(ros2_topic("/f", "std_msgs/msg/Float64"))(
         block_of("/f", [head + raw[2:], raw]), ledger
     )
 
@@ -262,7 +262,7 @@ def test_block_with_both_byte_orders_keeps_row_order() -> None:
     payloads = [serialized(store, m, name, little=i % 3 != 1) for i, m in enumerate(messages)]
     ledger = Ledger("made")
 
-    decoded = must_decode(ros2_topic("/p", name))(block_of("/p", payloads), ledger)
+    decoded = decoder_of(ros2_topic("/p", name))(block_of("/p", payloads), ledger)
 
     assert isinstance(decoded.rows, Table)
     assert_same_values(decoded.rows, messages, store, name)
@@ -310,7 +310,7 @@ def test_can_frames_are_decoded_to_columns() -> None:
     ]
     ledger = Ledger("made")
 
-    decoded = must_decode(ros2_topic("/can", name))(block_of("/can", payloads), ledger)
+    decoded = decoder_of(ros2_topic("/can", name))(block_of("/can", payloads), ledger)
 
     frames = decoded.rows
     assert isinstance(frames, CanFrames)
@@ -340,7 +340,7 @@ def test_compressed_images_share_memory_with_the_log() -> None:
     ]
     block, ledger = block_of("/cam", payloads), Ledger("made")
 
-    images = must_decode(ros2_topic("/cam", name))(block, ledger).rows
+    images = decoder_of(ros2_topic("/cam", name))(block, ledger).rows
 
     assert isinstance(images, Images)
     assert images.coding == ("jpeg", "png")
@@ -363,7 +363,7 @@ def test_learned_image_layout_validates_lengths(is_cdr: bool) -> None:
             store.serialize_cdr(made, name) if is_cdr else store.serialize_ros1(made, name)
         )
 
-    trained = must_decode(topic)
+    trained = decoder_of(topic)
     trained(block_of("/cam", [message(5)]), Ledger("made"))
     for length_error in range(-3, 4):
         for rest in range(6):
@@ -374,7 +374,7 @@ def test_learned_image_layout_validates_lengths(is_cdr: bool) -> None:
 
             from_layout, from_walk = (
                 trained(block, ledgers[0]),
-                must_decode(topic)(block, ledgers[1]),
+                decoder_of(topic)(block, ledgers[1]),
             )
 
             assert ledgers[0].details == ledgers[1].details
@@ -402,7 +402,7 @@ def test_raw_image_with_too_few_bytes_is_dropped() -> None:
         return serialized(store, store.types[name](header, 2, 3, "rgb8", 0, 9, pixels), name)
 
     ledger = Ledger("made")
-    images = must_decode(ros2_topic("/cam", name))(block_of("/cam", [image(18), image(17)]), ledger)
+    images = decoder_of(ros2_topic("/cam", name))(block_of("/cam", [image(18), image(17)]), ledger)
 
     assert isinstance(images.rows, Images)
     assert images.rows.pixel_format == ("rgb8",)
@@ -441,7 +441,7 @@ def test_standard_columns_contain_the_matching_fields(name: str, is_cdr: bool) -
     messages = [random_message(rng, store, name) for _ in range(5)]
     payloads = [serialized(store, each, name) for each in messages]
 
-    table = must_decode(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
+    table = decoder_of(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
 
     assert isinstance(table, Table)
     expected = [dict(numbers_in(message, store, name)) for message in messages]
@@ -459,7 +459,7 @@ def test_camera_info_keeps_matrices_and_distortion(is_cdr: bool) -> None:
     setattr(message, lens, np.arange(5.0))
     payloads = [serialized(store, message, name)]
 
-    table = must_decode(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
+    table = decoder_of(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
 
     assert isinstance(table, Table)
     assert table["k"].shape == (1, 9)
@@ -472,7 +472,7 @@ def test_missing_definition_falls_back_to_standard_type() -> None:
     message = random_message(np.random.default_rng(2), store, name)
     payloads = [serialized(store, message, name)]
 
-    table = must_decode(Topic("/mag", name, "cdr"))(block_of("/mag", payloads), Ledger("x")).rows
+    table = decoder_of(Topic("/mag", name, "cdr"))(block_of("/mag", payloads), Ledger("x")).rows
 
     assert isinstance(table, Table)
     assert table["mag_x_t"][0] == message.magnetic_field.x  # type: ignore[attr-defined]
@@ -484,7 +484,7 @@ def test_missing_definition_falls_back_to_standard_type() -> None:
 def test_columns_pass_unchanged() -> None:
     block = Block("/t", np.zeros(2, np.int64), Table({"a": np.zeros(2)}))
 
-    assert must_decode(Topic("/t", "crosscue/Table", "columns"))(block, Ledger("x")) is block
+    assert decoder_of(Topic("/t", "crosscue/Table", "columns"))(block, Ledger("x")) is block
 
 
 @pytest.mark.slow
@@ -541,7 +541,7 @@ def test_message_with_too_many_nested_items_is_dropped() -> None:
     payload = count.to_bytes(4, "little") + bytes(4 * count)
     ledger = Ledger("made")
 
-    decoded = must_decode(Topic("/t", "made_msgs/Root", "ros1", text.encode(), "ros1msg"))(
+    decoded = decoder_of(Topic("/t", "made_msgs/Root", "ros1", text.encode(), "ros1msg"))(
         block_of("/t", [payload]), ledger
     )
 
@@ -602,7 +602,7 @@ def test_damaged_definition_is_used_or_refused_in_one_line(seed: int, is_cdr: bo
 def test_empty_block_decodes_to_empty_block(is_cdr: bool) -> None:
     topic_of = ros2_topic if is_cdr else ros1_topic
     for name in ("sensor_msgs/msg/Imu", "can_msgs/msg/Frame", "sensor_msgs/msg/CompressedImage"):
-        assert len(must_decode(topic_of("/t", name))(block_of("/t", []), Ledger("x"))) == 0
+        assert len(decoder_of(topic_of("/t", name))(block_of("/t", []), Ledger("x"))) == 0
 
 
 def test_idl_definition_decodes_like_msg_definition() -> None:
@@ -623,7 +623,7 @@ def test_idl_definition_decodes_like_msg_definition() -> None:
     tables = []
     for schema, encoding in ((idl, "ros2idl"), (text, "ros2msg")):
         topic = Topic("/m", name, "cdr", schema.encode(), encoding)
-        rows = must_decode(topic)(block_of("/m", payloads), Ledger("x")).rows
+        rows = decoder_of(topic)(block_of("/m", payloads), Ledger("x")).rows
         assert isinstance(rows, Table)
         tables.append(rows)
 

@@ -16,7 +16,7 @@ import pytest
 
 from crosscue.detectors.images import MAX_PIXELS
 from crosscue.replay.base import DEFAULT_LIMITS, MIB
-from support.can_files import blf, made
+from support.can_files import blf, random_frames
 from support.measured import measured
 from support.mf4_files import unsorted
 from support.pictures import picture_folder
@@ -40,7 +40,9 @@ def _blf(declared: int) -> Callable[[Path], Path]:
         body = struct.pack("<H6xL4x", 2, declared) + _deflated(BOMB_BYTES)
         size = 16 + len(body)  # Of the object, including its header.
         padded = body + bytes(size % 4)
-        path.write_bytes(blf(made(30)) + struct.pack("<4sHHII", b"LOBJ", 16, 1, size, 10) + padded)
+        path.write_bytes(
+            blf(random_frames(30)) + struct.pack("<4sHHII", b"LOBJ", 16, 1, size, 10) + padded
+        )
         return path
 
     return make
@@ -100,7 +102,9 @@ def _mf4(size: int, declared: int) -> Callable[[Path], Path]:
     """Replace a log's second compressed block by another one at the file's end."""
 
     def make(folder: Path) -> Path:
-        sound = unsorted(made(200), virtual=True, is_finalized=True, stretch=500, coding=0).content
+        sound = unsorted(
+            random_frames(200), virtual=True, is_finalized=True, stretch=500, coding=0
+        ).content
         packed = _deflated(size)
         head = struct.pack("<2sBxLQQ", b"DT", 0, 0, declared, len(packed))
         block = struct.pack("<4s4xQQ", b"##DZ", 24 + len(head) + len(packed), 0) + head + packed

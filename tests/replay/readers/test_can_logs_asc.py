@@ -10,7 +10,7 @@ import pytest
 
 from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError
 from crosscue.replay.logs.opening import open_log
-from support.can_files import Sent, read_back, same_as_python_can
+from support.can_files import Sent, assert_equal_to_python_can, read_back
 from support.data import shared
 
 HEAD = "date Fri Jul 10 12:00:00.000 pm 2015\nbase hex  timestamps absolute\n"
@@ -212,4 +212,4 @@ def test_real_logs_match_python_can(monkeypatch: pytest.MonkeyPatch, name: str) 
         assert isinstance(message.channel, int)
         message.channel += 1
 
-    same_as_python_can(path, peer, "can/{}")
+    assert_equal_to_python_can(path, peer, "can/{}")

@@ -15,7 +15,15 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import ERROR, NOT_ASKED_TIME, Ledger, Limits, LogFormatError, Selection
 from crosscue.replay.logs.opening import open_log
-from support.can_files import START_NS, Sent, blf, by_bus, made, read_back, same_as_python_can
+from support.can_files import (
+    START_NS,
+    Sent,
+    assert_equal_to_python_can,
+    blf,
+    by_bus,
+    random_frames,
+    read_back,
+)
 from support.data import shared
 
 
@@ -37,7 +45,7 @@ def _objects(frames: list[Sent]) -> bytes:
 
 
 def test_damaged_container_drops_only_its_frames(tmp_path: Path) -> None:
-    frames = made(400)
+    frames = random_frames(400)
     content = bytearray(blf(frames, container=4000))
     hit = content.find(b"LOBJ", 3000) + 60
     content[hit] ^= 0xFF
@@ -52,7 +60,7 @@ def test_damaged_container_drops_only_its_frames(tmp_path: Path) -> None:
 
 
 def test_unclosed_log_is_read_completely_and_reported(tmp_path: Path) -> None:
-    frames = made(200)
+    frames = random_frames(200)
 
     found, ledger = read_back(_log(tmp_path, blf(frames, is_closed=False)))
 
@@ -62,7 +70,7 @@ def test_unclosed_log_is_read_completely_and_reported(tmp_path: Path) -> None:
 
 
 def test_missing_declared_objects_are_dropped(tmp_path: Path) -> None:
-    frames = made(50)
+    frames = random_frames(50)
     content = bytearray(blf(frames))
     content[32:36] = struct.pack("<L", 60)
 
@@ -72,7 +80,7 @@ def test_missing_declared_objects_are_dropped(tmp_path: Path) -> None:
 
 
 def test_error_frames_are_kept(tmp_path: Path) -> None:
-    (frame,) = made(1, fd=False)
+    (frame,) = random_frames(1, fd=False)
     error = Sent(frame.t_ns, "1", 0x12, b"\1\2", False, ERROR)
 
     found, _ = read_back(_log(tmp_path, blf([error])))
@@ -81,9 +89,9 @@ def test_error_frames_are_kept(tmp_path: Path) -> None:
 
 
 def test_other_objects_are_counted_as_skipped(tmp_path: Path) -> None:
-    objects = bytearray(_objects(made(3, fd=False)))
+    objects = bytearray(_objects(random_frames(3, fd=False)))
     objects[12:16] = struct.pack("<L", 96)
-    header = blf(made(3))[:144]
+    header = blf(random_frames(3))[:144]
 
     found, ledger = read_back(_log(tmp_path, header + _container(bytes(objects))))
 
@@ -93,7 +101,7 @@ def test_other_objects_are_counted_as_skipped(tmp_path: Path) -> None:
 
 
 def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
-    frames = made(50)
+    frames = random_frames(50)
 
     found, ledger = read_back(_log(tmp_path, blf(frames)[:144] + _objects(frames)))
 
@@ -102,7 +110,7 @@ def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
 
 
 def test_object_signature_inside_payload_is_ignored(tmp_path: Path) -> None:
-    frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in made(20)]
+    frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in random_frames(20)]
 
     found, ledger = read_back(_log(tmp_path, blf(frames, container=333)))
 
@@ -113,7 +121,7 @@ def test_object_signature_inside_payload_is_ignored(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [0, 1, 15, 1 << 20, 0xFFFFFFFF])
 @pytest.mark.parametrize("stored", [False, True])
 def test_object_of_invalid_size_drops_one_frame(tmp_path: Path, size: int, stored: bool) -> None:
-    frames = made(100, fd=False)
+    frames = random_frames(100, fd=False)
     objects = bytearray(_objects(frames))
     objects[10 * 48 + 8 : 10 * 48 + 12] = struct.pack("<L", size)
     content = blf(frames)[:144] + (bytes(objects) if stored else _container(bytes(objects)))
@@ -126,7 +134,7 @@ def test_object_of_invalid_size_drops_one_frame(tmp_path: Path, size: int, store
 
 @pytest.mark.parametrize("declared", [100, 50_000_000])
 def test_container_larger_than_declared_or_limit_is_refused(tmp_path: Path, declared: int) -> None:
-    frames = made(30)
+    frames = random_frames(30)
     bomb = _container(bytes(50_000_000), declared)
     path = _log(tmp_path, blf(frames) + bomb)
     ledger = Ledger(str(path))
@@ -143,7 +151,7 @@ def test_invalid_containers_after_frames_are_reported(tmp_path: Path) -> None:
     nested = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 8, 10)
 
     for junk in (false * 20_000, nested * 20_000, b"LOBJ" * 100_000):
-        found, ledger = read_back(_log(tmp_path, blf(made(30)) + junk))
+        found, ledger = read_back(_log(tmp_path, blf(random_frames(30)) + junk))
 
         assert sum(map(len, found.values())) == 30
         assert not ledger.is_whole
@@ -172,7 +180,7 @@ def _read_with_python_can(path: Path) -> list[can.Message]:
 
 def test_log_written_by_python_can_matches_its_reader(tmp_path: Path) -> None:
     path = tmp_path / "x.blf"
-    frames = made(3000)
+    frames = random_frames(3000)
     with can.BLFWriter(path) as writer:
         for k, f in enumerate(frames):
             is_error = k % 100 == 7
@@ -188,15 +196,17 @@ def test_log_written_by_python_can_matches_its_reader(tmp_path: Path) -> None:
                     channel=int(f.bus) - 1,
                 )
             )
-    same_as_python_can(path, _read_with_python_can(path), "can/{}")
+    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}")
 
 
 def test_real_log_matches_python_can() -> None:
     path = shared("can", "python_can", "issue_1905.blf")
-    same_as_python_can(path, _read_with_python_can(path), "can/{}")
+    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}")
 
 
-MINUTE_FRAMES = [replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(made(6_000))]
+MINUTE_FRAMES = [
+    replace(f, t_ns=START_NS + k * 10_000_000) for k, f in enumerate(random_frames(6_000))
+]
 MINUTE_LOG = blf(MINUTE_FRAMES, container=4_000)
 
 
@@ -271,7 +281,7 @@ def test_read_buffer_may_end_anywhere_in_object(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
     monkeypatch.setattr("crosscue.replay.readers.blf.reader.STREAM_BYTES", step)
-    frames = made(100)
+    frames = random_frames(100)
 
     found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)))
 
@@ -284,7 +294,7 @@ def test_read_buffer_may_end_anywhere_in_object(
 def test_every_deleted_object_is_reported_as_dropped(
     tmp_path_factory: pytest.TempPathFactory, deleted: set[int]
 ) -> None:
-    frames = made(80)
+    frames = random_frames(80)
     kept = [frame for k, frame in enumerate(frames) if k not in deleted]
     content = blf(kept)[:32] + struct.pack("<L", len(frames)) + blf(kept)[36:]
 

@@ -15,7 +15,14 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text import dialect as can_text
 from crosscue.replay.readers.can_text import digits
 from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, lines_of
-from support.can_files import Sent, by_bus, candump, made, read_back, same_as_python_can
+from support.can_files import (
+    Sent,
+    assert_equal_to_python_can,
+    by_bus,
+    candump,
+    random_frames,
+    read_back,
+)
 from support.data import shared
 
 VALID_LINE = "(1.000000) can0 123#DEADBEEF\n"
@@ -32,7 +39,7 @@ def _log(folder: Path, text: str | bytes, name: str = "x.log") -> Path:
 def test_frames_survive_write_and_read(
     tmp_path_factory: pytest.TempPathFactory, seed: int, fd: bool
 ) -> None:
-    frames = made(300, seed, fd=fd)
+    frames = random_frames(300, seed, fd=fd)
     path = _log(tmp_path_factory.mktemp("log"), candump(frames))
 
     found, ledger = read_back(path)
@@ -44,7 +51,7 @@ def test_frames_survive_write_and_read(
 def test_chunk_boundaries_do_not_change_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    frames = made(400)
+    frames = random_frames(400)
     path = _log(tmp_path, candump(frames))
     monkeypatch.setattr(can_text, "lines_of", lambda p, _=0: lines_of(p, 400))
 
@@ -136,7 +143,7 @@ def test_last_line_without_line_end_is_dropped(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_truncation_is_reported_and_adds_no_frames(tmp_path: Path) -> None:
-    frames = made(14)
+    frames = random_frames(14)
     text = candump(frames)
     ends = {0, *(k + 1 for k, c in enumerate(text) if c == 10)}
     for at in range(1, len(text), 3):
@@ -154,7 +161,7 @@ def test_truncation_is_reported_and_adds_no_frames(tmp_path: Path) -> None:
 
 
 def test_unselected_frames_are_counted_but_not_read(tmp_path: Path) -> None:
-    frames = made(500)
+    frames = random_frames(500)
     path = _log(tmp_path, candump(frames))
     lo, hi = frames[100].t_ns, frames[300].t_ns
 
@@ -255,12 +262,12 @@ def test_ford_log_matches_python_can() -> None:
     path = shared(
         "can", "ford_fusion_2017", "acc_on_speed_changing_from_30km_to_80km_per_hour.candump"
     )
-    same_as_python_can(path, can.CanutilsLogReader(path))
+    assert_equal_to_python_can(path, can.CanutilsLogReader(path))
 
 
 def test_savvycan_log_matches_python_can() -> None:
     path = shared("can", "savvycan", "candump.log")
-    same_as_python_can(path, can.CanutilsLogReader(path))
+    assert_equal_to_python_can(path, can.CanutilsLogReader(path))
 
 
 @pytest.mark.slow

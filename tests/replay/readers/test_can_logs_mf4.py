@@ -24,7 +24,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.mf4.blocks import Blocks
-from support.can_files import Sent, made, read_back, same_as_python_can
+from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back
 from support.data import shared
 
 asammdf = pytest.importorskip("asammdf")
@@ -141,15 +141,15 @@ def _read_with_python_can(path: Path) -> list[can.Message]:
 
 @pytest.mark.parametrize("compression", [0, 2])
 def test_bus_logs_match_python_can(tmp_path: Path, compression: int) -> None:
-    frames = [f for f in made(500) if f.kind == 0]
+    frames = [f for f in random_frames(500) if f.kind == 0]
     path = _bus_log(tmp_path / "x.mf4", frames, compression)
-    same_as_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
+    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
 
 
 @pytest.mark.slow
 def test_real_log_matches_python_can() -> None:
     path = shared(*REAL)
-    same_as_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
+    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
 
 
 def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def _frames_of_cut(path: Path, content: bytes, at: int) -> tuple[int, bool] | No
 
 @pytest.mark.parametrize("compression", [0, 2])
 def test_truncation_is_reported(tmp_path: Path, compression: int) -> None:
-    frames = [f for f in made(300) if f.kind == 0]
+    frames = [f for f in random_frames(300) if f.kind == 0]
     content = _bus_log(tmp_path / "whole.mf4", frames, compression).read_bytes()
     for at in range(0, len(content) - 1, len(content) // 150):
         outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
@@ -197,7 +197,7 @@ def test_truncation_of_real_log_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compression", [0, 2])
 def test_damage_raises_only_crosscue_errors(tmp_path: Path, compression: int) -> None:
-    content = _bus_log(tmp_path / "whole.mf4", made(200), compression).read_bytes()
+    content = _bus_log(tmp_path / "whole.mf4", random_frames(200), compression).read_bytes()
     path = tmp_path / "x.mf4"
     for seed in range(150):
         chance = random.Random(seed)

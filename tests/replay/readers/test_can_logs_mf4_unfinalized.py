@@ -13,7 +13,7 @@ import pytest
 
 from crosscue.replay.base import CanFrames, Ledger
 from crosscue.replay.logs.opening import open_log
-from support.can_files import Sent, by_bus, made, read_back
+from support.can_files import Sent, by_bus, random_frames, read_back
 from support.data import shared
 from support.mf4_files import unsorted
 
@@ -158,7 +158,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 def _frames(count: int, seed: int = 1, *, virtual: bool) -> list[Sent]:
     """Return frames for a log; the older layout contains only data frames."""
-    return [f for f in made(count, seed) if virtual or f.kind == 0]
+    return [f for f in random_frames(count, seed) if virtual or f.kind == 0]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

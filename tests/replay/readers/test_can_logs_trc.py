@@ -15,7 +15,7 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text.lines import CHUNK_BYTES
 from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD
-from support.can_files import Sent, made, read_back, same_as_python_can, trc
+from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back, trc
 from support.data import shared
 
 HEAD_V1 = ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n"
@@ -170,7 +170,7 @@ def test_real_logs_match_python_can(name: str, missing: int) -> None:
     path = shared("can", "rusefi_trc", name)
 
     # python-can rounds the start time to microseconds.
-    same_as_python_can(path, can.TRCReader(path), "can/{}", within_ns=800, missing=missing)
+    assert_equal_to_python_can(path, can.TRCReader(path), "can/{}", within_ns=800, missing=missing)
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _log_without(version: str, count: int, deleted: set[int]) -> LogWithGaps:
     Deleted rows at the end of the log cannot be detected and are not counted.
     """
     is_old = version < "1.2"
-    frames = [replace(f, bus="1") if is_old else f for f in made(count, fd=version > "2")]
+    frames = [replace(f, bus="1") if is_old else f for f in random_frames(count, fd=version > "2")]
     lines = trc(frames, version).decode().splitlines(keepends=True)
     head, rows = lines[:-count], lines[-count:]
     kept = [k for k in range(count) if k not in deleted]
