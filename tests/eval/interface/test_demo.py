@@ -1,4 +1,4 @@
-"""The real demonstration is downloaded once, verified, replayed, scored and shown."""
+"""The demonstration on a recorded drive: download, checksums, replay and score."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ PICTURE = "drive/camera/front_camera/03.jpg"
 
 
 @pytest.fixture
-def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StandIn]:
+def stand_in_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StandIn]:
     monkeypatch.chdir(tmp_path)
     with serving() as server:
         yield stand_in(tmp_path / "stand_in", server, monkeypatch)
 
 
-def test_it_is_fetched_once_replayed_scored_and_shown(
-    made_up: StandIn, capsys: pytest.CaptureFixture[str]
+def test_real_demo_is_fetched_once_replayed_and_scored(
+    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["demo", "--real"]) == 0
     printed = capsys.readouterr().out
-    asked = len(made_up.server.gets)
+    requests = len(stand_in_drive.server.gets)
 
-    assert asked == len(made_up.known.files) + 1
+    assert requests == len(stand_in_drive.known.files) + 1
     assert "against our annotations" in printed
     assert "stop_sign" in printed
     assert "pictures   nobody" in printed
@@ -48,13 +48,13 @@ def test_it_is_fetched_once_replayed_scored_and_shown(
 
     assert run(["demo", "--real", "--overwrite", "--json"]) == 0
     tree = json.loads(capsys.readouterr().out)
-    assert len(made_up.server.gets) == asked
-    assert Path(tree["log"]) == recordings.place_of(made_up.known)
+    assert len(stand_in_drive.server.gets) == requests
+    assert Path(tree["log"]) == recordings.place_of(stand_in_drive.known)
     assert tree["metrics"]["coverage"]
 
 
-def test_a_demo_that_is_there_is_not_replaced(
-    made_up: StandIn, capsys: pytest.CaptureFixture[str]
+def test_existing_demo_is_not_replaced(
+    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["demo", "--real", "-q"]) == 0
     assert run(["demo", "--real"]) == 1
@@ -62,24 +62,24 @@ def test_a_demo_that_is_there_is_not_replaced(
     assert "--overwrite" in capsys.readouterr().err
 
 
-def test_from_a_folder_or_the_data_folder_nothing_is_asked(
-    made_up: StandIn, monkeypatch: pytest.MonkeyPatch
+def test_local_data_folder_needs_no_download(
+    stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(["demo", "--real", "--data", str(made_up.folder), "-q"]) == 0
-    shutil.rmtree(recordings.place_of(made_up.known).parent)
+    assert run(["demo", "--real", "--data", str(stand_in_drive.folder), "-q"]) == 0
+    shutil.rmtree(recordings.place_of(stand_in_drive.known).parent)
     shutil.rmtree(places.cache_folder())
-    monkeypatch.setenv(weights.DATA, str(made_up.folder))
+    monkeypatch.setenv(weights.DATA, str(stand_in_drive.folder))
 
     drive = crosscue.fetch_drive()
 
     assert drive.log.is_dir()
-    assert not made_up.server.gets
+    assert not stand_in_drive.server.gets
 
 
-def test_a_cut_transfer_goes_on_where_it_stopped(
-    made_up: StandIn, capsys: pytest.CaptureFixture[str]
+def test_interrupted_download_is_resumed(
+    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made_up.server.failing = 1
+    stand_in_drive.server.failing = 1
     assert run(["demo", "--real"]) == 1
     first = capsys.readouterr().err
     assert "needed: recording pandaset_002: " in first
@@ -89,42 +89,42 @@ def test_a_cut_transfer_goes_on_where_it_stopped(
 
     crosscue.fetch_drive()
 
-    assert made_up.server.gets[1].startswith("bytes=")
-    assert not list(recordings.place_of(made_up.known).rglob("*.part"))
+    assert stand_in_drive.server.gets[1].startswith("bytes=")
+    assert not list(recordings.place_of(stand_in_drive.known).rglob("*.part"))
 
 
 @pytest.mark.parametrize("name", [PICTURE, "net.onnx"])
-def test_another_file_than_the_published_one_is_not_kept(made_up: StandIn, name: str) -> None:
-    made_up.server.files[name] = made_up.server.files[name][:-1] + b"\0"
+def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) -> None:
+    stand_in_drive.server.files[name] = stand_in_drive.server.files[name][:-1] + b"\0"
 
     with pytest.raises(crosscue.CrosscueError, match="expected SHA-256"):
         crosscue.fetch_drive()
 
-    below = (recordings.place_of(made_up.known), places.cache_folder())
+    below = (recordings.place_of(stand_in_drive.known), places.cache_folder())
     names = [path.name for folder in below for path in folder.rglob("*")]
     assert Path(name).name not in names
 
 
-def test_a_file_that_changed_in_the_cache_is_fetched_again(made_up: StandIn) -> None:
+def test_changed_cached_file_is_fetched_again(stand_in_drive: StandIn) -> None:
     drive = crosscue.fetch_drive()
     picture = drive.log / PICTURE.removeprefix("drive/")
-    whole = picture.read_bytes()
-    picture.write_bytes(whole[:-1] + b"\0")
+    original = picture.read_bytes()
+    picture.write_bytes(original[:-1] + b"\0")
 
     crosscue.fetch_drive()
 
-    assert picture.read_bytes() == whole
+    assert picture.read_bytes() == original
 
 
-def test_without_a_network_one_line_names_all_that_is_needed(
-    made_up: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_missing_network_error_names_all_requirements(
+    stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(recordings.MIRROR, "http://127.0.0.1:9")
 
     assert run(["demo", "--real"]) == 1
 
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
     for part in (
         "pandaset_002: 11 files",
         "CC BY 4.0",
@@ -132,52 +132,52 @@ def test_without_a_network_one_line_names_all_that_is_needed(
         "--data FOLDER",
         weights.DATA,
     ):
-        assert part in said
+        assert part in message
     assert not Path("demo-real").exists()
 
 
-def test_a_mirror_is_asked_instead(made_up: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in made_up.server.files if name.startswith("drive/")]:
+def test_configured_mirror_is_used(
+    stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in stand_in_drive.server.files if name.startswith("drive/")]:
         moved = name.replace("drive/", "mirror/pandaset_002/")
-        made_up.server.files[moved] = made_up.server.files.pop(name)
-    monkeypatch.setenv(recordings.MIRROR, f"{made_up.server.base}/mirror")
+        stand_in_drive.server.files[moved] = stand_in_drive.server.files.pop(name)
+    monkeypatch.setenv(recordings.MIRROR, f"{stand_in_drive.server.base}/mirror")
 
     assert crosscue.fetch_drive().log.is_dir()
 
 
-def test_a_folder_without_the_recording_or_with_another_is_wrong_usage(
-    made_up: StandIn, tmp_path: Path
-) -> None:
+def test_folder_without_the_recording_is_refused(stand_in_drive: StandIn, tmp_path: Path) -> None:
     with pytest.raises(crosscue.LogError, match="expected a folder with"):
         crosscue.fetch_drive(tmp_path)
 
-    other = made_up.folder / "sequences" / "pandaset_002" / PICTURE.removeprefix("drive/")
+    other = stand_in_drive.folder / "sequences" / "pandaset_002" / PICTURE.removeprefix("drive/")
     other.write_bytes(b"another")
     with pytest.raises(crosscue.UsageError, match="recording pandaset_002 requires"):
-        crosscue.fetch_drive(made_up.folder)
+        crosscue.fetch_drive(stand_in_drive.folder)
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("--real --layout C", "--layout: applies only to a simulated drive"),
         ("--real --seed 0", "--seed: applies only to a simulated drive"),
         ("--data .", "--data: applies only to a real drive; add --real"),
     ],
 )
-def test_options_of_the_other_demo_are_wrong_usage(
-    line: str, said: str, capsys: pytest.CaptureFixture[str]
+def test_options_of_the_other_demo_are_refused(
+    line: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["demo", *line.split()]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_python_refuses_a_source_for_a_simulated_drive() -> None:
+def test_source_for_simulated_demo_is_refused() -> None:
     with pytest.raises(crosscue.UsageError, match="add real=True"):
         crosscue.demo(source="folder")
 
 
-def test_our_files_of_the_real_drive_fit_together() -> None:
+def test_files_of_the_real_demo_are_consistent() -> None:
     known = recordings.recording(real_demo.REAL)
     vehicle, truth = load_vehicle(known.vehicle), load_truth(known.truth)
 
@@ -189,7 +189,7 @@ def test_our_files_of_the_real_drive_fit_together() -> None:
     assert (known.truth.parent / truth.ranges).is_file()
 
 
-def test_the_truth_is_what_the_script_writes(tmp_path: Path) -> None:
+def test_stored_truth_equals_output_of_annotation_script(tmp_path: Path) -> None:
     sequence = shared("sequences", "pandaset_002")
 
     annotate_pandaset.annotate(sequence, tmp_path)
@@ -199,7 +199,7 @@ def test_the_truth_is_what_the_script_writes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_real_drive_is_replayed_and_scored(
+def test_real_demo_on_recorded_drive_meets_precision_and_recall(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = shared("sequences", "pandaset_002").parents[1]

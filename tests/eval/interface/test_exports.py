@@ -19,7 +19,7 @@ ROOT: Final = Path(__file__).parents[3]
 HEAVY: Final = ("torch", "rerun", "ray", "matplotlib", "numba", "pyarrow", "numpy", "pydantic")
 
 
-def test_importing_crosscue_imports_nothing_heavy() -> None:
+def test_import_of_crosscue_loads_no_heavy_packages() -> None:
     code = f"import sys, crosscue; print(sorted(set({HEAVY!r}) & sys.modules.keys()))"
 
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -27,7 +27,7 @@ def test_importing_crosscue_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_the_version_is_the_one_that_the_command_prints(
+def test_version_equals_output_of_the_command(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert cli.run(["--version"]) == 0
@@ -37,14 +37,14 @@ def test_the_version_is_the_one_that_the_command_prints(
 
 
 @pytest.mark.parametrize("name", crosscue.__all__)
-def test_every_public_name_exists_and_says_what_it_is(name: str) -> None:
+def test_public_name_exists_and_is_documented(name: str) -> None:
     found = getattr(crosscue, name)
 
     assert (found.__doc__ or "").strip()
     assert name in dir(crosscue)
 
 
-def test_the_reference_pages_list_the_public_names_and_no_others() -> None:
+def test_reference_pages_list_exactly_the_public_names() -> None:
     listed = [
         name
         for page in ("interface", "errors")
@@ -69,7 +69,7 @@ def test_every_error_is_public() -> None:
     assert raised <= {*crosscue.__all__}
 
 
-def test_type_checkers_see_what_is_imported() -> None:
+def test_type_checking_imports_match_the_export_table() -> None:
     """The imports under TYPE_CHECKING are those of the table."""
     source = (ROOT / "crosscue" / "__init__.py").read_text(encoding="utf-8")
     seen = {
@@ -83,6 +83,6 @@ def test_type_checkers_see_what_is_imported() -> None:
     assert seen == {name: f"crosscue.{module}" for name, module in crosscue._EXPORTS.items()}
 
 
-def test_a_name_that_does_not_exist_is_an_attribute_error() -> None:
+def test_unknown_public_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="nonsense"):
         getattr(crosscue, "nonsense")  # noqa: B009

@@ -15,17 +15,17 @@ from support.pandaset_drive import pandaset_drive
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drive of four seconds, with ``car.toml`` and ``truth.json`` next to it."""
+    """Write a drive of four seconds with ``car.toml`` and ``truth.json`` next to it."""
     return write_drive(tmp_path_factory.mktemp("drive"), Clock(), seconds=4)
 
 
-def test_a_log_is_converted_in_part(drive: Path, tmp_path: Path) -> None:
-    asked = []
+def test_part_of_a_log_is_converted(drive: Path, tmp_path: Path) -> None:
+    progress = []
     with crosscue.open(drive) as log:
         found = crosscue.convert(
             log.part(1.0, 2.0),
             tmp_path / "part.mcap",
-            on_rows=lambda done, of: asked.append((done, of)),
+            on_rows=lambda done, of: progress.append((done, of)),
         )
 
     assert found.is_whole
@@ -34,10 +34,10 @@ def test_a_log_is_converted_in_part(drive: Path, tmp_path: Path) -> None:
     assert repr(found).startswith("topic ")
     assert repr(found).endswith(", read back")
     assert found.as_dict()["bytes"] == found.path.stat().st_size
-    assert asked[-1][0] <= asked[-1][1]
+    assert progress[-1][0] <= progress[-1][1]
 
 
-def test_several_logs_are_not_one_file(drive: Path, tmp_path: Path) -> None:
+def test_conversion_of_several_logs_is_refused(drive: Path, tmp_path: Path) -> None:
     with (
         crosscue.open(drive, drive) as log,
         pytest.raises(crosscue.UsageError, match="expected one log, found 2"),
@@ -45,7 +45,7 @@ def test_several_logs_are_not_one_file(drive: Path, tmp_path: Path) -> None:
         crosscue.convert(log, tmp_path / "both.mcap")
 
 
-def test_a_drive_is_decoded(drive: Path, tmp_path: Path) -> None:
+def test_decode_reports_all_tables_that_it_writes(drive: Path, tmp_path: Path) -> None:
     found = crosscue.decode(drive, tmp_path / "tables", drive.parent / "car.toml")
 
     assert found.path == tmp_path / "tables"
@@ -53,7 +53,7 @@ def test_a_drive_is_decoded(drive: Path, tmp_path: Path) -> None:
     assert all(f"{name} " in repr(found) for name in found.rows)
 
 
-def test_logs_are_sealed_and_checked(drive: Path, tmp_path: Path) -> None:
+def test_seal_check_finds_changed_log(drive: Path, tmp_path: Path) -> None:
     logs = [tmp_path / name for name in ("a.mcap", "b.mcap")]
     for log in logs:
         log.write_bytes(drive.read_bytes())
@@ -73,14 +73,14 @@ def test_logs_are_sealed_and_checked(drive: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_a_url_among_logs_is_refused_before_any_is_sealed(drive: Path) -> None:
+def test_seal_refuses_url_before_sealing_any_log(drive: Path) -> None:
     with pytest.raises(crosscue.UsageError, match="a URL cannot be sealed"):
         crosscue.seal(drive, "https://host/drive.mcap")
 
     assert not drive.with_name("drive.mcap.seal").exists()
 
 
-def test_a_vehicle_file_is_drafted_and_reads_back(drive: Path, tmp_path: Path) -> None:
+def test_vehicle_draft_is_written_once_as_printed(drive: Path, tmp_path: Path) -> None:
     found = crosscue.draft_vehicle(drive, [drive.parent / "simulated_car.dbc"])
 
     assert found.path is None
@@ -92,7 +92,7 @@ def test_a_vehicle_file_is_drafted_and_reads_back(drive: Path, tmp_path: Path) -
         crosscue.draft_vehicle(drive, output=tmp_path / "car.toml")
 
 
-def test_a_draft_has_the_published_intrinsics_and_what_no_log_shows_as_comments(
+def test_vehicle_draft_has_published_intrinsics_and_commented_sections(
     tmp_path: Path,
 ) -> None:
     text = crosscue.draft_vehicle(pandaset_drive(tmp_path / "002", 4)).text
@@ -108,7 +108,7 @@ def test_a_draft_has_the_published_intrinsics_and_what_no_log_shows_as_comments(
     parse("\n".join(line for line in kept if 'kind = "curve"' not in line), "uncommented")
 
 
-def test_damaged_intrinsics_are_one_line(tmp_path: Path) -> None:
+def test_damaged_intrinsics_are_refused(tmp_path: Path) -> None:
     drive = pandaset_drive(tmp_path / "002", 4)
     (drive / "camera" / "front_camera" / "intrinsics.json").write_text('{"fx": 0, "cx": 1}')
 
@@ -117,7 +117,7 @@ def test_damaged_intrinsics_are_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_draft_takes_intrinsics_from_a_calibration_message(tmp_path: Path) -> None:
+def test_vehicle_draft_uses_intrinsics_of_calibration_message(tmp_path: Path) -> None:
     files = crosscue.simulate_approach(tmp_path, "L0", width_px=64)
     known = crosscue.load_vehicle(files.vehicle).camera
 
@@ -127,7 +127,7 @@ def test_a_draft_takes_intrinsics_from_a_calibration_message(tmp_path: Path) -> 
     assert drafted.center_px == pytest.approx(known.center_px)
 
 
-def test_a_draft_never_names_a_request(drive: Path, tmp_path: Path) -> None:
+def test_vehicle_draft_excludes_request_signals(drive: Path, tmp_path: Path) -> None:
     dbc = tmp_path / "car.dbc"
     text = (drive.parent / "simulated_car.dbc").read_text()
     dbc.write_text(text.replace("SG_ REAR_LEFT ", "SG_ REAR_LEFT_CMD "))
@@ -136,23 +136,23 @@ def test_a_draft_never_names_a_request(drive: Path, tmp_path: Path) -> None:
     assert "_CMD" not in crosscue.draft_vehicle(drive, [dbc]).text
 
 
-def test_truth_is_held_against_its_log(drive: Path) -> None:
+def test_truth_is_checked_against_its_log(drive: Path) -> None:
     found = crosscue.check_truth(drive.parent / "truth.json", drive)
 
     assert found.approaches == found.as_dict()["approaches"]
     assert repr(found).startswith("fits  ")
 
 
-def test_truth_is_carried_by_data_sets_alone(drive: Path, tmp_path: Path) -> None:
+def test_log_without_truth_is_refused_and_schemas_are_available(
+    drive: Path, tmp_path: Path
+) -> None:
     with pytest.raises(crosscue.EmptyResultError, match="carries no truth"):
         crosscue.write_truth(drive, tmp_path)
     assert crosscue.truth_schema()["title"] == "Truth"
     assert "anyOf" in crosscue.run_schema() or "oneOf" in crosscue.run_schema()
 
 
-def test_runs_are_scored_together_and_one_that_cannot_be_is_named(
-    drive: Path, tmp_path: Path
-) -> None:
+def test_runs_are_scored_together_and_failed_run_is_reported(drive: Path, tmp_path: Path) -> None:
     run = crosscue.replay_drive(drive, tmp_path / "run", drive.parent / "car.toml")
     gates = tmp_path / "gates.toml"
     gates.write_text(
@@ -180,7 +180,7 @@ def test_runs_are_scored_together_and_one_that_cannot_be_is_named(
     assert (tmp_path / "pooled" / "junit.xml").exists()
 
 
-def test_a_mounting_that_is_given_is_written(tmp_path: Path) -> None:
+def test_vehicle_draft_keeps_specified_mounting(tmp_path: Path) -> None:
     log = pandaset_drive(tmp_path / "002", 4)
 
     camera = crosscue.draft_vehicle(

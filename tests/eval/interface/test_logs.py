@@ -25,7 +25,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
     return write_drive(tmp_path_factory.mktemp("drive"), DriveSettings(seed=3, blocks=1))
 
 
-def test_topics_are_a_table_in_print(drive: DriveFiles) -> None:
+def test_topics_are_printed_as_a_table(drive: DriveFiles) -> None:
     with crosscue.open(drive.log) as log:
         head, *lines = repr(log.topics).splitlines()
 
@@ -36,10 +36,10 @@ def test_topics_are_a_table_in_print(drive: DriveFiles) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
-def test_every_format_gives_tables_and_frames(name: str, tmp_path: Path) -> None:
+def test_each_format_yields_tables_or_frames(name: str, tmp_path: Path) -> None:
     rows = 0
     with (
-        warnings.catch_warnings(record=True) as heard,
+        warnings.catch_warnings(record=True) as warned,
         crosscue.open(EVERY_FORMAT[name](tmp_path)) as log,
     ):
         warnings.simplefilter("always", crosscue.LossWarning)
@@ -52,10 +52,10 @@ def test_every_format_gives_tables_and_frames(name: str, tmp_path: Path) -> None
             assert len(table) == reported["used"] == sum(map(len, topic.batches()))
             assert table.column_names[0] == "log_t_ns"
             rows += len(table)
-    assert rows or heard
+    assert rows or warned
 
 
-def test_a_table_equals_what_decode_writes(drive: DriveFiles, tmp_path: Path) -> None:
+def test_topic_table_equals_output_of_decode(drive: DriveFiles, tmp_path: Path) -> None:
     assert cli.run(["decode", str(drive.log), "-o", str(tmp_path / "out"), "-q"]) == 0
     decoded = RunFolder(tmp_path / "out")
 
@@ -71,24 +71,24 @@ def test_a_table_equals_what_decode_writes(drive: DriveFiles, tmp_path: Path) ->
     assert table.replace_schema_metadata() == written.replace_schema_metadata()
 
 
-def test_a_span_is_half_open_and_parts_intersect(drive: DriveFiles) -> None:
+def test_time_spans_are_half_open_and_intersect(drive: DriveFiles) -> None:
     with crosscue.open(drive.log) as log:
         name = next(n for n in log.topics if n != "/can")
-        whole = log[name].table()["log_t_ns"].to_numpy()
+        recorded = log[name].table()["log_t_ns"].to_numpy()
         zero = min(log[one].table()["log_t_ns"].to_numpy().min() for one in log.topics)
-        some = log[name].table(start_s=1, end_s=2)["log_t_ns"].to_numpy()
+        selected = log[name].table(start_s=1, end_s=2)["log_t_ns"].to_numpy()
         parts = log.part(end_s=2)[name].table(start_s=1)["log_t_ns"].to_numpy()
 
-        inside = (whole >= zero + 1_000_000_000) & (whole < zero + 2_000_000_000)
-        np.testing.assert_array_equal(some, whole[inside])
-        np.testing.assert_array_equal(parts, some)
+        inside = (recorded >= zero + 1_000_000_000) & (recorded < zero + 2_000_000_000)
+        np.testing.assert_array_equal(selected, recorded[inside])
+        np.testing.assert_array_equal(parts, selected)
         with pytest.raises(crosscue.UsageError, match="not after start_s"):
             log.part(start_s=2, end_s=2)
         with pytest.raises(crosscue.UsageError, match="seconds after"):
             log.part(start_s=float("nan"))
 
 
-def test_signals_are_a_table_for_each_message_with_units(drive: DriveFiles) -> None:
+def test_signals_are_tables_by_message_with_units(drive: DriveFiles) -> None:
     dbc = next(drive.vehicle.parent.glob("*.dbc"))
     with crosscue.open(drive.log) as log:
         signals = log.signals(dbc)
@@ -106,19 +106,19 @@ def test_signals_are_a_table_for_each_message_with_units(drive: DriveFiles) -> N
             signals[name + "x"]
 
 
-def test_payloads_are_as_long_as_the_frame_says(tmp_path: Path) -> None:
+def test_payload_length_equals_length_column(tmp_path: Path) -> None:
     with crosscue.open(EVERY_FORMAT["candump"](tmp_path)) as log:
         for topic in log.topics.values():
             table = topic.table()
             assert [len(one) for one in table["data"].to_pylist()] == table["length"].to_pylist()
 
 
-def test_what_is_missing_is_warned_of_and_stands_in_the_table(
+def test_losses_raise_warning_and_are_recorded_in_table_metadata(
     tmp_path: Path, drive: DriveFiles
 ) -> None:
     cut = tmp_path / "cut.mcap"
-    whole = drive.log.read_bytes()
-    cut.write_bytes(whole[: len(whole) // 2])
+    recorded = drive.log.read_bytes()
+    cut.write_bytes(recorded[: len(recorded) // 2])
 
     with crosscue.open(cut) as log, pytest.warns(crosscue.LossWarning):
         table = log["/can"].table()
@@ -129,7 +129,7 @@ def test_what_is_missing_is_warned_of_and_stands_in_the_table(
     assert any(one["dropped"] or one["dropped_unknown"] for one in lost)
 
 
-def test_the_account_of_a_whole_topic_adds_up(drive: DriveFiles) -> None:
+def test_account_of_complete_topic_adds_up(drive: DriveFiles) -> None:
     with crosscue.open(drive.log) as log:
         table = log["/can"].table(end_s=1)
 
@@ -139,7 +139,7 @@ def test_the_account_of_a_whole_topic_adds_up(drive: DriveFiles) -> None:
     assert not reported["dropped"]
 
 
-def test_logs_of_one_drive_are_read_one_after_another(tmp_path: Path) -> None:
+def test_tables_of_several_logs_are_concatenated(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
     first, second = (EVERY_FORMAT["candump"](tmp_path / name) for name in ("a", "b"))
@@ -149,7 +149,7 @@ def test_logs_of_one_drive_are_read_one_after_another(tmp_path: Path) -> None:
         assert len(both[name].table()) == 2 * len(one[name].table())
 
 
-def test_pictures_are_frames_and_not_a_table(tmp_path: Path) -> None:
+def test_pictures_are_frames_and_have_no_table(tmp_path: Path) -> None:
     with crosscue.open(EVERY_FORMAT["images"](tmp_path)) as log:
         camera = next(iter(log.topics.values()))
         frame = next(camera.frames())
@@ -173,7 +173,7 @@ def test_pictures_are_frames_and_not_a_table(tmp_path: Path) -> None:
         (("x.unknown",), crosscue.UnknownFormatError),
     ],
 )
-def test_what_cannot_be_opened_is_an_error_of_ours(
+def test_unreadable_paths_raise_crosscue_errors(
     paths: tuple[str, ...], error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -183,7 +183,7 @@ def test_what_cannot_be_opened_is_an_error_of_ours(
         crosscue.open(*paths)
 
 
-def test_a_topic_that_is_not_there_is_named_with_the_nearest(drive: DriveFiles) -> None:
+def test_missing_topic_error_suggests_the_nearest(drive: DriveFiles) -> None:
     with (
         crosscue.open(drive.log) as log,
         pytest.raises(crosscue.MissingTopicError, match="did you mean /can"),

@@ -12,7 +12,7 @@ from crosscue.eval.cli import run
 from support.onnx_models import bright_box_model
 
 
-def test_the_catalog_is_a_sequence_of_models(capsys: pytest.CaptureFixture[str]) -> None:
+def test_model_catalog_matches_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     found = crosscue.models()
 
     assert run(["model", "list", "--json"]) == 0
@@ -23,7 +23,7 @@ def test_the_catalog_is_a_sequence_of_models(capsys: pytest.CaptureFixture[str])
     assert repr(crosscue.model(found[0].name)) == repr(found[0])
 
 
-def test_a_model_says_what_the_cues_count(capsys: pytest.CaptureFixture[str]) -> None:
+def test_model_lists_its_cue_labels_and_size(capsys: pytest.CaptureFixture[str]) -> None:
     found = crosscue.model("yolox-nano")
 
     assert {"car", "stop sign", "traffic light"} <= {*found.cue_labels}
@@ -32,7 +32,7 @@ def test_a_model_says_what_the_cues_count(capsys: pytest.CaptureFixture[str]) ->
     assert capsys.readouterr().out == f"{found!r}\n"
 
 
-def test_a_misspelt_model_is_answered_with_the_nearest() -> None:
+def test_misspelt_model_name_gets_a_suggestion() -> None:
     with pytest.raises(crosscue.UsageError, match="did you mean yolox-nano"):
         crosscue.model("yolox-nanno")
     with pytest.raises(crosscue.UsageError, match="did you mean yolox-nano"):
@@ -42,7 +42,7 @@ def test_a_misspelt_model_is_answered_with_the_nearest() -> None:
 @pytest.mark.parametrize(
     "name", ['a "quoted" one', "back\\slash", "delete\x7f", "tab\t", "Stoppschild ü"]
 )
-def test_a_card_keeps_any_class_name(name: str, tmp_path: Path) -> None:
+def test_card_keeps_unusual_class_names(name: str, tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(bright_box_model())
 
     drafted = crosscue.draft_card(tmp_path / "net.onnx", class_names=[name], size_px=(96, 64))
@@ -50,7 +50,7 @@ def test_a_card_keeps_any_class_name(name: str, tmp_path: Path) -> None:
     assert crosscue.model(drafted.path).card.output.classes == (name,)
 
 
-def test_a_card_is_drafted_and_checked_without_files_of_names(tmp_path: Path) -> None:
+def test_card_is_drafted_and_checked_from_python(tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(bright_box_model())
 
     drafted = crosscue.draft_card(tmp_path / "net.onnx", class_names=["bright"], size_px=(96, 64))

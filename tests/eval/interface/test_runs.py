@@ -1,4 +1,4 @@
-"""Runs in the public interface: make, print, estimate again, score, compare."""
+"""Runs in the public interface: replay, print, estimate again, score and compare."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
 
 @pytest.fixture(scope="module")
 def run(drive: DriveFiles, tmp_path_factory: pytest.TempPathFactory) -> crosscue.Run:
-    """A replay with the vehicle file next to the log."""
+    """Replay the drive with the vehicle file next to its log."""
     return crosscue.replay_drive(drive.log, tmp_path_factory.mktemp("runs") / "run")
 
 
-def test_a_run_is_tables(run: crosscue.Run) -> None:
+def test_run_exposes_its_tables_and_notices(run: crosscue.Run) -> None:
     assert isinstance(run.pose, pa.Table)
     assert len(run.pose) > 100
     assert run.pose == run["pose"]
@@ -39,7 +39,7 @@ def test_a_run_is_tables(run: crosscue.Run) -> None:
         run["nonsense"]
 
 
-def test_its_manifest_is_printed_a_field_a_line(run: crosscue.Run) -> None:
+def test_manifest_is_printed_with_one_field_per_line(run: crosscue.Run) -> None:
     head, *lines = repr(run.manifest).splitlines()
 
     assert head == "EstimateManifest"
@@ -47,7 +47,7 @@ def test_its_manifest_is_printed_a_field_a_line(run: crosscue.Run) -> None:
     assert max(map(len, lines)) < 130
 
 
-def test_it_is_what_the_command_writes(
+def test_replay_function_writes_the_tables_of_the_command(
     drive: DriveFiles, run: crosscue.Run, tmp_path: Path
 ) -> None:
     argv = ["replay", str(drive.log), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "r")]
@@ -58,7 +58,7 @@ def test_it_is_what_the_command_writes(
         assert (tmp_path / "r" / name).read_bytes() == (run.path / name).read_bytes()
 
 
-def test_a_part_of_a_drive_is_replayed(drive: DriveFiles, tmp_path: Path) -> None:
+def test_part_of_a_drive_is_replayed(drive: DriveFiles, tmp_path: Path) -> None:
     with crosscue.open(drive.log) as log:
         run = crosscue.replay_drive(log.part(end_s=5), tmp_path / "run", drive.vehicle)
 
@@ -66,7 +66,7 @@ def test_a_part_of_a_drive_is_replayed(drive: DriveFiles, tmp_path: Path) -> Non
     assert 3e9 < t_ns[-1] - t_ns[0] < 5e9
 
 
-def test_it_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:
+def test_run_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:
     scored = crosscue.score_run(run, drive.truth, has_figures=False)
 
     assert "APE" in repr(scored)
@@ -79,7 +79,9 @@ def test_it_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:
         crosscue.score_run(run, drive.truth, threshold=2.0)
 
 
-def test_other_settings_go_beside_it(run: crosscue.Run, drive: DriveFiles) -> None:
+def test_estimate_with_other_settings_is_written_to_another_folder(
+    run: crosscue.Run, drive: DriveFiles
+) -> None:
     before = {path.name: path.read_bytes() for path in run.path.glob("*.parquet")}
     vehicle = crosscue.load_vehicle(drive.vehicle)
     odometry = vehicle.odometry.model_copy(update={"wheel_scale": 1.1})
@@ -98,30 +100,30 @@ def test_other_settings_go_beside_it(run: crosscue.Run, drive: DriveFiles) -> No
         crosscue.estimate_run(run, vehicle, run.path / "inside")
 
 
-def test_a_recording_has_a_name_that_rerun_knows(run: crosscue.Run) -> None:
+def test_recording_of_unsupported_file_type_is_refused(run: crosscue.Run) -> None:
     with pytest.raises(crosscue.UsageError, match="ends in"):
         crosscue.save_recording(run, run.path / "drive.mp4")
 
 
-def test_a_folder_without_a_run_is_an_error_of_ours(tmp_path: Path) -> None:
+def test_folder_without_run_is_a_run_error(tmp_path: Path) -> None:
     with pytest.raises(crosscue.RunError):
         crosscue.open_run(tmp_path)
 
 
 @pytest.mark.parametrize("wrong", [{"width_px": 100}, {"layout": "Z"}, {"rate_hz": 11}])
-def test_a_simulation_that_cannot_be_is_wrong_usage(wrong: dict[str, int], tmp_path: Path) -> None:
+def test_invalid_simulation_settings_are_refused(wrong: dict[str, int], tmp_path: Path) -> None:
     with pytest.raises(crosscue.UsageError):
         crosscue.simulate_approach(tmp_path / "d", **wrong)  # type: ignore[arg-type]
     assert not (tmp_path / "d").exists()
 
 
-def test_a_sign_is_drawn_and_an_unknown_one_named() -> None:
+def test_known_sign_is_drawn_and_unknown_sign_refused() -> None:
     assert crosscue.draw_sign("one way left", 48).ndim == 2
     with pytest.raises(crosscue.UsageError, match="one way left"):
         crosscue.draw_sign("one way up", 48)
 
 
-def test_a_drive_is_summed_up_as_info_prints_it(
+def test_log_summary_equals_output_of_info(
     drive: DriveFiles, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.run(["info", str(drive.log)]) == 0

@@ -15,7 +15,7 @@ from crosscue.eval.cli import run
 
 
 @pytest.mark.slow
-def test_training_frames_are_those_of_the_command(
+def test_training_frames_equal_those_of_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen: list[tuple[int, int]] = []
@@ -41,7 +41,7 @@ def test_training_frames_are_those_of_the_command(
         crosscue.render_training_frames(tmp_path / "c", ["A"])
 
 
-def test_a_study_of_intersections_refuses_layouts_that_are_not_scored() -> None:
+def test_intersection_study_refuses_training_layouts() -> None:
     with pytest.raises(crosscue.UsageError, match="expected some of A to H"):
         crosscue.IntersectionStudy(layouts=("L1",))
 
@@ -64,7 +64,7 @@ def _defaults(command: str) -> dict[str, object]:
         ("mask_rcnn", crosscue.MaskRcnnTrainingSettings(data="", images="")),
     ],
 )
-def test_a_training_from_python_has_the_command_s_defaults(
+def test_training_settings_have_the_defaults_of_the_command(
     command: str, settings: crosscue.RoadTrainingSettings | crosscue.MaskRcnnTrainingSettings
 ) -> None:
     flags = {"width_px": "width", "window_px": "window"}
@@ -79,7 +79,7 @@ def test_a_training_from_python_has_the_command_s_defaults(
             assert value == default, field.name
 
 
-def test_a_training_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_invalid_training_settings_are_refused_before_writing(tmp_path: Path) -> None:
     road = crosscue.RoadTrainingSettings(layouts=["L1"], width_px=130)
     masks = crosscue.MaskRcnnTrainingSettings(data="gone", images="gone", window_px=(65, 64))
 

@@ -20,20 +20,20 @@ def car(right_mps: float, ahead_mps: float) -> CarMotion:
     return seen._replace(box_px=BOX)
 
 
-def test_a_standing_car_has_no_way_whatever_its_image_does() -> None:
+def test_stationary_car_has_no_arrow() -> None:
     assert not way_px(car(0.0, 0.0)._replace(step_px=(9.0, 3.0)), CAMERA, SIZE).any()
 
 
-def test_an_oncoming_car_goes_away_from_the_axis_and_an_outgoing_one_towards_it() -> None:
+def test_oncoming_car_moves_from_the_optical_axis_and_outgoing_towards_it() -> None:
     assert (way_px(car(0.0, -10.0), CAMERA, SIZE) > 0.0).all()
     assert (way_px(car(0.0, 10.0), CAMERA, SIZE) < 0.0).all()
 
 
-def test_a_crossing_car_goes_sideways_as_far_as_a_pinhole_sees_it() -> None:
+def test_arrow_of_crossing_car_equals_pinhole_projection() -> None:
     np.testing.assert_allclose(way_px(car(8.0, 0.0), CAMERA, SIZE), [700.0 * 8.0 / 40.0, 0.0])
 
 
-def test_a_car_that_would_pass_the_camera_has_a_finite_way() -> None:
+def test_arrow_of_car_that_passes_the_camera_is_finite() -> None:
     near = car(0.0, -60.0)
     way = way_px(near, CAMERA, SIZE)
     tip = np.array(near.center_px) + way
@@ -42,7 +42,7 @@ def test_a_car_that_would_pass_the_camera_has_a_finite_way() -> None:
     assert (tip <= SIZE).all()
 
 
-def test_regions_lie_below_the_horizon_and_mirror_each_other() -> None:
+def test_regions_are_below_the_horizon_and_symmetric() -> None:
     left, straight, right = outlines(CAMERA, Regions(kind="ground"), Place(20.0, 36.0, 0.5), SIZE)
 
     assert left is not None
@@ -56,5 +56,5 @@ def test_regions_lie_below_the_horizon_and_mirror_each_other() -> None:
 
 
 @pytest.mark.parametrize("place", [None, Place(-30.0, -14.0, 1.0)])
-def test_what_has_no_known_place_or_lies_behind_is_not_drawn(place: Place | None) -> None:
+def test_regions_of_unknown_or_passed_intersection_are_not_drawn(place: Place | None) -> None:
     assert outlines(CAMERA, Regions(kind="ground"), place, SIZE)[0] is None

@@ -29,7 +29,7 @@ from support.scoring import at, good_truth, truth_folder
 
 
 def _rows(path: Path) -> Counter[str]:
-    """Rows on the timeline by entity."""
+    """Return the number of rows on the timeline by entity."""
     found: Counter[str] = Counter()
     for chunk in RrdReader(path).stream():
         if not chunk.is_static:
@@ -39,7 +39,7 @@ def _rows(path: Path) -> Counter[str]:
 
 
 def _cells(path: Path, entity: str, component: str) -> list[Any]:
-    """Values of a component over time, a list for each row."""
+    """Return the values of a component over time, one list for each row."""
     cells: list[Any] = []
     for chunk in RrdReader(path).stream():
         if chunk.entity_path == entity and not chunk.is_static:
@@ -49,7 +49,7 @@ def _cells(path: Path, entity: str, component: str) -> list[Any]:
     return cells
 
 
-def _saved(tmp_path: Path, **more: Any) -> Path:
+def _saved_recording(tmp_path: Path, **more: Any) -> Path:
     run = scene_run(tmp_path / "drive", **more)
     track = TruthTrack(np.array([at(0), at(9)]), np.array([0.0, 9.0]), np.zeros(2))
     path = tmp_path / "drive.rrd"
@@ -57,10 +57,10 @@ def _saved(tmp_path: Path, **more: Any) -> Path:
     return path
 
 
-def test_every_frame_has_its_picture_marks_and_way_ahead_on_the_drives_timeline(
+def test_each_frame_has_picture_marks_and_belief_on_the_timeline(
     tmp_path: Path,
 ) -> None:
-    rows = _rows(_saved(tmp_path))
+    rows = _rows(_saved_recording(tmp_path))
 
     marks = (
         "picture",
@@ -83,8 +83,8 @@ def test_every_frame_has_its_picture_marks_and_way_ahead_on_the_drives_timeline(
     assert rows["/plan/true_car"] == 2
 
 
-def test_a_cue_comes_and_goes_with_its_frames(tmp_path: Path) -> None:
-    path = _saved(tmp_path)
+def test_cue_state_changes_with_its_frames(tmp_path: Path) -> None:
+    path = _saved_recording(tmp_path)
 
     states = _cells(path, "/cues/road_left", "state")
     assert states == [None, ["found"], None] or states == [[], ["found"], []]
@@ -93,15 +93,15 @@ def test_a_cue_comes_and_goes_with_its_frames(tmp_path: Path) -> None:
 
 
 def test_arrows_follow_a_crossing_car(tmp_path: Path) -> None:
-    path = _saved(tmp_path)
+    path = _saved_recording(tmp_path)
 
     vectors = _cells(path, "/camera/cars", "vectors")
     assert [len(one or []) for one in vectors] == [0] + [1] * (FRAMES - 1)
     assert all(one[0][0] > 0.0 == one[0][1] for one in vectors[1:])
 
 
-def test_names_from_outside_stay_text_and_paths_are_ours(tmp_path: Path) -> None:
-    path = _saved(tmp_path)
+def test_labels_are_plain_text_and_entity_paths_are_fixed(tmp_path: Path) -> None:
+    path = _saved_recording(tmp_path)
 
     labels = _cells(path, "/camera/objects", "labels")
     assert labels[0][-1] == f"{LABEL} 0.50"
@@ -124,8 +124,10 @@ def test_names_from_outside_stay_text_and_paths_are_ours(tmp_path: Path) -> None
         frozenset({"frames", "detections", "road", "cues", "belief", "range"}),
     ],
 )
-def test_a_run_shows_what_it_has(tmp_path: Path, without: frozenset[str]) -> None:
-    rows = _rows(_saved(tmp_path, without=without))
+def test_run_without_some_tables_records_the_others(
+    tmp_path: Path, without: frozenset[str]
+) -> None:
+    rows = _rows(_saved_recording(tmp_path, without=without))
 
     assert rows["/camera/picture"] == FRAMES
     assert ("/plan/car" in rows) == ("pose" not in without)
@@ -133,14 +135,14 @@ def test_a_run_shows_what_it_has(tmp_path: Path, without: frozenset[str]) -> Non
     assert ("/camera/objects" in rows) == ("frames" not in without)
 
 
-def test_the_file_is_hardly_larger_than_its_pictures(tmp_path: Path) -> None:
+def test_recording_is_little_larger_than_its_pictures(tmp_path: Path) -> None:
     bytes_ = write_pictures(tmp_path / "pictures.mcap")
-    size = _saved(tmp_path).stat().st_size
+    size = _saved_recording(tmp_path).stat().st_size
 
     assert bytes_ < size < 1.05 * bytes_ + 300_000
 
 
-def test_pictures_that_the_viewer_cannot_read_become_jpeg() -> None:
+def test_unsupported_picture_encodings_become_jpeg() -> None:
     pixels = np.full((20, 30, 3), (10, 200, 30), np.uint8)
     layout = (30, 20, 90, "bgr8")
 
@@ -153,7 +155,7 @@ def test_pictures_that_the_viewer_cannot_read_become_jpeg() -> None:
     assert shown(Encoded("raw", memoryview(b"too short"), layout)) is None
 
 
-def test_a_recording_never_replaces_what_is_no_recording(
+def test_view_refuses_to_replace_another_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     letter = tmp_path / "letter.md"
@@ -165,7 +167,7 @@ def test_a_recording_never_replaces_what_is_no_recording(
     assert letter.read_text() == "keep me"
 
 
-def test_view_takes_truth_without_a_track(
+def test_view_accepts_truth_without_a_track(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = scene_run(tmp_path / "drive")
@@ -179,13 +181,13 @@ def test_view_takes_truth_without_a_track(
     assert "/plan/true_car" not in rows
 
 
-def test_the_layout_has_a_place_for_whatever_there_is() -> None:
+def test_layout_has_views_for_available_data() -> None:
     pose = {name: np.array([0.0, 1.0]) for name in ("x_m", "y_m")}
-    whole = blueprint(Shown(TOPIC, pose, has_truth=True, has_scene=True))
+    complete = blueprint(Shown(TOPIC, pose, has_truth=True, has_scene=True))
     bare = blueprint(Shown(None, None, has_truth=False, has_scene=True))
     alone = blueprint(Shown(None, pose, has_truth=False, has_scene=False))
 
-    counted = [len(list(_views(one.root_container))) for one in (whole, bare, alone)]
+    counted = [len(list(_views(one.root_container))) for one in (complete, bare, alone)]
     assert counted == [11, 5, 6]
 
 
@@ -199,7 +201,7 @@ def _views(part: Any) -> Any:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 30), st.integers(0, 20), st.integers(3, 30), st.integers(3, 20))
-def test_an_outline_runs_along_the_masks_border(x: int, y: int, width: int, height: int) -> None:
+def test_outline_follows_the_border_of_the_mask(x: int, y: int, width: int, height: int) -> None:
     mask = rle.encode(np.ones((height, width), np.bool_), (x, y), (64, 48))
     box = np.array([x, y, x + width, y + height], np.float64)
 
@@ -210,7 +212,7 @@ def test_an_outline_runs_along_the_masks_border(x: int, y: int, width: int, heig
     assert line.max(axis=0).tolist() == [x + width - 0.5, y + height - 0.5]
 
 
-def test_road_is_drawn_in_the_pictures_pixels() -> None:
+def test_road_lines_are_in_picture_pixels() -> None:
     mask = rle.encode(np.ones((4, 8), np.bool_), (0, 5), (8, 9))
 
     lines = road_lines(RoadMask(0, (80, 90), mask, (8, 9)))
@@ -221,12 +223,12 @@ def test_road_is_drawn_in_the_pictures_pixels() -> None:
     assert everything[:, 1].min() == pytest.approx(55.0)
 
 
-def test_a_clock_that_begins_with_the_machine_is_shown_as_durations() -> None:
+def test_time_since_boot_is_shown_as_a_duration() -> None:
     assert not time_of(5).is_date
     assert time_of(1_700_000_000_000_000_000).is_date
 
 
-def test_landmarks_used_are_on_the_map_by_name(tmp_path: Path) -> None:
+def test_used_landmarks_are_labelled_on_the_map(tmp_path: Path) -> None:
     path = tmp_path / "landmarks.rrd"
     recording = rr.RecordingStream("test")
     recording.save(path)

@@ -21,8 +21,8 @@ LISTENING = "0A"
 PORTS = (9090, 9876)
 
 
-def _group(leader: int) -> list[int]:
-    """Processes of a session, independent of their parent."""
+def _processes_of_session(leader: int) -> list[int]:
+    """Return the processes of a session, also those whose parent has ended."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         try:
@@ -34,8 +34,8 @@ def _group(leader: int) -> list[int]:
     return found
 
 
-def _listening(pids: list[int]) -> Iterator[tuple[str, int]]:
-    """Address in the kernel's notation, and port."""
+def _listening_sockets(pids: list[int]) -> Iterator[tuple[str, int]]:
+    """Yield address, in the kernel's notation, and port of each listening socket."""
     sockets = set()
     for pid in pids:
         for link in Path(f"/proc/{pid}/fd").glob("*"):
@@ -61,7 +61,7 @@ def _are_free(ports: tuple[int, ...]) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not _are_free(PORTS), reason="another viewer is open on this machine")
-def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_command(tmp_path: Path) -> None:
+def test_web_viewer_listens_on_loopback_only_and_ends_with_the_command(tmp_path: Path) -> None:
     drive = write_drive(tmp_path / "drive", DriveSettings(seed=1))
     run = tmp_path / "run"
     replay = ["replay", str(drive.log), "--vehicle", str(drive.vehicle), "-o", str(run), "-q"]
@@ -75,21 +75,21 @@ def test_the_web_viewer_listens_on_loopback_only_and_ends_with_the_command(tmp_p
         stderr=subprocess.DEVNULL,
     )
     try:
-        heard: set[tuple[str, int]] = set()
+        listening: set[tuple[str, int]] = set()
         end = time.monotonic() + 40.0
-        while len(heard) < len(PORTS) and time.monotonic() < end and view.poll() is None:
+        while len(listening) < len(PORTS) and time.monotonic() < end and view.poll() is None:
             time.sleep(0.1)
-            heard = set(_listening(_group(view.pid)))
-        assert {port for _, port in heard} == set(PORTS)
-        assert {address for address, _ in heard} == {"0100007F"}
+            listening = set(_listening_sockets(_processes_of_session(view.pid)))
+        assert {port for _, port in listening} == set(PORTS)
+        assert {address for address, _ in listening} == {"0100007F"}
 
         view.send_signal(signal.SIGTERM)
         assert view.wait(20) == 143
         end = time.monotonic() + 10.0
-        while _group(view.pid) and time.monotonic() < end:
+        while _processes_of_session(view.pid) and time.monotonic() < end:
             time.sleep(0.05)
-        assert _group(view.pid) == []
+        assert _processes_of_session(view.pid) == []
     finally:
-        for pid in _group(view.pid):
+        for pid in _processes_of_session(view.pid):
             os.kill(pid, signal.SIGKILL)
         view.wait()

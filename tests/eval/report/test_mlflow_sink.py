@@ -21,7 +21,7 @@ needs_mlflow = pytest.mark.skipif(
 @pytest.mark.slow
 @needs_mlflow
 @pytest.mark.filterwarnings("default")
-def test_scores_tags_and_report_are_read_back_as_they_are(
+def test_scores_tags_and_report_are_stored_in_mlflow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from mlflow.tracking import MlflowClient
@@ -58,17 +58,17 @@ def test_scores_tags_and_report_are_read_back_as_they_are(
 @needs_mlflow
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize(
-    ("uri", "status", "what"),
+    ("uri", "status", "message"),
     [
         ("folder", 1, "unless MLFLOW_ALLOW_FILE_STORE=true is set"),
         ("ftp://nowhere", 1, "ftp"),
     ],
 )
-def test_a_store_that_cannot_be_used_is_one_line_before_anything_is_scored(
+def test_unusable_mlflow_store_is_refused_before_scoring(
     tmp_path: Path,
     uri: str,
     status: int,
-    what: str,
+    message: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -77,19 +77,19 @@ def test_a_store_that_cannot_be_used_is_one_line_before_anything_is_scored(
 
     assert cli.run(["score", "no_such_run", "--mlflow", uri]) == status
 
-    said = capsys.readouterr().err
-    assert what in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
 
 
-def test_without_mlflow_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mlflow_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mlflow.tracking", None)
 
     with pytest.raises(crosscue.UsageError, match=r"pip install 'crosscue\[mlflow\]'"):
         crosscue.open_mlflow("http://localhost:1")
 
 
-def test_names_are_made_to_fit() -> None:
+def test_metric_names_are_sanitised_for_mlflow() -> None:
     assert fit("cues.stop_sign.by_condition.low sun.recall") == (
         "cues.stop_sign.by_condition.low sun.recall"
     )

@@ -37,7 +37,7 @@ from support.scoring import approach, at, good_truth, span, truth, truth_folder
 HOSTILE = '<script>alert(1)</script>"onload="x'
 
 
-class _Page(HTMLParser):
+class _ParsedPage(HTMLParser):
     """Parser of elements, the resources that they load, and their handlers."""
 
     def __init__(self, page: str) -> None:
@@ -54,7 +54,7 @@ class _Page(HTMLParser):
 
 
 def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
-    """A run with a false crossing car from frame 21 on."""
+    """Score a run with a false crossing car from frame 21 on."""
     run = scene_run(folder, **more)
     reported = truth(
         [*good_truth().truth.cues, span("cross_traffic_right", 0, 40, present=False, count=0)],
@@ -63,7 +63,7 @@ def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
     return judge_run(run, truth_folder(folder, reported))
 
 
-def _written(folder: Path, *scored: RunScored, **more: Any) -> str:
+def _report_text(folder: Path, *scored: RunScored, **more: Any) -> str:
     scores = scores_of(scored)
     path = write_report(
         folder, scored, scores, {**metrics_of(scored, scores), **more}, worst_frames(scored)
@@ -71,10 +71,10 @@ def _written(folder: Path, *scored: RunScored, **more: Any) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def test_nothing_that_logs_or_truth_say_becomes_active(tmp_path: Path) -> None:
-    page = _written(tmp_path, _scored(tmp_path / HOSTILE.replace("/", ""), HOSTILE))
+def test_hostile_names_do_not_become_active_content(tmp_path: Path) -> None:
+    page = _report_text(tmp_path, _scored(tmp_path / HOSTILE.replace("/", ""), HOSTILE))
 
-    seen = _Page(page)
+    seen = _ParsedPage(page)
     assert not {"script", "iframe", "object", "embed", "link", "b onload"} & set(seen.tags)
     assert seen.handlers == []
     assert all(re.match(r"data:image/(jpeg|png);base64,", one) for one in seen.loads)
@@ -84,8 +84,8 @@ def test_nothing_that_logs_or_truth_say_becomes_active(tmp_path: Path) -> None:
     assert "/camera/[red]&lt;script&gt;" in page
 
 
-def test_coverage_comes_first_and_losses_are_reported(tmp_path: Path) -> None:
-    page = _written(tmp_path, _scored(tmp_path / "drive"))
+def test_coverage_is_first_and_losses_are_reported(tmp_path: Path) -> None:
+    page = _report_text(tmp_path, _scored(tmp_path / "drive"))
 
     order = [
         page.index(f"<h2>{name}</h2>")
@@ -98,10 +98,10 @@ def test_coverage_comes_first_and_losses_are_reported(tmp_path: Path) -> None:
     assert "Not scored:</b> pose (the truth has no track (pose: missing))" in page
 
 
-def test_tables_report_the_metrics_and_what_was_published(tmp_path: Path) -> None:
+def test_tables_report_metrics_and_published_values(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     metrics = metrics_of([one], scores_of([one]))
-    page = _written(tmp_path, one)
+    page = _report_text(tmp_path, one)
 
     precision = metrics["cues"]["cross_traffic_right"]["precision"]
     assert (precision["right"], precision["of"]) == (0, 19)
@@ -112,19 +112,19 @@ def test_tables_report_the_metrics_and_what_was_published(tmp_path: Path) -> Non
     assert "<b>15.0 m</b>" in page
 
 
-def test_simulated_drives_are_called_so(tmp_path: Path) -> None:
-    made_up = _scored(tmp_path / "drive")
-    assert "Simulated" not in _written(tmp_path, made_up)
+def test_simulated_drives_are_labelled(tmp_path: Path) -> None:
+    drive = _scored(tmp_path / "drive")
+    assert "Simulated" not in _report_text(tmp_path, drive)
 
     reported = json.loads((tmp_path / "drive" / "truth.json").read_text())
     reported["source"] = "simulated by crosscue"
     (tmp_path / "drive" / "truth.json").write_text(json.dumps(reported))
-    page = _written(tmp_path, judge_run(made_up.run, tmp_path / "drive" / "truth.json"))
+    page = _report_text(tmp_path, judge_run(drive.run, tmp_path / "drive" / "truth.json"))
 
     assert "<b>Simulated</b>: this drive and the truth were computed" in page
 
 
-def test_what_became_of_candidates_is_a_table_with_its_sentences(tmp_path: Path) -> None:
+def test_candidates_are_reported_in_table_and_notices(tmp_path: Path) -> None:
     scored = _scored(tmp_path / "a")
     lights = CandidateRow(
         unit="detections",
@@ -145,10 +145,12 @@ def test_what_became_of_candidates_is_a_table_with_its_sentences(tmp_path: Path)
         ranged={"traffic_light": lights},
         not_looked_for={"do_not_enter": "no detector can report their labels"},
     )
-    whole = estimate_manifest(scored.run)
-    write_manifest(scored.run, whole.model_copy(update={"scene": scene, "notices": ("warning",)}))
+    manifest = estimate_manifest(scored.run)
+    write_manifest(
+        scored.run, manifest.model_copy(update={"scene": scene, "notices": ("warning",)})
+    )
 
-    page = _written(tmp_path, scored)
+    page = _report_text(tmp_path, scored)
 
     assert "<li>warning</li>" in page
     assert "<li>traffic_light: 87 detections, none above 0.90 (highest 0.62)" in page
@@ -158,7 +160,7 @@ def test_what_became_of_candidates_is_a_table_with_its_sentences(tmp_path: Path)
     assert f"<td>range: traffic light</td>{row}" in page
 
 
-def test_the_worst_frame_is_shown_with_its_box_and_time(tmp_path: Path) -> None:
+def test_worst_frame_is_shown_with_picture_and_time(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
 
     (worst,) = worst_frames([one])
@@ -168,11 +170,11 @@ def test_the_worst_frame_is_shown_with_its_box_and_time(tmp_path: Path) -> None:
     pixels = cv2.imdecode(np.frombuffer(base64.b64decode(worst.picture), np.uint8), 1)
     assert pixels is not None
     assert pixels.shape == (SIZE[1], SIZE[0], 3)
-    page = _written(tmp_path, one)
+    page = _report_text(tmp_path, one)
     assert f"({at(21)} ns): <code>crosscue view {one.run.path}</code>" in page
 
 
-def test_a_log_that_is_gone_is_an_error_unless_pictures_are_left_out(
+def test_missing_log_is_an_error_unless_images_are_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = _scored(tmp_path / "drive").run
@@ -182,10 +184,10 @@ def test_a_log_that_is_gone_is_an_error_unless_pictures_are_left_out(
     argv = ["score", str(run.path), "--truth", str(truth)]
 
     assert cli.run(argv) == 4
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "drive.mcap is gone; say where it is with --logs DIR" in said
-    assert "--without-images" in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert "drive.mcap is gone; say where it is with --logs DIR" in printed
+    assert "--without-images" in printed
     assert not run.file("score").exists()
 
     assert cli.run([*argv, "--logs", str(tmp_path / "moved")]) == 3
@@ -194,16 +196,16 @@ def test_a_log_that_is_gone_is_an_error_unless_pictures_are_left_out(
     assert "Its picture is not available." in (run.file("score") / "report.html").read_text()
 
 
-def test_the_same_scores_give_the_same_bytes(tmp_path: Path) -> None:
+def test_equal_scores_yield_equal_reports(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
 
-    first = _written(tmp_path / "a", one)
+    first = _report_text(tmp_path / "a", one)
     again = judge_run(RunFolder(one.run.path), tmp_path / "drive" / "truth.json")
 
-    assert _written(tmp_path / "b", again) == first
+    assert _report_text(tmp_path / "b", again) == first
 
 
-def test_what_a_cue_was_worth_is_reported_beside_the_others(tmp_path: Path) -> None:
+def test_attribution_of_a_cue_is_reported(tmp_path: Path) -> None:
     nothing = {"value": 0.0, "low": None, "high": None}
     worth = {
         "stop_sign": {
@@ -217,7 +219,7 @@ def test_what_a_cue_was_worth_is_reported_beside_the_others(tmp_path: Path) -> N
     }
     one = _scored(tmp_path / "drive")
 
-    page = _written(tmp_path, one, attribution=worth)
+    page = _report_text(tmp_path, one, attribution=worth)
 
     row = re.findall(r"<tr><td>stop sign</td><td>([+].*?)</tr>", page)[0]
     cells = re.split(r"</?td>+", row)
@@ -233,10 +235,10 @@ def test_what_a_cue_was_worth_is_reported_beside_the_others(tmp_path: Path) -> N
         "-",
     ]
     assert "crosscue score --attribution" not in page
-    assert "crosscue score --attribution" in _written(tmp_path, one)
+    assert "crosscue score --attribution" in _report_text(tmp_path, one)
 
 
-def test_several_drives_make_one_page(tmp_path: Path) -> None:
+def test_several_drives_share_one_page(tmp_path: Path) -> None:
     drives = [_scored(tmp_path / name, name) for name in ("one", "two", "three")]
     failed = {"runs/<four>": "runs/<four>: no manifest.json"}
     scores = scores_of(drives)
@@ -251,16 +253,16 @@ def test_several_drives_make_one_page(tmp_path: Path) -> None:
     assert page.count("Probability against distance") == 3
 
 
-def test_a_run_without_a_scene_has_a_page(tmp_path: Path) -> None:
+def test_run_without_belief_has_a_page(tmp_path: Path) -> None:
     gone = frozenset({"belief", "range"})
-    page = _written(tmp_path, _scored(tmp_path / "drive", without=gone))
+    page = _report_text(tmp_path, _scored(tmp_path / "drive", without=gone))
 
     assert "<h2>Cues</h2>" in page
     assert "<h2>Belief</h2>" not in page
     assert "belief (the run has no belief)" in page
 
 
-def test_score_writes_the_page_and_names_it(
+def test_score_writes_the_page_and_prints_its_path(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = [str(_scored(tmp_path / name, name).run.path) for name in ("one", "two")]
@@ -272,7 +274,7 @@ def test_score_writes_the_page_and_names_it(
     assert "<h1>2 drives</h1>" in (tmp_path / "all" / "report.html").read_text()
 
 
-def test_charts_say_in_words_what_they_show(tmp_path: Path) -> None:
+def test_charts_have_text_descriptions(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     scores = scores_of([one])
     assert scores.approaches is not None
@@ -292,7 +294,7 @@ def test_charts_say_in_words_what_they_show(tmp_path: Path) -> None:
     assert "bias 0.50 m, rms error 0.50 m" in charts[2]
 
 
-def test_without_true_distances_belief_is_drawn_over_time(tmp_path: Path) -> None:
+def test_belief_without_true_distances_is_drawn_over_time(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     assert one.judged.approaches is not None
     (curve,) = one.judged.approaches.curves
@@ -306,7 +308,7 @@ def test_without_true_distances_belief_is_drawn_over_time(tmp_path: Path) -> Non
     assert chart.count("<polyline") + chart.count("<path") >= len(curve.features)
 
 
-def test_the_claimed_interval_fits_into_the_chart_of_ranges(tmp_path: Path) -> None:
+def test_range_chart_includes_the_claimed_interval(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     scores = scores_of([one])
     unsure = [replace(part, var_m2=np.full_like(part.var_m2, 100.0)) for part in one.judged.ranges]
@@ -317,7 +319,7 @@ def test_the_claimed_interval_fits_into_the_chart_of_ranges(tmp_path: Path) -> N
     assert not re.search(r">-20<", draw_range(one.judged.ranges, scores.range))
 
 
-def test_the_chart_of_ranges_keeps_its_worst_bin(tmp_path: Path) -> None:
+def test_range_chart_shows_its_worst_bins(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     scores = dict(scores_of([one]).range)
     bins = dict(scores["start"].by_distance)
@@ -335,7 +337,7 @@ def test_the_chart_of_ranges_keeps_its_worst_bin(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 9))
-def test_ticks_are_few_round_and_inside(low: float, width: float, max_count: int) -> None:
+def test_ticks_are_few_and_inside_the_range(low: float, width: float, max_count: int) -> None:
     found = ticks(low, low + width, max_count)
 
     assert len(found) <= max_count + 1
@@ -343,7 +345,7 @@ def test_ticks_are_few_round_and_inside(low: float, width: float, max_count: int
     assert found == sorted(found)
 
 
-def test_a_curve_breaks_where_a_value_is_missing() -> None:
+def test_curve_breaks_at_missing_values() -> None:
     drawing = Drawing(100, 100, "title", "description")
     panel = Panel(0, 0, 100, 100, (0.0, 4.0), (0.0, 1.0))
 
@@ -352,6 +354,6 @@ def test_a_curve_breaks_where_a_value_is_missing() -> None:
     assert drawing.svg().count("<polyline") == 2
 
 
-def test_times_are_reported_as_the_viewer_shows_them() -> None:
+def test_times_are_formatted_like_the_viewer() -> None:
     assert reported_time(1_700_000_014_250_999_999) == "2023-11-14 22:13:34.250 UTC"
     assert reported_time(2_500_000_000) == "2.500 s"

@@ -29,7 +29,7 @@ def paused(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
-    """Time and value of each row of an entity of a recording."""
+    """Return time and value of each row of an entity of a recording."""
     found: list[tuple[int, Any]] = []
     for chunk in RrdReader(path).stream():
         if chunk.entity_path == entity and not chunk.is_static:
@@ -41,12 +41,12 @@ def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
 
 
 def _crosses(rows: Sequence[tuple[int, Any]], gap: Gap) -> bool:
-    """Return whether a line crosses the gap."""
+    """Return True if a line crosses the gap."""
     before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
     return bool(np.isfinite(before[-1][0]))
 
 
-def test_the_gap_is_where_the_wheels_were_silent(paused: RunFolder) -> None:
+def test_gap_spans_the_pause_of_odometry(paused: RunFolder) -> None:
     (gap,) = gaps_of(paused.drive_manifest().timeline)
 
     assert (gap.start_ns, gap.end_ns) == (BEGIN + 5 * SECOND - ROW, BEGIN + 71 * ROW)
@@ -54,7 +54,7 @@ def test_the_gap_is_where_the_wheels_were_silent(paused: RunFolder) -> None:
     assert broken_at([gap], np.array([gap.start_ns, gap.end_ns])).tolist() == [1]
 
 
-def test_no_line_of_a_recording_runs_across_a_gap(paused: RunFolder, tmp_path: Path) -> None:
+def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     save(paused, path)
 
@@ -81,7 +81,7 @@ def test_no_line_of_a_recording_runs_across_a_gap(paused: RunFolder, tmp_path: P
     assert len(strips[0][name].to_pylist()[0]) == 2
 
 
-def test_the_report_shades_each_gap_with_its_length(
+def test_report_shades_each_gap_with_its_duration(
     paused: RunFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figures: list[Figure] = []
@@ -107,7 +107,7 @@ def test_the_report_shades_each_gap_with_its_length(
     assert np.isnan(np.asarray(by_way.lines[0].get_ydata(), np.float64)).sum() == 1
 
 
-def test_a_long_gap_does_not_squeeze_the_rest() -> None:
+def test_long_gap_is_shortened_on_the_time_axis() -> None:
     t_ns = np.concatenate([np.arange(60), np.arange(60, 140) + 12_000]) * ROW
     n = len(t_ns)
     gap = Gap(59 * ROW, 12_060 * ROW, "gap of 1200.1 s")
@@ -123,7 +123,7 @@ def test_a_long_gap_does_not_squeeze_the_rest() -> None:
     assert np.allclose(np.diff(seconds)[np.arange(n - 1) != 59], 0.1)
 
 
-def test_what_comes_twice_is_shaded_as_set_back(tmp_path: Path) -> None:
+def test_repeated_time_is_shaded_as_clock_set_back(tmp_path: Path) -> None:
     run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0)))
 
     (gap,) = gaps_of(run.drive_manifest().timeline)

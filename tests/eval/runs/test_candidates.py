@@ -18,7 +18,7 @@ def _row(seen: int, skipped: dict[str, int], **more: object) -> CandidateRow:
     return CandidateRow.model_validate(content)
 
 
-def test_a_threshold_that_nothing_reaches_is_named_with_the_highest_score() -> None:
+def test_unreached_threshold_is_reported_with_highest_score() -> None:
     (line,) = candidate_lines({"traffic_light": _row(87, {"below score": 87})}, {})
 
     assert line == (
@@ -27,7 +27,7 @@ def test_a_threshold_that_nothing_reaches_is_named_with_the_highest_score() -> N
     )
 
 
-def test_cues_with_the_same_fate_share_a_line_and_whole_ones_have_none() -> None:
+def test_cues_of_equal_counts_share_a_line_and_empty_ones_have_none() -> None:
     cars = _row(9, {"below score": 4, "not seen from the side": 5})
     lines = candidate_lines(
         {"parked_left": cars, "parked_right": cars, "stop_sign": _row(0, {})}, {}
@@ -39,7 +39,7 @@ def test_cues_with_the_same_fate_share_a_line_and_whole_ones_have_none() -> None
     ]
 
 
-def test_a_range_without_a_curve_says_so() -> None:
+def test_ranges_without_a_curve_are_reported() -> None:
     ranged = {"traffic_light": _row(100, {"below score": 15, NO_CURVE: 80, "no height": 5})}
 
     assert candidate_lines({}, ranged) == [
@@ -50,7 +50,7 @@ def test_a_range_without_a_curve_says_so() -> None:
     ]
 
 
-def test_road_is_reported_only_where_it_never_was() -> None:
+def test_road_cue_is_reported_only_if_it_was_never_used() -> None:
     road = {"unit": "frames", "setting": "[cues] road_fraction", "threshold": 0.2}
     never = _row(8, {"too little road": 8}, **{**road, "max_score": 0.13})
     lines = candidate_lines(

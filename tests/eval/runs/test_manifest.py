@@ -1,4 +1,4 @@
-"""The manifest is a typed record: reading returns what was written, and other keys are refused."""
+"""The manifest is a typed record that is read back unchanged and refuses other keys."""
 
 import json
 import re
@@ -39,21 +39,21 @@ LOST = account([log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cu
 
 
 @pytest.mark.parametrize(
-    "made",
+    "manifest",
     [estimated(), estimated(detect=RICH, account=LOST), RICH],
     ids=["bare", "rich", "detect"],
 )
-def test_what_is_written_is_read_again(made: Manifest, tmp_path: Path) -> None:
+def test_manifest_is_read_back_unchanged(manifest: Manifest, tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
-    write_manifest(run, made)
+    write_manifest(run, manifest)
     first = run.file("manifest.json").read_bytes()
 
-    assert run.manifest() == made
+    assert run.manifest() == manifest
     write_manifest(run, run.manifest())
     assert run.file("manifest.json").read_bytes() == first
 
 
-def test_decode_writes_its_stage_and_is_no_run(tmp_path: Path) -> None:
+def test_decode_manifest_is_not_accepted_as_a_run(tmp_path: Path) -> None:
     wheels = Topic("wheels", "crosscue/WheelSpeeds", "columns")
     log = MemoryLog((wheels,), [wheel_block([3], [1.0])], path=Path(__file__))
     run = create(tmp_path / "out", overwrite=False)
@@ -68,7 +68,7 @@ def test_decode_writes_its_stage_and_is_no_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["score", "estimate", "view"])
-def test_commands_on_one_drive_refuse_other_folders_in_one_line(
+def test_single_drive_commands_refuse_merged_run_in_one_line(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     merged = merge_runs({}, create(tmp_path / "merged", overwrite=False), {}).run.path
@@ -78,7 +78,7 @@ def test_commands_on_one_drive_refuse_other_folders_in_one_line(
     assert re.fullmatch(r"crosscue: .*many drives.*\n", capsys.readouterr().err)
 
 
-def _changed(run: RunFolder, **changes: Any) -> RunFolder:
+def _run_with_changed_manifest(run: RunFolder, **changes: Any) -> RunFolder:
     write_manifest(run, estimated())
     path = run.file("manifest.json")
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
@@ -86,7 +86,7 @@ def _changed(run: RunFolder, **changes: Any) -> RunFolder:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"format_version": 2}, rf"format 2, this crosscue reads {FORMAT_VERSION}: replay again"),
         ({"format_version": None}, r"format None"),
@@ -97,26 +97,24 @@ def _changed(run: RunFolder, **changes: Any) -> RunFolder:
         ({"colour": "red"}, r"colour: extra inputs are not permitted"),
     ],
 )
-def test_another_version_or_value_is_refused_in_one_line(
-    changes: dict[str, Any], said: str, tmp_path: Path
+def test_invalid_manifest_is_refused_in_one_line(
+    changes: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    run = _changed(create(tmp_path / "run", overwrite=False), **changes)
+    run = _run_with_changed_manifest(create(tmp_path / "run", overwrite=False), **changes)
 
-    with pytest.raises(RunError, match=said) as error:
+    with pytest.raises(RunError, match=message) as error:
         open_run(run.path)
     assert "\n" not in str(error.value)
 
 
-def test_a_record_takes_no_unknown_name_and_never_changes() -> None:
+def test_records_refuse_unknown_fields_and_changes() -> None:
     with pytest.raises(ValidationError, match="Extra inputs"):
         Account(**{**LOST.as_json(), "lost": 1})
     with pytest.raises(ValidationError, match="frozen"):
         estimated().notices = ("other",)
 
 
-def test_the_schema_is_that_of_every_stage(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_schema_covers_all_stages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["run", "schema"]) == 0
     printed = capsys.readouterr().out
     assert cli.run(["run", "schema", "-o", str(tmp_path / "s.json")]) == 0

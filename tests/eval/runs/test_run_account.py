@@ -39,8 +39,8 @@ def damaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
     return folder, files.log, files.vehicle
 
 
-def _agrees(run: Path, printed: dict[str, Any]) -> Account:
-    """Return the run's account after comparing it with every place that shows it."""
+def _checked_account(run: Path, printed: dict[str, Any]) -> Account:
+    """Return the run's account after comparing it with the output and the skipped table."""
     folder = open_run(run)
     found = folder.drive_manifest().account
     check(found)
@@ -51,17 +51,17 @@ def _agrees(run: Path, printed: dict[str, Any]) -> Account:
         reported[row["topic"], row["reason"], row["is_dropped"]] += row["count"] or 0
         if row["count"] is None:
             unknown.add((row["topic"], row["reason"]))
-    wanted: Counter[tuple[str, str, bool]] = Counter()
+    expected: Counter[tuple[str, str, bool]] = Counter()
     for log in found.reading:
         for topic, one in log.topics.items():
-            wanted.update({(topic, why, False): n for why, n in one.skipped.items()})
-            wanted.update({(topic, why, True): n for why, n in one.dropped.items()})
-            assert {(topic, why) for why in one.dropped_unknown} <= unknown
-    assert +reported == +wanted
+            expected.update({(topic, reason, False): n for reason, n in one.skipped.items()})
+            expected.update({(topic, reason, True): n for reason, n in one.dropped.items()})
+            assert {(topic, reason) for reason in one.dropped_unknown} <= unknown
+    assert +reported == +expected
     return found
 
 
-def test_replay_and_estimate_of_a_damaged_log(
+def test_account_of_truncated_log_balances_for_replay_and_estimate(
     damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, log, vehicle = damaged
@@ -85,7 +85,7 @@ def test_replay_and_estimate_of_a_damaged_log(
         ["estimate", str(run), "--json"],
     ):
         assert cli.run(argv) == 3
-        found = _agrees(run, json.loads(capsys.readouterr().out))
+        found = _checked_account(run, json.loads(capsys.readouterr().out))
         assert {stage for stage, _, _ in found.lines()} == {"reading", "estimating"}
         assert not found.is_whole
         assert found.estimating["wheel speeds"].used > 0
@@ -98,7 +98,7 @@ def test_replay_and_estimate_of_a_damaged_log(
     assert sum(one.used for at, _, one in found.lines() if at == "reading") > 0
 
 
-def test_detect_over_pictures_that_do_not_decode(
+def test_account_of_undecodable_pictures_balances_for_detect(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, run = picture_folder(tmp_path / "cam", 6, "rate_hz: 10\n"), tmp_path / "run"
@@ -112,7 +112,7 @@ def test_detect_over_pictures_that_do_not_decode(
     argv = ["detect", str(log), "-o", str(run), "--detectors", BRIGHT, "--no-cache", "--json"]
     assert cli.run(argv) == 3
 
-    found = _agrees(run, json.loads(capsys.readouterr().out))
+    found = _checked_account(run, json.loads(capsys.readouterr().out))
     ((name, frames),) = found.detecting.items()
     topics = found.reading[0].topics
     assert (frames.entered, frames.used) == (6, 4)
@@ -121,7 +121,7 @@ def test_detect_over_pictures_that_do_not_decode(
     assert sum(frames.dropped.values()) + sum(frames.skipped.values()) == 2
 
 
-def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
+def test_rows_beyond_the_kept_details_are_summed(tmp_path: Path) -> None:
     ledger = Ledger("log")
     ledger.find("/t", 3 * DETAILS_KEPT)
     for _ in range(DETAILS_KEPT + 7):
@@ -137,7 +137,7 @@ def test_single_rows_beyond_those_kept_are_added_up(tmp_path: Path) -> None:
     assert [row["count"] for row in rows if row["reason"] == "who knows"] == [None]
 
 
-def _made() -> Account:
+def _account() -> Account:
     return account(
         [log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cut": 1})],
         {"/cam": line(5, 4, {}, {"not decoded": 1})},
@@ -148,8 +148,8 @@ def _made() -> Account:
 @pytest.mark.parametrize("stage", ["reading", "detecting", "estimating"])
 @pytest.mark.parametrize("by", [-1, 1])
 @pytest.mark.parametrize("what", ["entered", "used", "skipped", "dropped"])
-def test_one_row_more_or_less_anywhere_is_a_bug_and_loud(stage: str, by: int, what: str) -> None:
-    wrong = _made()
+def test_unbalanced_account_raises_an_error(stage: str, by: int, what: str) -> None:
+    wrong = _account()
     (one,) = [one for at, _, one in wrong.lines() if at == stage]
     if what in ("entered", "used"):
         object.__setattr__(one, what, getattr(one, what) + by)
@@ -160,8 +160,8 @@ def test_one_row_more_or_less_anywhere_is_a_bug_and_loud(stage: str, by: int, wh
         check(wrong)
 
 
-def test_runs_add_up_and_stay_damaged() -> None:
-    both = summed([_made(), _made()])
+def test_sum_of_accounts_adds_rows_and_keeps_losses() -> None:
+    both = summed([_account(), _account()])
 
     assert both.reading["/t"].entered == 20
     assert both.reading["/t"].dropped == {"cut": 2}
@@ -170,8 +170,8 @@ def test_runs_add_up_and_stay_damaged() -> None:
     assert not both.is_whole
 
 
-def test_a_person_reads_every_stage_and_every_reason_once() -> None:
-    text = "\n".join(account_lines(_made()))
+def test_printed_account_has_each_stage_and_reason_once() -> None:
+    text = "\n".join(account_lines(_account()))
 
     for words in (
         "10 rows: 7 used, 2 skipped, 1 dropped",
@@ -184,7 +184,7 @@ def test_a_person_reads_every_stage_and_every_reason_once() -> None:
     assert np.all([len(part) <= 100 for part in text.splitlines()])
 
 
-def test_one_row_beyond_those_kept_and_one_of_unknown_number_are_not_lost(tmp_path: Path) -> None:
+def test_single_row_beyond_the_kept_details_is_counted(tmp_path: Path) -> None:
     ledger = Ledger("log")
     ledger.find("/t", 3 * DETAILS_KEPT)
     ledger.drop("/t", "cut", 3)
@@ -200,7 +200,7 @@ def test_one_row_beyond_those_kept_and_one_of_unknown_number_are_not_lost(tmp_pa
     assert [row["count"] for row in rows if row["reason"] == "cut"] == [3, None]
 
 
-def test_headings_that_the_first_belief_is_made_of_are_used(
+def test_account_includes_headings_of_the_first_pose(
     damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, log, vehicle = damaged
@@ -219,5 +219,5 @@ def test_headings_that_the_first_belief_is_made_of_are_used(
 
     printed = json.loads(capsys.readouterr().out)
     assert any("start heading" in sentence for sentence in printed["notices"])
-    headings = _agrees(run, printed).estimating["headings"]
+    headings = _checked_account(run, printed).estimating["headings"]
     assert headings.entered == headings.used + sum(headings.skipped.values())

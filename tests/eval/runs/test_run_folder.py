@@ -1,4 +1,4 @@
-"""A run folder holds only complete files, and has one writer at a time."""
+"""A run folder contains only complete files and has one writer at a time."""
 
 import errno
 import json
@@ -18,7 +18,7 @@ from crosscue.replay.base import OutputError, RunError, write_text, write_whole
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 
 
-def test_a_writer_that_fails_leaves_the_old_file_alone(tmp_path: Path) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "old")
 
     def fail(partial: Path) -> None:
@@ -32,21 +32,21 @@ def test_a_writer_that_fails_leaves_the_old_file_alone(tmp_path: Path) -> None:
     assert (tmp_path / "a.txt").read_text() == "old"
 
 
-def test_a_table_is_named_only_when_whole(tmp_path: Path) -> None:
+def test_incomplete_table_is_not_left_in_the_folder(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
 
-    def cut_short() -> None:
+    def write_and_fail() -> None:
         with TableSink(run, "pose", SCHEMA) as sink:
             sink.write({"t_ns": np.arange(3)})
             raise RuntimeError("killed")
 
     with pytest.raises(RuntimeError, match="killed"):
-        cut_short()
+        write_and_fail()
 
     assert list(run.path.iterdir()) == []
 
 
-def test_a_flipped_byte_in_a_table_is_reported(tmp_path: Path) -> None:
+def test_damaged_table_is_reported(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     with TableSink(run, "pose", SCHEMA) as sink:
         sink.write({"t_ns": np.arange(10_000)})
@@ -59,7 +59,7 @@ def test_a_flipped_byte_in_a_table_is_reported(tmp_path: Path) -> None:
         run.table("pose")
 
 
-def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
+def test_equal_rows_yield_equal_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         run = create(tmp_path / name, overwrite=False)
         with TableSink(run, "pose", SCHEMA) as sink:
@@ -69,7 +69,7 @@ def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
     assert first == second
 
 
-def test_where_the_kernel_keeps_no_locks_the_text_reports_who_holds_it(
+def test_lock_file_names_its_holder_without_kernel_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = create(tmp_path / "run", overwrite=False)
@@ -87,7 +87,7 @@ def test_where_the_kernel_keeps_no_locks_the_text_reports_who_holds_it(
         pass
 
 
-def test_a_lock_of_a_dead_process_is_taken_over(tmp_path: Path) -> None:
+def test_lock_of_dead_process_is_taken_over(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     run.file(".lock").write_text(f"4194305 {socket.gethostname()} some-other-boot")
 
@@ -96,7 +96,7 @@ def test_a_lock_of_a_dead_process_is_taken_over(tmp_path: Path) -> None:
     assert not run.file(".lock").exists()
 
 
-def test_foreign_files_are_never_overwritten(tmp_path: Path) -> None:
+def test_folder_with_other_files_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
 
     with pytest.raises(RunError, match=r"thesis\.tex"):
@@ -106,20 +106,22 @@ def test_foreign_files_are_never_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("{", "unreadable"),
         (json.dumps({"format_version": 99}), "format 99"),
         (json.dumps([1]), "format None"),
     ],
 )
-def test_a_damaged_or_foreign_manifest_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_damaged_or_unsupported_manifest_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
     (tmp_path / "manifest.json").write_text(text)
 
-    with pytest.raises(RunError, match=said):
+    with pytest.raises(RunError, match=message):
         open_run(tmp_path)
 
 
-def test_a_folder_without_manifest_is_no_finished_run(tmp_path: Path) -> None:
+def test_folder_without_manifest_is_an_incomplete_run(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="cut short"):
         open_run(tmp_path)

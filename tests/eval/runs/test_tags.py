@@ -38,7 +38,7 @@ def test_tags_are_set_listed_and_removed(runs: Path, capsys: pytest.CaptureFixtu
     ]
 
 
-def test_a_run_without_its_last_tag_is_as_it_was(runs: Path) -> None:
+def test_removing_the_last_tag_restores_the_run_folder(runs: Path) -> None:
     before = tree(runs / "a/monday")
 
     crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
@@ -60,7 +60,7 @@ def test_tags_are_columns_of_runs_and_approaches(runs: Path) -> None:
     assert len(found.select("tags['weather'] is null")) == 3
 
 
-def test_a_run_that_is_made_again_keeps_its_tags(runs: Path) -> None:
+def test_overwritten_run_keeps_its_tags(runs: Path) -> None:
     run = open_run(runs / "a/monday")
     crosscue.tag_runs([run.path], {"weather": "rain"})
     with locked(run), staged(run) as new:
@@ -72,7 +72,7 @@ def test_a_run_that_is_made_again_keeps_its_tags(runs: Path) -> None:
     assert [path.name for path in run.path.iterdir()] == ["tags.json"]
 
 
-def test_merging_keeps_tags_and_depends_on_nothing_else_in_them(runs: Path) -> None:
+def test_merged_manifest_keeps_tags_of_each_drive(runs: Path) -> None:
     crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
     found, failures = gathered([runs / "a"])
     manifest = merge_runs(found, create(runs / "all", overwrite=False), failures).run.manifest()
@@ -94,7 +94,7 @@ def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("argv", "said"),
+    ("argv", "message"),
     [
         (["weather="], "weather=: expected KEY=VALUE"),
         (["1weather=rain"], "expected KEY=VALUE"),
@@ -104,14 +104,14 @@ def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
         (["--remove", "a b"], "a b: not a valid key of a tag"),
     ],
 )
-def test_wrong_tags_change_nothing(
-    runs: Path, argv: list[str], said: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_tags_are_refused_without_changes(
+    runs: Path, argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = tree(runs)
 
     assert cli.run(["tag", str(runs / "a"), *argv]) == 2
 
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert tree(runs) == before
 
 
@@ -132,7 +132,7 @@ def test_damaged_tags_are_reported_and_not_overwritten(runs: Path) -> None:
     assert "tags.json: unreadable" in crosscue.catalog(runs).left_out["a/monday"]
 
 
-def test_a_run_that_is_being_written_is_not_tagged(runs: Path) -> None:
+def test_locked_run_is_not_tagged(runs: Path) -> None:
     run = open_run(runs / "a/monday")
     with locked(run), pytest.raises(RunError, match="is writing it"):
         crosscue.tag_runs([run.path], {"weather": "rain"})

@@ -22,8 +22,8 @@ from support.pandaset_drive import pandaset_drive
 FIX = Topic("fix", "sensor_msgs/msg/NavSatFix", "columns")
 
 
-def checked(yaw_sign: float = 1.0, wheel_scale: float = 1.0) -> Checked:
-    """Twenty seconds of bends at 10 m/s with wheels, gyro and GNSS."""
+def checked_signals(yaw_sign: float = 1.0, wheel_scale: float = 1.0) -> Checked:
+    """Check a simulated log: 20 s of bends at 10 m/s with wheels, gyro and GNSS."""
     times = np.arange(400, dtype=np.int64) * 50_000_000
     yaw_rate = 0.3 * np.sin(0.8 * times * 1e-9)
     course = np.cumsum(yaw_rate) * 0.05
@@ -43,8 +43,8 @@ def checked(yaw_sign: float = 1.0, wheel_scale: float = 1.0) -> Checked:
     return check([log], Vehicle(version=1), EVERYTHING)
 
 
-def test_signals_that_agree_are_said_to() -> None:
-    found = checked()
+def test_consistent_signals_have_no_contradictions() -> None:
+    found = checked_signals()
 
     assert found.contradictions == ()
     by_name = {row.signal: row for row in found.signals}
@@ -54,17 +54,19 @@ def test_signals_that_agree_are_said_to() -> None:
     assert "the course of GNSS fix" in by_name["yaw_rate"].agrees
 
 
-def test_a_yaw_rate_of_the_wrong_sign_contradicts() -> None:
-    assert any("positive to the right" in text for text in checked(yaw_sign=-1.0).contradictions)
+def test_yaw_rate_of_wrong_sign_is_a_contradiction() -> None:
+    assert any(
+        "positive to the right" in text for text in checked_signals(yaw_sign=-1.0).contradictions
+    )
 
 
-def test_speeds_that_disagree_contradict() -> None:
-    found = checked(wheel_scale=1.6).contradictions
+def test_inconsistent_speeds_are_a_contradiction() -> None:
+    found = checked_signals(wheel_scale=1.6).contradictions
 
     assert any(text.startswith("wheel_speeds: contradicts") for text in found)
 
 
-def test_the_horizon_is_where_a_level_road_ends() -> None:
+def test_horizon_is_the_limit_of_a_level_road() -> None:
     camera = Camera(focal_px=800.0, center_px=(320.0, 200.0), pitch_rad=0.05, z_m=1.4)
     size_px = (640, 400)
 
@@ -74,7 +76,7 @@ def test_the_horizon_is_where_a_level_road_ends() -> None:
     assert ground.horizon_px(np.array([x]))[0] == pytest.approx(y, abs=1e-3)
 
 
-def test_a_picture_shows_the_horizon_unless_nobody_knows_where_it_is() -> None:
+def test_horizon_is_drawn_only_with_known_intrinsics() -> None:
     pixels = np.full((400, 640, 3), 90, np.uint8)
     known = Vehicle(version=1, camera=Camera(focal_px=800.0, center_px=(320.0, 150.0)))
 
@@ -85,14 +87,14 @@ def test_a_picture_shows_the_horizon_unless_nobody_knows_where_it_is() -> None:
     np.testing.assert_array_equal(draw_ground(pixels, Vehicle(version=1)), pixels)
 
 
-def vehicle_of(path: Path, camera: str) -> Path:
-    """A vehicle file with this section."""
+def write_vehicle(path: Path, camera: str) -> Path:
+    """Write a vehicle file with a camera section."""
     path.write_text(f"version = 1\n[camera]\n{camera}\n")
     return path
 
 
 @pytest.mark.parametrize(
-    ("camera", "says"),
+    ("camera", "message"),
     [
         ("focal_px = 1970.0\ncenter_px = [970.5, 483.0]", "center_px = (970.5, 483): outside"),
         ("focal_px = 20000.0", "focal_px = 20000: images"),
@@ -100,22 +102,24 @@ def vehicle_of(path: Path, camera: str) -> Path:
         ("focal_px = 1500.0", "the data set publishes 1970"),
     ],
 )
-def test_intrinsics_of_other_pictures_contradict(tmp_path: Path, camera: str, says: str) -> None:
+def test_intrinsics_of_other_pictures_are_contradictions(
+    tmp_path: Path, camera: str, message: str
+) -> None:
     drive = pandaset_drive(tmp_path / "002")
-    vehicle = vehicle_of(tmp_path / "car.toml", camera)
+    vehicle = write_vehicle(tmp_path / "car.toml", camera)
 
     found = crosscue.check_vehicle(drive, vehicle)
 
     # The generated pictures are tiny, with the published intrinsics of 1920 x 1080.
-    assert any(says in text for text in found.contradictions)
+    assert any(message in text for text in found.contradictions)
     assert f"WRONG    {found.contradictions[0]}" in repr(found)
 
 
-def test_the_page_and_the_table_hold_the_same(
+def test_check_page_and_json_have_equal_content(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drive = pandaset_drive(tmp_path / "002")
-    vehicle = vehicle_of(tmp_path / "car.toml", "focal_px = 1500.0")
+    vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
     page = tmp_path / "check.html"
     line = ["vehicle", "check", str(drive), "--vehicle", str(vehicle), "-o", str(page)]
 
@@ -132,21 +136,21 @@ def test_the_page_and_the_table_hold_the_same(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["-o", "page.pdf"], "expected a page or a picture"),
         (["--seconds", "0"], "seconds: expected more than 0"),
         (["--start-s", "1000"], "no signal and no picture"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    tmp_path: Path, arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_check_options_are_refused_in_one_line(
+    tmp_path: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drive = pandaset_drive(tmp_path / "002")
-    vehicle = vehicle_of(tmp_path / "car.toml", "focal_px = 1500.0")
+    vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
 
     assert run(["vehicle", "check", str(drive), "--vehicle", str(vehicle), *arguments]) in (1, 2)
 
-    said = capsys.readouterr().err
-    assert says in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
