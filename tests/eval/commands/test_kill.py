@@ -20,7 +20,7 @@ from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import create, locked, open_run
+from crosscue.eval.runs.folder import RunFolder, create, locked, open_run
 from crosscue.replay.base import RunError
 from support import faults, scenes
 from support.trees import tree
@@ -230,10 +230,10 @@ def test_locked_run_is_refused_and_names_the_process(drive: Drive, tmp_path: Pat
 def test_lock_is_exclusive_among_many_processes(tmp_path: Path) -> None:
     run = create(tmp_path / "run", overwrite=False)
     children = []
-    for _ in range(8):
+    for _ in range(4):
         child = os.fork()
         if child == 0:
-            os._exit(_lock_in_turn(run.path, 40))
+            os._exit(_lock_in_turn(run.path, 20))
         children.append(child)
 
     statuses = {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children}
@@ -241,10 +241,10 @@ def test_lock_is_exclusive_among_many_processes(tmp_path: Path) -> None:
     assert statuses == {0}
 
 
-def _lock_in_turn(path: Path, rounds: int) -> int:
-    """Return 0 if the lock was exclusive, else 1; imitate a killed process every third time."""
+def _lock_in_turn(path: Path, turns: int) -> int:
+    """Return 0 if the lock was exclusive, else 1; leave locks of killed processes between turns."""
     run, inside = create(path, overwrite=True), path.parent / "inside"
-    for number in range(rounds):
+    while turns:
         try:
             with locked(run):
                 try:
@@ -253,14 +253,24 @@ def _lock_in_turn(path: Path, rounds: int) -> int:
                     return 1
                 time.sleep(0.0005)
                 inside.unlink()
-                if number % 3 == 0:
-                    # As after a killed process: the file remains, with the id of an ended process.
-                    dead = path / ".lock.dead"
-                    dead.write_text("4194305 elsewhere gone")
-                    dead.unlink()
         except RunError:
             continue
+        turns -= 1
+        if turns % 4 == 0:
+            _leave_lock_of_killed_process(run)
     return 0
+
+
+def _leave_lock_of_killed_process(run: RunFolder) -> None:
+    """Lock the run in a process that is killed at once; do nothing while another holds it."""
+    child = os.fork()
+    if child == 0:
+        lock = locked(run)
+        try:
+            lock.__enter__()
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become nobody")
