@@ -1,9 +1,11 @@
-"""A recording of a part of a run holds exactly that part."""
+"""A recording of a part of a run contains exactly that part."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
@@ -25,7 +27,7 @@ def entities(path: Path) -> set[str]:
     return {chunk.entity_path.split("/")[1] for chunk in RrdReader(path).stream()}
 
 
-def test_tables_of_a_part_have_its_rows_whatever_columns_are_asked_for(run: RunFolder) -> None:
+def test_tables_of_a_part_have_only_its_rows_and_selected_columns(run: RunFolder) -> None:
     part = part_of(run, at(10), at(19))
 
     assert part.table("frames")["t_ns"].to_pylist() == [at(frame) for frame in range(10, 20)]
@@ -33,9 +35,7 @@ def test_tables_of_a_part_have_its_rows_whatever_columns_are_asked_for(run: RunF
     assert sum(len(batch) for batch in part.batches("detections", ["label"])) == 2 * 10
 
 
-def test_a_moment_opens_two_seconds_before_it_with_all_that_was_there(
-    run: RunFolder, tmp_path: Path
-) -> None:
+def test_recording_at_a_moment_begins_two_seconds_before(run: RunFolder, tmp_path: Path) -> None:
     path = crosscue.save_recording(run.path, tmp_path / "at.rrd", at=3.0)
 
     times: set[int] = set()
@@ -47,9 +47,7 @@ def test_a_moment_opens_two_seconds_before_it_with_all_that_was_there(
     assert times == {at(frame) for frame in range(10, 50)}
 
 
-def test_the_same_moment_in_nanoseconds_is_the_same_recording_in_time(
-    run: RunFolder, tmp_path: Path
-) -> None:
+def test_moment_in_nanoseconds_yields_the_same_recording(run: RunFolder, tmp_path: Path) -> None:
     rows = [
         sum(
             chunk.num_rows
@@ -63,17 +61,28 @@ def test_the_same_moment_in_nanoseconds_is_the_same_recording_in_time(
     assert rows[0] == rows[1]
 
 
-def test_views_that_were_not_asked_for_are_not_in_the_file(run: RunFolder, tmp_path: Path) -> None:
+def test_unselected_views_are_not_recorded(run: RunFolder, tmp_path: Path) -> None:
     path = crosscue.save_recording(run.path, tmp_path / "only.rrd", only=("belief", "cues"))
 
     assert {"plots", "cues"} <= entities(path)
     assert not {"camera", "ahead", "plan"} & entities(path)
 
 
-def test_an_approach_is_recorded_from_its_first_step_to_its_last(
-    run: RunFolder, tmp_path: Path
-) -> None:
-    crosscue.save_recording(run.path, tmp_path / "approach.rrd", approach=7, only=("belief",))
+def test_approach_is_recorded_from_its_first_step_to_its_last(tmp_path: Path) -> None:
+    run = scene_run(tmp_path / "drive")
+    belief = run.table("belief")
+    column = belief.schema.get_field_index("approach")
+    numbers = [7 if 10 <= frame < 30 else None for frame in range(len(belief))]
+    numbers = pa.array(numbers, belief.schema.field("approach").type)
+    pq.write_table(belief.set_column(column, "approach", numbers), run.file("belief.parquet"))
+
+    path = crosscue.save_recording(run.path, tmp_path / "a.rrd", approach=7, only=("belief",))
+
+    times: set[int] = set()
+    for chunk in RrdReader(path).stream():
+        if not chunk.is_static:
+            times.update(chunk.to_record_batch().column("drive").cast("int64").to_pylist())
+    assert times == {at(frame) for frame in range(10, 30)}
     with pytest.raises(UsageError, match="it has: 7"):
         crosscue.save_recording(run.path, tmp_path / "none.rrd", approach=8)
 
@@ -88,7 +97,7 @@ def test_an_approach_is_recorded_from_its_first_step_to_its_last(
         ("--only sky", "expected some of cameras"),
     ],
 )
-def test_what_the_run_does_not_have_is_one_line_of_wrong_usage(
+def test_invalid_part_options_are_refused_in_one_line(
     run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, named: str
 ) -> None:
     output = tmp_path / "x.rrd"
@@ -100,7 +109,7 @@ def test_what_the_run_does_not_have_is_one_line_of_wrong_usage(
     assert not output.exists()
 
 
-def test_views_of_what_the_run_lacks_are_refused_with_those_it_has(tmp_path: Path) -> None:
+def test_unavailable_views_are_refused_with_available_ones(tmp_path: Path) -> None:
     bare = scene_run(tmp_path, without=frozenset({"pose"}))
 
     with pytest.raises(UsageError, match="it has ahead,belief"):
