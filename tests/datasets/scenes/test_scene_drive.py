@@ -83,7 +83,7 @@ def test_picture_spacing_does_not_change_times_of_other_sensors(
         np.testing.assert_array_equal(found_ns, all_ns)
 
 
-def test_every_picture_is_read_back_with_its_size(files: SceneFiles) -> None:
+def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) -> None:
     import cv2
 
     ledger = Ledger(str(files.log))
@@ -91,6 +91,7 @@ def test_every_picture_is_read_back_with_its_size(files: SceneFiles) -> None:
         for _ in log.read(ledger):
             pass
         declared = {topic.name: topic.declared for topic in log.topics}
+    assert ledger.is_whole
     assert declared[IMAGES] == declared[CALIBRATION] == files.pictures
     count = 0
     for block in blocks(files.log, IMAGES):

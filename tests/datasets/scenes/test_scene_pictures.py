@@ -192,6 +192,7 @@ def test_unknown_layouts_are_refused(name: str) -> None:
 def test_moving_cars_stay_on_road(layout: str) -> None:
     scene = world(layout)
     moving = [one for one in scene.things if one.velocity != (0.0, 0.0)]
+    assert moving
     for thing in moving:
         for t_s in np.arange(0.0, 15.0, 0.5):
             x, y = thing.at[0] + thing.shift(t_s)[0], thing.at[1] + thing.shift(t_s)[1]

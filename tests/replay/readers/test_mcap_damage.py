@@ -271,10 +271,10 @@ def test_malicious_chunk_is_reported_quickly(tmp_path: Path, bomb: str) -> None:
     path.write_bytes(MAGIC + header() + sound.coded() + BOMBS[bomb])
     limits = Limits(chunk_bytes=32 << 20, records_per_chunk=100_000)
 
-    begin = time.monotonic()
+    begin = time.process_time()
     reading = read_back(path, limits=limits)
 
-    assert time.monotonic() - begin < 5.0
+    assert time.process_time() - begin < 5.0
     assert reading.count() == 10
     assert not reading.ledger.is_whole
 
