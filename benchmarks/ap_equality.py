@@ -5,10 +5,11 @@
 DATA holds ``sequences/pandaset_002``, whose 3-D boxes are projected into its 80 pictures, and
 ``signs/stop_vs_nostop_us_streets``, whose pictures are labelled with a stop sign or none. Bare is
 ONNX Runtime with YOLOX's published pre- and postprocessing, implemented here independently of
-crosscue. Both are measured with the picture decoded in full, and with JPEGs decoded only as finely
-as the network needs (``decode = "reduced"`` in the card). pycocotools evaluates all. Only YOLOX has
-a bare implementation here; of other models, only crosscue's numbers are printed. CPU times are of
-the same pictures in the same run, alternating. ``--evidence`` prints tables for the model's card.
+crosscue. Both are measured with fully decoded pictures, and with JPEGs decoded at the reduced
+resolution that the network needs (``decode = "reduced"`` in the card). pycocotools evaluates both.
+Only YOLOX has a bare implementation here; for other models, only crosscue's numbers are printed.
+CPU times are measured alternating, on the same pictures in one run. ``--evidence`` prints tables
+for the model's card.
 """
 
 from __future__ import annotations
@@ -48,40 +49,40 @@ from crosscue.detectors.registry import make
 Floats = NDArray[np.float64]
 Size = tuple[int, int]
 VEHICLES = {2: "car", 5: "bus", 7: "truck"}
-"""Numbers of COCO's 80 classes."""
+"""Vehicle classes by their number among COCO's 80 classes."""
 STOP_SIGN = 11
 VEHICLE_WORDS = ("Car", "Truck", "Bus", "Vehicle", "Van", "Towed")
 NEAR_M, FAR_M = 30.0, 80.0
 MIN_VISIBLE = 0.5
 MIN_SCORE = 0.01
-"""Of what takes part in the average precision."""
+"""Lowest score of detections that count towards the average precision."""
 RECALL_SCORE, FALSE_SCORE, SIGN_SCORE = 0.3, 0.5, 0.9
 MAX_FALSE_FRACTION = 0.1
-"""A box with a larger part on a vehicle's box is not on no vehicle at all."""
+"""Fraction of a false box that may overlap a vehicle's box at most."""
 BLOCK = 10
-"""Successive pictures that are drawn together, one second: their errors are not independent."""
+"""Successive pictures (1 s) that are resampled together, because their errors correlate."""
 DRAWS = 300
 ROUNDS = 5
-"""Of the times of a picture, in turn; the least is what a busy machine disturbs least."""
+"""Timings of each picture; the minimum is the least disturbed by other work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Detections in one picture: boxes (N, 4), scores (N,), COCO class numbers (N,)."""
+    """Detections in one picture: boxes (N, 4), scores (N,) and COCO class numbers (N,)."""
 
     boxes: Floats
     scores: Floats
     classes: NDArray[np.int64]
 
     def of(self, numbers: Sequence[int]) -> Found:
-        """Only these classes."""
+        """Return the detections of the given classes."""
         keep = np.isin(self.classes, list(numbers))
         return Found(self.boxes[keep], self.scores[keep], self.classes[keep])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labelled:
-    """A picture with the boxes of its vehicles (N, 4), how far and how visible each is (N,)."""
+    """A picture with boxes (N, 4), ranges (N,) and visible fractions (N,) of its vehicles."""
 
     path: Path
     boxes: Floats
@@ -89,12 +90,12 @@ class Labelled:
     visible: Floats
 
     def is_counted(self, reach_m: float) -> NDArray[np.bool_]:
-        """Mask of the vehicles to be found; others are ignored."""
+        """Return the mask of the vehicles to detect; others are ignored."""
         return (self.range_m <= reach_m) & (self.visible >= MIN_VISIBLE)
 
 
 def pandaset(folder: Path) -> list[Labelled]:
-    """The pictures of a sequence with its 3-D boxes projected."""
+    """Return the pictures of a sequence with its 3-D boxes projected."""
     camera = folder / "camera" / "front_camera"
     lens = json.loads((camera / "intrinsics.json").read_text())
     poses = json.loads((camera / "poses.json").read_text())
@@ -121,7 +122,7 @@ def pandaset(folder: Path) -> list[Labelled]:
 
 
 def _labelled(path: Path, nearest_first: list[tuple[float, Floats, bool]], size: Size) -> Labelled:
-    """Visible part of each box: inside the picture, and not behind a nearer box."""
+    """Return the vehicles with the fraction of each in the picture and not hidden."""
     is_hidden = np.zeros((size[1] // 2, size[0] // 2), bool)
     kept = []
     for distance, whole, is_vehicle in nearest_first:
@@ -137,7 +138,7 @@ def _labelled(path: Path, nearest_first: list[tuple[float, Floats, bool]], size:
 
 
 def streets(folder: Path) -> list[tuple[Path, bool]]:
-    """Pictures of streets, and whether one has a stop sign."""
+    """Return pictures of streets; True for those with a stop sign."""
     lines = (folder / "labels.tsv").read_text().splitlines()
     with_sign = {name for name, _, said in (line.partition("\t") for line in lines) if said == "1"}
     files = sorted(path for path in folder.iterdir() if path.suffix != ".tsv")
@@ -145,7 +146,7 @@ def streets(folder: Path) -> list[tuple[Path, bool]]:
 
 
 class Bare:
-    """The published network and the steps published with it, and nothing else."""
+    """The published network with the published pre- and postprocessing only."""
 
     def __init__(self, weights: Path, size: Size) -> None:
         self.min_score = MIN_SCORE
@@ -176,7 +177,7 @@ class Bare:
 
         Args:
             path: The picture.
-            view: Decode it as crosscue does for a detector that asks for this; else in full.
+            view: View to decode, as crosscue does for a detector; the full picture by default.
         """
         whole = cv2.imread(str(path))
         assert whole is not None
@@ -210,7 +211,7 @@ class Bare:
 
 
 def _suppressed(boxes: Any, scores: Any, classes: Any) -> list[int]:
-    """Per class, as published: of two boxes over 0.45 of each other the better stays."""
+    """Return the boxes kept by non-maximum suppression per class at IoU 0.45, as published."""
     kept: list[int] = []
     for number in np.unique(classes):
         order = [int(i) for i in np.argsort(-scores) if classes[i] == number]
@@ -227,7 +228,7 @@ def _suppressed(boxes: Any, scores: Any, classes: Any) -> list[int]:
 
 
 class Ours:
-    """The catalog's model through crosscue, from the file's bytes as a run takes them."""
+    """The catalog's model through crosscue, from the bytes of the file as in a run."""
 
     def __init__(
         self, model: str, size: Size, folder: Path, min_score: float, decode: str = "full"
@@ -254,7 +255,7 @@ class Ours:
 
 
 class Judge:
-    """pycocotools over one class, vehicle, with what is far or hidden ignored."""
+    """Evaluation by pycocotools of the class vehicle, ignoring far and hidden vehicles."""
 
     def __init__(
         self, pictures: Sequence[Labelled], found: Sequence[Found], reach_m: float
@@ -291,12 +292,12 @@ class Judge:
         self.images = self.judge.evalImgs[: len(pictures)]
 
     def average_precision(self) -> tuple[float, float]:
-        """At an overlap of 0.5, and over 0.5 to 0.95, in %."""
+        """Return the average precision in % at IoU 0.5, and its mean over IoU 0.5 to 0.95."""
         precision = self.judge.eval["precision"][:, :, 0, 0, 2]
         return 100 * float(precision[0].mean()), 100 * float(precision.mean())
 
     def interval(self) -> tuple[float, float]:
-        """95 % of the average precision at 0.5, seconds of the drive drawn with repetition."""
+        """Return the 95 % bootstrap interval of AP at IoU 0.5, resampled by seconds."""
         rng = np.random.default_rng(1)
         count = len(self.images) // BLOCK
         drawn = []
@@ -309,7 +310,7 @@ class Judge:
 
 
 def _area(images: Sequence[Any]) -> float:
-    """Average precision at an overlap of 0.5 as pycocotools has it, of pictures judged by it."""
+    """Return AP at IoU 0.5, computed as in pycocotools, of pictures that it evaluated."""
     some = [one for one in images if one is not None]
     scores = np.concatenate([one["dtScores"] for one in some])
     is_right = np.concatenate([one["dtMatches"][0] > 0 for one in some])
@@ -328,7 +329,7 @@ def _xywh(box: Floats) -> list[float]:
 
 
 def recall(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, int]:
-    """Number of vehicles with a box of IoU 0.5 and score 0.3 or more, and of all vehicles."""
+    """Return the numbers of vehicles with a box of IoU and score above limits, and of all."""
     hits = total = 0
     for picture, one in zip(pictures, found, strict=True):
         boxes = one.boxes[one.scores >= RECALL_SCORE]
@@ -341,7 +342,7 @@ def recall(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, i
 
 
 def on_nothing(pictures: Sequence[Labelled], found: Sequence[Found]) -> tuple[int, int]:
-    """Number of boxes above 0.5 that overlap no vehicle's projected box, and of all boxes."""
+    """Return the numbers of boxes above 0.5 that overlap no vehicle, and of all boxes."""
     alone = total = 0
     for picture, one in zip(pictures, found, strict=True):
         for box in one.boxes[one.scores > FALSE_SCORE]:
@@ -357,7 +358,7 @@ def _both(box: Floats, others: Floats) -> Floats:
 
 
 def proportion(hits: int, total: int) -> tuple[float, float, float]:
-    """Fraction in % with its 95 % interval by Clopper and Pearson."""
+    """Return a fraction in % with its 95 % Clopper-Pearson interval."""
     low = beta.ppf(0.025, hits, total - hits + 1) if hits else 0.0
     high = beta.ppf(0.975, hits + 1, total - hits) if hits < total else 1.0
     return 100 * hits / total, 100 * float(low), 100 * float(high)
@@ -365,7 +366,7 @@ def proportion(hits: int, total: int) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One metric: of how many labelled objects, value and 95 % interval in %."""
+    """One metric: number of labelled objects, value and 95 % interval in %."""
 
     pictures: str
     boxes: int
@@ -380,7 +381,7 @@ def measured(
     drive: Sequence[Labelled],
     signs: Sequence[tuple[Path, bool]],
 ) -> list[Result]:
-    """All metrics of a pipeline."""
+    """Return all metrics of a pipeline."""
     found = [run(picture.path)[0].of([*VEHICLES]) for picture in drive]
     where = f"PandaSet sequence 002, {len(drive)} pictures, 3-D boxes projected"
     results = []
@@ -421,7 +422,7 @@ def measured(
 
 
 def cpu_times(bare: Bare, ours: Ours, pictures: Sequence[Labelled]) -> str:
-    """Medians over the pictures of CPU times, the least of several in turn, and of their ratios."""
+    """Return medians over pictures of minimum CPU times, alternating, and of their ratios."""
     rows = []
     for picture in pictures:
         seconds = []
@@ -441,7 +442,7 @@ def cpu_times(bare: Bare, ours: Ours, pictures: Sequence[Labelled]) -> str:
 
 
 def main() -> None:
-    """Print all."""
+    """Print metrics and CPU times of each model and input size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("models", nargs="*", default=["yolox-nano"])

@@ -38,7 +38,7 @@ COLUMNS = (
 
 
 def originals(folder: Path) -> dict[str, Path]:
-    """One small file of each kind."""
+    """Write one small file of each kind."""
     rows = rows_of(600)
     made = {
         f"bag {kind}": write_bag(folder / f"{kind}.bag", rows, kind)

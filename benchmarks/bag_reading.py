@@ -1,7 +1,7 @@
-"""Read a drive from ROS 1 bags and ROS 2 SQLite bags: our readers beside rosbags, in one run.
+"""Read a drive from ROS 1 bags and ROS 2 SQLite bags: our readers next to rosbags, in one run.
 
     python benchmarks/bag_reading.py [rounds] [seconds of drive]
-    python benchmarks/bag_reading.py memory [megabytes]    # peak memory, a tenth of it against it
+    python benchmarks/bag_reading.py memory [megabytes]    # peak memory of two sizes
 
 The drive has 15 camera pictures of 150 kB, 2,258 CAN frames and 100 IMU messages per second. The
 pictures are noise, which is as incompressible as JPEG. The cases alternate in one process, and
@@ -71,7 +71,7 @@ def store_of(which: Stores) -> Typestore:
 
 
 def moments(seconds: int) -> list[tuple[int, str]]:
-    """Log time and topic of every message, in time order."""
+    """Return log time and topic of every message, in time order."""
     made = []
     for topic, rate in (("/camera", PICTURES), ("/can", FRAMES), ("/imu", IMUS)):
         steps = np.arange(seconds * rate) * (1_000_000_000 / rate)
@@ -80,7 +80,7 @@ def moments(seconds: int) -> list[tuple[int, str]]:
 
 
 def drive(store: Typestore, is_ros1: bool, seconds: int) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, time and serialised message of the whole drive."""
+    """Yield topic, time and serialised message of the complete drive."""
     types = store.types
     rng = np.random.default_rng(3)
     for i, (t_ns, topic) in enumerate(moments(seconds)):

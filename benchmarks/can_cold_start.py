@@ -1,4 +1,4 @@
-"""Decode all signals of a candump log with a large DBC file in a new process, beside two peers.
+"""Decode all signals of a candump log with a large DBC file in a new process, next to two peers.
 
     python benchmarks/can_cold_start.py [--rounds 5]
 
@@ -75,7 +75,7 @@ NEEDS: Final = {"hilspy": ("hilspy",), "python-can + cantools": ("can", "cantool
 
 
 def run(name: str, log: Path, dbc: Path, cache: str) -> tuple[int, float, float]:
-    """Values decoded, and CPU seconds of the work and of the whole process."""
+    """Return the number of values, and the CPU seconds of the work and of the process."""
     script = _HEAD + CASES[name] + _FOOT
     done = subprocess.run(
         [sys.executable, "-c", script, str(log), str(dbc)],
@@ -98,7 +98,7 @@ def main() -> None:
     for name in CASES.keys() - set(names):
         print(f"{name}: not installed, left out")
     with tempfile.TemporaryDirectory() as folder:
-        # The peers know the format by this suffix.
+        # The peers recognise the format by this suffix.
         log, dbc = Path(folder, "drive.log"), asked.data / DBC
         log.write_bytes((asked.data / LOG).read_bytes())
         first = run("ours", log, dbc, folder)

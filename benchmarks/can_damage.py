@@ -25,7 +25,7 @@ COLUMNS = ("refused", "same", "reported", "undetectable", "SILENT", "INVENTED", 
 def count(
     kind: Kind, folder: Path, what: str, copies: int, show: bool
 ) -> tuple[Counter[str], float]:
-    """Return the verdicts over ``copies`` copies, and the longest time of one."""
+    """Return the verdicts over ``copies`` damaged copies, and the longest reading time."""
     frames = kind.frames(60)
     whole = kind.spell(frames)
     chance = random.Random(1)
@@ -49,7 +49,7 @@ def count(
 
 
 def main() -> None:
-    """Print one line for each format and kind of harm."""
+    """Print one line for each format and kind of damage."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--copies", type=int, default=1000, help="of each format and kind of harm")
     parser.add_argument("--only", default="", help="formats whose name holds this")

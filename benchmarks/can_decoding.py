@@ -1,13 +1,14 @@
-"""Decode the signals of real CAN buses: ours with NumPy and Numba beside cantools, in one run.
+"""Decode the signals of real CAN buses: ours with NumPy and Numba next to cantools, in one run.
 
     python benchmarks/can_decoding.py [rounds]
 
 Every case decodes all frames of a bus that its DBC file defines. cantools receives them as bytes
 with their message already looked up, and runs ``message.decode(decode_choices=False)`` on each.
 Ours also looks up, checks and accounts for every frame of the bus, and sorts the rows by message.
-The cases alternate, and ratios are taken round by round. Every value is compared before. Times are
-CPU seconds of one thread, because other work on the machine would hide milliseconds; a case of a
-few milliseconds is repeated ten times. The recordings are in $CROSSCUE_DATA or ../shared/data.
+The cases alternate, and ratios are taken round by round. All values are compared before timing.
+Times are CPU seconds of one thread, because other work on the machine would hide milliseconds; a
+case of a few milliseconds is repeated ten times. The recordings are in $CROSSCUE_DATA or
+../shared/data.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ FORD = DATA / "can/ford_fusion_2017"
 
 @dataclass(frozen=True, slots=True)
 class Bus:
-    """A recorded bus and the file that explains it."""
+    """A recorded bus and its DBC file."""
 
     name: str
     block: Block
@@ -76,7 +77,7 @@ def block_of(
 
 
 class Cantools:
-    """Decode frame by frame, with the message of each already looked up."""
+    """Decode frame by frame with cantools; messages are looked up before."""
 
     def __init__(self, bus: Bus, database: CanDatabase) -> None:
         parsed = dbc.load_string(bus.dbc.read_text(encoding="utf-8"), False).messages
@@ -94,7 +95,7 @@ class Cantools:
                 self.row.append((key, i))
 
     def __call__(self) -> None:
-        """Decode every frame."""
+        """Decode every frame with crosscue."""
         for message, payload in self.work:
             message.decode(payload, decode_choices=False)
 
@@ -108,7 +109,7 @@ def ours(bus: Bus, database: CanDatabase, engine: EngineName) -> Callable[[], li
 
 
 def count_equal(database: CanDatabase, theirs: Cantools, blocks: list[Block]) -> int:
-    """Compare every value; messages with overlapping signals cantools decodes shifted."""
+    """Return the number of compared values; overlapping signals, which differ, are left out."""
     names = {m.key: m.topic_name for m in database.messages if not any(overlaps(m))}
     following = dict.fromkeys((b.topic for b in blocks), 0)
     by_topic: dict[str, list[Block]] = {}

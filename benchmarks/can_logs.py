@@ -1,6 +1,6 @@
 """Read CAN logs with our readers and with python-can, alternating, and print the ratios.
 
-The Ford candump is real; the other formats hold the same frames, written by python-can. Both
+The Ford candump is real; the other formats contain the same frames, written by python-can. Both
 sides must return the same number of frames. Ours yields columns, python-can an object per frame.
 """
 
@@ -28,7 +28,7 @@ FORD = "can/ford_fusion_2017/acc_on_speed_changing_from_30km_to_80km_per_hour.ca
 
 
 def ours(path: Path) -> int:
-    """Frames that our reader yields."""
+    """Return the number of frames that our reader yields."""
     ledger = Ledger(str(path))
     with open_log(path) as log:
         count = sum(len(block) for block in log.read(ledger))
@@ -38,13 +38,13 @@ def ours(path: Path) -> int:
 
 
 def theirs(path: Path) -> int:
-    """Frames that python-can yields."""
+    """Return the number of frames that python-can yields."""
     with can.LogReader(path) as reader:
         return sum(1 for _ in reader)
 
 
 def originals(folder: Path, data: Path, repeat: int) -> list[Path]:
-    """One file of each format, all with the same frames."""
+    """Write one file of each format, all with the same frames."""
     ford = data / FORD
     content = ford.read_bytes() if ford.exists() else candump(random_frames(41_250, fd=False))
     if not ford.exists():
@@ -65,7 +65,7 @@ def originals(folder: Path, data: Path, repeat: int) -> list[Path]:
 
 
 def seconds(read: Callable[[Path], int], path: Path) -> tuple[float, int]:
-    """Duration of one pass, and its counts."""
+    """Return the duration and the counts of one pass."""
     began = time.perf_counter()
     count = read(path)
     return time.perf_counter() - began, count

@@ -1,8 +1,8 @@
-"""False car cues of a simulated study: each positive car beside the true one.
+"""False car cues of a simulated study: each positive car compared with the true car.
 
 Run it as ``python benchmarks/car_cues.py STUDY`` on the folder of ``crosscue study intersections``.
 Every car that counted as cross traffic (eq. 15) or parked (eq. 16) is matched with the nearest true
-car of the drive's ``objects.json``, and counted by what that car does.
+car of the drive's ``objects.json``, and counted by the motion of that car.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from support.perfect_boxes import role_at, true_cars
 
 
 def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, float]]:
-    """Time, cue and place of every car that counted."""
+    """Yield time, cue and image position of every car that counted for a cue."""
     found = run.drive_manifest().detected
     assert found is not None
     before: CarShapes | None = None
@@ -56,7 +56,7 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
 
 
 def is_true(truth: Truth, cue: str, t_ns: int) -> bool | None:
-    """Truth of the cue in the frame, whichever car was meant; None if unknown."""
+    """Return the truth of the cue in the frame, independent of the car; None if unknown."""
     at = cue_at([one for one in truth.cues if one.cue == cue], np.array([t_ns], np.int64))
     return None if at.present[0] < 0 else bool(at.present[0])
 

@@ -48,11 +48,11 @@ REASONS = (
     "detected with too low a score, or for the first time",
     "not detected",
 )
-"""Unmet conditions, from the last condition of the rule to the first."""
+"""Names of unmet conditions, from the last condition of the rule to the first."""
 
 
 class Missed(NamedTuple):
-    """A frame without a positive: the reason, and the car that meets most conditions."""
+    """A missed frame: the reason, and distance and visible fraction of the best car."""
 
     reason: str
     distance_m: float
@@ -60,7 +60,7 @@ class Missed(NamedTuple):
 
 
 def reason_of(car: CarMotion, vehicle: Vehicle, place: Place | None) -> str:
-    """Return the first condition that a followed car does not meet; ``FOUND`` without any."""
+    """Return the first condition that a tracked car does not meet; ``FOUND`` if it meets all."""
     rules, ahead_mps = vehicle.cars, abs(car.ahead_mps)
     is_aside = abs(car.bearing) * car.distance_m > rules.past_aside_m
     failed = (
@@ -76,7 +76,7 @@ def reason_of(car: CarMotion, vehicle: Vehicle, place: Place | None) -> str:
 
 
 def places(run: RunFolder) -> dict[int, Place]:
-    """The intersection's place after each frame, by time."""
+    """Return the position of the intersection after each frame, by time."""
     found: dict[int, dict[str, tuple[float, float]]] = {}
     for row in run.table("range").to_pylist():
         known = found.setdefault(row["t_ns"], {})
@@ -89,7 +89,7 @@ def places(run: RunFolder) -> dict[int, Place]:
 
 
 def owner(box_px: Sequence[float], boxes: Boxes, rows: np.ndarray) -> int | None:
-    """Row of the 3-D box that a box in the picture overlaps most."""
+    """Return the row of the 3-D box that a box in the picture overlaps most."""
     overlaps = [iou(boxes.outline_px[row], np.asarray(box_px)) for row in rows]
     best = int(np.argmax(overlaps)) if overlaps else 0
     return int(rows[best]) if overlaps and overlaps[best] > MIN_IOU else None
@@ -108,7 +108,7 @@ def why_missed(
 
     def is_same(box_px: Sequence[float]) -> bool:
         found = owner(box_px, boxes, rows)
-        # Most cars are boxed twice.
+        # Most cars have two 3-D boxes.
         return found is not None and bool(
             np.hypot(*(boxes.at_m[found] - boxes.at_m[row])) < BEHIND_M
         )
@@ -121,7 +121,7 @@ def why_missed(
 
 
 def main() -> None:
-    """Print how many frames each reason costs, for both ways."""
+    """Print the number of frames missed for each reason, for both directions."""
     run, sequence = open_run(Path(sys.argv[1])), Path(sys.argv[2])
     manifest, poses = run.drive_manifest(), read_poses(sequence)
     assert manifest.detected is not None

@@ -35,7 +35,7 @@ SQL = (
 
 
 def main() -> None:
-    """Make, index, open, group, print."""
+    """Write the synthetic runs, and time indexing, opening and grouping."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=100_000)
     parser.add_argument("--approaches", type=int, default=10, help="of each run")
@@ -85,7 +85,7 @@ def _grouped(path: Path) -> pa.Table:
 
 
 def _timed(work: Callable[[], object], times: int = 3) -> tuple[float, float]:
-    """CPU and wall seconds."""
+    """Return the lowest CPU and wall seconds of several calls."""
     found = []
     for _ in range(times):
         cpu, wall = time.process_time(), time.perf_counter()

@@ -1,10 +1,10 @@
-"""Convert a ROS 1 bag to MCAP: ours beside ``rosbags.convert``, the same work in one run.
+"""Convert a ROS 1 bag to MCAP: ours next to ``rosbags.convert``, in one run.
 
     python benchmarks/conversion.py [rounds]
 
 There are two simulated logs: a drive (30 s with 450 pictures of 150 kB of noise, which is as
 incompressible as JPEG, 60,000 CAN frames and 3,000 IMU messages) and the same without pictures.
-Both write zstd chunks; only ours writes checksums. "and read back" is the whole command, which
+Both write zstd chunks; only ours writes checksums. "and read back" is the complete command, which
 reads the new file again with every checksum. The cases alternate after one warm-up round, and
 ratios are taken round by round. The messages of both outputs are compared before timing.
 """
@@ -44,7 +44,7 @@ ROUNDS = 7
 
 
 def messages(*, with_pictures: bool) -> Iterator[tuple[int, str, str, bytes]]:
-    """Time, topic, type and ROS 1 bytes of every message, in time order."""
+    """Yield time, topic, type and ROS 1 bytes of every message, in time order."""
     rng = np.random.default_rng(0)
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(FRAME, "can_msgs/msg/Frame"))
@@ -111,7 +111,7 @@ def ours_read_back(bag: Path, out: Path) -> Path:
 
 def peer(bag: Path, out: Path) -> Path:
     folder = Path(tempfile.mkdtemp(dir=out.parent)) / "peer"
-    # A target store makes it transcribe to ROS 2, as ours does.
+    # With a target type store, rosbags converts to ROS 2 serialisation, as ours does.
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(FRAME, "can_msgs/msg/Frame"))
     rosbags_convert([bag], folder, "mcap", 9, "zstd", "storage", None, store, (), (), (), ())

@@ -1,4 +1,4 @@
-"""Draw docs/simulated_detections.jpg: what was found in some drives of a study, in one picture.
+"""Draw docs/simulated_detections.jpg: detections in some drives of a study, in one picture.
 
     crosscue study intersections --runs 10 -o study
     python benchmarks/detection_sheet.py study -o docs/simulated_detections.jpg
@@ -19,11 +19,11 @@ from crosscue.eval.studies.intersections.contact_sheet import write_sheet
 
 RUNS: Final = (1, 4, 6, 9)
 QUALITY: Final = 60
-"""Of the JPEG; the page that shows it should load quickly."""
+"""Quality of the JPEG, low so that its page loads quickly."""
 
 
 def main() -> None:
-    """Draw."""
+    """Draw the sheet."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("study", type=Path, help="what crosscue study intersections wrote")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="JPEG")

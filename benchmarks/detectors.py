@@ -42,7 +42,7 @@ VEHICLE = Vehicle(version=1)
 
 
 def stored_frames() -> list[Detections]:
-    """Five cars a frame, each with a mask of 120 by 45 pixels."""
+    """Return frames of five cars, each with a mask of 120 by 45 pixels."""
     rng = np.random.default_rng(1)
     found = []
     for t in range(FRAMES):
@@ -56,7 +56,7 @@ def stored_frames() -> list[Detections]:
 
 
 def cue_seconds(found: list[Detections]) -> float:
-    """One pass over all frames, CPU time."""
+    """Return the CPU seconds of one pass over all frames."""
     cues = CuePass(VEHICLE)
     began = time.process_time()
     for one in found:
@@ -65,7 +65,7 @@ def cue_seconds(found: list[Detections]) -> float:
 
 
 def decode_seconds() -> None:
-    """A simulated picture for networks of several widths, ours and the peer in turn, CPU time."""
+    """Print CPU times of decoding for several network widths, ours and the peer alternating."""
     settings = SceneSettings("L800", 1)
     _, _, world = world_of(settings)
     shown = Renderer(world, settings.camera, settings.picture).picture(5.0)
@@ -91,7 +91,7 @@ def decode_seconds() -> None:
 
 
 def camera(folder: Path) -> Path:
-    """Simulated JPEG pictures."""
+    """Write a folder of simulated JPEG pictures."""
     from support.sign_scenes import clutter
 
     folder.mkdir()
@@ -103,7 +103,7 @@ def camera(folder: Path) -> Path:
 
 
 def detect_seconds(log_path: Path, run_path: Path, cache: Path) -> float:
-    """One run of the sign detector."""
+    """Return the seconds of one run of the sign detector."""
     run = create(run_path, overwrite=True)
     began = time.perf_counter()
     with open_log(log_path) as log:
@@ -112,7 +112,7 @@ def detect_seconds(log_path: Path, run_path: Path, cache: Path) -> float:
 
 
 def main() -> None:
-    """All subjects."""
+    """Print the results of all three measurements."""
     cv2.setNumThreads(1)
     found = stored_frames()
     taken = median(cue_seconds(found) for _ in range(ROUNDS))

@@ -38,7 +38,7 @@ _OVERSIZE: Final = 8
 
 
 def main() -> None:
-    """Write all pictures into the folder given."""
+    """Write all pictures to the given folder."""
     into = Path(sys.argv[1])
     for name in ("detectors", "scenes"):
         (into / name).mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def grey_sign(kind: Kind, height_px: int) -> Bytes:
-    """One sign for the detector: drawn large, then shrunk; edges are as soft as a camera's."""
+    """Return a sign for the detector, reduced from a larger drawing to soften its edges."""
     size = size_of(kind, height_px)
     width, height = size[0] * _OVERSIZE, size[1] * _OVERSIZE
     if kind.startswith("one way"):
@@ -62,7 +62,7 @@ def grey_sign(kind: Kind, height_px: int) -> Bytes:
 
 
 def stop(size_px: int = 256) -> Rgba:
-    """A red octagon with white border and the word STOP."""
+    """Return a red octagon with white border and the word STOP."""
     n = size_px * OVER
     canvas = _blank(n, n)
     _fill(canvas, _octagon(n, 0.5), WHITE)
@@ -72,7 +72,7 @@ def stop(size_px: int = 256) -> Rgba:
 
 
 def do_not_enter(size_px: int = 256) -> Rgba:
-    """A white square, a red disc with a white bar, DO NOT above it and ENTER below."""
+    """Return a red disc with a white bar on a white square, between DO NOT and ENTER."""
     n = size_px * OVER
     canvas = _blank(n, n)
     _fill(canvas, _box(n, 0.0, 0.0, 1.0, 1.0), WHITE)
@@ -84,17 +84,17 @@ def do_not_enter(size_px: int = 256) -> Rgba:
 
 
 def one_way_left(size_px: int = 256) -> Rgba:
-    """A black board with a white arrow to the left, ONE WAY in it."""
+    """Return a black board with a white arrow to the left that contains ONE WAY."""
     return _one_way(size_px, points_left=True)
 
 
 def one_way_right(size_px: int = 256) -> Rgba:
-    """A black board with a white arrow to the right, ONE WAY in it."""
+    """Return a black board with a white arrow to the right that contains ONE WAY."""
     return _one_way(size_px, points_left=False)
 
 
 def speed_limit(size_px: int = 256) -> Rgba:
-    """A white board: SPEED LIMIT 30."""
+    """Return a white board with the text SPEED LIMIT 30."""
     n = size_px * OVER
     canvas = _blank(n, n * 5 // 4)
     high = canvas.shape[0] / n
@@ -167,7 +167,7 @@ def _word(
     rgb: Rgb,
     stroke: float,
 ) -> None:
-    """Letters of one stroke, stretched into a box: places and sizes in canvas widths."""
+    """Draw single-stroke letters stretched to a box; sizes are in widths of the canvas."""
     n = canvas.shape[1]
     letters: NDArray[np.uint8] = np.zeros((400, 200 * len(text) + 200), np.uint8)
     cv2.putText(letters, text, (60, 290), cv2.FONT_HERSHEY_SIMPLEX, 8.0, 255, 1)

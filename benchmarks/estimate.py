@@ -48,17 +48,17 @@ residual_sd_m = 5.9
 
 
 class Busy:
-    """Six objects with masks in every frame; its pictures are not examined."""
+    """Detector that returns six objects with masks in every frame and ignores the picture."""
 
     view = View(min_width_px=64)
     identity = "busy 1"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """Objects of a seed that each frame's time gives."""
+        """Return random objects of each frame, seeded by its time."""
         return [self._of(frame) for frame in frames]
 
     def _of(self, frame: Frame) -> Found:
-        # Each object stays for some seconds and moves a little, so that cars are found again.
+        # Each object stays for some seconds and moves slightly, so that cars are matched again.
         rng = np.random.default_rng(frame.t_ns // STAYS_NS)
         corner = np.column_stack([rng.integers(0, 1100, 6), rng.integers(100, 600, 6)])
         corner[:, 0] += frame.t_ns % STAYS_NS * 50 // STAYS_NS
@@ -80,12 +80,12 @@ def _outline(width: int, height: int) -> np.ndarray[tuple[int, int], np.dtype[np
 
 
 def build() -> Busy:
-    """For ``--detectors``."""
+    """Build the detector; the function that ``--detectors`` names."""
     return Busy()
 
 
 def pictures(times: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Block:
-    """A grey JPEG for each time, padded to a usual size with noise that no codec can shrink."""
+    """Return a grey JPEG for each time, padded to a typical size with incompressible noise."""
     import cv2
 
     _, coded = cv2.imencode(".jpg", np.full((SIZE[1], SIZE[0], 3), 128, np.uint8))
@@ -101,7 +101,7 @@ def pictures(times: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Block:
 
 
 def write_log(path: Path, settings: DriveSettings) -> float:
-    """The log; its length in seconds."""
+    """Write the log and return its length in seconds."""
     motion = drive(settings)
     first, last = int(motion.t_ns[0]), int(motion.t_ns[-1])
     with LogWriter(path, Ledger(str(path))) as writer:
@@ -119,7 +119,7 @@ def write_log(path: Path, settings: DriveSettings) -> float:
 
 
 def main() -> None:
-    """Make the drive once, estimate it several times."""
+    """Write the drive once and estimate it several times."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
     settings = DriveSettings(blocks=max(4, round(minutes * 60.0 / SECONDS_PER_BLOCK)))
     with tempfile.TemporaryDirectory() as name:

@@ -1,7 +1,7 @@
-"""Frames per second of the fusion, and its belief beside GTSAM's.
+"""Frames per second of the fusion, and its belief compared with GTSAM's.
 
 A synthetic drive of ten minutes at ten frames per second passes an intersection every 130 m. The
-whole loop has no peer (its range filter is filterpy's). Its belief is measured beside GTSAM's
+complete loop has no peer (its range filter is filterpy's). Its belief is compared with GTSAM's
 discrete factor graph (the previous belief as priors, a factor for each message, marginals after
 each frame). Both alternate within one run, because timings of different runs are not comparable.
 Times are CPU times of the process, which a busy machine affects little.
@@ -52,7 +52,7 @@ def drive() -> list[FrameEvidence]:
 
 
 def learned() -> Fusion:
-    """As if for every edge of the usual graph something had been learned."""
+    """Return made-up learned rates for every edge of the default graph."""
     usual = Fusion()
     rates = tuple(
         Rates(cue=name, feature=feature, near=near, if_there=0.5, if_not=0.2)
@@ -94,7 +94,7 @@ def gtsam_belief(evidence: list[FrameEvidence]) -> int:
                 yes = precision[edge.cue] if edge.is_direct else 1.0 - precision[edge.cue]
                 factors.add(keys[edge.feature], [1.0 - yes, yes])
         marginals = gtsam.DiscreteMarginals(factors)
-        # Kept off the ends, where the product would stay for good.
+        # Clipped away from 0 and 1, from which the product would never return.
         now = {
             name: min(max(float(marginals.marginalProbabilities(key)[1]), 1e-12), 1.0 - 1e-12)
             for name, key in keys.items()

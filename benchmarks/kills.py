@@ -36,13 +36,13 @@ MIN_S = 0.001
 
 
 class Bright:
-    """One box around the brightest pixel of each frame: quick, and every frame differs."""
+    """Fast detector of one box around the brightest pixel, which differs in every frame."""
 
     view = View(min_width_px=64)
     identity = "bright 1"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
-        """A box a frame."""
+        """Return one box for each frame."""
         return [self._of(frame) for frame in frames]
 
     def _of(self, frame: Frame) -> Found:
@@ -53,12 +53,12 @@ class Bright:
 
 
 def build() -> Bright:
-    """For ``--detectors``."""
+    """Build the detector; the function that ``--detectors`` names."""
     return Bright()
 
 
 def contents(run: Path) -> dict[str, str]:
-    """From a file's name to the hash of what it holds; the manifest's times are left out."""
+    """Return the hash of each file by its name, except of the manifest, which has timings."""
     found = {}
     for path in sorted(run.rglob("*")):
         if path.is_file() and path.name != "manifest.json" and not path.name.startswith("."):
@@ -67,7 +67,7 @@ def contents(run: Path) -> dict[str, str]:
 
 
 def started(argv: list[str]) -> int:
-    """A process with everything imported already, running one command line in silence."""
+    """Fork a process that runs a command line without output; return its id."""
     child = os.fork()
     if child:
         return child
@@ -78,14 +78,14 @@ def started(argv: list[str]) -> int:
 
 
 def ended(child: int) -> int:
-    """Its exit status; minus the signal's number if it was killed."""
+    """Return the exit status of a process; the negative signal number if it was killed."""
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def kill_and_resume(
     argv: list[str], run: Path, after_s: float, right: dict[str, str]
 ) -> tuple[list[str], float]:
-    """Outcome of a killed replay, of its remains and of the resumed replay, with durations."""
+    """Return the outcomes of a killed and resumed replay, and the seconds of the latter."""
     child = started(argv)
     time.sleep(after_s)
     os.kill(child, signal.SIGKILL)
@@ -98,7 +98,7 @@ def kill_and_resume(
 
 
 def main() -> None:
-    """Kill, resume, compare."""
+    """Kill, resume and compare replays, and print the counts."""
     kills = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     rng = random.Random(int(sys.argv[2]) if len(sys.argv) > 2 else 0)
     sys.modules["kills"] = sys.modules[__name__]
@@ -146,7 +146,7 @@ def main() -> None:
 
 
 def after_kill(run: Path, right: dict[str, str]) -> str:
-    """State of a killed run: it may be unfinished, but never wrong."""
+    """Return the state of a killed run, which may be incomplete but not wrong."""
     try:
         manifest = open_run(run).manifest()
     except RunError:

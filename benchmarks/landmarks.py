@@ -56,7 +56,7 @@ def build(path: Path, count: int) -> float:
 
 
 def measure(path: Path, count: int) -> dict[str, float]:
-    """One size, in this process: milliseconds a frame and memory."""
+    """Return milliseconds per frame and memory for one size, measured in this process."""
     side_m = SPACING_M * np.ceil(np.sqrt(count))
     rng = np.random.default_rng(2)
     seen = some_features(7, 500)
@@ -109,7 +109,7 @@ def growth(sizes: list[int]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """A frame, its true position, and the position estimated by the filter."""
+    """A frame with its true position and the position estimated by the filter."""
 
     seen: Features
     true_m: Floats
@@ -174,7 +174,7 @@ def simulated_walls() -> None:
 
 
 def real_street(data: Path) -> None:
-    """KITTI frames 0 to 30 every 10 m as landmarks, with strangers; 15 frames lie beyond."""
+    """Compare on KITTI: frames 0, 10, 20, 30 and other places are landmarks, the rest queries."""
     folder = data / "sequences" / "kitti_seq2_right_turn_98deg"
     strangers = sorted((data / "place_recognition").rglob("*.jpg"))
     if not folder.is_dir():
@@ -196,7 +196,7 @@ def real_street(data: Path) -> None:
 
 
 def real_days(data: Path) -> None:
-    """Eight pairs of one place on different days, labelled by eye; 178 pairs of two places."""
+    """Compare eight pairs of one place on different days, labelled by eye, with other pairs."""
     folder = data / "place_recognition"
     if not folder.is_dir():
         return

@@ -6,7 +6,7 @@ The first part uses tiny drives (a run folder with eight small tables each) to m
 and merging: a plain loop, our engines with their journal, with and without merging, and
 ``concurrent.futures`` as the peer, alternating. The second part is ``crosscue replay`` of simulated
 town drives with a camera and cached detections, with one worker and with two. The third part is the
-merging of tables, beside reading all of them and writing one.
+merging of tables, next to reading all of them and writing one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 
-import estimate  # type: ignore[import-not-found]  # beside this script
+import estimate  # type: ignore[import-not-found]  # next to this script
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -52,13 +52,13 @@ kind = "estimate:build"
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """Minimal work that the engine requires."""
+    """Result of the minimal work that the engine requires."""
 
     exit_status: int = 0
 
 
 def tiny(job: Job) -> Written:
-    """A minimal drive."""
+    """Write a minimal run."""
     run = create(job.run, overwrite=True)
     with locked(run):
         clear(run)
@@ -84,7 +84,7 @@ def loop(jobs: Sequence[Job]) -> None:
 
 
 def merged(jobs: Sequence[Job]) -> None:
-    """As ``replay`` of many drives does it."""
+    """Run and merge the drives as ``replay`` of many drives does."""
     run_many(jobs, tiny, Processes(1))
     runs, failures = gathered([jobs[0].run.parent])
     merge_runs(runs, create(jobs[0].run.parent.parent / "merged", overwrite=True), failures)
@@ -141,7 +141,7 @@ def engines(folder: Path, rounds: int, drives: int) -> None:
 
 
 def town_drives(folder: Path, count: int, minutes: float) -> float:
-    """Drive folders; seconds of log in all."""
+    """Write drive folders and return the total seconds of their logs."""
     dbc = Path(__file__).parent.parent / "datasets" / "simulated" / "simulated_car.dbc"
     seconds = 0.0
     for seed in range(count):

@@ -1,9 +1,9 @@
-"""Mask R-CNN: our detector beside a plain torchvision loop, with the same weights and pictures.
+"""Mask R-CNN: our detector next to a plain torchvision loop, with equal weights and pictures.
 
 Times are medians on one thread, alternating: CPU seconds per picture, and the ratio to the plain
 loop by CPU and by wall time. The plain loop is torchvision's: 1000 proposals, scores from 0.05,
 every mask pasted into the picture. The script then counts which of its detections above a score
-ours has as well (same class, every side within half a pixel). As the pictures are simulated, it
+ours also has (same class, every side within half a pixel). As the pictures are simulated, it
 also counts correct, duplicate and false detections.
 
 The ResNet-50 has random weights, because COCO's are not available here. Its scores follow from a
@@ -61,7 +61,7 @@ PLAIN: Final = "torchvision, 1000 proposals, pasted"
 SAME_PX: Final = 0.5
 RIGHT_OVERLAP: Final = 0.3
 CUE_SCORES: Final = {"car": 0.95, "stop sign": 0.9, "traffic light": 0.9}
-"""Calibrated scores from which the cues take a detection."""
+"""Calibrated scores above which the cues use a detection."""
 SURE, COMPETING, REMAINING = 5, 60, 20
 
 Way = Callable[[Frame], Any]
@@ -78,7 +78,7 @@ class Scene:
 
 
 def scenes() -> list[Scene]:
-    """Simulated pictures of intersections that no network was trained on."""
+    """Render simulated pictures of intersections that no network was trained on."""
     taken = []
     for layout in LAYOUTS:
         _, _, world = world_of(SceneSettings(layout=layout))
@@ -96,7 +96,7 @@ def scenes() -> list[Scene]:
 
 @dataclass(frozen=True, slots=True)
 class PlainLoop:
-    """Torchvision's own loop, on the part of the picture that ours examines."""
+    """Torchvision's inference on the part of the picture that ours uses."""
 
     network: Any
     plan: Plan
@@ -105,7 +105,7 @@ class PlainLoop:
         """Return the detections with pasted masks."""
         placed = place(frame.pixels, self.plan).pixels
         height, width = placed.shape[:2]
-        # A size equal to the picture's: torchvision's transform then scales nothing.
+        # The size equals the picture's, so that torchvision's transform does not scale it.
         self.network.transform = GeneralizedRCNNTransform(height, width, list(MEAN), list(SPREAD))
         rgb = np.ascontiguousarray(placed[:, :, ::-1].transpose(2, 0, 1))
         with torch.inference_mode():
@@ -113,7 +113,7 @@ class PlainLoop:
         return dict(found)
 
     def detections(self, frame: Frame) -> Detections:
-        """The same in the frame's pixels, without masks."""
+        """Return the detections in the frame's pixels, without masks."""
         found = self(frame)
         placed = place(frame.pixels, self.plan)
         boxes = found["boxes"].double().numpy() + np.tile(placed.corner_px, 2)
@@ -129,7 +129,7 @@ class PlainLoop:
 
 
 def plain_loop(checkpoint: Checkpoint) -> PlainLoop:
-    """A copy of the network with torchvision's own limits."""
+    """Return a copy of the network with torchvision's default limits."""
     network = copy.deepcopy(checkpoint.network)
     set_limits(network, 1000, 0.05)
     network.rpn._pre_nms_top_n["testing"] = 1000
@@ -137,24 +137,24 @@ def plain_loop(checkpoint: Checkpoint) -> PlainLoop:
 
 
 def raw_detector(checkpoint: Checkpoint, **changes: Any) -> MaskRcnnDetector:
-    """Ours without calibration, so that scores can be compared; with limits of its own."""
+    """Return our detector without calibration, so that scores can be compared."""
     network = copy.deepcopy(checkpoint.network)
     bare = replace(checkpoint, network=network, facts=Facts(plan=checkpoint.facts.plan))
     return detector_of(bare, MaskRcnnSettings.model_validate({"score": 0.5, **changes}), CPU)
 
 
 def one_result(detector: MaskRcnnDetector, frame: Frame) -> Detections:
-    """Its detections in one frame."""
+    """Return a detector's detections in one frame."""
     (found,) = detector([frame])
     assert isinstance(found, Detections)
     return found
 
 
 class WholeOnnx:
-    """The plain loop's network, exported whole, in onnxruntime on one thread."""
+    """The network of the plain loop, exported completely, in onnxruntime on one thread."""
 
     def __init__(self, checkpoint: Checkpoint, proposals: int, example: Frame) -> None:
-        """Export for the example's size, with the score that ours has here."""
+        """Export for the size of the example, with the same minimum score as ours."""
         onnxruntime: Any = import_module("onnxruntime")
         self.plan = checkpoint.facts.plan
         network = copy.deepcopy(checkpoint.network)
@@ -179,7 +179,7 @@ class WholeOnnx:
         return torch.from_numpy(np.ascontiguousarray(rgb)).float() / 255.0
 
     def __call__(self, frame: Frame) -> Detections:
-        """The same as ours, without masks, though it pastes them."""
+        """Return the detections without the masks, which it nevertheless pastes."""
         name = self.session.get_inputs()[0].name
         found, labels, scores, _ = self.session.run(None, {name: self._input(frame).numpy()})
         placed = place(frame.pixels, self.plan)
@@ -191,7 +191,7 @@ class WholeOnnx:
 
 
 def whole_onnx(checkpoint: Checkpoint, counts: Sequence[int], seen: Sequence[Scene]) -> None:
-    """Print ours beside the exported network: CPU time, and whether detections are equal."""
+    """Print CPU times of ours and the exported network, and the equality of detections."""
     for count in (min(counts), max(counts)):
         ours = raw_detector(checkpoint, proposals=count)
         theirs = WholeOnnx(checkpoint, count, seen[0].frame)
@@ -214,7 +214,7 @@ def whole_onnx(checkpoint: Checkpoint, counts: Sequence[int], seen: Sequence[Sce
 
 
 def our_ways(checkpoint: Checkpoint, counts: Sequence[int]) -> dict[str, MaskRcnnDetector]:
-    """Ours with so many proposals; in OpenVINO with the fewest and the most."""
+    """Return ours for each number of proposals; in OpenVINO for the lowest and the highest."""
     ways = {}
     for backend, of_backend in (("torch", counts), ("openvino", (min(counts), max(counts)))):
         try:
@@ -228,7 +228,7 @@ def our_ways(checkpoint: Checkpoint, counts: Sequence[int]) -> dict[str, MaskRcn
 
 
 def in_rotation(ways: Mapping[str, Way], frames: Sequence[Frame]) -> None:
-    """Print each way's median time and how many times as fast as the first, frame by frame."""
+    """Print the median time of each way, and the median ratio to the first by frame."""
     for way in ways.values():
         way(frames[0])
     cpu_s: dict[str, list[float]] = {name: [] for name in ways}
@@ -253,13 +253,13 @@ def _faster(first: Sequence[float], other: Sequence[float]) -> float:
 
 
 def above(found: Detections, min_score: Least) -> list[int]:
-    """Detections whose score reaches the min score of their class, best first."""
+    """Return the indices of detections from the minimum score of their class, best first."""
     kept = [i for i, label in enumerate(found.labels) if found.scores[i] >= min_score(label)]
     return sorted(kept, key=lambda i: -float(found.scores[i]))
 
 
 def matches(theirs: Detections, ours: Detections, min_score: Least) -> Counter[str]:
-    """Number of detections in both, and in only one of them."""
+    """Return the number of detections in both, and in only one of them."""
     free, counts = set(above(ours, min_score)), Counter[str]()
     for i in above(theirs, min_score):
         apart_px = {
@@ -278,7 +278,7 @@ def matches(theirs: Detections, ours: Detections, min_score: Least) -> Counter[s
 
 
 def judged(found: Detections, scene: Scene, min_score: Least) -> Counter[str]:
-    """Numbers of correct, duplicate and false detections."""
+    """Return the numbers of correct, duplicate and false detections."""
     counts, met = Counter[str](), set[int]()
     for i in above(found, min_score):
         fractions = [
@@ -301,7 +301,7 @@ def reported_equality(
     levels: Mapping[str, Least],
     is_true: bool,
 ) -> None:
-    """Print the plain loop's detections that ours finds, and with truth, the correct ones."""
+    """Print the plain loop's detections that ours finds and, with truth, the correct ones."""
     theirs = [plain.detections(scene.frame) for scene in seen]
     found = {name: [one_result(d, s.frame) for s in seen] for name, d in ours.items()}
     for level, min_score in levels.items():
@@ -327,7 +327,7 @@ def reported_equality(
 
 
 def score_levels(checkpoint: Checkpoint) -> dict[str, Least]:
-    """A raw score of one half, and the scores from which the cues take detections."""
+    """Return the minimum raw scores: one half, and those above which cues use detections."""
     by = checkpoint.facts.calibration
     cues = {
         name: raw_score(min_score, by.get(name, Calibration()))
@@ -340,10 +340,10 @@ def score_levels(checkpoint: Checkpoint) -> dict[str, Least]:
 
 
 class Ranked(nn.Module):
-    """A box predictor whose boxes are its own and whose scores follow a proposal's rank."""
+    """A box predictor that keeps its boxes and scores them by the rank of their proposal."""
 
     def __init__(self, plain: Any, classes: int) -> None:
-        """Rows of the table are ranks: sure, then competing, then background."""
+        """Rows of the score table are ranks: certain, then competing, then background."""
         super().__init__()
         self.plain = plain
         logits = torch.full((2000, classes), -12.0)
@@ -353,20 +353,20 @@ class Ranked(nn.Module):
         self.logits = nn.Parameter(logits, requires_grad=False)
 
     def forward(self, pooled: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits of classes, and shifts."""
+        """Return the logits of the classes and the shifts of the boxes."""
         own, shifts = self.plain(pooled)
         return self.logits[: own.shape[0]] + 0.0 * own, shifts
 
 
 def random_resnet() -> Checkpoint:
-    """A ResNet-50 with random weights and scores by rank."""
+    """Return a ResNet-50 with random weights and scores by rank."""
     torch.manual_seed(0)
     names = ("car", *(f"class {i}" for i in range(89)))
     plan = Plan(architecture="resnet50", classes=names, width_px=800)
     network = build_network(plan)
     heads = network.roi_heads
     with torch.no_grad():
-        # Shifts of a tenth of a box, as learnt ones are; else rounding moves boxes by pixels.
+        # Shifts of a tenth of a box, as in trained networks; larger ones amplify rounding.
         network.rpn.head.bbox_pred.weight.mul_(0.05)
         heads.box_predictor.bbox_pred.weight.mul_(0.05)
     heads.box_predictor = Ranked(heads.box_predictor, len(names) + 1)
@@ -391,7 +391,7 @@ def compare(
 
 
 def main() -> None:
-    """Print all."""
+    """Print the comparisons for each network."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--network", default="embedded", help="a checkpoint instead")
     parser.add_argument(

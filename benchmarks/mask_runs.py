@@ -1,4 +1,4 @@
-"""Masks as COCO's runs: ours beside pycocotools, on an ellipse in a picture of 1280 x 720."""
+"""Masks as COCO run lengths: ours next to pycocotools, on an ellipse in a picture of 1280 x 720."""
 
 from __future__ import annotations
 

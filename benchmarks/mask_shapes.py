@@ -32,13 +32,13 @@ LONG: Final = 2.0
 """Min length over height of cars that the cues evaluate."""
 
 Pair = tuple[Floats, Floats, bytes, bytes, LabelledPicture]
-"""The box found, the true box, the mask found, the true mask, the picture."""
+"""Detected box, true box, detected mask, true mask and picture."""
 
 
 def pairs(
     labelled: LabelledSet, found: Sequence[Detections], name: str, score: float
 ) -> Iterator[Pair]:
-    """Detections of a class above a score that lie over an object of it."""
+    """Yield detections of a class above a score that overlap an object of that class."""
     for picture, detections in zip(labelled.pictures, found, strict=True):
         truth = [one for one in picture.objects if CLASSES[one.label] == name]
         boxes = np.array([one.box_px for one in truth], np.float64).reshape(-1, 4)
@@ -53,13 +53,13 @@ def pairs(
 
 
 def height_px(mask: bytes, size_px: tuple[int, int]) -> int:
-    """Rows from the first to the last with the object."""
+    """Return the number of rows from the first to the last row of the object."""
     rows = np.flatnonzero(rle.decode(mask, size_px).any(axis=1))
     return int(rows[-1] - rows[0]) + 1
 
 
 def print_heights(labelled: LabelledSet, found: Sequence[Detections], name: str) -> None:
-    """Height found over the true one."""
+    """Print the ratio of detected to true height."""
     ratios = [
         height_px(own, picture.size_px) / height_px(true, picture.size_px)
         for _, _, own, true, picture in pairs(labelled, found, name, 0.9)
@@ -71,7 +71,7 @@ def print_heights(labelled: LabelledSet, found: Sequence[Detections], name: str)
 
 
 def print_noses(labelled: LabelledSet, found: Sequence[Detections]) -> None:
-    """Fraction of masks whose nose is at the same end as in the true mask."""
+    """Print the fraction of masks whose nose is at the same end as in the true mask."""
     agree: list[bool] = []
     for found_px, box, own, true, picture in pairs(labelled, found, "car", 0.95):
         is_whole = box[0] > 1.0 and box[2] < picture.size_px[0] - 1.0
@@ -86,7 +86,7 @@ def print_noses(labelled: LabelledSet, found: Sequence[Detections]) -> None:
 
 
 def main() -> None:
-    """Print all."""
+    """Print heights and noses of a labelled set."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="with coco.json and images")
     parser.add_argument("--network", default="embedded")

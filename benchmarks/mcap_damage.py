@@ -26,7 +26,7 @@ SHOWN = (Kind.REFUSED, Kind.SAME, Kind.NOTICED, Kind.REPORTED, Kind.CHANGED, *NE
 
 
 def main(number: int, seed: int) -> int:
-    """Returns how many copies were read wrong."""
+    """Return the number of copies that crashed the reader or were read incorrectly."""
     wrong = 0
     names = "".join(f"{kind.name.lower():>11}" for kind in SHOWN)
     print(f"{'file':24}{'':8}{names}{'crash':>8}{'kept':>8}{'slowest':>9}")
@@ -45,7 +45,7 @@ def main(number: int, seed: int) -> int:
                 begin = time.perf_counter()
                 try:
                     verdict = judge(path, truth)
-                except Exception as error:  # a crash is what this looks for
+                except Exception as error:  # crashes are counted
                     print(f"{name}, {what}, seed {seed}: {error!r}")
                     counts[how]["crash"] += 1
                     continue

@@ -1,4 +1,4 @@
-"""Read a ROS 2 MCAP drive: ours beside Rerun, rosbags, mcap and bare decompression, in one run.
+"""Read a ROS 2 MCAP drive: ours next to Rerun, rosbags, mcap and bare decompression.
 
     python benchmarks/mcap_reading.py [rounds]            # speed
     python benchmarks/mcap_reading.py memory [megabytes]  # peak memory, 200 MB against 2 GB
@@ -74,7 +74,7 @@ MINUTE_NS = 60_000_000_000
 
 
 def frames(address: np.ndarray, payload: np.ndarray, t_ns: np.ndarray, frame: bytes) -> list[bytes]:
-    """can_msgs/Frame in CDR, one per row."""
+    """Return can_msgs/Frame messages in CDR, one per row."""
     head = np.zeros(
         len(t_ns),
         dtype=[
@@ -98,7 +98,7 @@ def frames(address: np.ndarray, payload: np.ndarray, t_ns: np.ndarray, frame: by
 
 
 def pictures(count: int) -> Iterator[bytes]:
-    """sensor_msgs/CompressedImage in CDR; the scenes come again after two seconds and more."""
+    """Yield sensor_msgs/CompressedImage in CDR; scenes repeat after more than two seconds."""
     scenes = [scene(seed) for seed in range(SCENES)]
     for i in range(count):
         head = b"\x00\x01\x00\x00" + np.array([i, 0, 4], dtype="<u4").tobytes() + b"cam\x00"
@@ -108,7 +108,7 @@ def pictures(count: int) -> Iterator[bytes]:
 
 
 def scene(seed: int) -> bytes:
-    """A JPEG of 1280 x 720 with structure of all sizes and some noise."""
+    """Return a JPEG of 1280 x 720 with structure of all sizes and some noise."""
     rng = np.random.default_rng(seed)
     picture = np.full((720, 1280, 3), 128.0, dtype=np.float32)
     for size in (4, 16, 64, 256):
@@ -120,7 +120,7 @@ def scene(seed: int) -> bytes:
 
 
 def write_log(path: Path, compression: CompressionType, minutes: int = 1) -> None:
-    """The drive described above, ``minutes`` times over."""
+    """Write the drive described above, repeated ``minutes`` times."""
     column = {n: np.load(RAW_CAN / n, allow_pickle=False) for n in ("address", "data", "t")}
     payload = np.ascontiguousarray(column["data"]).view(np.uint8).reshape(-1, 8)
     seconds = column["t"] - column["t"][0]
@@ -199,7 +199,7 @@ def mcap_package(path: Path) -> int:
 
 
 def bare(path: Path, is_checked: bool = False) -> int:
-    """Read and decompress every chunk, perhaps with its checksum, nothing else; on one thread."""
+    """Read and decompress every chunk on one thread, optionally with its checksum."""
     file = ByteFile(path)
     segment = find_segments(file, path, TopicBook(DEFAULT_LIMITS), DEFAULT_LIMITS)[0]
     inflater = zstandard.ZstdDecompressor()
@@ -240,7 +240,7 @@ AGAINST = (
     ("rosbags, deserialised", 1, True),
     ("bare decompression", 2, False),
 )
-"""Reference of the ratios, printed digits, and True if more is better."""
+"""Reference of the ratios, number of digits, and True if higher is better."""
 
 
 def speed(rounds: int) -> None:
@@ -273,7 +273,7 @@ def speed(rounds: int) -> None:
 
 
 class Took(NamedTuple):
-    """Seconds by the clock and of all threads' processor time."""
+    """Return the wall seconds and the CPU seconds of all threads."""
 
     wall_s: float
     cpu_s: float
@@ -299,7 +299,7 @@ def _ratio(above: list[float], below: list[float]) -> float:
 
 
 def memory(megabytes: int) -> None:
-    """Peak memory of a process that reads a log of 200 MB, and one ten times as long."""
+    """Print the peak memory of processes that read a log of 200 MB and one of 2 GB."""
     with tempfile.TemporaryDirectory() as folder:
         for compression in CompressionType:
             added = []

@@ -2,7 +2,7 @@
 
     python benchmarks/memory.py [megabytes]
 
-Every log holds 500 vectors and 500 CAN frames per second and, if the format supports them, 15
+Every log contains 500 vectors and 500 CAN frames per second and, if the format supports them, 15
 pictures of 145 kB of noise. The short log is a tenth as long as the long one. Peaks are Linux's
 ``VmHWM``, imports included. The replay uses wheel speeds, yaw rates and pictures, with the tests'
 detector of bright spots.
@@ -29,7 +29,7 @@ from crosscue.replay.base import Block, Images, Ledger, Messages, Topic
 from crosscue.replay.write.convert import LogWriter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-# A script's own folder is where Python looks first.
+# Python imports from the folder of the script first.
 window = import_module("window_reading")
 PICTURE_BYTES = 145_000
 DETECTOR = "support.detecting:build"
@@ -42,7 +42,7 @@ TYPES = {
 
 
 def messages(megabytes: int) -> Iterator[tuple[int, str, bytes]]:
-    """Time, topic and CDR message, in order of time, up to about this size."""
+    """Yield time, topic and CDR message in time order, up to about this size."""
     left = megabytes * 1e6
     minutes = 1 + int(left / BYTES_A_SECOND / 60)
     for t_ns, k, message in window._messages(minutes, PICTURE_BYTES):
@@ -53,7 +53,7 @@ def messages(megabytes: int) -> Iterator[tuple[int, str, bytes]]:
 
 
 def write_mcap(path: Path, megabytes: int, *, chunked: bool) -> None:
-    """With pictures in chunks; unchunked the vectors and frames alone, up to this size."""
+    """Write messages in chunks or, without chunks, vectors and frames only, up to this size."""
     with path.open("wb") as stream:
         writer = Writer(stream, use_chunking=chunked)
         writer.start(profile="ros2")
@@ -83,7 +83,7 @@ def write_bag(path: Path, megabytes: int, compression: Literal["none", "lz4", "b
             for topic, (name, _) in TYPES.items()
         }
         for t_ns, topic, cdr in messages(megabytes):
-            # ROS 1 begins with a number, ends texts without a zero and aligns nothing.
+            # ROS 1 headers begin with a number, strings have no final zero, nothing is padded.
             body = cdr[20:] if topic != "/camera" else b"\4\0\0\0jpeg" + cdr[32:]
             writer.write(known[topic], t_ns, bytes(4) + cdr[4:12] + b"\3\0\0\0car" + body)
 
@@ -97,7 +97,7 @@ def write_db3(path: Path, megabytes: int) -> None:
             " timestamp INTEGER NOT NULL, data BLOB NOT NULL);"
             "CREATE INDEX timestamp_idx ON messages (timestamp ASC);"
         )
-        kept = [topic for topic in TYPES if topic != "/can"]  # its type is not a standard one
+        kept = [topic for topic in TYPES if topic != "/can"]  # not a standard type
         rows = [(i, topic, TYPES[topic][0], "cdr", "") for i, topic in enumerate(kept, 1)]
         base.executemany("INSERT INTO topics VALUES (?, ?, ?, ?, ?)", rows)
         base.executemany(
@@ -124,7 +124,7 @@ def write_candump(path: Path, megabytes: int) -> None:
 
 
 def write_drive(path: Path, megabytes: int) -> None:
-    """Wheel speeds, yaw rates and pictures for a replay."""
+    """Write wheel speeds, yaw rates and pictures for a replay."""
     support = import_module("support.memory_log")
     camera = Topic("camera", "crosscue/Images", "columns")
     rng = np.random.default_rng(2)

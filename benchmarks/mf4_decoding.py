@@ -1,4 +1,4 @@
-"""Decode signals of MF4 bus logs: ours beside asammdf, with a parsed DBC and from a cold start.
+"""Decode signals of MF4 bus logs: ours next to asammdf, with a parsed DBC and from a cold start.
 
     python benchmarks/mf4_decoding.py [rounds]
 
@@ -6,11 +6,11 @@ There are three logs: a CANedge log with its DBC; the Ford candump, repeated, wi
 unfinalized and unsorted as loggers leave it; and the same log finalized and sorted by asammdf.
 asammdf extracts with ``extract_bus_logging``. Ours reads and decodes the same bus or buses with its
 NumPy engine, looks up every frame and accounts for it. All values are compared before timing, by
-bus, identifier and signal, in order; where asammdf returns a table's text, its number is compared.
-Warm: one process, DBC parsed before by each, alternating, CPU seconds of the process; ratios are
-taken round by round. Cold: a process for each pass, imports and DBC included, CPU seconds of the
-child; the first start fills the caches, and the second uses them. The recordings are in
-$CROSSCUE_DATA or ../shared/data.
+bus, identifier and signal, in order; of values with texts in a value table, the numbers are
+compared. Warm: one process, DBC parsed before by each, alternating, CPU seconds of the process;
+ratios are taken round by round. Cold: a process for each pass, imports and DBC included, CPU
+seconds of the child; the first start fills the caches, and the second uses them. The recordings
+are in $CROSSCUE_DATA or ../shared/data.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 
 def ours(log: Path, database: Any) -> dict[str, list[Any]]:
-    """Blocks of signals by message."""
+    """Return the decoded blocks of each message, by topic."""
     from crosscue.replay.base import Ledger
     from crosscue.replay.can.decode import BusDecoder, DecodeSettings
     from crosscue.replay.logs.opening import open_log
@@ -64,7 +64,7 @@ def our_database(dbc: Path) -> Any:
 
 
 def theirs(log: Path, database: Any) -> Any:
-    """Signals extracted by asammdf, as an MDF object in memory."""
+    """Return the signals extracted by asammdf, as an MDF object in memory."""
     import asammdf
 
     with asammdf.MDF(log) as mdf:
@@ -83,7 +83,7 @@ SOURCE = re.compile(r"CAN(\d+)\.CAN_DataFrame\.ID=0x([0-9A-F]+) EXT=(?:True|Fals
 
 
 def compared(log: Path, dbc: Path) -> int:
-    """Values of all signals, each compared; ends the program at the first that differs."""
+    """Compare all values and return their number; exit at the first that differs."""
     numbers = {one.name: one.arbitration_id.id for one in their_database(dbc).frames}
     mine: dict[Key, list[Any]] = {}
     for topic, blocks in ours(log, our_database(dbc)).items():
@@ -98,7 +98,7 @@ def compared(log: Path, dbc: Path) -> int:
         if found is None:
             raise SystemExit(f"{log.name}: {signal.name} of {signal.source.path!r}: of no bus")
         key = (found[1], int(found[2], 16), signal.name)
-        # Ours are numbers where a table of the DBC has texts for them.
+        # Compare numbers, because ours has no texts of value tables.
         values = signal.physical(ignore_value2text_conversions=True).samples.astype(np.float64)
         if signal.invalidation_bits is not None:
             values = values[~np.asarray(signal.invalidation_bits, bool)]
@@ -117,7 +117,7 @@ def compared(log: Path, dbc: Path) -> int:
 
 
 def ford_logs(folder: Path) -> list[Path]:
-    """The repeated Ford frames: unfinalized as on a logger's card, and finalized."""
+    """Write the repeated Ford frames: unfinalized as by a logger, and finalized."""
     import asammdf
     import can
 
@@ -154,7 +154,7 @@ def cpu_s(run: Callable[[], object]) -> float:
 
 
 def cold_s(which: str, log: Path, dbc: Path, cache: Path) -> float:
-    """CPU seconds of a process that does one pass and nothing else."""
+    """Return the CPU seconds of a process that does only one pass."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
     command = [sys.executable, __file__, "--once", which, str(log), str(dbc)]
@@ -164,7 +164,7 @@ def cold_s(which: str, log: Path, dbc: Path, cache: Path) -> float:
 
 
 def once(which: str, log: Path, dbc: Path) -> None:
-    """One pass in a process of its own."""
+    """Do one pass; called in a separate process."""
     warnings.simplefilter("ignore")
     if which == "ours":
         ours(log, our_database(dbc))

@@ -1,4 +1,4 @@
-"""Speed of decoding a Mobileye's frames, beside cantools frame by frame.
+"""Speed of decoding a Mobileye's frames, next to cantools frame by frame.
 
 Both receive the same simulated frames and the same layout, for which our table (classic revision,
 family extended) is converted to an in-memory cantools database. cantools returns a dictionary per
@@ -36,7 +36,7 @@ SETTINGS: Final = MobileyeSettings(mounting=Mounting(1.8, 0.0))
 
 
 def simulated_bus() -> Block:
-    """Obstacles and lanes of ``IMAGES`` images, 66 ms apart: about 500 frames a second."""
+    """Return frames of obstacles and lanes in ``IMAGES`` images, about 500 frames a second."""
     rng = np.random.default_rng(11)
     image_ns = 10**18 + np.arange(IMAGES, dtype=np.int64) * 66 * MS
     n = IMAGES * OBJECTS
@@ -66,7 +66,7 @@ def simulated_bus() -> Block:
 
 
 def peer() -> cantools.database.Database:
-    """Return the layout table as a cantools database, with a message per instance."""
+    """Return the layout table as a cantools database with one message per instance."""
     messages = [_db_message(m, k) for m in layout().messages for k in range(len(m.ids))]
     return cantools.database.Database(messages)
 
@@ -96,7 +96,7 @@ def _signal(f: Field) -> Signal:
 
 
 def ours(block: Block) -> int:
-    """Rows of all tables, decoded block by block as from a reader."""
+    """Return the rows of all tables, decoded block by block as from a reader."""
     decoder = MobileyeDecoder("can1", Ledger("bench"), SETTINGS)
     rows = 0
     for start in range(0, len(block), BLOCK_ROWS):
@@ -105,7 +105,7 @@ def ours(block: Block) -> int:
 
 
 def theirs(database: cantools.database.Database, ids: list[int], payloads: list[bytes]) -> int:
-    """One dictionary per frame."""
+    """Return one dictionary per frame."""
     decode = database.decode_message
     return sum(1 for i, p in zip(ids, payloads, strict=True) if decode(i, p, decode_choices=False))
 

@@ -1,4 +1,4 @@
-"""Upper limits of the cue rules: true masks take the place of the networks.
+"""Upper limits of the cue rules, with true masks in place of the networks.
 
 ``python benchmarks/perfect_inputs.py DRIVES`` reads drives that ``crosscue simulate`` wrote. Every
 object in ``objects.json`` that is visible enough becomes a detection with its true mask and a score
@@ -54,14 +54,14 @@ from support.perfect_boxes import frames, is_there, role_at, true_cars
 
 VISIBLE = (0.3, 0.5, 0.7, 0.9)
 SHOWN = 0.7
-"""The threshold whose errors are broken down."""
+"""Visibility threshold for which errors are listed by their cause."""
 RULES = {"cross_traffic": cross_traffic, "parked": parked_cars}
 LABELLED = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
 Claims = dict[str, tuple[list[bool], list[int]]]
 
 
 def counts(drive: Path, vehicle: Vehicle, min_visible: float) -> Iterator[tuple[int, str, int]]:
-    """Time, cue and how many of it, for each frame and rule."""
+    """Yield time, cue and count for each frame and rule."""
     before: CarShapes | None = None
     rules = vehicle.cars
     for found in frames(drive, min_visible):
@@ -77,7 +77,7 @@ def counts(drive: Path, vehicle: Vehicle, min_visible: float) -> Iterator[tuple[
 
 
 def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion, Proportion]]:
-    """Precision and recall of each kind of cue, both sides together, by frames."""
+    """Return precision and recall of each kind of cue by frames, with both sides combined."""
     right: Claims = {}
     found: Claims = {}
     for number, drive in enumerate(drives):
@@ -96,7 +96,7 @@ def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion,
 
 
 def true_kinds(drives: list[Path], min_visible: float) -> dict[str, Counter[str]]:
-    """True state of the cars that each rule counts, by cue."""
+    """Return the numbers of cars that each rule counts, by cue and true motion."""
     kinds: dict[str, Counter[str]] = {cue: Counter() for cue in RULES}
     for drive in drives:
         rules, cars = load_vehicle(drive / "vehicle.toml").cars, true_cars(drive)
@@ -129,7 +129,7 @@ def _counted(one: Proportion) -> str:
 
 
 def every_cue(layouts: list[str], folder: Path) -> None:
-    """Print precision and recall of every cue where masks are perfect."""
+    """Print precision and recall of every cue with perfect masks."""
     judged = []
     for layout in layouts:
         drive = folder / layout
@@ -143,7 +143,7 @@ def every_cue(layouts: list[str], folder: Path) -> None:
 
 
 def _objects(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
-    """Frames without colours, until the car is at the intersection."""
+    """Yield frames without colours until the car is at the intersection."""
     renderer = Renderer(world, settings.camera, PictureSettings(samples=1))
     no_codes = np.zeros(world.ground.road.shape, np.uint8)
     for t_ns in picture_times(world, settings).tolist():
@@ -161,7 +161,7 @@ def simulate(folder: Path, runs: int) -> None:
     for run in range(1, runs + 1):
         for layout in SCORED:
             scene = SceneSettings(layout=layout, run=run, camera=camera_of_width(640))
-            # The truth is written last.
+            # The truth is written last, so its presence marks a complete drive.
             if not (folder / scene.name / "truth.json").exists():
                 write_scene(folder / scene.name, scene, overwrite=True, imager=OBJECTS)
 

@@ -23,11 +23,11 @@ RIGHT_M = (1.0, -6.0)
 WAY_M, FRAMES = 17.0, 80
 SCALE_SD = 0.01
 REAL = (0.18, 0.07)
-"""Mean NEES of the far and of the near light on PandaSet 002."""
+"""Mean NEES of the far and the near light on PandaSet 002."""
 
 
 def track(rng: np.random.Generator) -> NDArray[np.float64]:
-    """NEES of both lights in each frame, shape (frames, 2)."""
+    """Return the NEES of both lights in each frame, shape (frames, 2)."""
     housings = list(HOUSINGS.values())
     common = np.array([one.proportion for one in housings])
     housing = housings[rng.choice(len(housings), p=common / common.sum())]
@@ -58,7 +58,7 @@ def track(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def main() -> None:
-    """Print all."""
+    """Print the NEES over the simulated tracks and its comparison with the real drive."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     rng = np.random.default_rng(1)
     tracks = np.array([track(rng) for _ in range(count)])

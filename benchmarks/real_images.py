@@ -29,7 +29,7 @@ LABELS: Final = (
 
 
 def print_found(run: RunFolder, scores: list[float]) -> None:
-    """Frames and boxes of each label."""
+    """Print the number of frames and boxes of each label."""
     frames = run.table("frames", ["frame"]).num_rows
     table = run.table("detections", ["frame", "label", "score"]).to_pylist()
     print(f"{run.path}: {frames} frames")
@@ -44,7 +44,7 @@ def print_found(run: RunFolder, scores: list[float]) -> None:
 
 
 def print_cues(run: RunFolder) -> None:
-    """Frames with each positive cue."""
+    """Print the number of frames with each positive cue."""
     positive: dict[str, int] = defaultdict(int)
     for row in run.table("cues", ["cue", "count"]).to_pylist():
         positive[row["cue"]] += row["count"] > 0
@@ -53,7 +53,7 @@ def print_cues(run: RunFolder) -> None:
 
 
 def road_masks(run: RunFolder, size_px: tuple[int, int]) -> Iterator[NDArray[np.bool_]]:
-    """Road pixels of each frame, in the order of frames, shape (height, width)."""
+    """Yield the road mask of each frame in order, shape (height, width)."""
     table = run.table("road", ["mask", "mask_width_px", "mask_height_px"]).to_pylist()
     for row in table:
         mask = rle.decode(row["mask"], (row["mask_width_px"], row["mask_height_px"]))
@@ -62,7 +62,7 @@ def road_masks(run: RunFolder, size_px: tuple[int, int]) -> Iterator[NDArray[np.
 
 
 def print_road(run: RunFolder, other: RunFolder) -> None:
-    """Agreement over all frames' pixels."""
+    """Print the agreement of road masks over the pixels of all frames."""
     row = run.table("frames", ["width_px", "height_px"]).slice(0, 1).to_pylist()[0]
     size = (row["width_px"], row["height_px"])
     if run.table("road", ["t_ns"]) != other.table("road", ["t_ns"]):
@@ -79,7 +79,7 @@ def print_road(run: RunFolder, other: RunFolder) -> None:
 
 
 def main() -> None:
-    """Print all."""
+    """Print the counts of each run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--scores", type=float, nargs="+", default=[0.3, 0.5, 0.9, 0.95])

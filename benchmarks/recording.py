@@ -1,4 +1,4 @@
-"""Record a run for Rerun: ours in bulk columns beside logging frame by frame, in one run.
+"""Record a run for Rerun: ours in bulk columns next to logging frame by frame, in one run.
 
     python benchmarks/recording.py [MINUTES]
 
@@ -22,7 +22,7 @@ from statistics import median
 
 import numpy as np
 import rerun as rr
-from estimate import (  # type: ignore[import-not-found]  # a script beside this one
+from estimate import (  # type: ignore[import-not-found]  # a script next to this one
     RANGES,
     SECONDS_PER_BLOCK,
     write_log,
@@ -55,7 +55,7 @@ print(int(status["VmHWM"].split()[0]) // 1024)
 
 
 def make_run(folder: Path, minutes: float) -> tuple[RunFolder, float]:
-    """A finished run, and its drive's length in seconds."""
+    """Return a finished run and the length of its drive in seconds."""
     settings = DriveSettings(blocks=max(4, round(minutes * 60.0 / SECONDS_PER_BLOCK)))
     folder.mkdir()
     seconds = write_log(folder / "drive.mcap", settings)
@@ -69,7 +69,7 @@ def make_run(folder: Path, minutes: float) -> tuple[RunFolder, float]:
 
 
 def picture_bytes(run: RunFolder) -> int:
-    """Bytes of all JPEGs."""
+    """Return the total bytes of all JPEGs."""
     total = 0
 
     def add(block: Block) -> None:
@@ -84,7 +84,7 @@ def picture_bytes(run: RunFolder) -> int:
 
 
 def frame_by_frame(run: RunFolder, path: Path) -> None:
-    """The peer."""
+    """Record frame by frame, as in Rerun's tutorials."""
     recording = rr.RecordingStream("naive")
     recording.save(path)
 
@@ -126,7 +126,7 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
 
 
 def main() -> None:
-    """Make the drive once, record it several times both ways."""
+    """Write the drive once and record it several times both ways."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 2.0
     cases: dict[str, Callable[[RunFolder, Path], None]] = {
         "crosscue, bulk columns": save,

@@ -1,4 +1,4 @@
-"""Our sign search beside one ORB run per window and level, on the same simulated scenes.
+"""Our sign search next to one ORB run per window and level, on the same simulated scenes.
 
 Both search for the same templates on the same pyramid levels, with the same kind of features and
 the same ratio test. The peer slides a window of each template size in steps of 16 pixels, and runs
@@ -7,8 +7,8 @@ features that it contains. "one size" uses a single window as large as the large
 is the min number of ORB runs.
 
 On small pictures (templates over clutter), both search everywhere, and the signs found are counted.
-In simulated streets of a usual camera's size, the peer examines every 40th window on all levels,
-and its time is scaled up. The time for resizing the picture is not charged to it.
+In simulated streets of a typical camera's size, the peer examines every 40th window on all levels,
+and its time is scaled up. The time for resizing the picture is not counted for the peer.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ class Drawn(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A window of the peer: a view of a level, and its position in the picture."""
+    """A window of the peer: a view of a level with its position in the picture."""
 
     pixels: Bytes
     box: Floats
 
 
 class WindowSearch:
-    """The dissertation's search: ORB and the matcher run in every window of each level."""
+    """The dissertation's search, which runs ORB and the matcher in every window of each level."""
 
     def __init__(self, has_one_size: bool) -> None:
-        """Describe the drawings once."""
+        """Compute the descriptors of the templates once."""
         self._orb = cv2.ORB.create(
             nfeatures=POINTS_DRAWN,
             nlevels=1,
@@ -82,7 +82,7 @@ class WindowSearch:
             of_size.append(Drawn(one.kind, one.size_px, words.view(np.uint8)))
 
     def __call__(self, grey: Bytes) -> Found:
-        """The best window, if a tenth of a drawing's points are in it."""
+        """Return the best window if it contains a tenth of a template's points."""
         best: tuple[float, str, Floats] = (MIN_SHARE, "", np.zeros(4))
         for size, of_size in self._by_size.items():
             for window in self._windows(grey, size):
@@ -90,7 +90,7 @@ class WindowSearch:
         return [(best[1], best[2])] if best[1] else []
 
     def seconds(self, grey: Bytes, first: int) -> float:
-        """Seconds of a search, from every ``ONE_IN``-th window after ``first`` of each level."""
+        """Return the scaled seconds of a search of every ``ONE_IN``-th window of each level."""
         taken, looked, there = 0.0, 0, 0
         for size, of_size in self._by_size.items():
             for number, window in enumerate(self._windows(grey, size)):
@@ -128,7 +128,7 @@ class WindowSearch:
         return found
 
     def _described(self, grey: Bytes) -> Bytes:
-        # As fast as OpenCV's one call for both; upright, or left and right arrows look alike.
+        # As fast as OpenCV's combined call; upright, because rotated one-way arrows are alike.
         keypoints = self._orb.detect(grey, None)
         for keypoint in keypoints:
             keypoint.angle = 0.0
@@ -137,7 +137,7 @@ class WindowSearch:
 
 
 def _about(window: Window, size_px: Size) -> Floats:
-    """The sign's box in the middle of a window."""
+    """Return the box of the sign in the middle of a window."""
     scale = window.pixels.shape[1] / (window.box[2] - window.box[0])
     middle = (window.box[:2] + window.box[2:]) / 2.0
     half = np.array(size_px) / (2.0 * scale)
@@ -145,7 +145,7 @@ def _about(window: Window, size_px: Size) -> Floats:
 
 
 def ours(grey: Bytes) -> Found:
-    """Our detector's boxes."""
+    """Return the boxes of our detector."""
     found = DETECTOR([Frame(0, "", grey, (grey.shape[1], grey.shape[0]))])[0]
     assert isinstance(found, Detections)
     return list(zip(found.labels, found.boxes_px, strict=True))
@@ -157,7 +157,7 @@ def is_right(found: Found, kind: str, box: Floats) -> bool:
 
 
 def streets() -> list[Bytes]:
-    """Pictures of simulated approaches to intersections, as a drive has them."""
+    """Return pictures of simulated approaches to intersections."""
     found = []
     for i in range(ROUNDS):
         settings = SceneSettings(f"L{800 + i}", i + 1)
@@ -173,14 +173,14 @@ PEERS = {"one ORB a window": WindowSearch(False), "one size": WindowSearch(True)
 
 
 def timed(search: Callable[[], object]) -> float:
-    """Seconds."""
+    """Return the wall seconds of a call."""
     began = time.perf_counter()
     search()
     return time.perf_counter() - began
 
 
 def signs_found() -> None:
-    """Whole searches on small pictures."""
+    """Print the signs found and the time of complete searches on small pictures."""
     searches: dict[str, Callable[[Bytes], Found]] = {"ours": ours, **PEERS}
     kinds = [AMERICAN[i % 3] for i in range(SCENES)]
     scenes = [scene(kind, 40 + i) for i, kind in enumerate(kinds)]
@@ -198,7 +198,7 @@ def signs_found() -> None:
 
 
 def speed() -> None:
-    """Pictures of a usual camera's size, the peers in parts."""
+    """Print times on pictures of a typical size; the peers search a part of the windows."""
     seconds: dict[str, list[float]] = {name: [] for name in ("ours", *PEERS)}
     for i, grey in enumerate(streets()):
         seconds["ours"].append(median(timed(partial(ours, grey)) for _ in range(5)))
@@ -208,7 +208,7 @@ def speed() -> None:
 
 
 def print_table(what: str, seconds: dict[str, list[float]]) -> None:
-    """Medians, and medians of the ratio on the same picture."""
+    """Print median times, and medians of the ratios on the same picture."""
     print(f"{what:34} {'ms':>10} {'times ours':>11}")
     for name, taken in seconds.items():
         ratio = median(a / b for a, b in zip(taken, seconds["ours"], strict=True))
@@ -216,7 +216,7 @@ def print_table(what: str, seconds: dict[str, list[float]]) -> None:
 
 
 def main() -> None:
-    """Signs found, then speed."""
+    """Print the signs found, then the speed."""
     cv2.setNumThreads(1)
     ours(scene(AMERICAN[0], 1).grey)
     signs_found()

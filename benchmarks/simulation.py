@@ -1,6 +1,6 @@
 """Speed of simulating drives: pictures per second, stage by stage, on one core.
 
-No peer renders these scenes without a GPU. Each stage is printed as a fraction of the whole, and
+No peer renders these scenes without a GPU. Each stage is printed as a fraction of the total, and
 OpenCV's JPEG encoding of the same picture is the unit for comparing machines.
 
     python benchmarks/simulation.py

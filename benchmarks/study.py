@@ -1,4 +1,4 @@
-"""Simulated drives beside filterpy's filter on the same steps, in the same run.
+"""Simulated drives next to filterpy's filter on the same steps, in one run.
 
     python benchmarks/study.py [--rounds 5] [--drives 200]
 
@@ -44,7 +44,7 @@ def seeds(count: int) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
 
 
 class Odometry(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no types
-    """filterpy's filter on x, y, heading and, with four states, speed."""
+    """filterpy's filter on x, y, heading and, if it has four states, speed."""
 
     def __init__(self, first: tuple[float, float, float], states: int) -> None:
         super().__init__(states, 1)
@@ -63,7 +63,7 @@ class Odometry(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no t
         self.accel_var = sensors.accel_var_m2ps3 * car.step_s
 
     def predict_x(self, u: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Along the arc; the Jacobians for the covariance beside."""
+        """Move the state along an arc, and set the Jacobian ``F`` and the noise ``Q``."""
         way, t = u
         h, t2 = self.x[2, 0], t * t
         along = 1.0 - t2 / 6.0 * (1.0 - t2 / 20.0)
@@ -87,7 +87,7 @@ class Odometry(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy has no t
         self.x[2, 0] = wrap(h + t)
 
     def step(self, left: float, right: float, compass: float) -> None:
-        """Predict; speed, with four states; heading, where the compass was read."""
+        """Predict, and update by speed (with four states) and by compass readings."""
         way = 0.5 * (left + right)
         self.predict((way, (right - left) * self.per_track))
         if len(self.x) == 4:
@@ -113,7 +113,7 @@ def wrapped(a: Floats, b: Floats) -> Floats:
 
 
 def filterpy_alone(traced: Traced, steps: int, states: int) -> Floats:
-    """Its filter on one drive's readings; the state at the end."""
+    """Run the filter on the readings of one drive and return its final state."""
     kf = Odometry(traced.first_belief, states)
     for left, right, compass in traced.steps[:steps, 4:7].tolist():
         kf.step(left, right, compass)

@@ -1,4 +1,4 @@
-"""Sensitivity of the studies to what the source does not state: one assumption at a time.
+"""Sensitivity of the studies to assumptions that the source leaves open, one at a time.
 
     python benchmarks/study_assumptions.py [--only field|nees|landmarks] [--drives 200]
         [--field-drives 400] [--nees-drives 20000] [--seed 77]

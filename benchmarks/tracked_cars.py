@@ -3,7 +3,7 @@
 Run it as ``python benchmarks/tracked_cars.py DRIVES [LAYOUTS]`` on drives of ``crosscue simulate``;
 LAYOUTS, such as ``ACEG``, are the first letters of the drives to use. Every car of
 ``objects.json`` that is at least half visible becomes a detection with its true mask. The ego
-motion and the position of the intersection are true as well, so all misses are those of the rule.
+motion and the position of the intersection are also true, so all errors are those of the rule.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from support.perfect_boxes import frames, is_there
 
 VISIBLE = 0.5
 PLACE_SD_M = 2.0
-"""Standard deviation of the true range, so that rules treat it like a good estimate."""
+"""Standard deviation assumed for the true range, as of a good estimate."""
 
 
 class Totals(NamedTuple):
-    """Counts over all drives: (cue, counted, truly there), and gates by cue."""
+    """Counts over all drives: (cue, counted, true), and rejecting conditions by cue."""
 
     rows: Counter[tuple[str, bool, bool]]
     gates: Counter[str]
 
 
 class TrueCar(NamedTuple):
-    """One car of ``objects.json`` in one frame: what it does, how far ahead, and its box."""
+    """One car of ``objects.json`` in one frame: its motion, distance ahead and box."""
 
     role: str
     distance_m: float
@@ -53,7 +53,7 @@ class TrueCar(NamedTuple):
 
 
 def true_cars(drive: Path) -> dict[int, list[TrueCar]]:
-    """Map from a frame's time to its sufficiently visible cars."""
+    """Return the sufficiently visible cars of each frame, by time."""
     content = json.loads((drive / "objects.json").read_text())
     times = {one["id"]: one["t_ns"] for one in content["images"]}
     cars: dict[int, list[TrueCar]] = {t_ns: [] for t_ns in times.values()}
@@ -66,7 +66,7 @@ def true_cars(drive: Path) -> dict[int, list[TrueCar]]:
 
 
 def motions(drive: Path) -> dict[int, Motion]:
-    """Map from a frame's time to the true motion of the rear axle since the previous frame."""
+    """Return the true motion of the rear axle since the previous frame, by time."""
     found = {}
     last: tuple[float, float, float, int] | None = None
     for line in (drive / "pose.tum").read_text().splitlines():
@@ -84,7 +84,7 @@ def motions(drive: Path) -> dict[int, Motion]:
 
 
 def places(drive: Path) -> dict[int, Place]:
-    """Map from a frame's time to the true position of the intersection."""
+    """Return the true position of the intersection in each frame, by time."""
     with (drive / "ranges.csv").open() as file:
         return {
             int(row["t_ns"]): Place(float(row["start_m"]), float(row["end_m"]), PLACE_SD_M)
@@ -94,7 +94,7 @@ def places(drive: Path) -> dict[int, Place]:
 
 
 def judge_drive(drive: Path, totals: Totals) -> None:
-    """Add one drive: cross traffic and parked cars frame by frame, the others car by car."""
+    """Count a drive: cross traffic and parked cars by frame, the other cues by car."""
     truth, vehicle = load(drive / "truth.json"), load_vehicle(drive / "vehicle.toml")
     camera, settings = vehicle.camera, vehicle.cars
     moved, at, known = motions(drive), places(drive), true_cars(drive)
@@ -168,7 +168,7 @@ def _between(
 
 
 def main() -> None:
-    """Print both for the layouts asked for."""
+    """Print both for the selected layouts."""
     letters = sys.argv[2] if len(sys.argv) > 2 else "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
     drives = sorted(
         path.parent

@@ -3,8 +3,8 @@
     python benchmarks/vehicle_ranges.py RUN SEQUENCE [CAMERA_HEIGHT_M ...]
 
 RUN is a run of ``replay`` over SEQUENCE (as published, with annotations/cuboids.parquet). A
-detection belongs to the projected box that it overlaps most, from IoU 0.6; its true range is that
-of the box's nearest corner along the camera's axis.
+detection belongs to the projected box that it overlaps most, at IoU 0.6 or more; its true range is
+that of the nearest corner of the box along the camera's axis.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ VEHICLE_WORDS = ("Car", "Truck", "Bus", "Vehicle", "Van")
 
 
 def _projected(folder: Path, focal_px: float, center_px: tuple[float, float]) -> dict[int, Floats]:
-    """By frame, rows of x0, y0, x1, y1 and nearest depth."""
+    """Return rows of x0, y0, x1, y1 and nearest depth for each frame."""
     poses = json.loads((folder / "camera/front_camera/poses.json").read_text())
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5
     found: dict[int, list[list[float]]] = {}
@@ -61,7 +61,7 @@ def _projected(folder: Path, focal_px: float, center_px: tuple[float, float]) ->
 
 
 def _pairs(run: Path, folder: Path) -> Iterator[tuple[dict[str, Any], float]]:
-    """Detections that are not cut by the image border, with their true range."""
+    """Yield detections that are not cut by the image border, with their true range."""
     opened = open_run(run)
     camera = opened.drive_manifest().settings.camera
     boxes = _projected(folder, camera.focal_px or 0.0, camera.center_px or (0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Two seconds of one signal topic out of a long log: ours beside the peers, in one run.
+"""Two seconds of one signal topic of a long log: ours next to the peers, in one run.
 
     python benchmarks/window_reading.py [rounds]
 
@@ -7,8 +7,8 @@ frames a second and 15 pictures of noise a second: 5 minutes with pictures of 14
 50 minutes with pictures of 14.5 kB. Every case opens the file, finds two seconds in its middle,
 decodes the vectors and closes the file. The cases run in rotation; CPU seconds of all threads, and
 the medians of the ratios to ours and to Rerun, the fastest peer, taken round by round. Ours
-verifies the checksums of what it reads; the peers do not. Ours goes through ``read_topic``, which
-is what users call.
+verifies the checksums of what it reads; the peers do not. Ours calls ``read_topic``, as
+users do.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _head(t_ns: int) -> bytes:
 
 
 def _messages(minutes: int, picture_bytes: int) -> Iterator[tuple[int, int, bytes]]:
-    """Time, topic number and message, in order of time."""
+    """Yield time, topic number and message in time order."""
     rng = np.random.default_rng(1)
     for i in range(minutes * 60 * 500):
         t_ns = START_NS + i * 2_000_000
@@ -87,7 +87,7 @@ def _messages(minutes: int, picture_bytes: int) -> Iterator[tuple[int, int, byte
 
 
 def write_log(path: Path, minutes: int, picture_bytes: int) -> None:
-    """The log described above."""
+    """Write the log described above."""
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(profile="ros2")
@@ -163,7 +163,7 @@ LOGS = {"5 min, 145 kB": (5, 145_000), "5 min, 14.5 kB": (5, 14_500), "50 min": 
 
 
 def measure(path: Path, minutes: int, rounds: int) -> dict[str, list[float]]:
-    """CPU seconds of each case in each round, after one to warm up."""
+    """Return the CPU seconds of each case in each round, after one warm-up round."""
     begin = START_NS + minutes * 30 * SECOND_NS
     window = (begin, begin + SPAN_S * SECOND_NS)
     counts = {name: case(path, *window) for name, case in CASES.items()}
@@ -182,7 +182,7 @@ def measure(path: Path, minutes: int, rounds: int) -> dict[str, list[float]]:
 def main() -> None:
     rounds = int(sys.argv[1]) if len(sys.argv) > 1 else 15
     if not (find_spec("small_mcap") and find_spec("mcap_ros2_support_fast")):
-        # Under the GPL, so not among the tools of this project.
+        # Licensed under the GPL, so not a dependency of this project.
         print("without small-mcap; to have it: pip install small-mcap mcap-ros2-support-fast")
         del CASES["small-mcap, decoded"]
     ours_s: dict[str, float] = {}
