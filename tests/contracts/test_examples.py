@@ -145,6 +145,22 @@ def test_a_command_on_a_page_is_understood(
             assert any(code == block for code, _ in found), f"{block.place}: no command was run"
 
 
+@pytest.mark.parametrize("page", SHELL_PAGES)
+def test_no_command_on_a_page_writes_where_an_earlier_one_did(page: str, tmp_path: Path) -> None:
+    written: dict[str, str] = {}
+    for code, (program, *command) in commands_of([c for c in CODE if c.page == page], tmp_path):
+        names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]
+        if program != "crosscue" or not names:
+            continue
+        parser = cli.parser_of(name := max(names, key=len))[1]
+        given = vars(parser.parse_args(command[len(name.split()) :]))
+        place = str(given.get("output"))
+        # A fit adds to the vehicle file that it read; commands without --overwrite may write again.
+        if place not in (str(given.get("vehicle")), "None") and given.get("overwrite") is False:
+            assert place not in written, f"{code.place}: {place}: written by {written[place]}"
+            written[place] = code.place
+
+
 def test_other_programs_on_a_page_exist(tmp_path: Path) -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
