@@ -1,4 +1,4 @@
-"""Every example in the documentation is one that crosscue understands, or a test runs it.
+"""Every example in the documentation is valid, or a test runs it.
 
 Commands are expanded by bash and parsed by their own parsers, Python is compared with the public
 interface, settings are read as the files they belong to, and queries run on a small catalog.
@@ -31,7 +31,7 @@ EXECUTED: Final = {
     ("CONTRIBUTING.md", "python"): "tests/contracts/test_contributing.py",
     ("docs/howto/query.md", "sql"): "tests/eval/catalog/test_query_page.py",
 }
-"""Blocks of a page that a test runs word by word, and that test."""
+"""Pages and languages of blocks that a test runs, and that test."""
 OTHERS: Final = {
     "--array": "SLURM",
     "--bind": "Rerun",
@@ -40,7 +40,7 @@ OTHERS: Final = {
     "--include": "YOLOv5",
     "--serve-web": "Rerun",
 }
-"""Options of other programs in inline code and messages, and those programs."""
+"""Options of other programs that occur in inline code and messages, and those programs."""
 PACKAGES: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 SHELL_PAGES: Final = sorted(
     {code.page for code in CODE if code.kind in ("bash", "console", "yaml")}
@@ -73,7 +73,7 @@ def words_of(text: str) -> list[str]:
 
 
 def commands_in(words: list[str]) -> list[str]:
-    """Commands that inline code names: one, several (``fit a|b``), or a group of them."""
+    """Return the commands that inline code names: one, several (``fit a|b``), or a group."""
     for length in (2, 1):
         first = words[: length - 1]
         names = [
@@ -85,7 +85,7 @@ def commands_in(words: list[str]) -> list[str]:
 
 
 def fault_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The error of a complete command line, empty if its parser accepts it."""
+    """Return the error of a complete command line, or an empty text if its parser accepts it."""
     names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]
     if not names:
         return f"no command {command[:2]}"
@@ -104,7 +104,7 @@ def fault_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def vehicle_of(text: str) -> Vehicle:
-    """The vehicle file that a fragment is part of."""
+    """Parse a fragment of a vehicle file."""
     return parse(text if "version =" in text else f"version = 1\n{text}", "example")
 
 
@@ -119,7 +119,7 @@ def test_every_block_names_its_language() -> None:
 
 
 @pytest.mark.parametrize(("page", "kind"), EXECUTED)
-def test_a_page_whose_blocks_a_test_runs_is_read_there(page: str, kind: str) -> None:
+def test_executed_blocks_are_read_by_their_test(page: str, kind: str) -> None:
     test = (ROOT / EXECUTED[page, kind]).read_text(encoding="utf-8")
 
     assert Path(page).name in test
@@ -128,7 +128,7 @@ def test_a_page_whose_blocks_a_test_runs_is_read_there(page: str, kind: str) -> 
 
 
 @pytest.mark.parametrize("page", SHELL_PAGES)
-def test_a_command_on_a_page_is_understood(
+def test_commands_on_page_are_accepted_by_parser(
     page: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blocks = [code for code in CODE if code.page == page]
@@ -185,7 +185,7 @@ def test_other_programs_on_a_page_exist(tmp_path: Path) -> None:
 
 
 def inline_commands() -> Iterator[tuple[str, list[str]]]:
-    """Place and words of each command in inline code, of docstrings too, without ``crosscue``."""
+    """Yield place and words of each ``crosscue`` command in inline code and docstrings."""
     for code in [*CODE, *NOTEBOOKS]:
         if code.kind == "inline" and code.text.startswith("crosscue "):
             yield code.place, words_of(code.text)[1:]
@@ -213,7 +213,7 @@ def test_inline_commands_and_their_options_exist() -> None:
     assert wrong == []
 
 
-def test_every_option_in_inline_code_exists() -> None:
+def test_options_in_inline_code_exist() -> None:
     texts = [code for code in [*CODE, *NOTEBOOKS] if code.kind == "inline"]
     named = {
         option: code.place
@@ -225,7 +225,7 @@ def test_every_option_in_inline_code_exists() -> None:
     assert {option: named[option] for option in unknown} == {}
 
 
-def test_every_option_in_a_message_exists() -> None:
+def test_options_in_messages_exist() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}:{number}: {option}"
         for package in PACKAGES
@@ -243,7 +243,7 @@ def test_every_option_in_a_message_exists() -> None:
     [*of_kind("python"), *(c for c in NOTEBOOKS if c.kind == "python")],
     ids=lambda c: c.place,
 )
-def test_python_uses_what_the_public_interface_has(code: Code) -> None:
+def test_python_examples_use_existing_public_names(code: Code) -> None:
     assert [
         f"{code.page}:{code.line + line - 1}: {fault}" for line, fault in faults_in(code.text)
     ] == []
@@ -262,22 +262,22 @@ def test_settings_are_accepted(code: Code, tmp_path: Path) -> None:
         vehicle_of(code.text)
 
 
-def test_settings_called_defaults_are_the_defaults() -> None:
+def test_documented_default_settings_equal_defaults() -> None:
     texts = {code.page: code.text for code in of_kind("toml")}
 
     assert vehicle_of(texts["docs/explanation/time_segments.md"]) == Vehicle(version=1)
 
 
-def test_queries_in_commands_run(tmp_path: Path) -> None:
+def test_queries_in_examples_run(tmp_path: Path) -> None:
     runs = crosscue.catalog(runs_below(tmp_path / "runs"))
-    asked = 0
+    queries = 0
     for number, page in enumerate(SHELL_PAGES):
         folder = tmp_path / str(number)
         folder.mkdir()
         for _, (program, *words) in commands_of([c for c in CODE if c.page == page], folder):
             if program == "crosscue" and words[0] == "query":
                 runs.query(words[2])
-                asked += 1
+                queries += 1
             conditions = [
                 words[words.index(option) + 1]
                 for option in ("--runs", "--against", "--where")
@@ -285,11 +285,11 @@ def test_queries_in_commands_run(tmp_path: Path) -> None:
             ]
             for condition in conditions:
                 runs.select(condition)
-                asked += 1
-    assert asked
+                queries += 1
+    assert queries
 
 
-def test_a_wrong_example_is_found(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_example_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     code = (
         "import crosscue\n"
         "log = crosscue.open('a', nope=1)\n"
@@ -303,7 +303,7 @@ def test_a_wrong_example_is_found(capsys: pytest.CaptureFixture[str]) -> None:
     assert "yolox-pico" in fault_of(["replay", "a", "-o", "b", "--detectors", "yolox-pico"], capsys)
 
 
-def test_a_session_on_a_console_is_not_its_output(tmp_path: Path) -> None:
+def test_console_session_excludes_its_output(tmp_path: Path) -> None:
     session = Code(
         "page", 1, "console", '$ for i in 1 2; do \\\n crosscue info "$i"; done\ncrosscue x\n'
     )

@@ -1,7 +1,7 @@
-"""The text of the product uses the field's words: none that the style guide replaces.
+"""The text of the product uses the terms of the style guide.
 
-Names, comments, docstrings and messages of every module, and the pages of the documentation. A
-changelog keeps the words of its time.
+This covers names, comments, docstrings and messages of every module, and the pages of the
+documentation. The changelog is excluded, because past entries are not reworded.
 """
 
 import io
@@ -46,7 +46,7 @@ PHRASES: Final = {
     "where known": r"\bas far as (it |that )?(is|can be) (known|said)\b",
     "is not a": r"(?<!there )\bis no (layout|time|number|text|multiplexer|file|table|count)\b",
 }
-"""Recommended words, and the patterns in prose that they replace."""
+"""Recommended words, and patterns of the words in prose that they replace."""
 
 NAMES: Final = {
     "report": r"(^|_)(told|tells|tell)(_|$)(?!apart|from)",
@@ -55,10 +55,10 @@ NAMES: Final = {
     "repair": r"(^|_)mend(s|ed|ing)?(_|$)",
     "overconfident": r"(^|_)(over|under)_sure(_|$)",
 }
-"""The same for identifiers."""
+"""Recommended words, and patterns of the words in identifiers that they replace."""
 
 NAMES_OF_OTHERS: Final = {"tell", "row_shares", "column_shares"}
-"""A method of files, arguments of Rerun."""
+"""Names of other libraries: a method of files, and arguments of Rerun."""
 
 
 def _sources(ending: str) -> list[Path]:
@@ -71,9 +71,9 @@ def _sources(ending: str) -> list[Path]:
 
 
 def _words(path: Path) -> Iterator[tuple[int, str, dict[str, str]]]:
-    """Line, text and the table that it is held to."""
+    """Yield line and text of each token to check, and the table that applies to it."""
     text = path.read_text(encoding="utf-8")
-    # Dividing a file into tokens takes long; most have none of the words anywhere.
+    # Splitting a file into tokens is slow, and most files contain none of the words.
     if not _may_be_in(text):
         return
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
@@ -93,7 +93,7 @@ def _may_be_in(text: str) -> bool:
 
 @cache
 def _loosely(*patterns: str) -> re.Pattern[str]:
-    """Any of the patterns, without what must not stand before or behind."""
+    """Combine patterns without their lookaround assertions, for a fast first search."""
     around = r"\(\?<?!(?:[^()]|\([^()]*\))*\)"
     return re.compile("|".join(re.sub(around, "", one) for one in patterns), re.MULTILINE)
 
@@ -107,7 +107,7 @@ def _replaced(where: str, text: str, table: dict[str, str]) -> Iterator[str]:
             yield f"{where}: {found[0]!r}; write: {instead}"
 
 
-def test_code_uses_the_words_of_the_style_guide() -> None:
+def test_code_uses_terms_of_style_guide() -> None:
     found = [
         line
         for path in _sources(".py")
@@ -118,7 +118,7 @@ def test_code_uses_the_words_of_the_style_guide() -> None:
     assert not found, "\n".join(found)
 
 
-def test_pages_use_the_words_of_the_style_guide() -> None:
+def test_documentation_uses_terms_of_style_guide() -> None:
     top = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
     pages = [*_sources(".md"), *(ROOT / name for name in top)]
     found = [
@@ -131,7 +131,7 @@ def test_pages_use_the_words_of_the_style_guide() -> None:
     assert not found, "\n".join(found)
 
 
-def test_a_replaced_word_is_found() -> None:
+def test_replaced_terms_are_found() -> None:
     assert list(_replaced("a.py:1", "the reader tells of two losses", PHRASES))
     assert list(_replaced("a.py:1", "MOST_BYTES", NAMES))
     assert not list(_replaced("a.py:1", "cannot tell one from the other", PHRASES))

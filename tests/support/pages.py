@@ -28,7 +28,7 @@ for program in {" ".join(PROGRAMS)}; do
 done
 command_not_found_handle() {{ :; }}
 """
-"""Functions in place of programs: they note their arguments and print a number."""
+"""Functions in place of programs, which record their arguments and print a number."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Code:
 
 
 def _parsed(page: str, text: str, first: int = 1) -> Iterator[Code]:
-    """Blocks and inline code of a text in Markdown."""
+    """Yield the blocks and inline code of a text in Markdown."""
     for token in MarkdownIt("commonmark").enable("table").parse(text):
         line = first + (token.map[0] if token.map else 0)
         if token.type == "fence":
@@ -76,7 +76,7 @@ def code_of_pages() -> list[Code]:
 
 
 def code_of_notebooks() -> list[Code]:
-    """Inline code of the notebooks' text, and their Python in one block a notebook."""
+    """Inline code of the notebooks' text, and the Python of each notebook as one block."""
     found: list[Code] = []
     for path in NOTEBOOKS:
         page = str(path.relative_to(ROOT))
@@ -102,10 +102,10 @@ def _shell_of(code: Code) -> str:
 
 
 def commands_of(page: Sequence[Code], folder: Path) -> list[tuple[Code, list[str]]]:
-    """Program and arguments of every command that a shell runs for the blocks of one page.
+    """Return program and arguments of every command that a shell runs for the blocks of one page.
 
-    bash itself expands variables, loops and functions. Programs are replaced by functions that
-    note their arguments, no other program is found, and nothing is written.
+    bash expands variables, loops and functions. Functions that record their arguments replace
+    programs, no other program is available, and nothing is written.
     """
     blocks = [code for code in page if code.kind in ("bash", "console", "yaml")]
     script = "\n".join(f"record block {i}\n{_shell_of(code)}" for i, code in enumerate(blocks))

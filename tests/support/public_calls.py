@@ -1,7 +1,7 @@
 """Check Python examples against the public interface without running them.
 
-Names, arguments and the attributes of results are looked up by type: a call has the type that the
-function's annotation states. Where a type is unknown, nothing is checked.
+Names, arguments and attributes of results are looked up by type. The type of a call is the return
+annotation of the function. Expressions of unknown type are not checked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PUBLIC: Final = {"crosscue": crosscue, "crosscue.testing": crosscue.testing}
 
 @dataclass(frozen=True)
 class Instance:
-    """An object of which only the type is known."""
+    """An object with a known type and an unknown value."""
 
     type: Any
 
@@ -32,7 +32,7 @@ class Check:
     """Faults of one piece of code.
 
     Attributes:
-        known: By name, a module, a function, a class, or an ``Instance``.
+        known: Module, function, class or ``Instance`` of each known name.
         faults: Line and message of every fault.
     """
 
@@ -40,12 +40,12 @@ class Check:
     faults: list[tuple[int, str]] = field(default_factory=list)
 
     def fault(self, node: ast.expr | ast.stmt, message: str) -> None:
-        """Add a fault once."""
+        """Add a fault unless it is recorded already."""
         if (node.lineno, message) not in self.faults:
             self.faults.append((node.lineno, message))
 
     def visit(self, node: ast.AST) -> None:
-        """Check a node and all below it, in order."""
+        """Check a node and its descendants, in order."""
         if isinstance(node, ast.Import):
             for alias in node.names:
                 self._import(node, alias.name)
@@ -155,7 +155,7 @@ def _is_ours(found: Any) -> bool:
 
 
 def _class_of(found: Any) -> Any:
-    """The class of an instance; None if it is not a single class."""
+    """Class of an instance; None if its type is not a single class."""
     if not isinstance(found, Instance):
         return None
     origin = typing.get_origin(found.type) or found.type
@@ -163,7 +163,7 @@ def _class_of(found: Any) -> Any:
 
 
 def _instance(hint: Any) -> Instance | None:
-    """An instance of an annotation, of an optional one where it is not None."""
+    """Instance of an annotated type; None is removed from optional types."""
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
         some = [one for one in typing.get_args(hint) if one is not type(None)]
         hint = some[0] if len(some) == 1 else None
@@ -171,14 +171,14 @@ def _instance(hint: Any) -> Instance | None:
 
 
 def _returned(function: Any) -> Instance | None:
-    """An instance of what a function returns."""
+    """Instance of a function's return type."""
     if not _is_ours(function):
         return None
     return _instance(_hints(function).get("return"))
 
 
 def _hints(annotated: Any) -> dict[str, Any]:
-    """Types by name, none if one of them is imported for type checking only."""
+    """Annotated types by name, or none if one of them is imported for type checking only."""
     try:
         return typing.get_type_hints(annotated)
     except NameError:
@@ -186,7 +186,7 @@ def _hints(annotated: Any) -> dict[str, Any]:
 
 
 def _element(found: Any) -> Instance | None:
-    """An instance of what iterating over an instance yields."""
+    """Instance of the element type of an iterable."""
     cls = _class_of(found)
     if cls is None:
         return None
