@@ -226,8 +226,8 @@ def test_oversized_camera_picture_is_reported_with_size_and_limit(
     drive = tmp_path / "drive"
     drive.mkdir()
     coded = [*CODED][[*HOLDERS].index(holder) % len(CODED)]
-    sound = [("png", picture(number)) for number in range(3)]
-    log = HOLDERS[holder](drive, [(coded, CODED[coded]()), *sound])
+    valid = [("png", picture(number)) for number in range(3)]
+    log = HOLDERS[holder](drive, [(coded, CODED[coded]()), *valid])
     _annotate(drive, 0 if holder == "folder" else START_NS)
     with LandmarkWriter(tmp_path / "known.db", "orb"):
         pass

@@ -121,7 +121,7 @@ def test_rows_without_time_stamp_are_dropped(
     log = EVERY_FORMAT[name](tmp_path)
     if name == "images":
         (log / file).write_text("".join(f"{0.1 * i:.3f}\n" for i in range(12)))
-    whole, _ = _times(log)
+    complete, _ = _times(log)
     path = log / file if log.is_dir() else log.with_name(file)
     raw = path.read_bytes()
     seen = set[str]()
@@ -129,7 +129,7 @@ def test_rows_without_time_stamp_are_dropped(
         path.write_bytes(raw[:size])
         cut, ledger = _times(log)
 
-        for topic, times in whole.items():
+        for topic, times in complete.items():
             assert cut[topic] <= times, (size, topic)
             account = ledger.topic(topic)
             assert account.used + account.dropped.total() == len(times), (size, topic)

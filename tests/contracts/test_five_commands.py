@@ -45,8 +45,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / HOME).mkdir(parents=True)
     (place / HOME / "vehicle.toml").write_text("version = 1\n")
     start_ns, end_ns = round(1e9 * (START_S - 1.0)), round(1e9 * (START_S + 1.0))
-    there = CueTruth(cue="stop_sign", present=True, start_ns=start_ns, end_ns=end_ns)
-    save(Truth(version=1, start_ns=start_ns, end_ns=end_ns, cues=(there,)), place / HOME)
+    cue = CueTruth(cue="stop_sign", present=True, start_ns=start_ns, end_ns=end_ns)
+    save(Truth(version=1, start_ns=start_ns, end_ns=end_ns, cues=(cue,)), place / HOME)
     return place
 
 

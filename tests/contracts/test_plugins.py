@@ -167,8 +167,8 @@ def test_plugins_are_listed_with_their_problems(site: Path) -> None:
         if one["package"] == "dummy-package"
     }
     assert all(one["version"] == "1.2" for one in listed if one["package"] == "dummy-package")
-    sound = [key for key, problem in ours.items() if not problem]
-    assert sorted(sound) == [
+    valid = [key for key, problem in ours.items() if not problem]
+    assert sorted(valid) == [
         ("cue", "zebra"),
         ("dataset", "line-drive"),
         ("detector", "bright"),

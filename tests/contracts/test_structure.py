@@ -46,8 +46,8 @@ def imported_by(path: Path, known: set[str]) -> set[str]:
         if isinstance(node, ast.Import):
             found.update(name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
-            whole = {f"{node.module}.{name.name}" for name in node.names}
-            found |= whole & known or {node.module}
+            full_names = {f"{node.module}.{name.name}" for name in node.names}
+            found |= full_names & known or {node.module}
     return found & known
 
 
@@ -64,8 +64,8 @@ def longest_chain(imports: Graph) -> list[str]:
         open_now.discard(name)
         return (name, *found)
 
-    whole: list[tuple[str, ...]] = [from_here(one) for one in imports]
-    longest = max(whole, key=len)
+    chains_of_all: list[tuple[str, ...]] = [from_here(one) for one in imports]
+    longest = max(chains_of_all, key=len)
     return list(longest)
 
 

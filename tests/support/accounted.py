@@ -16,11 +16,11 @@ def read(
     ledger = Ledger(str(path))
     with open_log(path, limits) as log:
         blocks = list(log.read(ledger, selection))
-    given = Counter[str]()
+    returned = Counter[str]()
     for block in blocks:
-        given[block.topic] += len(block)
+        returned[block.topic] += len(block)
     for name, account in ledger.accounts.items():
         assert account.found == account.used + account.skipped.total()
-        assert given.pop(name, 0) == account.used
-    assert not given
+        assert returned.pop(name, 0) == account.used
+    assert not returned
     return blocks, ledger

@@ -277,19 +277,19 @@ def by_bus(frames: Sequence[Sent], spelled: str = "can/{}") -> dict[str, list[Se
     return found
 
 
-def damaged(whole: bytes, seed: int) -> bytes:
+def damaged(intact: bytes, seed: int) -> bytes:
     """Replace 1 to 64 consecutive bytes by random ones or zeros, or flip one bit."""
     rng = random.Random(seed)
-    at = rng.randrange(len(whole))
-    count = min(rng.randrange(1, 65), len(whole) - at)
+    at = rng.randrange(len(intact))
+    count = min(rng.randrange(1, 65), len(intact) - at)
     match rng.randrange(3):
         case 0:
             patch = rng.randbytes(count)
         case 1:
             patch = bytes(count)
         case _:
-            patch = bytes([whole[at] ^ 1 << rng.randrange(8)])
-    return whole[:at] + patch + whole[at + len(patch) :]
+            patch = bytes([intact[at] ^ 1 << rng.randrange(8)])
+    return intact[:at] + patch + intact[at + len(patch) :]
 
 
 def assert_equal_to_python_can(

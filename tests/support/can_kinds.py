@@ -90,8 +90,8 @@ class Verdict:
         return self.word.isupper()
 
 
-def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: Path) -> Verdict:
-    """Read ``copy``, a truncated or damaged ``whole``, and compare it with ``frames``."""
+def judge(kind: Kind, frames: Sequence[Sent], intact: bytes, copy: bytes, path: Path) -> Verdict:
+    """Read ``copy``, a truncated or damaged ``intact``, and compare it with ``frames``."""
     path.write_bytes(copy)
     try:
         open_log(path).close()
@@ -104,7 +104,7 @@ def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: P
     read = Counter((f.arbitration_id, f.payload) for rows in found.values() for f in rows)
     new, lost = (read - sent).total(), (sent - read).total()
     numbers = f"{new} new, {lost} lost, {len(frames)} sent"
-    if new > hit(kind, whole, copy) or read.total() > len(frames):
+    if new > hit(kind, intact, copy) or read.total() > len(frames):
         return Verdict("INVENTED", numbers)
     events = len(frames) // 50 + 1 if kind.suffix == ".asc" else 0
     is_empty_reported = any("no objects" in notice for notice in ledger.notices)
@@ -112,15 +112,15 @@ def judge(kind: Kind, frames: Sequence[Sent], whole: bytes, copy: bytes, path: P
         return Verdict("reported", numbers)
     if read.total() < len(frames):
         # A text log that ends with a complete line is a valid, shorter log.
-        is_short = not kind.declares_end and whole.startswith(copy) and copy.endswith(b"\n")
+        is_short = not kind.declares_end and intact.startswith(copy) and copy.endswith(b"\n")
         return Verdict("undetectable" if is_short else "SILENT", numbers)
     return Verdict("same" if found == kind.expected(frames) else "undetectable", numbers)
 
 
-def hit(kind: Kind, whole: bytes, copy: bytes) -> int:
+def hit(kind: Kind, intact: bytes, copy: bytes) -> int:
     """Number of frames that the damage may have changed without a checksum to detect it."""
     if kind.suffix == ".blf":
         # A span of 64 bytes touches three objects of 48 at most.
         return 3 if kind is KINDS["blf-stored"] else 0
-    places = [k for k, (a, b) in enumerate(zip(whole, copy, strict=False)) if a != b]
-    return whole[places[0] : places[-1] + 1].count(b"\n") + 1 if places else 0
+    places = [k for k, (a, b) in enumerate(zip(intact, copy, strict=False)) if a != b]
+    return intact[places[0] : places[-1] + 1].count(b"\n") + 1 if places else 0

@@ -135,12 +135,12 @@ class BrightBlob:
         return Detections(frame.t_ns, frame.size_px, boxes, np.ones(1), ("bright",), (b"",))
 
 
-def build(**given: object) -> BrightBlob:
+def build(**settings: object) -> BrightBlob:
     """Build the detector, as a user's factory does."""
-    return BrightBlob(settings_of(BrightSettings, given, "detector bright"))
+    return BrightBlob(settings_of(BrightSettings, settings, "detector bright"))
 
 
-def too_few(**given: object) -> BrightBlob:
+def too_few(**settings: object) -> BrightBlob:
     """Build a detector that returns no results, which violates the contract."""
 
     class Forgetful(BrightBlob):

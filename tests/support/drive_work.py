@@ -35,11 +35,11 @@ class Letters:
     threads: str
 
 
-def write_jobs(folder: Path, says: Sequence[str], runs: str = "runs") -> list[Job]:
+def write_jobs(folder: Path, words: Sequence[str], runs: str = "runs") -> list[Job]:
     """Write one log for each word, and return their jobs."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs = []
-    for i, word in enumerate(says):
+    for i, word in enumerate(words):
         log = folder / f"drive{i}.txt"
         if not log.exists():
             log.write_text(word)

@@ -30,13 +30,13 @@ def _bytes(path: Path, content: bytes) -> Path:
 
 
 def _mcap(folder: Path) -> Path:
-    whole = write_folder(folder / "whole", rows_of(400), "mcap")
-    return Path(shutil.move(str(next(whole.glob("*.mcap"))), folder / "log.mcap"))
+    bag = write_folder(folder / "whole", rows_of(400), "mcap")
+    return Path(shutil.move(str(next(bag.glob("*.mcap"))), folder / "log.mcap"))
 
 
 def _db3(folder: Path) -> Path:
-    whole = write_folder(folder / "whole", rows_of(400))
-    return Path(shutil.move(str(next(whole.glob("*.db3"))), folder / "log.db3"))
+    bag = write_folder(folder / "whole", rows_of(400))
+    return Path(shutil.move(str(next(bag.glob("*.db3"))), folder / "log.db3"))
 
 
 def _mf4(path: Path, frames: Sequence[Sent]) -> Path:

@@ -75,8 +75,8 @@ class ShadeMatcher:
 
     def match(self, seen: Features, known: Features, /) -> Match:
         """Return 100 minus the difference in brightness."""
-        apart = abs(float(seen.descriptors[0, 0]) - float(known.descriptors[0, 0]))
-        return Match(100.0 - apart, 25, 25)
+        difference = abs(float(seen.descriptors[0, 0]) - float(known.descriptors[0, 0]))
+        return Match(100.0 - difference, 25, 25)
 
 
 def shade(camera: CameraGeometry) -> ShadeMatcher:

@@ -21,8 +21,8 @@ CPU: Final = torch.device("cpu")
 
 
 def plan_of(width_px: int = 128, **changes: Any) -> Plan:
-    asked = {"architecture": "compact", "classes": CLASSES, "width_px": width_px}
-    return Plan.model_validate({**asked, **changes})
+    plan = {"architecture": "compact", "classes": CLASSES, "width_px": width_px}
+    return Plan.model_validate({**plan, **changes})
 
 
 @cache

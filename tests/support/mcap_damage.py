@@ -102,10 +102,10 @@ def judge(path: Path, truth: Reading) -> Verdict:
     kept = reading.count() / truth.count()
     if not reading.adds_up():
         return Verdict(Kind.UNBALANCED, kept)
-    strange = _of_all(reading) - _of_all(truth)
-    if strange:
+    unexpected = _of_all(reading) - _of_all(truth)
+    if unexpected:
         is_uncovered = any(one in reading.ledger.integrity for one in UNCOVERED)
-        only_changed = is_uncovered and _are_changed(strange, _of_all(truth) - _of_all(reading))
+        only_changed = is_uncovered and _are_changed(unexpected, _of_all(truth) - _of_all(reading))
         return Verdict(Kind.CHANGED if only_changed else Kind.WRONG, kept)
     if reading.count() < truth.count():
         accounts = reading.ledger.accounts.values()
@@ -122,15 +122,15 @@ def _of_all(reading: Reading) -> Counter[tuple[str, Message]]:
 
 
 def _are_changed(
-    strange: Counter[tuple[str, Message]], missing: Counter[tuple[str, Message]]
+    unexpected: Counter[tuple[str, Message]], missing: Counter[tuple[str, Message]]
 ) -> bool:
     """Return whether changed bytes or a renamed topic can explain every unexpected message.
 
     Damage of at most 64 bytes touches at most three records.
     """
     known = {topic for topic, _ in missing}
-    changed = sum(count for (topic, _), count in strange.items() if topic in known)
-    return changed <= 3 and strange.total() <= missing.total()
+    changed = sum(count for (topic, _), count in unexpected.items() if topic in known)
+    return changed <= 3 and unexpected.total() <= missing.total()
 
 
 def cut(coded: bytes, rng: np.random.Generator) -> bytes:

@@ -234,7 +234,7 @@ def read_back(
     path: Path, selection: Selection = EVERYTHING, limits: Limits = DEFAULT_LIMITS
 ) -> Reading:
     """Read a file to its end, as plain tuples."""
-    given: dict[str, list[Message]] = {}
+    messages: dict[str, list[Message]] = {}
     ledger = Ledger(str(path))
     with open_mcap(path, limits) as log:
         names = tuple(topic.name for topic in log.topics)
@@ -242,10 +242,10 @@ def read_back(
             assert isinstance(block.rows, Messages)
             assert block.publish_ns is not None
             rows = block.rows
-            given.setdefault(block.topic, []).extend(
+            messages.setdefault(block.topic, []).extend(
                 (log_ns, publish_ns, bytes(rows.payload(i)))
                 for i, (log_ns, publish_ns) in enumerate(
                     zip(block.log_ns.tolist(), block.publish_ns.tolist(), strict=True)
                 )
             )
-    return Reading(given, ledger, names)
+    return Reading(messages, ledger, names)

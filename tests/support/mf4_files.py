@@ -172,19 +172,21 @@ def virtual_group(bus: int, kind: int, *, is_extended: bool, is_fd: bool, is_lon
     """
     prefix = f"{KINDS[kind]}."
     width = 4 if is_extended else 2
-    room = 0 if kind == REMOTE else 4 if is_long else 8
+    payload_bytes = 0 if kind == REMOTE else 4 if is_long else 8
 
     def encode(frame: Sent, offset: int) -> bytes:
         ticks = (frame.t_ns - START_NS) // 1000
         code = FD_LENGTHS.index(len(frame.payload))
         head = struct.pack("<Q", ticks)[:6] + struct.pack("<L", frame.arbitration_id)[:width]
-        payload = struct.pack("<L", offset) if is_long else frame.payload.ljust(room, b"\0")
-        return head + bytes([code]) + payload[:room]
+        payload = (
+            struct.pack("<L", offset) if is_long else frame.payload.ljust(payload_bytes, b"\0")
+        )
+        return head + bytes([code]) + payload[:payload_bytes]
 
     table = tuple(float(x) for pair in enumerate(FD_LENGTHS) for x in pair)
     fields = [
         Field("Timestamp", 0, 48, type=MASTER, conversion=(1, (0.0, 1e-6))),
-        Field(prefix[:-1], 6, 8 * (width + 1 + room), data_type=BYTES),
+        Field(prefix[:-1], 6, 8 * (width + 1 + payload_bytes), data_type=BYTES),
         constant(prefix + "BusChannel", bus),
         Field(prefix + "ID", 6, 29 if is_extended else 11),
         constant(prefix + "IDE", int(is_extended)),
@@ -193,11 +195,11 @@ def virtual_group(bus: int, kind: int, *, is_extended: bool, is_fd: bool, is_lon
         constant(prefix + "Dir", bus % 2),
         constant(prefix + "EDL", int(is_fd)),
     ]
-    if room:
+    if payload_bytes:
         type_ = VARIABLE if is_long else VALUE
-        fields.append(Field(prefix + "DataBytes", 7 + width, 8 * room, 0, type_, BYTES))
+        fields.append(Field(prefix + "DataBytes", 7 + width, 8 * payload_bytes, 0, type_, BYTES))
     name = f"CAN{bus}{'_RTR' * (kind == REMOTE)}{'_IDE' * is_extended}{'_FD' * is_fd}"
-    return Made(name, 7 + width + room, fields, encode)
+    return Made(name, 7 + width + payload_bytes, fields, encode)
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,8 +372,8 @@ def deflated(part: bytes, coding: int, columns: int = 20) -> bytes:
     original = part
     if coding == 1:
         rows = len(part) // columns
-        whole = b"".join(part[c : rows * columns : columns] for c in range(columns))
-        part = whole + part[rows * columns :]
+        transposed = b"".join(part[c : rows * columns : columns] for c in range(columns))
+        part = transposed + part[rows * columns :]
     packed = zlib.compress(part)
     parameter = columns if coding == 1 else 0
     head = struct.pack("<2sBxLQQ", b"DT", coding, parameter, len(original), len(packed))

@@ -37,14 +37,14 @@ def _garbled_picture(folder: Path) -> None:
 
 def _cut_jpeg(folder: Path) -> None:
     pictures = sorted(folder.glob("camera/*/*.jpg"))
-    whole = pictures[len(pictures) // 2]
-    whole.write_bytes(whole.read_bytes()[:-20])
+    path = pictures[len(pictures) // 2]
+    path.write_bytes(path.read_bytes()[:-20])
 
 
 def _cut_png(folder: Path) -> None:
     pictures = sorted(folder.rglob("*.png"))
-    whole = pictures[len(pictures) // 2]
-    whole.write_bytes(whole.read_bytes()[:-20])
+    path = pictures[len(pictures) // 2]
+    path.write_bytes(path.read_bytes()[:-20])
 
 
 def _unknown_topic(path: Path) -> None:

@@ -53,17 +53,19 @@ def serving() -> Iterator[Served]:
                 self.send_header("Content-Length", "0")
                 self.end_headers()
                 return
-            asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
-            begin, end = (int(asked[1]), int(asked[2]) + 1) if asked else (0, len(content))
+            requested = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+            begin, end = (
+                (int(requested[1]), int(requested[2]) + 1) if requested else (0, len(content))
+            )
             body = content[begin:end]
-            self.send_response(206 if asked else 200)
+            self.send_response(206 if requested else 200)
             self.send_header("Accept-Ranges", "bytes")
             self.send_header("Content-Length", str(len(body)))
             self.send_header("Content-Type", "application/octet-stream")
             self.send_header("ETag", f'"{hash(content):x}"')
-            if asked:
-                whole = f"bytes {begin}-{begin + len(body) - 1}/{len(content)}"
-                self.send_header("Content-Range", whole)
+            if requested:
+                content_range = f"bytes {begin}-{begin + len(body) - 1}/{len(content)}"
+                self.send_header("Content-Range", content_range)
             self.end_headers()
             if not with_body:
                 return

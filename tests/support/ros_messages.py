@@ -162,13 +162,13 @@ def _nanoseconds(value: Any, name: str, *, is_ros1: bool) -> int:
 
 def messages_of(payloads: Sequence[bytes], gap: int = 0) -> Messages:
     """Payloads in one buffer, with ``gap`` unrelated bytes before each."""
-    whole, start, stop = bytearray(), [], []
+    joined, start, stop = bytearray(), [], []
     for payload in payloads:
-        whole += b"\xa5" * gap
-        start.append(len(whole))
-        whole += payload
-        stop.append(len(whole))
-    buffer: NDArray[np.uint8] = np.frombuffer(bytes(whole), np.uint8)
+        joined += b"\xa5" * gap
+        start.append(len(joined))
+        joined += payload
+        stop.append(len(joined))
+    buffer: NDArray[np.uint8] = np.frombuffer(bytes(joined), np.uint8)
     return Messages(buffer, np.array(start, np.int64), np.array(stop, np.int64))
 
 

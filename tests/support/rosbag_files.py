@@ -160,17 +160,17 @@ def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) 
     was_reported = was_reported or any(account.skipped for account in ledger.accounts.values())
     if by_topic(reading.rows) == by_topic(truth):
         return "same"
-    strange = Counter(reading.rows) - Counter(truth)
-    if not strange:
+    unexpected = Counter(reading.rows) - Counter(truth)
+    if not unexpected:
         return "reported" if was_reported else "SILENT LOSS"
-    if _only_payloads_differ(reading.rows, truth, strange, path.suffix == ".db3"):
+    if _only_payloads_differ(reading.rows, truth, unexpected, path.suffix == ".db3"):
         assert "cannot be detected" in ledger.integrity
         return "undetectable"
     return "wrong, reported" if was_reported else "SILENT WRONG"
 
 
 def _only_payloads_differ(
-    rows: Sequence[Row], truth: Sequence[Row], strange: Counter[Row], is_sqlite: bool
+    rows: Sequence[Row], truth: Sequence[Row], unexpected: Counter[Row], is_sqlite: bool
 ) -> bool:
     """Return whether every unexpected row replaces a missing one.
 
@@ -182,28 +182,28 @@ def _only_payloads_differ(
         return ("", row.log_ns, 0) if is_sqlite else (row.topic, row.log_ns, len(row.payload))
 
     missing = Counter(truth) - Counter(rows)
-    return not Counter(map(place, strange.elements())) - Counter(map(place, missing.elements()))
+    return not Counter(map(place, unexpected.elements())) - Counter(map(place, missing.elements()))
 
 
 def _check_identity(ledger: Ledger, rows: Sequence[Row]) -> None:
     """Check that rows in the file are used, skipped or dropped, and used rows were returned."""
-    given = Counter(row.topic for row in rows)
+    returned = Counter(row.topic for row in rows)
     for name, account in ledger.accounts.items():
-        assert account.used == given.get(name, 0), (name, account)
+        assert account.used == returned.get(name, 0), (name, account)
         assert account.in_file == account.used + account.skipped.total() + account.dropped.total()
-    assert not given.keys() - ledger.accounts.keys()
+    assert not returned.keys() - ledger.accounts.keys()
 
 
-def damaged_copies(whole: bytes, cuts: int, flips: int, seed: int) -> Iterator[tuple[str, bytes]]:
+def damaged_copies(intact: bytes, cuts: int, flips: int, seed: int) -> Iterator[tuple[str, bytes]]:
     """Yield damaged copies with a description; the seed determines all."""
     rng = np.random.default_rng(seed)
-    for at in rng.integers(0, len(whole), size=cuts):
-        yield f"cut at {at}", whole[: int(at)]
+    for at in rng.integers(0, len(intact), size=cuts):
+        yield f"cut at {at}", intact[: int(at)]
     for _ in range(flips):
         length = int(rng.choice([1, 1, 2, 4, 8, 16, 32, 64]))
-        at = int(rng.integers(0, max(1, len(whole) - length)))
+        at = int(rng.integers(0, max(1, len(intact) - length)))
         kind = ("noise", "zeros", "bit")[int(rng.integers(0, 3))]
-        copy = bytearray(whole)
+        copy = bytearray(intact)
         if kind == "bit":
             copy[at] ^= 1 << int(rng.integers(0, 8))
         elif kind == "zeros":

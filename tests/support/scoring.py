@@ -122,11 +122,13 @@ def belief_table(
             now = changes.get(frame, now)
             values.append(now)
         columns[name] = pa.array(values, pa.float64())
-    open_doors = [
+    roads = [
         columns[name].to_pylist() for name in ("intersection", "left", "right") if name in columns
     ]
-    sure = [any(v[i] > 0.9 for v in open_doors) for i in range(len(frames))]
-    columns["established"] = pa.array([any(sure[: i + 1]) for i in range(len(frames))], pa.bool_())
+    is_established = [any(v[i] > 0.9 for v in roads) for i in range(len(frames))]
+    columns["established"] = pa.array(
+        [any(is_established[: i + 1]) for i in range(len(frames))], pa.bool_()
+    )
     return pa.table(columns)
 
 

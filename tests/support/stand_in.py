@@ -95,8 +95,8 @@ def _card(network: Path, server: Served) -> ModelCard:
         size_bytes=len(content),
         sha256=sha256,
     )
-    whole = entries.entry("yolox-nano")
-    return whole.model_copy(update={"weights": network.name, "sha256": sha256, "files": (file,)})
+    original = entries.entry("yolox-nano")
+    return original.model_copy(update={"weights": network.name, "sha256": sha256, "files": (file,)})
 
 
 def _write_bundled(kept: Path, drive: Path, network: Path) -> None:

@@ -193,12 +193,12 @@ def test_missing_or_malformed_truth_is_reported(tmp_path: Path) -> None:
 
     with pytest.raises(SchemaError, match="has no ranges"):
         pairs_of_truth(tmp_path, "stop_sign")
-    whole = drive(tmp_path / "a")
-    (whole / "objects.json").write_text('{"images": 3}')
+    complete = drive(tmp_path / "a")
+    (complete / "objects.json").write_text('{"images": 3}')
     with pytest.raises(SchemaError, match="no COCO file"):
-        pairs_of_truth(whole, "stop_sign")
+        pairs_of_truth(complete, "stop_sign")
     with pytest.raises(UnreadableRunError, match=r"detections.parquet: not there"):
-        pairs_of_run(tmp_path, whole, "stop_sign", 0.9)
+        pairs_of_run(tmp_path, complete, "stop_sign", 0.9)
 
 
 def test_unequal_numbers_of_runs_and_drives_are_refused(

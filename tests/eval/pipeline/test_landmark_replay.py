@@ -117,11 +117,11 @@ def errors_m(town: Town, run: RunFolder) -> Floats:
     track = read_tum(town.drive.truth.parent / "pose.tum")
     table = run.table("pose")
     t_ns = table["t_ns"].to_numpy()
-    apart = [
+    offsets_m = [
         table[name].to_numpy() - np.interp(t_ns, track.t_ns, track.xyz_m[:, i])
         for i, name in enumerate(("x_m", "y_m"))
     ]
-    return np.asarray(np.hypot(*apart), np.float64)
+    return np.asarray(np.hypot(*offsets_m), np.float64)
 
 
 def test_landmarks_correct_a_drifting_pose(
@@ -372,7 +372,7 @@ def test_real_frames_match_nearest_landmarks_of_kitti_turn(tmp_path: Path) -> No
     assert cli.run([*add, "--coordinates", str(csv)]) == 0
 
     stage = stage_at(database, Ledger("kitti"))
-    apart = []
+    offsets_m = []
     for i in range(2, 51, 4):
         picture = (folder / "image_l" / f"{i:06d}.png").read_bytes()
         seen = stage.search.matcher.describe(grey_of(Encoded("png", memoryview(picture))))
@@ -380,8 +380,8 @@ def test_real_frames_match_nearest_landmarks_of_kitti_turn(tmp_path: Path) -> No
         best = best_of(seen, everything, stage.search.database, stage.search.matcher)
         assert best is not None
         assert best.match.score > 50
-        apart.append(float(np.hypot(*(best.place.xy_m - east_north[i]))))
-    assert max(apart) < 4.5
+        offsets_m.append(float(np.hypot(*(best.place.xy_m - east_north[i]))))
+    assert max(offsets_m) < 4.5
 
 
 def test_vehicle_file_accepts_landmarks_section(tmp_path: Path) -> None:

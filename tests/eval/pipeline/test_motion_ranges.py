@@ -151,15 +151,15 @@ def test_nearest_stop_sign_marks_start() -> None:
     ],
 )
 def test_settings_select_one_source_of_ranges(text: str, source: str | None) -> None:
-    given = vehicle(text)
-    ranges = MotionRanges(given)
+    car = vehicle(text)
+    ranges = MotionRanges(car)
     rows = drive(ranges, [FAR], 5)
     seen = found([FAR], 0.0)
 
-    by_curve = SignRanges(given)
+    by_curve = SignRanges(car)
     made = by_curve([seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
 
-    assert source_of(given, "traffic_light") == source
+    assert source_of(car, "traffic_light") == source
     assert bool(rows[-1]) == (source == "motion")
     assert bool(made) == (source == "curve")
     assert bool(ranges.counts) == (source == "motion")
@@ -169,12 +169,12 @@ def test_settings_select_one_source_of_ranges(text: str, source: str | None) -> 
 
 def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:
     aside: Thing = ("traffic light", 20.0, -12.75, 1.3)
-    given = vehicle()
+    car = vehicle()
     seen = found([aside], 0.0)
-    counted = SignRanges(given)
+    counted = SignRanges(car)
     counted([seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
 
-    assert drive(MotionRanges(given), [aside], 3)[0] == ()
+    assert drive(MotionRanges(car), [aside], 3)[0] == ()
     assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
 
 

@@ -78,15 +78,15 @@ def test_incomplete_run_is_identified_by_input_file(
 ) -> None:
     cut = tmp_path / "cut"
     assert _replay(drives / "D-0", cut) == 0
-    whole = tree(cut)
+    expected = tree(cut)
     (cut / "manifest.json").unlink()
 
     assert _replay(drives / "D-1", cut, "--resume") == 2
     assert "--resume would destroy it" in capsys.readouterr().err
     assert _replay(drives / "D-0", cut, "--resume") == 0
-    assert tree(cut) == whole
+    assert tree(cut) == expected
     assert _replay(drives / "D-1", cut, "--overwrite", "--resume") == 0
-    assert tree(cut) != whole
+    assert tree(cut) != expected
 
 
 def test_run_of_older_format_is_refused(
@@ -166,7 +166,7 @@ def test_merged_shards_equal_single_batch(drives: Path, tmp_path: Path, seed: in
     logs = [str(path) for path in sorted(drives.glob("*/drive.mcap"))]
     single = tmp_path / "single"
     assert run(["replay", *logs, "--each", "-o", str(single), *PART]) == 3
-    whole = _bytes(single / "merged")
+    expected = _bytes(single / "merged")
 
     shards: list[list[str]] = [[], [], []]
     for log in logs:
@@ -183,8 +183,8 @@ def test_merged_shards_equal_single_batch(drives: Path, tmp_path: Path, seed: in
     folders = [folder for folder in folders if Path(folder, "merged").exists()]
     rng.shuffle(folders)
 
-    assert _merged(["merge", *folders], tmp_path / "all", 3) == whole
-    assert _merged(["merge", *folders, *folders[:1]], tmp_path / "twice", 3) == whole
+    assert _merged(["merge", *folders], tmp_path / "all", 3) == expected
+    assert _merged(["merge", *folders, *folders[:1]], tmp_path / "twice", 3) == expected
 
 
 def test_reused_folder_keeps_drives_of_both_batches(drives: Path, tmp_path: Path) -> None:

@@ -78,14 +78,14 @@ def test_clock_jump_neither_adds_nor_removes_distance(tmp_path: Path, by_s: int)
         _replay(tmp_path / "second", _part(blocks, first=cut_ns)),
     )
 
-    whole = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_s * SECOND))
+    jumped = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_s * SECOND))
 
-    assert whole.exit_status == 3
-    assert len(whole.segments) == 2
-    assert whole.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
-    assert _distance(whole, 0) == _distance(first)
-    assert _distance(whole, 1) == _distance(second)
-    pose = whole.run.table("pose")
+    assert jumped.exit_status == 3
+    assert len(jumped.segments) == 2
+    assert jumped.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
+    assert _distance(jumped, 0) == _distance(first)
+    assert _distance(jumped, 1) == _distance(second)
+    pose = jumped.run.table("pose")
     assert np.all(np.diff(pose["t_ns"].to_numpy()) > 0)
     original = pose["log_t_ns"].to_numpy()
     expected = np.concatenate(
@@ -121,10 +121,10 @@ def test_distance_around_any_clock_jump_is_sum_of_halves(
     ]
     alone = [half.travelled_m for half in halves]
 
-    whole = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_ms * 1_000_000))
+    jumped = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_ms * 1_000_000))
 
-    assert len(whole.segments) == 2
-    assert whole.travelled_m == pytest.approx(sum(alone), abs=1e-9)
+    assert len(jumped.segments) == 2
+    assert jumped.travelled_m == pytest.approx(sum(alone), abs=1e-9)
 
 
 def test_pause_is_reported_as_gap_with_its_length(tmp_path: Path) -> None:
@@ -222,8 +222,10 @@ def test_any_motion_in_gap_is_within_three_sigma(gap_s: float) -> None:
         turn = rng.uniform(-limits.max_turn_rate_radps, limits.max_turn_rate_radps)
         time_s = np.linspace(0.0, gap_s, 2000)
         speed = np.clip(15.0 + accel * time_s, 0.0, limits.max_speed_mps)
-        way = speed * gap_s / 2000
-        xy = np.array([(way * np.cos(turn * time_s)).sum(), (way * np.sin(turn * time_s)).sum()])
+        step_m = speed * gap_s / 2000
+        xy = np.array(
+            [(step_m * np.cos(turn * time_s)).sum(), (step_m * np.sin(turn * time_s)).sum()]
+        )
         error = xy - crossed.mean[:2]
         assert error @ np.linalg.solve(crossed.cov[:2, :2], error) < 9.0
 

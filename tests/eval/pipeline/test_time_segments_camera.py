@@ -73,29 +73,29 @@ def test_tables_around_clock_jump_equal_those_of_halves(
 
     first = run("first", Clock(pause_s=(cut_s, NEVER_S)))
     second = run("second", Clock(pause_s=(0.0, cut_s)))
-    whole = run("whole", Clock(set_at_s=cut_s, by_s=by_ms / 1000))
+    jumped = run("whole", Clock(set_at_s=cut_s, by_s=by_ms / 1000))
 
-    assert len(whole.segments) == 2
-    assert whole.exit_status == 3
-    assert whole.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
-    assert whole.detected is not None
-    assert set(whole.detected.counts.from_cache.values()) == {140}
+    assert len(jumped.segments) == 2
+    assert jumped.exit_status == 3
+    assert jumped.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
+    assert jumped.detected is not None
+    assert set(jumped.detected.counts.from_cache.values()) == {140}
     assert all(_columns(half, "range")["t_ns"] for half in (first, second))
     assert all(half.scene and half.scene.positive["stop_sign"] for half in (first, second))
     for name in ("frames", "detections", "cues", "range", "belief"):
-        _assert_equal(_columns(whole, name, 0), _columns(first, name))
+        _assert_equal(_columns(jumped, name, 0), _columns(first, name))
     restarts = by_ms < 0 or by_ms + ONE_ROW_MS > RESTART_MS
     for name in ("cues", "range", "belief") if restarts else ("detections",):
-        _assert_equal(_columns(whole, name, 1, by_ms), _columns(second, name))
+        _assert_equal(_columns(jumped, name, 1, by_ms), _columns(second, name))
 
 
 @pytest.mark.parametrize("by_s", [-3600.0, -7.0, 1200.0])
 def test_every_table_records_segment_and_original_stamp(tmp_path: Path, by_s: float) -> None:
-    whole = replay(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s)))
+    jumped = replay(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s)))
 
     for name in LABELLED:
-        assert {"segment", "log_t_ns"} <= set(whole.run.schema(name).names)
-    frames = whole.run.table("frames")
+        assert {"segment", "log_t_ns"} <= set(jumped.run.schema(name).names)
+    frames = jumped.run.table("frames")
     assert np.all(np.diff(frames["t_ns"].to_numpy()) > 0)
     assert set(frames["segment"].to_pylist()) == {0, 1}
 

@@ -62,16 +62,16 @@ def test_clock_set_back_in_camera_log_leaves_odometry_unchanged(tmp_path: Path) 
     straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
     camera = Clock(set_at_s=6.0, by_s=-3.0)
 
-    whole = _two_logs(tmp_path, Clock(), camera, "whole")
+    shifted = _two_logs(tmp_path, Clock(), camera, "whole")
 
     assert (straight.exit_status, len(straight.segments)) == (0, 1)
-    assert (whole.exit_status, len(whole.segments)) == (3, 2)
-    assert whole.travelled_m == straight.travelled_m
+    assert (shifted.exit_status, len(shifted.segments)) == (3, 2)
+    assert shifted.travelled_m == straight.travelled_m
     for column in ("t_ns", "log_t_ns", "x_m", "travelled_m"):
         np.testing.assert_array_equal(
-            _column(whole.run, "pose", column), _column(straight.run, "pose", column)
+            _column(shifted.run, "pose", column), _column(straight.run, "pose", column)
         )
-    frames = whole.run.table("frames")
+    frames = shifted.run.table("frames")
     true_ns = np.arange(140) * ROW + BEGIN
     assert frames["log_t_ns"].to_pylist() == camera.recorded(true_ns)[1].tolist()
     assert np.all(np.diff(frames["t_ns"].to_numpy()) > 0)
@@ -81,12 +81,12 @@ def test_clock_set_back_in_camera_log_leaves_odometry_unchanged(tmp_path: Path) 
 def test_clock_jump_in_wheel_log_is_gap_without_distance(tmp_path: Path) -> None:
     straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
 
-    whole = _two_logs(tmp_path, Clock(set_at_s=6.0, by_s=3.0), Clock(), "whole")
+    shifted = _two_logs(tmp_path, Clock(set_at_s=6.0, by_s=3.0), Clock(), "whole")
 
-    assert (whole.exit_status, len(whole.segments)) == (3, 2)
-    assert whole.segments[1].gap_ns == 3 * SECOND + ROW
-    assert whole.travelled_m == pytest.approx(straight.travelled_m - STEP_M, abs=1e-6)
-    frames = whole.run.table("frames")
+    assert (shifted.exit_status, len(shifted.segments)) == (3, 2)
+    assert shifted.segments[1].gap_ns == 3 * SECOND + ROW
+    assert shifted.travelled_m == pytest.approx(straight.travelled_m - STEP_M, abs=1e-6)
+    frames = shifted.run.table("frames")
     assert frames["t_ns"].equals(frames["log_t_ns"])
     assert frames["t_ns"].to_pylist() == straight.run.table("frames")["t_ns"].to_pylist()
     # The odometry's second half begins at 9 s; pictures up to a second earlier belong to it.
@@ -173,11 +173,13 @@ def test_compare_reports_segment_column_as_changed(
 ) -> None:
     jumped = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=3.0))
     gap = replayed(tmp_path, jumped, "gap").path
-    whole = replayed(tmp_path, write_drive(tmp_path, Clock(), name="whole.mcap"), "whole").path
+    without_gap = replayed(
+        tmp_path, write_drive(tmp_path, Clock(), name="whole.mcap"), "whole"
+    ).path
     capsys.readouterr()
 
     changed = []
-    for before, status in ((gap, 0), (whole, 1)):
+    for before, status in ((gap, 0), (without_gap, 1)):
         assert cli.run(["compare", str(before), str(gap), "--json"]) == status
         tables = json.loads(capsys.readouterr().out)["tables"]
         changed.append({one["name"]: sorted(one["columns"]) for one in tables})

@@ -14,9 +14,9 @@ def _odometer() -> Odometer:
     """Odometry at 10 m/s: two seconds, an assumed gap of two seconds, and two more seconds."""
     start = np.array([0, 1, 2, 4, 5]) * SECOND
     stop = np.array([1, 2, 4, 5, 6]) * SECOND
-    way = np.array([10.0, 10.0, 20.0, 10.0, 10.0])
+    distance_m = np.array([10.0, 10.0, 20.0, 10.0, 10.0])
     is_gap = np.array([False, False, True, False, False])
-    return Odometer(iter([(start, stop, way, 0.1 * way, 0.01 * way, is_gap)]))
+    return Odometer(iter([(start, stop, distance_m, 0.1 * distance_m, 0.01 * distance_m, is_gap)]))
 
 
 def test_distance_across_gap_is_reported_as_assumed() -> None:

@@ -20,49 +20,49 @@ def sizes(rng: np.random.Generator, clusters: int, *, equal: bool) -> Int64s:
 @pytest.mark.parametrize("clusters", [4, 5, 8, 30])
 def test_intervals_of_means_have_stated_coverage(clusters: int, equal: bool) -> None:
     rng = np.random.default_rng(clusters)
-    held = 0
+    covered = 0
     for _ in range(TIMES):
         rows = sizes(rng, clusters, equal=equal)
         which = np.repeat(np.arange(clusters), rows)
         values = rng.normal(0.0, 1.0, clusters)[which] + rng.normal(0.0, 1.0, len(which))
         low, high = mean_by_cluster(values, which)
-        held += low <= 0.0 <= high
+        covered += low <= 0.0 <= high
 
-    assert held / TIMES > 0.95 - SLACK
+    assert covered / TIMES > 0.95 - SLACK
 
 
-@pytest.mark.parametrize("alike", [0.05, 0.2])
+@pytest.mark.parametrize("correlation", [0.05, 0.2])
 @pytest.mark.parametrize("fraction", [0.5, 0.8, 0.95])
 @pytest.mark.parametrize("clusters", [4, 5, 8, 30])
 def test_intervals_of_fractions_have_nearly_stated_coverage(
-    clusters: int, fraction: float, alike: float
+    clusters: int, fraction: float, correlation: float
 ) -> None:
     rng = np.random.default_rng(clusters)
-    held = 0
+    covered = 0
     for _ in range(TIMES):
         rows = sizes(rng, clusters, equal=False)
-        rest = 1.0 / alike - 1.0
+        rest = 1.0 / correlation - 1.0
         which = np.repeat(np.arange(clusters), rows)
         is_right = (
             rng.random(len(which))
             < rng.beta(fraction * rest, (1.0 - fraction) * rest, clusters)[which]
         )
         low, high = fraction_by_cluster(is_right, which)
-        held += low <= fraction <= high
+        covered += low <= fraction <= high
 
-    assert held / TIMES > 0.89
+    assert covered / TIMES > 0.89
 
 
 def test_cluster_bootstrap_would_cover_too_little() -> None:
     rng = np.random.default_rng(5)
-    held = 0
+    covered = 0
     for _ in range(TIMES):
         means = rng.normal(0.0, 1.0, 5)
         drawn = rng.choice(means, (400, 5)).mean(axis=1)
         low, high = np.percentile(drawn, [2.5, 97.5])
-        held += low <= 0.0 <= high
+        covered += low <= 0.0 <= high
 
-    assert 0.78 < held / TIMES < 0.88
+    assert 0.78 < covered / TIMES < 0.88
 
 
 def test_interval_with_one_row_per_cluster_is_students_t() -> None:
@@ -97,13 +97,13 @@ def test_dominant_cluster_widens_interval_of_mean() -> None:
 
 def test_ratio_interval_covers_and_equals_ratio_of_means_over_all_drives() -> None:
     rng = np.random.default_rng(2)
-    held = 0
+    covered = 0
     for _ in range(TIMES):
         bottom = rng.gamma(5.0, 1.0, 20)
         top = bottom * rng.gamma(20.0, 1.3 / 20.0, 20)
         found = ratio_of(top, bottom)
-        held += found.low <= 1.3 <= found.high
+        covered += found.low <= 1.3 <= found.high
         every = np.ones(20)
         assert ratio_of_means(top, every, bottom, every) == pytest.approx(found, rel=1e-9)
 
-    assert held / TIMES > 0.92
+    assert covered / TIMES > 0.92

@@ -261,8 +261,8 @@ def test_coverage_accounts_for_every_true_pose() -> None:
     assert interpolated.coverage == Coverage(100, 79, 10, 5, 6)
     assert nearest.coverage == Coverage(100, 83, 8, 3, 6)
     for coverage in (interpolated.coverage, nearest.coverage):
-        lost = coverage.before_estimate + coverage.after_estimate + coverage.in_gap
-        assert coverage.scored + lost == coverage.truth_poses
+        unscored = coverage.before_estimate + coverage.after_estimate + coverage.in_gap
+        assert coverage.scored + unscored == coverage.truth_poses
 
 
 @given(seed=SEEDS, fraction=st.floats(0.0, 1.0))
@@ -280,9 +280,9 @@ def test_interpolation_is_linear_in_time(seed: int, fraction: float) -> None:
     )
     assert found.cov_xyh is not None
     np.testing.assert_allclose(found.cov_xyh[0], part)
-    whole = angle_rad(product(inverse(two.quat_wxyz[0]), two.quat_wxyz[1]))
-    gone = angle_rad(product(inverse(two.quat_wxyz[0]), found.estimate.quat_wxyz[0]))
-    assert gone == pytest.approx(part * whole, abs=1e-7)
+    total_rad = angle_rad(product(inverse(two.quat_wxyz[0]), two.quat_wxyz[1]))
+    turned_rad = angle_rad(product(inverse(two.quat_wxyz[0]), found.estimate.quat_wxyz[0]))
+    assert turned_rad == pytest.approx(part * total_rad, abs=1e-7)
 
 
 def test_interpolation_between_equal_rotations_is_constant() -> None:

@@ -266,8 +266,8 @@ def test_extra_and_split_approaches_are_counted() -> None:
         belief_table(BELIEF, 3, range(30, 45)),
         belief_table({**BELIEF, "intersection": {70: 0.95}}, 4, range(70, 75)),
     ]
-    whole = pa.concat_tables([p.select(["t_ns", "approach", "intersection"]) for p in pieces])
-    judged = judge_approaches(run_tables("made up", belief_table=whole), truth([], [far]))
+    joined = pa.concat_tables([p.select(["t_ns", "approach", "intersection"]) for p in pieces])
+    judged = judge_approaches(run_tables("made up", belief_table=joined), truth([], [far]))
 
     assert judged is not None
     assert (judged.extra, judged.extra_detected, judged.not_judged) == (1, 1, 1)
@@ -289,13 +289,13 @@ def test_without_true_ranges_detection_counts_without_distance() -> None:
 
 
 def test_brier_and_log_score_computed_by_hand() -> None:
-    p, there = np.array([0.5, 0.9, 1.0, 0.0]), np.array([True, True, True, True])
+    p, is_present = np.array([0.5, 0.9, 1.0, 0.0]), np.array([True, True, True, True])
 
-    assert brier(p, there) == pytest.approx([0.25, 0.01, 0.0, 1.0])
-    assert log_score(p, there) == pytest.approx(
+    assert brier(p, is_present) == pytest.approx([0.25, 0.01, 0.0, 1.0])
+    assert log_score(p, is_present) == pytest.approx(
         [math.log(2), -math.log(0.9), 1e-6, -math.log(CLIP)]
     )
-    assert log_score(1.0 - p, ~there) == pytest.approx(log_score(p, there), rel=1e-6)
+    assert log_score(1.0 - p, ~is_present) == pytest.approx(log_score(p, is_present), rel=1e-6)
 
 
 def test_reliability_of_calibrated_belief_is_on_diagonal() -> None:

@@ -44,18 +44,18 @@ def _result(**changes: object) -> ApproachResult:
 
 
 def _cue(
-    cue: str, *, found: int = 0, there: int = 0, visible: float = 1.0, approach: int = 0
+    cue: str, *, positives: int = 0, objects: int = 0, visible: float = 1.0, approach: int = 0
 ) -> CueFrames:
-    """Build frames of a cue: objects in the first ``there``, positives in the first ``found``."""
+    """Build frames of a cue with objects and positives in the first frames."""
     first = np.arange(FRAMES)
     return CueFrames(
         drive="runs/X-01",
         cue=cue,
         t_ns=first.astype(np.int64),
-        count=(first < found).astype(np.int64),
+        count=(first < positives).astype(np.int64),
         approach=np.full(FRAMES, approach, np.int64),
         distance_m=DISTANCE_M,
-        is_object=(first < there).astype(np.int8),
+        is_object=(first < objects).astype(np.int8),
         is_feature=np.ones(FRAMES, np.int8),
         true_count=np.ones(FRAMES, np.int64),
         visible=np.full(FRAMES, visible),
@@ -74,7 +74,7 @@ NO_LEFT = _result(features_m={"intersection": 40.0, "left": None}, full_m=None)
 
 
 def test_approach_established_in_time_has_no_finding() -> None:
-    assert _found(_result(), _cue("road_left", there=40)) == []
+    assert _found(_result(), _cue("road_left", objects=40)) == []
 
 
 def test_feature_established_only_at_intersection_is_late() -> None:
@@ -91,14 +91,16 @@ def test_feature_without_visible_cue_is_reported_as_not_shown() -> None:
 
 
 def test_occluded_cue_is_reported_as_hidden() -> None:
-    (one,) = _found(NO_LEFT, _cue("road_left", there=30, visible=0.4))
+    (one,) = _found(NO_LEFT, _cue("road_left", objects=30, visible=0.4))
 
     assert one.cause == "hidden"
     assert "30 frames" in one.reported
 
 
 def test_visible_cue_without_detections_is_reported_as_not_found() -> None:
-    (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("parked_left", there=10))
+    (one,) = _found(
+        NO_LEFT, _cue("road_left", objects=30, positives=4), _cue("parked_left", objects=10)
+    )
 
     assert one.cause == "not found"
     assert "4 of 40" in one.reported
@@ -108,7 +110,9 @@ def test_visible_cue_without_detections_is_reported_as_not_found() -> None:
 
 def test_positives_on_hidden_cue_do_not_count_as_found() -> None:
     (one,) = _found(
-        NO_LEFT, _cue("road_left", there=30, visible=0.4, found=30), _cue("parked_left", there=8)
+        NO_LEFT,
+        _cue("road_left", objects=30, visible=0.4, positives=30),
+        _cue("parked_left", objects=8),
     )
 
     assert one.cause == "not found"
@@ -116,7 +120,9 @@ def test_positives_on_hidden_cue_do_not_count_as_found() -> None:
 
 
 def test_more_frequent_contradicting_cue_is_reported_as_denial() -> None:
-    (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=4), _cue("one_way_right", found=9))
+    (one,) = _found(
+        NO_LEFT, _cue("road_left", objects=30, positives=4), _cue("one_way_right", positives=9)
+    )
 
     assert one.cause == "denied"
     assert "one way right" in one.reported
@@ -124,7 +130,7 @@ def test_more_frequent_contradicting_cue_is_reported_as_denial() -> None:
 
 def test_road_found_before_presence_is_established_waits_for_presence() -> None:
     result = _result(features_m={"intersection": None, "left": None}, detected_m=None)
-    cues = _cue("road_left", there=30, found=25), _cue("stop_sign", there=30, found=2)
+    cues = _cue("road_left", objects=30, positives=25), _cue("stop_sign", objects=30, positives=2)
     one, other = _found(result, *cues)
 
     assert (one.feature, one.cause) == ("intersection", "not found")
@@ -132,14 +138,14 @@ def test_road_found_before_presence_is_established_waits_for_presence() -> None:
 
 
 def test_counted_cue_below_threshold_is_reported_as_too_little() -> None:
-    (one,) = _found(NO_LEFT, _cue("road_left", there=30, found=25))
+    (one,) = _found(NO_LEFT, _cue("road_left", objects=30, positives=25))
 
     assert one.cause == "too little"
 
 
 def test_invented_feature_names_cues_that_support_it() -> None:
     result = _result(false_features=("straight",))
-    (one,) = _found(result, _cue("road_straight", found=12), _cue("lanes_past", found=1))
+    (one,) = _found(result, _cue("road_straight", positives=12), _cue("lanes_past", positives=1))
 
     assert (one.failing, one.cause) == ("invented", "claimed wrongly")
     assert one.reported == f"road straight in 12 of {FAR}, lanes past in 1 of {FAR}"
@@ -147,8 +153,8 @@ def test_invented_feature_names_cues_that_support_it() -> None:
 
 
 def test_frames_of_other_approaches_or_at_intersection_are_ignored() -> None:
-    other = _cue("road_left", there=40, found=40, approach=1)
-    near = replace(_cue("parked_left", there=40), distance_m=np.full(FRAMES, 5.0))
+    other = _cue("road_left", objects=40, positives=40, approach=1)
+    near = replace(_cue("parked_left", objects=40), distance_m=np.full(FRAMES, 5.0))
     (one,) = _found(NO_LEFT, other, near)
 
     assert one.cause == "nothing shows it"
@@ -190,9 +196,9 @@ def test_permanent_condition_of_intersection_does_not_exclude_good_runs() -> Non
 
 def test_condition_cost_is_nan_without_runs_to_compare() -> None:
     here = _result(conditions=("clear",))
-    there = _result(intersection="Y", conditions=("clear",))
+    elsewhere = _result(intersection="Y", conditions=("clear",))
     lost = _result(intersection="Y", conditions=("rain",), detected_m=None)
-    (cost,) = condition_costs([here, there, lost])
+    (cost,) = condition_costs([here, elsewhere, lost])
 
     assert math.isnan(cost.detected_m.value)
     assert cost.undetected == 1

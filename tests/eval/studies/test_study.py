@@ -163,12 +163,14 @@ def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() ->
     study = SMALL.model_copy(
         update={"strategies": ("straight to goal", "hybrid"), "densities_per_km2": (0.5,)}
     )
-    ways = np.array([[1000.0, 2000.0, 9000.0], [1100.0, 2200.0, 12_000.0]])
+    distances_m = np.array([[1000.0, 2000.0, 9000.0], [1100.0, 2200.0, 12_000.0]])
     outcomes = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-    assert math.isnan(ratio_of_means(ways[0], outcomes[1], ways[1], outcomes[1]).value)
+    assert math.isnan(
+        ratio_of_means(distances_m[0], outcomes[1], distances_m[1], outcomes[1]).value
+    )
     rows = [
-        {**dict.fromkeys(Result._fields, np.ones(3)), "travelled_m": way, "outcome": outcome}
-        for way, outcome in zip(ways, outcomes, strict=True)
+        {**dict.fromkeys(Result._fields, np.ones(3)), "travelled_m": distance_m, "outcome": outcome}
+        for distance_m, outcome in zip(distances_m, outcomes, strict=True)
     ]
     (found,) = comparisons_of(study, rows)
 
@@ -443,10 +445,10 @@ def test_range_is_infinite_if_all_drives_succeed_and_zero_if_none() -> None:
 
 def test_intervals_of_study_cover_true_values() -> None:
     rng = np.random.default_rng(1)
-    held = [(m := mean_of(rng.normal(5.0, 2.0, 60))).low < 5.0 < m.high for _ in range(400)]
+    covered = [(m := mean_of(rng.normal(5.0, 2.0, 60))).low < 5.0 < m.high for _ in range(400)]
     ratio = ratio_of(rng.normal(1.3, 0.1, 300), rng.normal(1.0, 0.1, 300))
 
-    assert 0.91 < np.mean(held) < 0.98
+    assert 0.91 < np.mean(covered) < 0.98
     assert ratio.low < 1.3 < ratio.high
     assert fraction_of(8, 10).value == 0.8
     assert fraction_of(0, 0).low == 0.0

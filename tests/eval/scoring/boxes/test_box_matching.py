@@ -209,9 +209,9 @@ def test_intervals_of_six_blocks_cover_value_of_many() -> None:
         return _measured(value, average_precision(matched, 0, drawn(which, 0, rounds)), which)
 
     true = of(500, 1).value
-    held = sum(one.low <= true <= one.high for one in (of(6, 100) for _ in range(50)))
+    covered = sum(one.low <= true <= one.high for one in (of(6, 100) for _ in range(50)))
 
-    assert held >= 42
+    assert covered >= 42
 
 
 def test_calibration_error_is_zero_for_calibrated_scores_only() -> None:
