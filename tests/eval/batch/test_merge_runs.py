@@ -5,7 +5,6 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from crosscue.eval import cli
 from crosscue.eval.batch.jobs import in_turn, run_many
 from crosscue.eval.batch.merge import is_merged, merge_runs
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
@@ -85,16 +84,6 @@ def test_columns_of_different_types_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"belief\.parquet does not fit those of other drives"):
         merge_runs(runs, create(tmp_path / "out", overwrite=False), {})
     assert not (tmp_path / "out" / "manifest.json").exists()
-
-
-def test_single_drive_commands_refuse_merged_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    merged = str(_merged(tmp_path, ["abc", "de"]).path)
-
-    for argv in (["estimate", merged], ["view", merged, "-o", str(tmp_path / "x.rrd")]):
-        assert cli.run(argv) == 1
-        assert "holds the tables of many drives" in capsys.readouterr().err
 
 
 def test_merging_no_runs_writes_an_empty_run(tmp_path: Path) -> None:

@@ -136,20 +136,24 @@ def test_check_page_and_json_have_equal_content(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "status", "message"),
     [
-        (["-o", "page.pdf"], "expected a page or a picture"),
-        (["--seconds", "0"], "seconds: expected more than 0"),
-        (["--start-s", "1000"], "no signal and no picture"),
+        (["-o", "page.pdf"], 2, "expected a page or a picture"),
+        (["--seconds", "0"], 2, "seconds: expected more than 0"),
+        (["--start-s", "1000"], 1, "no signal and no picture"),
     ],
 )
 def test_invalid_check_options_are_refused_in_one_line(
-    tmp_path: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    arguments: list[str],
+    status: int,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     drive = pandaset_drive(tmp_path / "002")
     vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
 
-    assert run(["vehicle", "check", str(drive), "--vehicle", str(vehicle), *arguments]) in (1, 2)
+    assert run(["vehicle", "check", str(drive), "--vehicle", str(vehicle), *arguments]) == status
 
     printed = capsys.readouterr().err
     assert message in printed
