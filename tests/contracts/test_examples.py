@@ -146,7 +146,7 @@ def test_commands_on_page_are_accepted_by_parser(
 
 
 @pytest.mark.parametrize("page", SHELL_PAGES)
-def test_no_command_on_a_page_writes_where_an_earlier_one_did(page: str, tmp_path: Path) -> None:
+def test_commands_on_page_write_to_different_outputs(page: str, tmp_path: Path) -> None:
     written: dict[str, str] = {}
     for code, (program, *command) in commands_of([c for c in CODE if c.page == page], tmp_path):
         names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]

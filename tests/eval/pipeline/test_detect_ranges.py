@@ -129,9 +129,7 @@ def drive(folder: Path, noise_m: float = 0.0) -> Path:
 
 
 @pytest.mark.parametrize("cue", HEIGHTS)
-def test_signs_pair_with_start_lights_with_end_and_hidden_boxes_are_omitted(
-    cue: str, tmp_path: Path
-) -> None:
+def test_signs_pair_with_start_and_lights_with_end(cue: str, tmp_path: Path) -> None:
     pairs = pairs_of_truth(drive(tmp_path / "a"), cue)
 
     assert len(pairs.range_m) == 60

@@ -97,7 +97,7 @@ def test_metrics_no_longer_scored_are_reported(scores: dict[str, Any]) -> None:
     assert no_longer_scored(fleet(scores), fleet(scores)) == ()
 
 
-def test_metrics_of_drives_on_one_side_only_are_not_reported_as_lost() -> None:
+def test_metrics_of_unpaired_drives_are_not_reported_as_lost() -> None:
     """A fleet with one more drive has conditions that the other lacks."""
 
     def of(log: str, metric: str) -> DriveMetric:

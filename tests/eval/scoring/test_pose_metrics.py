@@ -300,7 +300,7 @@ def paired_with(error: Floats, cov_xyh: Floats) -> Paired:
     return Paired(truth, estimate, cov_xyh, Coverage(n, n, 0, 0, 0))
 
 
-def test_nees_of_consistent_errors_lies_in_band() -> None:
+def test_nees_of_consistent_errors_is_in_band() -> None:
     rng = np.random.default_rng(11)
     root = np.array([[3.0, 0.0, 0.0], [1.0, 2.0, 0.0], [0.02, -0.03, 0.05]])
     cov = root @ root.T

@@ -143,7 +143,7 @@ def test_full_detection_requires_intersection_feature_only_with_sign_or_light(
     assert result.full_m == full_m
 
 
-def test_probability_equal_to_threshold_is_no_detection() -> None:
+def test_probability_equal_to_threshold_is_not_a_detection() -> None:
     run = tables(belief=belief_table({"intersection": {0: 0.9}}), ranges=range_table(0, 40))
     judged = judge_approaches(run, truth())
 
@@ -179,7 +179,7 @@ def test_spike_of_one_frame_is_spurious_unless_scored_as_published() -> None:
         assert one.why_spurious == ("for fewer than 3 frames" if spurious_m else "")
 
 
-def test_single_spike_is_no_detection() -> None:
+def test_single_spike_is_not_a_detection() -> None:
     only = {name: {35: 0.95, 37: 0.5} for name in ("intersection", "left", "right")}
     judged = judge_approaches(tables(belief=belief_table(only), ranges=range_table(0, 45)), truth())
     assert judged is not None
@@ -192,7 +192,7 @@ def test_single_spike_is_no_detection() -> None:
     assert score.spurious == 1
 
 
-def test_range_outside_its_interval_is_no_detection() -> None:
+def test_range_outside_its_interval_is_not_a_detection() -> None:
     for error_m, var_m2, detected_m in (
         (100.0, 1.0, None),
         (1.9, 1.0, 30.0),

@@ -36,7 +36,7 @@ def test_every_fold_has_layouts_with_and_without_each_feature(fold: int, feature
     assert {True, False} <= set(known)
 
 
-def test_study_has_at_least_100_layouts_with_two_distinct_drives_each() -> None:
+def test_study_has_100_layouts_with_two_drives_each() -> None:
     scenes = STUDY.scenes()
 
     assert len(set(STUDY.layouts)) >= 100
@@ -156,7 +156,7 @@ def test_probability_one_half_has_brier_score_one_quarter() -> None:
     assert scored.log_score.value == pytest.approx(np.log(2.0))
 
 
-def test_false_features_are_counted_once_per_drive_and_not_in_silent_frames() -> None:
+def test_false_features_are_counted_once_per_drive_except_in_silent_frames() -> None:
     wrong = {"intersection": 0.95, "left": 0.2, "right": 0.95}
 
     assert score_layouts([belief(wrong, NOTHING)]).false_features.value == 2.0

@@ -159,7 +159,7 @@ def test_duplicate_detection_of_label_is_false() -> None:
     assert matched.is_wrong[0].tolist() == [False, True]
 
 
-def test_labels_are_binned_by_true_range_and_false_detections_by_estimated_range() -> None:
+def test_labels_are_binned_by_true_and_false_detections_by_estimated_range() -> None:
     truth = boxes((0, 0, UNIT), (0, 0, AWAY), range_m=[10.0, 50.0])
     low = (400.0, 0.0, 440.0, 40.0)
     found = boxes((0, 0, UNIT), (0, 0, low), scores=[0.9, 0.8], range_m=[30.0, 45.0])
