@@ -2,7 +2,7 @@
 
 The dissertation scores one approach per run, but a drive has many. The life of an approach:
 
-* It opens with the first evidence: a sign with a range, or a cue with ``speaks_first``. A neutral
+* It opens with the first evidence: a sign with a range, or a cue with ``can_start``. A neutral
   belief is therefore never old at the next intersection.
 * It closes when the intersection's end is behind the rear axle (the measured end, or the start plus
   a typical length), when the car has turned at the intersection, or when the evidence is stale.
@@ -11,7 +11,7 @@ The dissertation scores one approach per run, but a drive has many. The life of 
 * If it closes before presence is established, it was noise: it counts as neutral, not as a
   detection.
 
-Only signs with a range and cues with ``speaks_first`` keep evidence fresh, because road straight
+Only signs with a range and cues with ``can_start`` keep evidence fresh, because road straight
 ahead is seen everywhere. Staleness depends on distance, not on time, so the approach of a car that
 waits at the stop line remains open. Without odometry, the distance is estimated with
 ``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
@@ -144,7 +144,7 @@ class Approaches:
         self._filter = range_filter
         self._new_model = message_models_of(graph, fusion)
         self._over_drive = _over_drive(graph, fusion)
-        self._first = tuple(cue.name for cue in graph.cues if cue.speaks_first)
+        self._first = tuple(cue.name for cue in graph.cues if cue.can_start)
         self._persistence = Persistence(graph) if fusion.kind == "persistent" else None
         self._open: _Open | None = None
         self._last_ns: int | None = None
@@ -163,17 +163,17 @@ class Approaches:
         signs = self._plausible(evidence.signs)
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
         confirmed = self._confirmed(evidence.counts, evidence.is_new_picture)
-        speaks = any(confirmed.counts.get(cue, 0) > 0 for cue in self._first)
+        can_open = any(confirmed.counts.get(cue, 0) > 0 for cue in self._first)
         if self._open is not None and _is_about_another(self._open, ranged, self._fusion.longest_m):
             self._close("another ahead")
-        if self._open is None and (ranged or (speaks and self._rest_m <= 0.0)):
+        if self._open is None and (ranged or (can_open and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
             self._count_silent(confirmed.silent)
             if self._over_drive is not None:
                 update_with(self._over_drive, self._situation(evidence, confirmed.counts, moved))
             return Step(evidence.t_ns, None, evidence.counts, not_believed=confirmed.silent)
-        if ranged or speaks:
+        if ranged or can_open:
             self._open.since_evidence_m = 0.0
         return self._step(self._open, evidence, confirmed, signs, past, moved)
 

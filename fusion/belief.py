@@ -75,8 +75,8 @@ class _Line(NamedTuple):
     """One cue, precomputed: the features that it affects, and its messages if present or absent."""
 
     cue: str
-    speaks_first: bool
-    is_counted: bool
+    can_start: bool
+    is_per_detection: bool
     detected: tuple[tuple[int, float], ...]
     absent: tuple[tuple[int, float], ...]
 
@@ -85,7 +85,7 @@ class _Line(NamedTuple):
 class PublishedMessageModel:
     """The published messages: precision along direct edges, its complement along exclusive ones.
 
-    Until earlier frames have established presence, only cues with ``speaks_first`` send messages.
+    Until earlier frames have established presence, only cues with ``can_start`` send messages.
     """
 
     size: int
@@ -95,12 +95,12 @@ class PublishedMessageModel:
         """Sum the messages of one frame."""
         out = [0.0] * self.size
         counts = situation.counts
-        for cue, speaks_first, is_counted, detected, absent in self.lines:
+        for cue, can_start, is_per_detection, detected, absent in self.lines:
             count = counts.get(cue)
-            if count is None or not (speaks_first or situation.is_established):
+            if count is None or not (can_start or situation.is_established):
                 continue
             if count > 0:
-                times = count if is_counted else 1
+                times = count if is_per_detection else 1
                 for feature, odds in detected:
                     out[feature] += times * odds
             elif situation.may_dissent:
@@ -118,6 +118,8 @@ def published_message_model(graph: FactorGraph, dissent: float) -> PublishedMess
         edges = [edge for edge in graph.edges if edge.cue == cue.name]
         says = log_odds(cue.precision)
         detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
-        absent = tuple((place[e.feature], against) for e in edges if cue.dissents and e.is_direct)
-        lines.append(_Line(cue.name, cue.speaks_first, cue.counted, detected, absent))
+        absent = tuple(
+            (place[e.feature], against) for e in edges if cue.absence_counts and e.is_direct
+        )
+        lines.append(_Line(cue.name, cue.can_start, cue.per_detection, detected, absent))
     return PublishedMessageModel(len(place), tuple(lines))

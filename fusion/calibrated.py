@@ -76,7 +76,7 @@ class CueMessages:
 
     Attributes:
         cue: Name of the cue.
-        speaks_first: True if it sends messages before presence is established.
+        can_start: True if it sends messages before presence is established.
         fade: Distance or time over which its observations become independent.
         near: Edges with fitted rates, near the intersection.
         far: Edges with fitted rates, elsewhere.
@@ -85,7 +85,7 @@ class CueMessages:
     """
 
     cue: str
-    speaks_first: bool
+    can_start: bool
     fade: Fade
     near: tuple[Learned, ...]
     far: tuple[Learned, ...]
@@ -123,7 +123,7 @@ class CalibratedMessageModel:
             return out
         for messages, history in self._cues:
             count = situation.counts.get(messages.cue)
-            if count is None or not (messages.speaks_first or situation.is_established):
+            if count is None or not (messages.can_start or situation.is_established):
                 continue
             self._add_messages(messages, history, count, situation, out)
         return out
@@ -176,7 +176,7 @@ def cue_messages_of(graph: FactorGraph, learned: Calibrated) -> tuple[CueMessage
     return tuple(
         CueMessages(
             cue.name,
-            cue.speaks_first,
+            cue.can_start,
             learned.fades.get(cue.name, USUAL_FADE),
             _learned(graph, cue, True, rates, scales),
             _learned(graph, cue, False, rates, scales),

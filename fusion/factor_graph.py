@@ -60,9 +60,9 @@ class CueNode:
     Attributes:
         name: Name, as in ``cues.parquet``.
         precision: Message of a detection along a direct edge, as a probability.
-        speaks_first: True if it sends messages before presence is established.
-        counted: True to send one message per detection.
-        dissents: True if its absence near the intersection is evidence against its features.
+        can_start: True if it sends messages before presence is established.
+        per_detection: True to send one message per detection.
+        absence_counts: True if its absence near the intersection is evidence against its features.
         seen_frames: With persistence: minimum number of positive frames.
         of_frames: With persistence: number of last frames among which ``seen_frames`` are counted.
         within_m: With persistence: distance of the intersection beyond which it sends no message.
@@ -71,9 +71,9 @@ class CueNode:
 
     name: str
     precision: float
-    speaks_first: bool = False
-    counted: bool = False
-    dissents: bool = False
+    can_start: bool = False
+    per_detection: bool = False
+    absence_counts: bool = False
     seen_frames: int = 1
     of_frames: int = 1
     within_m: float = math.inf
@@ -155,9 +155,9 @@ def graph_of(fusion: Fusion) -> FactorGraph:
             CueNode(
                 name,
                 c.precision,
-                c.speaks_first,
-                c.counted,
-                c.dissents,
+                c.can_start,
+                c.per_detection,
+                c.absence_counts,
                 c.seen_frames,
                 c.of_frames,
                 c.within_m,

@@ -142,7 +142,7 @@ class PersistentMessageModel:
 def _why_silent(cue: CueNode, situation: Situation) -> str | None:
     if situation.range_m is not None and situation.range_m > cue.within_m:
         return f"intersection further than {cue.within_m:g} m"
-    if not (cue.speaks_first or situation.is_established):
+    if not (cue.can_start or situation.is_established):
         return "no intersection established"
     return None
 
@@ -155,6 +155,8 @@ def _lines_of(graph: FactorGraph, dissent: float) -> tuple[_Line, ...]:
         edges = [edge for edge in graph.edges if edge.cue == cue.name]
         says = log_odds(cue.precision)
         detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
-        absent = tuple((place[e.feature], against) for e in edges if cue.dissents and e.is_direct)
+        absent = tuple(
+            (place[e.feature], against) for e in edges if cue.absence_counts and e.is_direct
+        )
         lines.append(_Line(cue, detected, absent))
     return tuple(lines)

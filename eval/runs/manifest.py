@@ -26,7 +26,7 @@ from .account import Account, SummedAccount
 from .candidates import CandidateRow
 from .record import Record
 
-FORMAT_VERSION: Final = 5
+FORMAT_VERSION: Final = 6
 LINE: Final = 100
 """Max characters of a printed field."""
 OWN_FRAME: Final = "no start heading and no compass: the map's x axis points where the car did"
@@ -223,7 +223,7 @@ class EstimateTimings(Record):
 
 
 class _Versioned(Record):
-    format_version: Literal[5] = FORMAT_VERSION
+    format_version: Literal[6] = FORMAT_VERSION
     versions: dict[str, str]
     """Versions of crosscue, Python and the libraries that results depend on."""
 
@@ -318,7 +318,7 @@ class MergedDrive(Record):
 class MergedManifest(Record):
     """Many drives as one folder of tables."""
 
-    format_version: Literal[5] = FORMAT_VERSION
+    format_version: Literal[6] = FORMAT_VERSION
     stage: Literal["merged"] = "merged"
     tables: tuple[str, ...]
     drives: tuple[MergedDrive, ...]

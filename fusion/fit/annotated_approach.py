@@ -44,5 +44,5 @@ class AnnotatedApproach:
         count = self.counts.get(cue.name)
         if count is None:
             return np.empty(0, np.int64)
-        speaks = (count != NOT_EVALUATED) & (self.is_established | cue.speaks_first)
-        return np.flatnonzero(speaks).astype(np.int64)
+        sends = (count != NOT_EVALUATED) & (self.is_established | cue.can_start)
+        return np.flatnonzero(sends).astype(np.int64)

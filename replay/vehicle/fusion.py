@@ -91,11 +91,11 @@ class CueEntry(Section):
     """Features whose presence it implies: direct edges."""
     excludes: tuple[Name, ...] = ()
     """Features whose absence it implies: exclusive edges."""
-    speaks_first: bool = False
+    can_start: bool = False
     """If true, it sends messages before presence is established."""
-    counted: bool = False
+    per_detection: bool = False
     """If true, it sends one message per detection instead of one per frame."""
-    dissents: bool = False
+    absence_counts: bool = False
     """If true, its absence near the intersection is evidence against the supported features."""
     seen_frames: Annotated[int, Field(ge=1)] = 3
     """With ``kind = "persistent"``: required number of positive frames among ``of_frames``."""
@@ -132,9 +132,9 @@ def usual_cues() -> dict[str, CueEntry]:
             precision=cue.precision,
             supports=cue.supports,
             excludes=cue.excludes,
-            speaks_first=cue.can_start,
-            counted=cue.per_detection,
-            dissents=cue.absence_counts,
+            can_start=cue.can_start,
+            per_detection=cue.per_detection,
+            absence_counts=cue.absence_counts,
             seen_frames=cue.seen_frames,
             of_frames=cue.of_frames,
             within_m=cue.within_m,
@@ -179,7 +179,7 @@ class Fusion(Section):
     withdrawn: Probability = 0.5
     """With ``kind = "temporal"``: presence is withdrawn if no such feature is more probable."""
     dissent: Probability = 0.49
-    """Message strength of a cue with ``dissents`` that is not detected near the intersection."""
+    """Message strength of an undetected cue with ``absence_counts``, near the intersection."""
     dissent_within_m: NotNegative = 20.0
     dissent_every_m: NotNegative = 0.1
     """Minimum distance between two such messages: a stationary vehicle gains no new evidence."""
@@ -312,8 +312,8 @@ class Fusion(Section):
     def _can_begin(self) -> Self:
         if not any(one.use and one.establishes for one in self.features.values()):
             raise _refused("features: none establishes presence; set establishes = true for one")
-        if not any(one.use and one.speaks_first for one in self.cues.values()):
-            raise _refused("cues: none speaks first; set speaks_first = true for one")
+        if not any(one.use and one.can_start for one in self.cues.values()):
+            raise _refused("cues: none can start an approach; set can_start = true for one")
         return self
 
 

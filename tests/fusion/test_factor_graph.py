@@ -75,7 +75,7 @@ def sent_messages(
         for edge in graph.edges:
             cue, count = cues[edge.cue], counts.get(edge.cue, 0)
             if count:
-                yield cue, edge, count if cue.counted else 1
+                yield cue, edge, count if cue.per_detection else 1
 
 
 @FEW_EXAMPLES
@@ -234,9 +234,9 @@ def test_absent_direction_cues_dissent_near_intersection_but_signs_do_not() -> N
 def test_only_four_cues_send_messages_before_presence_is_established() -> None:
     model = published_message_model(DEFAULT_GRAPH, DISSENT)
 
-    speaking = {cue for cue in CUES if any(model(situation({cue: 1}, established=False)))}
+    sending = {cue for cue in CUES if any(model(situation({cue: 1}, established=False)))}
 
-    assert speaking == {"traffic_light", "stop_sign", "road_left", "road_right"}
+    assert sending == {"traffic_light", "stop_sign", "road_left", "road_right"}
 
 
 @pytest.mark.parametrize(

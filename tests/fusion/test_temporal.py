@@ -26,7 +26,7 @@ FILTER: Final = RangeFilter()
 TEMPORAL: Final[dict[str, object]] = {"kind": "temporal"}
 GRAPH: Final = FactorGraph(
     (Feature("intersection", establishes=True), Feature("left", establishes=True)),
-    (CueNode("sign", 0.9, speaks_first=True), CueNode("road", 0.7, speaks_first=True)),
+    (CueNode("sign", 0.9, can_start=True), CueNode("road", 0.7, can_start=True)),
     (Edge("sign", "intersection"), Edge("road", "left")),
 )
 

@@ -15,9 +15,9 @@ from crosscue.replay.vehicle.temporal import CueChain, Temporal
 GRAPH: Final = FactorGraph(
     (Feature("intersection", establishes=True), Feature("left", establishes=True)),
     (
-        CueNode("sign", 0.9, speaks_first=True),
-        CueNode("road", 0.7, speaks_first=True),
-        CueNode("again", 0.7, speaks_first=True),
+        CueNode("sign", 0.9, can_start=True),
+        CueNode("road", 0.7, can_start=True),
+        CueNode("again", 0.7, can_start=True),
         CueNode("unseen", 0.7),
     ),
     (

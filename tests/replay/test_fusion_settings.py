@@ -33,7 +33,7 @@ def test_setting_one_field_keeps_other_fields_of_cue() -> None:
 def test_user_defined_cue_and_feature_are_fused() -> None:
     fusion = fusion_of(
         "[fusion]\nkind = 'source'\n[fusion.features]\nzebra = { prior = 0.2 }\n"
-        "[fusion.cues]\nstripes = { precision = 0.8, supports = ['zebra'], speaks_first = true }"
+        "[fusion.cues]\nstripes = { precision = 0.8, supports = ['zebra'], can_start = true }"
     )
     graph = graph_of(fusion)
     approaches = Approaches(graph, fusion, parse("version = 1", "").range_filter)
@@ -62,7 +62,7 @@ def test_edges_to_disabled_feature_are_removed() -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("[fusion.cues]\nstop_sgn = { speaks_first = true }", r"did you mean stop_sign\?.*there"),
+        ("[fusion.cues]\nstop_sgn = { can_start = true }", r"did you mean stop_sign\?.*there"),
         (
             "[fusion.cues]\nstripes = { precision = 0.8, supports = ['strait'] }",
             r"stripes: no feature 'strait' \(did you mean straight\?\); there are: intersection",
@@ -92,11 +92,9 @@ def test_invalid_fusion_setting_is_refused_with_hint(text: str, match: str) -> N
         fusion_of(text)
 
 
-def test_fusion_without_cue_that_speaks_first_is_refused() -> None:
+def test_fusion_without_cue_that_can_start_is_refused() -> None:
     silent = "\n".join(
-        f"{name} = {{ speaks_first = false }}"
-        for name in usual_cues()
-        if usual_cues()[name].speaks_first
+        f"{name} = {{ can_start = false }}" for name in usual_cues() if usual_cues()[name].can_start
     )
-    with pytest.raises(VehicleError, match="none speaks first"):
+    with pytest.raises(VehicleError, match="none can start an approach"):
         fusion_of(f"[fusion.cues]\n{silent}")

@@ -38,7 +38,9 @@ def graphs(draw: st.DrawFn) -> FactorGraph:
     return FactorGraph(
         tuple(Feature(name, draw(inside), draw(st.booleans())) for name in features),
         tuple(
-            CueNode(name, draw(inside), draw(st.booleans()), draw(st.booleans()), dissents=True)
+            CueNode(
+                name, draw(inside), draw(st.booleans()), draw(st.booleans()), absence_counts=True
+            )
             for name in cues
         ),
         tuple(joined),

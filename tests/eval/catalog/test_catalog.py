@@ -162,15 +162,15 @@ def test_merged_run_is_not_counted_again(tmp_path: Path) -> None:
 def test_unreadable_runs_are_left_out_and_reported(tmp_path: Path) -> None:
     add_run(tmp_path / "good", "good")
     manifest = add_run(tmp_path / "other", "other").file(MANIFEST)
-    manifest.write_text(manifest.read_text().replace('"format_version": 5', '"format_version": 4'))
+    manifest.write_text(manifest.read_text().replace('"format_version": 6', '"format_version": 5'))
     add_run(tmp_path / "half", "half").file(MANIFEST).unlink()
-    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 5, "stage"')
+    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 6, "stage"')
 
     found = crosscue.catalog(tmp_path)
 
     assert [path.name for path in found.runs] == ["good"]
     assert found.left_out.keys() == {"other", "half", "torn"}
-    assert "format 4, this crosscue reads 5; replay again" in found.left_out["other"]
+    assert "format 5, this crosscue reads 6; replay again" in found.left_out["other"]
     assert "cut short" in found.left_out["half"]
     assert "unreadable" in found.left_out["torn"]
     listed = found.query("select run, reason from left_out").to_pylist()
