@@ -337,12 +337,16 @@ def test_range_chart_shows_its_worst_bins(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 9))
-def test_ticks_are_few_and_inside_the_range(low: float, width: float, max_count: int) -> None:
+def test_ticks_are_few_round_and_inside_the_range(low: float, width: float, max_count: int) -> None:
     found = ticks(low, low + width, max_count)
 
-    assert len(found) <= max_count + 1
+    assert max_count // 2 <= len(found) <= max_count + 1
     assert all(low - 1e-6 * width <= one <= low + width * (1 + 1e-6) for one in found)
-    assert found == sorted(found)
+    steps = np.diff(found)
+    np.testing.assert_allclose(steps, np.full(len(steps), steps[:1].sum()), rtol=1e-3)
+    assert (steps > 0.0).all()
+    leading = steps / 10.0 ** np.floor(np.log10(steps) + 1e-4)
+    assert (np.abs(leading[:, None] - [1.0, 2.0, 2.5, 5.0]).min(axis=1) < 1e-3).all()
 
 
 def test_curve_breaks_at_missing_values() -> None:
