@@ -155,12 +155,14 @@ def test_folder_without_export_and_unknown_format_are_refused(
         crosscue.export(worst, tmp_path / "x", to="voc")
 
 
-def test_deleted_run_is_left_out_of_the_export(worst: Path, tmp_path: Path) -> None:
+def test_deleted_run_is_left_out_of_the_export_with_its_reason(worst: Path, tmp_path: Path) -> None:
     from crosscue.eval.failures.record import read_failures
 
     kept: tuple[Failure, ...] = read_failures(worst)
     gone = replace(kept[0], run=str(tmp_path / "gone"))
 
     found = crosscue.export([*kept, gone], tmp_path / "labelling")
-    assert list(found.failed) == [gone.run]
+    ((run, reason),) = found.failed.items()
+    assert run == gone.run
+    assert "no manifest.json" in str(reason)
     assert found.pictures == len({one.t_ns for one in kept})
