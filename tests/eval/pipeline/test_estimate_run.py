@@ -222,10 +222,10 @@ def test_estimate_refuses_missing_or_changed_log(
     with (copy / "drive.mcap").open("ab") as file:
         file.write(b"more")
 
-    assert run(["estimate", str(copy / "run")]) != 0
+    assert run(["estimate", str(copy / "run")]) == 4
     assert "has changed since" in capsys.readouterr().err
     (copy / "drive.mcap").unlink()
-    assert run(["estimate", str(copy / "run")]) != 0
+    assert run(["estimate", str(copy / "run")]) == 4
     assert "is gone; say where it is with --logs DIR" in capsys.readouterr().err
 
 
@@ -279,6 +279,6 @@ def test_custom_cue_with_existing_name_is_refused(
     (tmp_path / "v.toml").write_text(text)
 
     arguments = ["estimate", str(drive / "run"), "--vehicle", str(tmp_path / "v.toml")]
-    assert run(arguments) != 0
+    assert run(arguments) == 2
 
     assert "a cue of this name already exists" in capsys.readouterr().err

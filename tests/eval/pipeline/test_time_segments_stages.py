@@ -156,7 +156,7 @@ def test_merge_keeps_segments_of_each_drive(tmp_path: Path) -> None:
         log = write_drive(tmp_path, clock, name=f"{name}.mcap")
         runs.append(replayed(tmp_path, log, f"runs/{name}"))
 
-    assert cli.run(["merge", str(tmp_path / "runs"), "-o", str(tmp_path / "merged")]) in (0, 3)
+    assert cli.run(["merge", str(tmp_path / "runs"), "-o", str(tmp_path / "merged")]) == 0
 
     for name in ("frames", "cues", "range", "belief", "pose"):
         merged = RunFolder(tmp_path / "merged").table(name).to_pylist()

@@ -47,10 +47,10 @@ def _one(tmp_path: Path, name: str = "one") -> Path:
     return tmp_path / name / "run"
 
 
-def _fails(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
-    """Return the one line that a command fails with."""
+def _fails(capsys: pytest.CaptureFixture[str], status: int, *argv: object) -> str:
+    """Return the one line that a command prints when it fails with an exit status."""
     capsys.readouterr()
-    assert cli.run([str(one) for one in argv]) in (1, 2, 4)
+    assert cli.run([str(one) for one in argv]) == status
     line = capsys.readouterr().err
     assert line.startswith("crosscue: ")
     assert line.count("\n") == 1
@@ -157,7 +157,7 @@ def test_gates_set_exit_status_and_write_junit_file(tmp_path: Path) -> None:
 def test_invalid_gate_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], gate: str, message: str
 ) -> None:
-    line = _fails(capsys, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
+    line = _fails(capsys, 2, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
 
     assert message in line
 
@@ -187,7 +187,7 @@ def test_gates_over_several_runs_require_output_folder(
     runs = [_one(tmp_path, name) for name in ("one", "two")]
     gate = _gates(tmp_path, 'metric = "approaches.full"\nmin = 1.0')
 
-    assert "-o DIR" in _fails(capsys, "score", *runs, "--gate", gate)
+    assert "-o DIR" in _fails(capsys, 2, "score", *runs, "--gate", gate)
     argv = ["score", *map(str, runs), "--gate", gate, "-o", str(tmp_path / "all"), "-q"]
     assert cli.run(argv) == 0
     assert (tmp_path / "all" / "junit.xml").exists()
@@ -253,9 +253,9 @@ def test_truth_of_another_log_is_refused_by_time_or_hash(
     tree = json.loads(hashed.read_text())
     hashed.write_text(json.dumps(tree | {"log": "b.mcap", "log_sha256": {"b.mcap": "11"}}))
 
-    assert "another log or clock" in _fails(capsys, "score", run, "--truth", other)
+    assert "another log or clock" in _fails(capsys, 1, "score", run, "--truth", other)
     assert "belongs to another b.mcap by its hash" in _fails(
-        capsys, "score", run, "--truth", hashed
+        capsys, 1, "score", run, "--truth", hashed
     )
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q", "--any-log"]) == 0
     hashed.write_text(json.dumps(tree | {"log_sha256": {"drive.mcap": "00"}}))
@@ -270,7 +270,7 @@ def test_approach_outside_log_is_refused_unless_run_is_partial(
     whole_log = run_folder(tmp_path / "whole", selection=WHOLE_LOG)
     part = run_folder(tmp_path / "part", selection=Part(start_ns=None, end_ns=at(50), topics=None))
 
-    assert "approach 1 from" in _fails(capsys, "score", whole_log.path)
+    assert "approach 1 from" in _fails(capsys, 1, "score", whole_log.path)
     assert cli.run(["score", str(part.path), "-q"]) == 0
 
 
@@ -300,7 +300,7 @@ def test_invalid_truth_is_refused(
         change = {"approaches": [*tree["approaches"], tree["approaches"][0] | {"id": 1}]}
     path.write_text(json.dumps(tree | change))
 
-    assert message in _fails(capsys, "score", run)
+    assert message in _fails(capsys, 4, "score", run)
 
 
 @pytest.mark.parametrize(
@@ -312,7 +312,7 @@ def test_invalid_range_row_is_refused_with_line_number(
     run = _one(tmp_path)
     (tmp_path / "one" / "ranges.csv").write_text(f"t_ns,approach,start_m,end_m\n{line}\n")
 
-    assert "ranges.csv:2" in _fails(capsys, "score", run)
+    assert "ranges.csv:2" in _fails(capsys, 4, "score", run)
 
 
 def test_damaged_or_incomplete_run_is_refused(
@@ -324,14 +324,14 @@ def test_damaged_or_incomplete_run_is_refused(
 
     this = f'"format_version": {FORMAT_VERSION}'
     manifest.write_text(intact.replace(this, '"format_version": 99'))
-    assert "format 99" in _fails(capsys, "score", run)
+    assert "format 99" in _fails(capsys, 4, "score", run)
     manifest.write_text(intact[:50])
-    assert "manifest.json: unreadable" in _fails(capsys, "score", run)
+    assert "manifest.json: unreadable" in _fails(capsys, 4, "score", run)
     manifest.unlink()
-    assert "was cut short" in _fails(capsys, "score", run)
+    assert "was cut short" in _fails(capsys, 4, "score", run)
     manifest.write_text(intact)
     (run / "cues.parquet").write_bytes((run / "cues.parquet").read_bytes()[:-9])
-    assert "cues.parquet: damaged" in _fails(capsys, "score", run)
+    assert "cues.parquet: damaged" in _fails(capsys, 4, "score", run)
 
 
 def test_unwritable_score_folder_is_reported(
@@ -340,7 +340,7 @@ def test_unwritable_score_folder_is_reported(
     run = _one(tmp_path)
     (run / "score").write_text("a file in place of a folder")
 
-    assert "score" in _fails(capsys, "score", run)
+    assert "score" in _fails(capsys, 1, "score", run)
 
 
 def test_invalid_tables_are_refused_with_reason(
@@ -357,7 +357,7 @@ def test_invalid_tables_are_refused_with_reason(
     }
     for i, (message, tables) in enumerate(broken.items()):
         run = run_folder(tmp_path / f"run{i}", tables)
-        assert message in _fails(capsys, "score", run.path)
+        assert message in _fails(capsys, 4, "score", run.path)
 
 
 def test_run_with_nothing_to_score_reports_reasons(
@@ -367,7 +367,7 @@ def test_run_with_nothing_to_score_reports_reasons(
     bare = run_folder(tmp_path / "bare", {"frames": frame_table(5)})
     only_cues = run_folder(tmp_path / "cues", {"cues": cue_table(CUES)})
 
-    line = _fails(capsys, "score", bare.path)
+    line = _fails(capsys, 1, "score", bare.path)
     assert "the run has no cues; the run has no belief; the run has no range" in line
     assert cli.run(["score", str(only_cues.path)]) == 0
     assert "not scored belief: the run has no belief" in capsys.readouterr().out
@@ -378,7 +378,7 @@ def test_missing_truth_is_reported_with_truth_option(
 ) -> None:
     run = run_folder(tmp_path / "run")
 
-    assert "name it with --truth" in _fails(capsys, "score", run.path)
+    assert "name it with --truth" in _fails(capsys, 2, "score", run.path)
 
 
 def test_merged_run_is_not_scored_as_one_drive(
@@ -387,7 +387,7 @@ def test_merged_run_is_not_scored_as_one_drive(
     truth_folder(tmp_path)
     run = merge_runs({}, create(tmp_path / "merged", overwrite=False), {}).run
 
-    assert "tables of many drives" in _fails(capsys, "score", run.path)
+    assert "tables of many drives" in _fails(capsys, 1, "score", run.path)
     with pytest.raises(RunError, match="tables of many drives"):
         judge_run(run, tmp_path / "truth.json")
 
