@@ -15,7 +15,7 @@ from crosscue.testing import check_detector
 
 
 class Corner(BoxDetector):
-    """The top left corner of the decoded picture, of a given side."""
+    """Detector of a square of a given side in the top left corner of the decoded picture."""
 
     name, labels, view = "corner", ("corner", "nothing"), View(min_width_px=50)
     side_px: int = 4
@@ -26,11 +26,11 @@ class Corner(BoxDetector):
             yield "corner", 0.5, (0, 0, self.side_px, self.side_px)
 
 
-def test_it_keeps_the_contract_of_detectors() -> None:
+def test_box_detector_meets_the_detector_contract() -> None:
     check_detector(Corner.build)
 
 
-def test_boxes_are_in_the_camera_s_pixels() -> None:
+def test_boxes_are_in_camera_pixels() -> None:
     half = Frame(7, "cam", np.ones((30, 50), np.uint8), (100, 60))
     black = Frame(8, "cam", np.zeros((30, 50), np.uint8), (100, 60))
 
@@ -51,7 +51,7 @@ def test_settings_are_checked_and_decide_the_identity() -> None:
     assert len({one.identity for one in (Corner(), Corner(side_px=5), changed())}) == 3
 
 
-def test_a_class_is_named_with_its_factory() -> None:
+def test_detector_is_selected_by_class_and_factory() -> None:
     found = make(Choice("mine", f"{__name__}:Corner.build", {"side_px": 3}))
 
     assert isinstance(found, Corner)
@@ -59,20 +59,20 @@ def test_a_class_is_named_with_its_factory() -> None:
 
 
 class NoDetector:
-    """An object with one of a detector's three parts."""
+    """Class with one of a detector's three members."""
 
     def __call__(self, frames: object) -> object:
         """Return nothing of use."""
 
 
-def test_what_a_factory_leaves_out_is_named() -> None:
+def test_missing_detector_members_are_named() -> None:
     place = f"{__name__}:NoDetector"
 
     with pytest.raises(VehicleError, match=f"{place}.* without view, identity; .*BoxDetector"):
         make(Choice("mine", place, {}))
 
 
-def test_detections_of_one_label_with_their_heights() -> None:
+def test_detections_are_selected_by_label() -> None:
     boxes = np.array([[0, 0, 2, 5], [0, 0, 2, 7], [1, 1, 2, 2]], np.float64)
     found = Detections(0, (9, 9), boxes, np.ones(3), ("a", "b", "a"), (b"",) * 3)
 

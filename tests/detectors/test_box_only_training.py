@@ -1,4 +1,4 @@
-"""Annotations without masks train boxes; the mask head's weights remain unchanged."""
+"""Tests of training without masks: boxes are trained, and the mask head remains unchanged."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _mask_head(network: Any) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("absent", [None, []])
-def test_an_annotation_with_a_box_only_is_read(tmp_path: Path, absent: object) -> None:
+def test_annotation_without_mask_is_read(tmp_path: Path, absent: object) -> None:
     path = write_bars(tmp_path, 2)
     tree = json.loads(path.read_text())
     tree["annotations"][0]["segmentation"] = absent
@@ -70,7 +70,7 @@ def test_an_annotation_with_a_box_only_is_read(tmp_path: Path, absent: object) -
     assert one.box_px == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
 
 
-def test_a_sample_marks_the_objects_that_have_a_mask(tmp_path: Path) -> None:
+def test_sample_marks_objects_with_a_mask(tmp_path: Path) -> None:
     sampler = Sampler(_boxes(tmp_path, every=2), plan_of(), WINDOW, 0)
 
     marks = np.concatenate([sampler(number).has_mask for number in range(12)])
@@ -80,7 +80,7 @@ def test_a_sample_marks_the_objects_that_have_a_mask(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_boxes_only_lower_the_loss_and_leave_the_mask_head_alone(tmp_path: Path) -> None:
+def test_training_without_masks_keeps_the_mask_head(tmp_path: Path) -> None:
     training, sampler = _training(_boxes(tmp_path), Schedule(16, batch=2, rate=2e-3, warm_up=4))
     before = _mask_head(training.network)
 
@@ -94,7 +94,7 @@ def test_boxes_only_lower_the_loss_and_leave_the_mask_head_alone(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_a_mixed_set_trains_the_mask_head_on_the_objects_with_a_mask(tmp_path: Path) -> None:
+def test_mixed_data_trains_the_mask_head(tmp_path: Path) -> None:
     training, sampler = _training(_boxes(tmp_path, every=2), Schedule(2, batch=4, warm_up=1))
     before = _mask_head(training.network)
 
@@ -104,7 +104,7 @@ def test_a_mixed_set_trains_the_mask_head_on_the_objects_with_a_mask(tmp_path: P
     assert any(not torch.equal(value, after[name]) for name, value in before.items())
 
 
-def test_precision_of_masks_is_asked_only_of_objects_that_have_one(tmp_path: Path) -> None:
+def test_mask_precision_counts_only_objects_with_a_mask(tmp_path: Path) -> None:
     path = write_bars(tmp_path, 2)
     whole = read_coco(path, tmp_path / "images", ("car",))
     _without_masks(path, every=2)
@@ -114,7 +114,7 @@ def test_precision_of_masks_is_asked_only_of_objects_that_have_one(tmp_path: Pat
 
     found = []
     for number, picture in enumerate(whole.pictures):
-        # Objects with only a box in the mixed set have wrong masks here: half of the object.
+        # Objects without a mask in the mixed data have wrong masks here: half of the object.
         masks = []
         for k, one in enumerate(picture.objects):
             mask = mask_of(one, picture.size_px)
@@ -135,14 +135,14 @@ def test_precision_of_masks_is_asked_only_of_objects_that_have_one(tmp_path: Pat
     assert (box_scores["box"], box_scores["mask"], box_scores["mask50"]) == (100.0, None, None)
 
 
-def test_a_network_whose_mask_head_never_learnt_returns_boxes_without_masks() -> None:
+def test_network_without_trained_mask_head_returns_no_masks() -> None:
     known = random_checkpoint()
     facts = Facts(plan=known.facts.plan, has_masks=False)
-    blind = Checkpoint(facts, known.network, "blind")
+    boxes_only = Checkpoint(facts, known.network, "boxes_only")
     settings = MaskRcnnSettings(score=0.0, proposals=20)
 
     (masked,) = detector_of(known, settings, CPU)([noise_frame()])
-    (bare,) = detector_of(blind, settings, CPU)([noise_frame()])
+    (bare,) = detector_of(boxes_only, settings, CPU)([noise_frame()])
 
     assert isinstance(bare, Detections)
     assert isinstance(masked, Detections)
@@ -153,7 +153,7 @@ def test_a_network_whose_mask_head_never_learnt_returns_boxes_without_masks() ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("every", "has_masks", "bare"), [(1, False, 6), (2, True, 3)])
-def test_the_recipe_says_how_many_boxes_had_no_mask(
+def test_recipe_records_the_number_of_boxes_without_mask(
     every: int, has_masks: bool, bare: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path, 4)
@@ -173,7 +173,7 @@ def test_the_recipe_says_how_many_boxes_had_no_mask(
 
 
 @pytest.mark.slow
-def test_a_mask_head_that_learnt_these_classes_before_keeps_its_masks(tmp_path: Path) -> None:
+def test_previously_trained_mask_head_keeps_its_masks(tmp_path: Path) -> None:
     masked = crosscue.MaskRcnnTrainingSettings(
         data=write_bars(tmp_path / "a", 2),
         images=tmp_path / "a" / "images",

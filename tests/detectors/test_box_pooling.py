@@ -1,4 +1,4 @@
-"""RoIAlign compared with torchvision's, for boxes at any position."""
+"""Tests of RoIAlign against torchvision's, for boxes at any position."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _tensor(boxes: list[tuple[tuple[float, float], float, float]]) -> Tensor:
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from([(4, 8, 16, 32), (8, 16, 32)]), st.sampled_from([7, 14]), Boxes, Boxes)
-def test_it_is_what_torchvision_gives(
+def test_pooled_features_match_torchvision(
     strides: tuple[int, ...],
     side: int,
     first: list[tuple[tuple[float, float], float, float]],
@@ -51,7 +51,7 @@ def test_it_is_what_torchvision_gives(
     np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=2e-6)
 
 
-def test_a_box_that_is_no_number_pools_nothing_and_harms_no_other() -> None:
+def test_nan_box_pools_zeros_and_leaves_other_boxes_unchanged() -> None:
     levels = _levels((8, 16, 32), pictures=1)
     pool = MultiScaleRoIAlign(["0", "1", "2"], 7, 2)
     good = torch.tensor([[10.0, 20.0, 60.0, 70.0]])

@@ -5,7 +5,7 @@ import numpy as np
 from crosscue.detectors.boxes import best_of, overlaps
 
 
-def test_the_best_box_of_each_heap_stays() -> None:
+def test_suppression_keeps_the_best_of_overlapping_boxes() -> None:
     rng = np.random.default_rng(5)
     corners = rng.uniform(0.0, 60.0, (700, 2))
     boxes = np.hstack([corners, corners + rng.uniform(5.0, 30.0, (700, 2))])

@@ -1,4 +1,4 @@
-"""Tests of the catalog: every entry is a complete card; downloads are verified and resumed."""
+"""Tests of the catalog: every entry is complete, and downloads are verified and resumed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def server() -> Iterator[Served]:
 
 @pytest.fixture
 def card(server: Served, cache: Path, monkeypatch: pytest.MonkeyPatch) -> ModelCard:
-    """A catalog with one model, ``net``, whose weights are on the server."""
+    """Set up a catalog with one model, ``net``, with weights on the server."""
     whole = entries.entry("yolox-nano")
     file = WeightFile(
         name="net.onnx", url=f"{server.base}/net.onnx", size_bytes=len(CONTENT), sha256=SHA256
@@ -55,7 +55,7 @@ def card(server: Served, cache: Path, monkeypatch: pytest.MonkeyPatch) -> ModelC
 
 
 @pytest.mark.parametrize("name", places.names())
-def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> None:
+def test_every_entry_describes_its_model_and_weights(name: str) -> None:
     card = entries.entry(name)
 
     assert card.about
@@ -67,7 +67,7 @@ def test_every_entry_says_what_it_is_and_where_its_weights_are(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", [name for name in places.names() if "rcnn" in name])
-def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> None:
+def test_torchvision_entries_match_the_installed_torchvision(name: str) -> None:
     """Compare URL, start of the hash, network and classes with the installed package."""
     card = entries.entry(name)
     assert card.network is not None
@@ -91,34 +91,36 @@ def test_torchvision_s_weights_are_those_that_torchvision_names(name: str) -> No
 
 
 @pytest.mark.parametrize("name", places.names())
-def test_every_entry_at_hand_runs(name: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the file of exactly this hash, from the data folder."""
+def test_every_available_entry_runs(
+    name: str, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Load the weights with the recorded hash from the data folder."""
     monkeypatch.setenv(fetch.DATA, str(shared("weights").parent))
     monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9")
     try:
         fetch.fetch(name)
     except CrosscueError:
-        pytest.skip(f"the weights of {name} are not at hand")
+        pytest.skip(f"the weights of {name} are not available")
 
     detector = make(Choice(name, name))
 
     assert detector.identity.startswith("model-")
 
 
-def test_a_model_that_is_not_fetched_is_one_line_with_the_command(cache: Path) -> None:
+def test_unfetched_model_is_reported_with_the_fetch_command(cache: Path) -> None:
     with pytest.raises(VehicleError) as error:
         make(Choice("objects", "yolox-nano"))
 
-    said = "model yolox-nano: not fetched yet (3.7 MB, licence Apache-2.0); crosscue model fetch"
-    assert said in str(error.value)
+    message = "model yolox-nano: not fetched yet (3.7 MB, licence Apache-2.0); crosscue model fetch"
+    assert message in str(error.value)
 
 
-def test_a_name_with_a_typo_gets_the_nearest() -> None:
+def test_misspelled_model_name_suggests_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean yolox-nano"):
         places.card_path("yolo-nano")
 
 
-def test_it_comes_from_the_server_once(card: ModelCard, server: Served) -> None:
+def test_weights_are_downloaded_once(card: ModelCard, server: Served) -> None:
     (first,) = fetch.fetch("net")
     (second,) = fetch.fetch("net")
 
@@ -128,7 +130,7 @@ def test_it_comes_from_the_server_once(card: ModelCard, server: Served) -> None:
     assert [path.name for path in first.path.parent.iterdir()] == ["net.onnx"]
 
 
-def test_a_cut_transfer_goes_on_where_it_stopped(card: ModelCard, server: Served) -> None:
+def test_interrupted_download_is_resumed(card: ModelCard, server: Served) -> None:
     server.failing = 1
     with pytest.raises(CrosscueError, match="interrupted after 524288 of 1048576 bytes"):
         fetch.fetch("net")
@@ -142,7 +144,7 @@ def test_a_cut_transfer_goes_on_where_it_stopped(card: ModelCard, server: Served
 
 
 @pytest.mark.parametrize("content", [CONTENT[:-1] + b"x", CONTENT + b"more", b"<html>404</html>"])
-def test_another_file_than_the_catalog_means_is_not_kept(
+def test_download_with_another_hash_is_not_kept(
     card: ModelCard, server: Served, content: bytes
 ) -> None:
     server.files["net.onnx"] = content
@@ -159,7 +161,7 @@ def test_another_file_than_the_catalog_means_is_not_kept(
         assert not entries.place_of(card, card.files[0]).exists()
 
 
-def test_without_a_network_the_line_says_what_else_there_is(
+def test_failed_download_suggests_other_sources(
     card: ModelCard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9/")
@@ -172,7 +174,7 @@ def test_without_a_network_the_line_says_what_else_there_is(
     assert fetch.MIRROR in str(error.value)
 
 
-def test_a_mirror_is_asked_instead(
+def test_mirror_replaces_the_original_server(
     card: ModelCard, server: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server.files["mirror/net.onnx"] = server.files.pop("net.onnx")
@@ -183,7 +185,9 @@ def test_a_mirror_is_asked_instead(
     assert found.path.read_bytes() == CONTENT
 
 
-def test_from_a_file_or_its_folder(card: ModelCard, server: Served, tmp_path: Path) -> None:
+def test_weights_are_copied_from_a_file_or_folder(
+    card: ModelCard, server: Served, tmp_path: Path
+) -> None:
     file = tmp_path / "net.onnx"
     file.write_bytes(CONTENT)
 
@@ -200,7 +204,7 @@ def test_from_a_file_or_its_folder(card: ModelCard, server: Served, tmp_path: Pa
         fetch.fetch("net", tmp_path / "gone.onnx")
 
 
-def test_the_data_folder_is_looked_through(
+def test_weights_are_found_in_the_data_folder(
     card: ModelCard, server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "data" / "weights" / "net"
@@ -214,7 +218,9 @@ def test_the_data_folder_is_looked_through(
     assert not server.gets
 
 
-def test_list_and_show_print_every_model(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_model_list_and_show_print_every_entry(
+    cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(["model", "list"]) == 0
     listed = capsys.readouterr().out
     for name in places.names():
@@ -223,7 +229,7 @@ def test_list_and_show_print_every_model(cache: Path, capsys: pytest.CaptureFixt
         assert entries.entry(name).sha256 in capsys.readouterr().out
 
 
-def test_coco_s_numbers_have_their_gaps() -> None:
+def test_coco_class_numbers_keep_their_gaps() -> None:
     assert len(COCO_80) == 80
     assert len(COCO_90) == 90
     # Numbers from COCO's own annotation files.
@@ -243,5 +249,5 @@ def test_coco_s_numbers_have_their_gaps() -> None:
         ("stop light", None),
     ],
 )
-def test_class_names_of_other_vocabularies(name: str, label: str | None) -> None:
+def test_class_names_map_to_cue_labels(name: str, label: str | None) -> None:
     assert meaning_of(name) == label

@@ -1,4 +1,4 @@
-"""Drawn pictures: boxes at their position, tinted road, the cues' line within the picture."""
+"""Tests of pictures with drawn detections, road and cues."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _drawn(
     return draw(GREY, found, cues, enlarge)
 
 
-def test_a_box_is_drawn_on_its_sides_and_nowhere_inside() -> None:
+def test_only_the_outline_of_a_box_is_drawn() -> None:
     box = np.array([[100.0, 200.0, 180.0, 260.0]])
     found = Detections(0, SIZE, box, np.ones(1), ("car",), (b"",))
 
@@ -38,7 +38,7 @@ def test_a_box_is_drawn_on_its_sides_and_nowhere_inside() -> None:
     assert (GREY == 128).all()
 
 
-def test_road_alone_is_tinted() -> None:
+def test_only_road_is_tinted() -> None:
     mask = np.zeros((36, 64), np.bool_)
     mask[18:30, :32] = True
     road = RoadMask(0, SIZE, rle.encode(mask, (0, 0), (64, 36)), (64, 36))
@@ -51,21 +51,21 @@ def test_road_alone_is_tinted() -> None:
 
 @pytest.mark.parametrize("enlarge", [1.0, 2.0, 4.0])
 @pytest.mark.parametrize("count", [1, 5, 20])
-def test_the_line_of_cues_lies_within_the_picture(count: int, enlarge: float) -> None:
+def test_cue_text_fits_into_the_picture(count: int, enlarge: float) -> None:
     drawn = _drawn((), {f"cross_traffic_{i}": 1 for i in range(count)}, enlarge)
 
     assert (drawn != 128).any()
     assert (drawn[:, -MARGIN_PX // 2 :] == 128).all()
 
 
-def test_cues_that_are_not_there_are_not_named() -> None:
+def test_cues_with_a_zero_count_are_not_drawn() -> None:
     assert (_drawn((), {"stop_sign": 0}) == _drawn((), {})).all()
     assert (_drawn((), {"stop_sign": 1}) != _drawn((), {})).any()
 
 
 @given(frames=st.integers(0, 40), max_count=st.integers(0, 9))
 @settings(max_examples=40, deadline=None)
-def test_pictures_are_spread_evenly_over_a_drive_of_any_length(frames: int, max_count: int) -> None:
+def test_pictures_are_evenly_spaced_over_the_drive(frames: int, max_count: int) -> None:
     _, coded = cv2.imencode(".jpg", GREY[:16, :16])
     with TemporaryDirectory() as name:
         drawer = Drawer(Path(name) / "pictures", max_count)

@@ -1,4 +1,4 @@
-"""The detectors read from a label image what was drawn into it."""
+"""Tests that the detectors of label images recover the drawn objects and road."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def found(*drawn: LabelledObject) -> Detections:
 
 
 @pytest.mark.parametrize("label", CLASSES)
-def test_an_object_comes_back_with_its_box_mask_and_score(label: str) -> None:
+def test_drawn_object_is_recovered_with_box_mask_and_score(label: str) -> None:
     mask = np.array([[True, False], [True, True], [True, True]])
 
     back = found(LabelledObject(label, 0.8, (10, 5), mask))
@@ -32,7 +32,7 @@ def test_an_object_comes_back_with_its_box_mask_and_score(label: str) -> None:
     np.testing.assert_array_equal(rle.decode(back.masks[0], SIZE_PX)[5:8, 10:12], mask)
 
 
-def test_an_object_out_of_the_image_is_cut_and_one_behind_another_hidden() -> None:
+def test_objects_are_clipped_at_the_edge_and_occluded_ones_hidden() -> None:
     whole = np.ones((6, 6), np.bool_)
 
     back = found(
@@ -44,7 +44,7 @@ def test_an_object_out_of_the_image_is_cut_and_one_behind_another_hidden() -> No
     np.testing.assert_array_equal(back.boxes_px, [[0, 0, 8, 8]])
 
 
-def test_road_is_read_beside_objects() -> None:
+def test_road_mask_is_recovered() -> None:
     is_road = np.zeros((30, 40), np.bool_)
     is_road[20:] = True
 
@@ -54,5 +54,5 @@ def test_road_is_read_beside_objects() -> None:
     np.testing.assert_array_equal(rle.decode(back.mask, back.mask_size_px), is_road)
 
 
-def test_a_black_image_holds_nothing() -> None:
+def test_black_image_has_no_objects() -> None:
     assert len(found()) == 0

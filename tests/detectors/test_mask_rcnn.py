@@ -1,4 +1,4 @@
-"""Mask R-CNN detector: equal to torchvision's loop for any batch size, memory and picture."""
+"""Tests of the Mask R-CNN detector: agreement with torchvision, batches, and checkpoints."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _equal(one: Detections, other: Detections) -> bool:
     )
 
 
-def test_what_is_found_is_what_torchvision_finds_above_the_score() -> None:
+def test_detections_above_the_score_match_torchvision() -> None:
     detector = _detector(proposals=1000)
     frame = noise_frame()
     (ours,) = _found(detector, frame)
@@ -111,7 +111,7 @@ class _Bare(torch.nn.Module):
         return found
 
 
-def test_the_same_picture_gives_the_same_bytes_in_any_batch() -> None:
+def test_detections_do_not_depend_on_the_batch() -> None:
     frames = [noise_frame(k, t_ns=k) for k in range(3)]
     one, again = _detector(), _detector()
 
@@ -122,7 +122,7 @@ def test_the_same_picture_gives_the_same_bytes_in_any_batch() -> None:
     assert all(_equal(a, b) for a, b in zip(together, alone, strict=True))
 
 
-def test_a_camera_that_changes_size_midway_gets_results_in_its_own_pixels() -> None:
+def test_detections_follow_a_changing_picture_size() -> None:
     small, large = noise_frame(1), noise_frame(1, 256, 192)
     found = _found(_detector(batch=4), small, small, large, small)
 
@@ -134,7 +134,7 @@ def test_a_camera_that_changes_size_midway_gets_results_in_its_own_pixels() -> N
         assert all(rle.decode(mask, one.size_px).shape == (height, width) for mask in one.masks)
 
 
-def test_a_grey_picture_is_as_good_as_one_whose_colours_are_equal() -> None:
+def test_grey_picture_equals_picture_with_equal_channels() -> None:
     frame = noise_frame()
     grey = np.asarray(cv2.cvtColor(frame.pixels, cv2.COLOR_BGR2GRAY), np.uint8)
     coloured = np.repeat(grey[:, :, None], 3, axis=2)
@@ -145,7 +145,7 @@ def test_a_grey_picture_is_as_good_as_one_whose_colours_are_equal() -> None:
     assert _equal(one, other)
 
 
-def test_a_picture_decoded_at_half_size_is_answered_in_the_cameras_pixels() -> None:
+def test_detections_of_a_reduced_picture_are_in_camera_pixels() -> None:
     frame = noise_frame()
     (whole,) = _found(_detector(), frame)
     (half,) = _found(_detector(), replace(frame, size_px=(256, 192)))
@@ -153,7 +153,7 @@ def test_a_picture_decoded_at_half_size_is_answered_in_the_cameras_pixels() -> N
     np.testing.assert_allclose(half.boxes_px, 2.0 * whole.boxes_px)
 
 
-def test_what_is_cut_off_does_not_shift_what_is_found() -> None:
+def test_cropped_picture_keeps_its_offset_and_scale() -> None:
     plan = plan_of(256, top=0.25, bottom=0.25)
     placed = place(np.zeros((96, 128, 3), np.uint8), plan)
 
@@ -164,7 +164,7 @@ def test_what_is_cut_off_does_not_shift_what_is_found() -> None:
 
 @dataclass
 class _Small:
-    """A back end whose device has memory for a limited number of pictures."""
+    """Back end of a device with memory for a limited number of pictures."""
 
     within: Parts
     max_count: int
@@ -189,7 +189,7 @@ def _with_memory(max_count: int) -> tuple[MaskRcnnDetector, _Small]:
     return replace(plenty, parts=small), small
 
 
-def test_when_memory_runs_out_the_batch_shrinks_and_nothing_is_lost() -> None:
+def test_batch_shrinks_when_device_memory_runs_out() -> None:
     frames = [noise_frame(k, t_ns=k) for k in range(9)]
     detector, small = _with_memory(2)
 
@@ -202,14 +202,14 @@ def test_when_memory_runs_out_the_batch_shrinks_and_nothing_is_lost() -> None:
     )
 
 
-def test_when_not_even_one_picture_fits_it_says_what_to_do() -> None:
+def test_out_of_memory_for_one_picture_is_reported() -> None:
     detector, _ = _with_memory(0)
 
     with pytest.raises(CrosscueError, match=r'no memory on cpu for one picture.*device = "cpu"'):
         detector([noise_frame()])
 
 
-def test_identity_changes_with_all_that_changes_results() -> None:
+def test_identity_changes_with_every_setting_that_affects_results() -> None:
     base = _detector().identity
     other = replace(random_checkpoint(), sha256="other")
 
@@ -223,7 +223,7 @@ def test_identity_changes_with_all_that_changes_results() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0.02, 0.98), st.floats(0.02, 0.98), st.floats(0.2, 4.0), st.floats(-4.0, 4.0))
-def test_calibration_keeps_the_order_of_scores_and_can_be_undone(
+def test_calibration_is_monotonic_and_invertible(
     one: float, other: float, slope: float, offset: float
 ) -> None:
     by = Calibration(slope=slope, offset=offset)
@@ -234,7 +234,7 @@ def test_calibration_keeps_the_order_of_scores_and_can_be_undone(
     assert 0.0 <= calibrated(one, by) <= 1.0
 
 
-def test_calibrated_scores_reach_the_detections() -> None:
+def test_detections_have_calibrated_scores() -> None:
     plain = random_checkpoint()
     by = Calibration(slope=1.0, offset=-2.0)
     facts = plain.facts.model_copy(update={"calibration": dict.fromkeys(CLASSES, by)})
@@ -255,7 +255,7 @@ def test_calibrated_scores_reach_the_detections() -> None:
     st.integers(8, 90),
     st.floats(0.5, 1.0),
 )
-def test_a_mask_laid_into_its_box_is_the_one_torchvision_pastes(
+def test_mask_in_its_box_matches_torchvision(
     x: int, y: int, width: int, height: int, fullness: float
 ) -> None:
     box = np.clip(np.array([x, y, x + width, y + height], np.float64), 0, [128, 96, 128, 96])
@@ -279,7 +279,7 @@ def test_a_mask_laid_into_its_box_is_the_one_torchvision_pastes(
     assert ours[np.asarray(narrow) == 1].all()
 
 
-def test_a_full_mask_fills_its_box_and_nothing_else() -> None:
+def test_full_mask_fills_exactly_its_box() -> None:
     mask = rle.decode(
         laid_in(np.ones((28, 28), np.float32), np.array([3.0, 4.0, 9.0, 8.0]), (16, 12)), (16, 12)
     )
@@ -288,7 +288,7 @@ def test_a_full_mask_fills_its_box_and_nothing_else() -> None:
     assert mask.sum() == 24
 
 
-def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+def test_checkpoint_survives_a_round_trip(tmp_path: Path) -> None:
     plain = random_checkpoint()
     facts = plain.facts.model_copy(update={"measured": {"box": 12.5}})
     save_checkpoint(tmp_path / "one.safetensors", plain.network, facts, halve=False)
@@ -324,21 +324,21 @@ def _json(**changes: Any) -> str:
     return Facts(plan=plan_of(**changes)).model_dump_json()
 
 
-def test_a_checkpoint_with_other_classes_than_its_weights_is_refused(tmp_path: Path) -> None:
+def test_checkpoint_with_wrong_number_of_classes_is_refused(tmp_path: Path) -> None:
     path = _file(tmp_path, _json(classes=("car", "boat")))
 
     with pytest.raises(VehicleError, match=r"roi_heads.*expected shape \(12,.*got \(16,"):
         build(network=str(path))
 
 
-def test_a_checkpoint_of_another_network_is_refused(tmp_path: Path) -> None:
+def test_checkpoint_of_another_network_is_refused(tmp_path: Path) -> None:
     path = _file(tmp_path, _json(), {"backbone.body.conv1.weight": torch.zeros(2)})
 
     with pytest.raises(VehicleError, match=r"backbone\.body\.conv1\.weight .*only one of them"):
         build(network=str(path))
 
 
-def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+def test_nan_weights_are_refused(tmp_path: Path) -> None:
     tensors = {
         k: v.contiguous().clone() for k, v in random_checkpoint().network.state_dict().items()
     }
@@ -349,7 +349,7 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("facts", "why"),
+    ("facts", "message"),
     [
         (None, "has no description of classes"),
         ("{}", "plan: field required"),
@@ -359,15 +359,15 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
         ('{"version": 99, "plan": ' + plan_of().model_dump_json() + "}", "version"),
     ],
 )
-def test_a_checkpoint_that_describes_itself_badly_is_refused(
-    tmp_path: Path, facts: str | None, why: str
+def test_checkpoint_with_an_invalid_description_is_refused(
+    tmp_path: Path, facts: str | None, message: str
 ) -> None:
-    with pytest.raises(VehicleError, match=why):
+    with pytest.raises(VehicleError, match=message):
         load_checkpoint(_file(tmp_path, facts))
 
 
-class _Hostile:
-    """An object whose unpickling creates a folder."""
+class _Malicious:
+    """Object that creates a folder when it is unpickled."""
 
     def __init__(self, where: Path) -> None:
         self.where = where
@@ -377,12 +377,12 @@ class _Hostile:
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".pt", ".pkl", ".bin", ".ckpt", ".safetensors"])
-def test_a_hostile_pickle_is_refused_and_never_run(tmp_path: Path, suffix: str) -> None:
+def test_malicious_pickle_is_refused_and_not_executed(tmp_path: Path, suffix: str) -> None:
     trap = tmp_path / "sprung"
-    content = pickle.dumps(_Hostile(trap))
+    content = pickle.dumps(_Malicious(trap))
     if suffix == ".pt":
         buffer = io.BytesIO()
-        torch.save(_Hostile(trap), buffer)
+        torch.save(_Malicious(trap), buffer)
         content = buffer.getvalue()
     path = tmp_path / f"weights{suffix}"
     path.write_bytes(content)
@@ -394,7 +394,7 @@ def test_a_hostile_pickle_is_refused_and_never_run(tmp_path: Path, suffix: str) 
 
 
 @pytest.mark.parametrize("content", [b"", b"\x08", b"\xff" * 64, b"\x10" + b"\0" * 7 + b"{" * 16])
-def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "cut.safetensors"
     path.write_bytes(content)
 
@@ -404,7 +404,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None
 
 @given(at=st.floats(0.0, 1.0), bit=st.integers(0, 7))
 @settings(max_examples=60, deadline=None)
-def test_a_flipped_bit_is_never_another_network(at: float, bit: int) -> None:
+def test_flipped_bit_in_a_checkpoint_is_refused(at: float, bit: int) -> None:
     content = bytearray(_written())
     place = round(at * (len(content) - 1))
     content[place] ^= 1 << bit
@@ -417,7 +417,7 @@ def test_a_flipped_bit_is_never_another_network(at: float, bit: int) -> None:
                 load_checkpoint(path)
 
 
-def test_the_embedded_networks_are_those_that_were_measured(
+def test_damaged_embedded_checkpoint_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = bytearray(embedded_path().read_bytes())
@@ -430,9 +430,7 @@ def test_the_embedded_networks_are_those_that_were_measured(
         build(network="embedded")
 
 
-def test_coco_weights_that_were_damaged_on_the_disk_are_not_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_coco_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
@@ -442,7 +440,7 @@ def test_coco_weights_that_were_damaged_on_the_disk_are_not_loaded(
         build(network="resnet50")
 
 
-def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:
+def test_unknown_network_or_setting_is_reported_with_options(tmp_path: Path) -> None:
     with pytest.raises(
         VehicleError, match=r"expected one of embedded, resnet50, resnet50-v2 or .*got 'resnet'"
     ):
@@ -454,13 +452,13 @@ def test_a_wrong_name_or_setting_says_what_there_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-def test_a_device_that_is_not_there_is_named() -> None:
+def test_unavailable_device_is_reported() -> None:
     with pytest.raises(VehicleError, match="device cuda: not available"):
         chosen_device("cuda", "detector road")
     assert chosen_device("cpu", "detector road").type == "cpu"
 
 
-def test_without_a_network_it_says_where_coco_weights_go(
+def test_failed_download_reports_the_cache_folder(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: dict[str, Any] = {}
@@ -478,7 +476,7 @@ def test_without_a_network_it_says_where_coco_weights_go(
     assert asked["check_hash"] is True
 
 
-def test_coco_weights_come_with_the_names_of_their_classes() -> None:
+def test_coco_checkpoint_has_class_names() -> None:
     from torchvision.models.detection import MaskRCNN_ResNet50_FPN_Weights as Weights
 
     plan = Plan(architecture="resnet50", classes=("x",) * 90, width_px=1333)
@@ -490,7 +488,7 @@ def test_coco_weights_come_with_the_names_of_their_classes() -> None:
 
 
 @pytest.mark.parametrize("name", ["resnet50", "resnet50-v2"])
-def test_coco_weights_give_the_levels_that_torchvisions_own_network_gives(
+def test_coco_weights_yield_the_feature_levels_of_torchvision(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from torchvision.models import detection
@@ -528,13 +526,13 @@ def test_coco_weights_give_the_levels_that_torchvisions_own_network_gives(
         assert float((ours[level] - value).abs().max()) < 1e-3 * largest
 
 
-def test_the_registry_knows_it() -> None:
+def test_registry_builds_mask_rcnn_and_checks_its_settings() -> None:
     assert isinstance(make(Choice("mine", "mask-rcnn", {"device": "cpu"})), MaskRcnnDetector)
     with pytest.raises(VehicleError, match="proposals"):
         make(Choice("mine", "mask-rcnn", {"proposals": 0}))
 
 
-def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
+def test_embedded_checkpoint_is_small_and_documented() -> None:
     facts = load_checkpoint(embedded_path()).facts
 
     assert embedded_path().stat().st_size < 25e6
@@ -553,7 +551,7 @@ def test_the_checkpoint_in_the_package_is_small_and_says_what_it_is() -> None:
         ("C", -15.0, "car", "car"),
     ],
 )
-def test_the_checkpoint_in_the_package_sees_what_stands_at_intersections_it_never_saw(
+def test_embedded_checkpoint_detects_objects_of_unseen_layouts(
     layout: str, x_m: float, category: str, label: str
 ) -> None:
     picture = picture_at(world(layout), x_m, Camera())

@@ -1,4 +1,4 @@
-"""Mask R-CNN back ends: each returns the detections of torchvision's network."""
+"""Tests that each Mask R-CNN back end returns the detections of torchvision's network."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SCORE = 0.4
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Torch's threads wait by spinning, which is slow if other tests run in parallel."""
+    """Use one thread, because torch's threads spin while waiting and slow down parallel tests."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -54,13 +54,13 @@ def _one_thread() -> Iterator[None]:
 
 
 def _needs(backend: str) -> None:
-    # Without importing it, which would load its telemetry; crosscue's own import prevents that.
+    # An import here would load the telemetry of openvino; crosscue's own import prevents that.
     if find_spec(backend) is None:
         pytest.skip(f"the extra {backend} is not installed")
 
 
 def _detector(checkpoint: Checkpoint, backend: str, **changes: Any) -> MaskRcnnDetector:
-    """A checkpoint without calibration, so that scores are the network's."""
+    """Build a detector without calibration, so that scores are the network's."""
     _needs(backend)
     bare = Checkpoint(Facts(plan=checkpoint.facts.plan), checkpoint.network, checkpoint.sha256)
     asked = {"score": SCORE, "proposals": 1000, "backend": backend, **changes}
@@ -75,7 +75,7 @@ def _found(detector: MaskRcnnDetector, frame: Frame) -> Detections:
 
 @cache
 def _simulated() -> tuple[Frame, ...]:
-    """Pictures of a simulated drive: lights and cars."""
+    """Render pictures of a simulated drive with lights and cars."""
     taken = []
     for layout, x_m in (("E", -25.0), ("C", -15.0)):
         rgb = picture_at(world(layout), x_m, Camera()).rgb
@@ -85,7 +85,7 @@ def _simulated() -> tuple[Frame, ...]:
 
 @cache
 def _torchvision(network: Any, objectness: float = 0.0) -> Any:
-    """A copy with torchvision's number of proposals and uncalibrated scores."""
+    """Copy the network, with torchvision's number of proposals and uncalibrated scores."""
     own = copy.deepcopy(network).eval()
     own.rpn._pre_nms_top_n["testing"] = own.rpn._post_nms_top_n["testing"] = 1000
     own.rpn.score_thresh = objectness
@@ -142,7 +142,7 @@ def _assert_equal(ours: Detections, theirs: Detections) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("seed", [0, 7])
-def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed: int) -> None:
+def test_random_weights_match_torchvision(backend: str, seed: int) -> None:
     checkpoint = random_checkpoint(seed)
     detector = _detector(checkpoint, backend)
     found = 0
@@ -156,7 +156,7 @@ def test_random_weights_find_what_torchvision_finds_with_them(backend: str, seed
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_places_that_look_empty_are_left_out_as_torchvision_leaves_them_out(backend: str) -> None:
+def test_objectness_threshold_matches_torchvision(backend: str) -> None:
     checkpoint = random_checkpoint(0)
     counts = []
     for floor in (0.0, 0.5, 1.0):
@@ -170,7 +170,7 @@ def test_places_that_look_empty_are_left_out_as_torchvision_leaves_them_out(back
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_the_embedded_network_finds_what_torchvision_finds_with_it(backend: str) -> None:
+def test_embedded_network_matches_torchvision(backend: str) -> None:
     checkpoint = checkpoint_named("embedded")
     detector = _detector(checkpoint, backend)
     found = 0
@@ -181,7 +181,7 @@ def test_the_embedded_network_finds_what_torchvision_finds_with_it(backend: str)
     assert found > 10
 
 
-def test_openvino_follows_a_camera_that_changes_size_and_a_batch_of_any_length() -> None:
+def test_openvino_handles_changing_picture_and_batch_sizes() -> None:
     torch_detector = _detector(random_checkpoint(), "torch")
     detector = _detector(random_checkpoint(), "openvino", batch=3)
     wide, high = (128, 96), (128, 160)
@@ -195,14 +195,14 @@ def test_openvino_follows_a_camera_that_changes_size_and_a_batch_of_any_length()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_nothing_above_the_score_is_an_empty_result(backend: str) -> None:
+def test_score_above_all_detections_yields_empty_result(backend: str) -> None:
     found = _found(_detector(random_checkpoint(), backend, score=1.0), noise_frame())
 
     assert len(found) == 0
     assert found.boxes_px.shape == (0, 4)
 
 
-def test_identity_reports_back_ends_apart() -> None:
+def test_identity_differs_between_backends() -> None:
     one, other = (_detector(random_checkpoint(), backend).identity for backend in BACKENDS)
 
     assert one != other
@@ -217,7 +217,7 @@ def test_identity_reports_back_ends_apart() -> None:
     st.integers(1, 2),
     st.booleans(),
 )
-def test_winograds_way_gives_the_plain_sum(
+def test_winograd_convolution_matches_direct_convolution(
     inputs: int, outputs: int, height: int, width: int, count: int, has_bias: bool
 ) -> None:
     torch.manual_seed(inputs * outputs)
@@ -233,7 +233,7 @@ def test_winograds_way_gives_the_plain_sum(
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(1, 9), st.integers(1, 9))
-def test_means_by_slices_are_those_of_torch(height: int, width: int) -> None:
+def test_sliced_average_pooling_matches_torch(height: int, width: int) -> None:
     plain = nn.AvgPool2d(2, ceil_mode=True)
     x = torch.randn(2, 3, height, width)
 
@@ -241,12 +241,12 @@ def test_means_by_slices_are_those_of_torch(height: int, width: int) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_a_rough_look_loses_nothing_that_reaches_the_score(noise: float) -> None:
+def test_screening_keeps_all_detections_above_the_score(noise: float) -> None:
     torch.manual_seed(4)
     network = build_network(plan_of()).eval()
     heads = network.roi_heads
     with torch.no_grad():
-        # A first layer that thin matrices approximate, and one with noise that they do not.
+        # A first layer that low-rank matrices approximate, and a noisy one that they do not.
         first = heads.box_head.fc6.weight
         thin = torch.randn(256, 8) @ torch.randn(8, first.shape[1])
         first.copy_(0.02 * (thin + 10.0 * noise * torch.randn(first.shape)))
@@ -267,7 +267,7 @@ def test_a_rough_look_loses_nothing_that_reaches_the_score(noise: float) -> None
     assert bool((our_shifts == 0.0).all(1).any()) == (noise == 0.0)
 
 
-def test_the_copy_for_a_cpu_has_the_levels_of_its_original_and_leaves_it_alone() -> None:
+def test_cpu_copy_matches_the_original_and_leaves_it_unchanged() -> None:
     torch.manual_seed(3)
     network = build_network(plan_of())
     for module in network.modules():
@@ -297,12 +297,12 @@ def test_the_copy_for_a_cpu_has_the_levels_of_its_original_and_leaves_it_alone()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
-def test_a_back_end_that_is_not_known_says_which_there_are() -> None:
+def test_unknown_backend_is_reported_with_the_choices() -> None:
     with pytest.raises(VehicleError, match=r"backend: input should be 'torch' or 'openvino', got"):
         build(backend="tensorrt")
 
 
-def test_openvino_that_is_not_installed_is_named_with_its_extra(
+def test_missing_openvino_is_reported_with_its_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "openvino", None)
@@ -311,7 +311,7 @@ def test_openvino_that_is_not_installed_is_named_with_its_extra(
         build(backend="openvino")
 
 
-def test_openvino_on_a_graphics_card_is_refused() -> None:
+def test_openvino_with_device_cuda_is_refused() -> None:
     with pytest.raises(VehicleError, match=r"backend openvino runs on a cpu only, got device cuda"):
         build(backend="openvino", device="cuda")
 
@@ -336,7 +336,7 @@ assert "openvino.tools.ovc.telemetry_stub" in sys.modules
 
 
 @pytest.mark.slow
-def test_openvino_sends_nothing_and_leaves_nothing_in_the_home_folder(tmp_path: Path) -> None:
+def test_openvino_sends_no_telemetry_and_writes_no_home_files(tmp_path: Path) -> None:
     _needs("openvino")
     hidden = {"CI", "TF_BUILD", "JENKINS_URL"}
     around = {k: v for k, v in os.environ.items() if k not in hidden}

@@ -1,4 +1,4 @@
-"""Model cards end to end with generated networks: placement, batches, tiles, masks, sizes."""
+"""Tests of model cards end to end, mostly with generated networks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CLASSES = ("sign", "car")
 
 
 def card(folder: Path, model: bytes, output: str, **more: str) -> Path:
-    """A card for an ONNX file, with sections given as TOML."""
+    """Write a card for an ONNX file, with further sections as TOML."""
     (folder / "net.onnx").write_bytes(model)
     sections = {"input": "width_px = 64\nheight_px = 32\n"} | more
     text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
@@ -35,14 +35,14 @@ def card(folder: Path, model: bytes, output: str, **more: str) -> Path:
 
 
 def frame(width: int, height: int, box: tuple[int, int, int, int], t_ns: int = 0) -> Frame:
-    """A black picture with one white box."""
+    """Build a frame with a black picture and one white box."""
     pixels = np.zeros((height, width, 3), np.uint8)
     x0, y0, x1, y1 = box
     pixels[y0:y1, x0:x1] = 255
     return Frame(t_ns, "/camera", pixels, (width, height))
 
 
-def only(detector: Detector, *frames: Frame) -> list[Detections]:
+def detections_of(detector: Detector, *frames: Frame) -> list[Detections]:
     found = detector(frames)
     assert all(isinstance(one, Detections) for one in found)
     return [one for one in found if isinstance(one, Detections)]
@@ -52,29 +52,29 @@ BRIGHT = 'kind = "end-to-end"\nclasses = ["sign", "car"]\nscore = 0.5\noverlap =
 
 
 @pytest.mark.parametrize("fit", ["stretch", "letterbox", "letterbox-center", "crop"])
-def test_a_box_comes_back_where_it_was(tmp_path: Path, fit: str) -> None:
+def test_box_is_mapped_back_to_the_camera_picture(tmp_path: Path, fit: str) -> None:
     given = f'width_px = 128\nheight_px = 64\nfit = "{fit}"\npad = 0'
     detector = build(card=str(card(tmp_path, bright_box_model(), BRIGHT, input=given)))
 
-    (found,) = only(detector, frame(512, 400, (200, 160, 280, 240)))
+    (found,) = detections_of(detector, frame(512, 400, (200, 160, 280, 240)))
 
     assert found.labels == ("sign",)
     np.testing.assert_allclose(found.boxes_px, [[200, 160, 280, 240]], atol=8.0)
 
 
-def test_a_batch_gives_what_single_pictures_give(tmp_path: Path) -> None:
+def test_batched_detections_match_single_pictures(tmp_path: Path) -> None:
     frames = [frame(128, 64, (8 * i, 4 * i, 8 * i + 24, 4 * i + 16), i) for i in range(5)]
     found = []
     for size in (1, 3):
         given = f"width_px = 128\nheight_px = 64\nmax_batch = {size}"
         path = card(tmp_path, bright_box_model(), BRIGHT, input=given)
-        found.append([one.boxes_px for one in only(build(card=str(path)), *frames)])
+        found.append([one.boxes_px for one in detections_of(build(card=str(path)), *frames)])
 
     np.testing.assert_array_equal(found[0], found[1])
 
 
 @pytest.mark.parametrize(("decode", "width_px"), [("reduced", 128), ("full", None)])
-def test_the_card_says_how_finely_pictures_are_decoded(
+def test_card_sets_the_decoding_resolution(
     tmp_path: Path, decode: str, width_px: int | None
 ) -> None:
     given = f'width_px = 128\nheight_px = 64\ndecode = "{decode}"'
@@ -83,9 +83,9 @@ def test_the_card_says_how_finely_pictures_are_decoded(
     assert detector.view.min_width_px == width_px
 
 
-def test_the_network_gets_scaled_pixels_with_the_pad_around_them() -> None:
+def test_input_is_padded_and_normalised_by_the_card() -> None:
     pixels = np.random.default_rng(3).integers(0, 256, (20, 40, 3), np.uint8)
-    want = Input(
+    expected_input = Input(
         width_px=40,
         height_px=30,
         fit="letterbox-center",
@@ -95,37 +95,37 @@ def test_the_network_gets_scaled_pixels_with_the_pad_around_them() -> None:
         scale=(0.5, 0.25, 2.0),
     )
 
-    (numbers,), _ = prepared(pixels, want)
+    (numbers,), _ = prepared(pixels, expected_input)
 
     around = np.pad(pixels[:, :, ::-1], ((5, 5), (0, 0), (0, 0)), constant_values=7)
     expected = (around.astype(np.float32) - [1.0, 2.0, 3.0]) * [0.5, 0.25, 2.0]
     np.testing.assert_array_equal(numbers, expected.transpose(2, 0, 1))
 
 
-def test_tiles_find_what_the_whole_picture_loses(tmp_path: Path) -> None:
+def test_tiles_find_objects_too_small_for_the_full_picture(tmp_path: Path) -> None:
     """A bright box of 6 pixels vanishes if 1024 pixels become 128, but remains in a tile."""
     given = "width_px = 128\nheight_px = 64"
     small = frame(1024, 512, (701, 251, 707, 257))
     found = {}
     for name, sections in {"whole": {}, "tiles": {"tiles": "top = 0.4\nbottom = 0.6"}}.items():
         path = card(tmp_path, bright_box_model(), BRIGHT, input=given, **sections)
-        (found[name],) = only(build(card=str(path)), small)
+        (found[name],) = detections_of(build(card=str(path)), small)
 
     assert not len(found["whole"])
     np.testing.assert_allclose(found["tiles"].boxes_px, [[701, 251, 707, 257]], atol=1.0)
 
 
-def test_a_label_means_what_the_card_says(tmp_path: Path) -> None:
+def test_card_maps_labels(tmp_path: Path) -> None:
     given = "width_px = 128\nheight_px = 64"
     path = card(tmp_path, bright_box_model(), BRIGHT, input=given, labels='sign = "one way left"')
 
-    (found,) = only(build(card=str(path)), frame(128, 64, (8, 8, 40, 24)))
+    (found,) = detections_of(build(card=str(path)), frame(128, 64, (8, 8, 40, 24)))
 
     assert found.labels == ("one way left",)
 
 
-def test_a_mask_is_as_large_as_the_camera_s_picture(tmp_path: Path) -> None:
-    """A mask of two prototypes: the left half of a box in the centre."""
+def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
+    """The network's mask covers the left half of a box in the centre."""
     boxes = np.zeros((1, 2 + 4 + 32, 40), np.float32)
     boxes[0, :7, 3] = [32, 16, 32, 16, 0.9, 0.0, 1.0]
     prototypes = np.full((1, 32, 8, 16), -9.0, np.float32)
@@ -133,65 +133,67 @@ def test_a_mask_is_as_large_as_the_camera_s_picture(tmp_path: Path) -> None:
     model = constant_model((1, 3, 32, 64), {"boxes": boxes, "masks": prototypes})
     output = 'kind = "yolov8-seg"\nname = "boxes"\nprototypes = "masks"\nclasses = ["sign", "car"]'
 
-    (found,) = only(build(card=str(card(tmp_path, model, output))), frame(640, 320, (0, 0, 1, 1)))
+    (found,) = detections_of(
+        build(card=str(card(tmp_path, model, output))), frame(640, 320, (0, 0, 1, 1))
+    )
 
     np.testing.assert_allclose(found.boxes_px, [[160, 80, 480, 240]])
     mask = rle.decode(found.masks[0], (640, 320))
-    want = np.zeros((320, 640), bool)
-    want[80:240, 160:320] = True
-    np.testing.assert_array_equal(mask[:, :300], want[:, :300])
+    expected_input = np.zeros((320, 640), bool)
+    expected_input[80:240, 160:320] = True
+    np.testing.assert_array_equal(mask[:, :300], expected_input[:, :300])
     assert mask[:, 340:].sum() == 0
 
 
-def test_a_box_ends_at_the_picture_and_one_outside_is_left_out(tmp_path: Path) -> None:
+def test_boxes_are_clipped_at_the_picture_and_dropped_outside(tmp_path: Path) -> None:
     boxes = [[-8.0, -4.0, 20.0, 16.0, 0.9, 0.0], [70.0, 8.0, 90.0, 20.0, 0.8, 1.0]]
     model = constant_model((1, 3, 32, 64), {"out": np.array([boxes], np.float32)})
     path = card(tmp_path, model, BRIGHT)
 
-    (found,) = only(build(card=str(path)), frame(640, 320, (0, 0, 1, 1)))
+    (found,) = detections_of(build(card=str(path)), frame(640, 320, (0, 0, 1, 1)))
 
     np.testing.assert_allclose(found.boxes_px, [[0, 0, 200, 160]])
     check_detector(lambda: build(card=str(path)))
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"values": np.full((1, 3, 6), np.nan, np.float32)}, "3 of 3 candidates are not finite"),
         ({"values": np.zeros((1, 3, 7), np.float32)}, "expected (1, N, 6)"),
         ({"values": np.full((1, 3, 6), 9.0, np.float32)}, "class numbers 9 to 9"),
     ],
 )
-def test_an_output_that_makes_no_sense_is_one_line(
-    tmp_path: Path, change: dict[str, Any], said: str
+def test_invalid_output_is_reported_on_one_line(
+    tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     path = card(tmp_path, constant_model((1, 3, 32, 64), {"out": change["values"]}), BRIGHT)
 
     with pytest.raises(VehicleError) as error:
         build(card=str(path))
 
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "net.toml" in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("output", "sections", "said"),
+    ("output", "sections", "message"),
     [
         ('kind = "end-to-end"\nclasses = []', {}, "output.classes is empty"),
         (BRIGHT, {"labels": 'bicycle = "car"'}, "'bicycle' is not one of output.classes"),
         ('kind = "yolo12"\nclasses = ["car"]', {}, "yolox"),
     ],
 )
-def test_a_card_that_makes_no_sense_is_one_line(
-    tmp_path: Path, output: str, sections: dict[str, str], said: str
+def test_invalid_card_is_reported_on_one_line(
+    tmp_path: Path, output: str, sections: dict[str, str], message: str
 ) -> None:
     path = card(tmp_path, bright_box_model(), output, **sections)
 
     with pytest.raises(VehicleError) as error:
         build(card=str(path))
 
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -204,7 +206,7 @@ def _yolox(folder: Path, width: int, height: int, backend: str) -> Detections:
     path.write_text(text, encoding="utf-8")
     name = shared("sequences", "pandaset_002", "camera", "front_camera", "00.jpg")
     pixels = np.asarray(cv2.imread(str(name)), np.uint8)
-    (found,) = only(
+    (found,) = detections_of(
         build(card=str(path), backend=backend),
         Frame(0, "/camera", pixels, (pixels.shape[1], pixels.shape[0])),
     )
@@ -212,10 +214,10 @@ def _yolox(folder: Path, width: int, height: int, backend: str) -> Detections:
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "opencv"])
-def test_a_fully_convolutional_network_runs_at_the_card_s_size(
+def test_fully_convolutional_network_runs_at_the_size_of_the_card(
     tmp_path: Path, backend: str
 ) -> None:
-    """More is found at 1280 x 736 than at the 416 x 416 that the file declares."""
+    """More objects are found at 1280 x 736 than at the 416 x 416 declared in the file."""
     small = _yolox(tmp_path, 416, 416, "onnxruntime")
     large = _yolox(tmp_path, 1280, 736, backend)
 
@@ -223,7 +225,7 @@ def test_a_fully_convolutional_network_runs_at_the_card_s_size(
     assert large.labels.count("car") > small.labels.count("car")
 
 
-def test_back_ends_agree_at_another_size(tmp_path: Path) -> None:
+def test_backends_agree_at_a_changed_input_size(tmp_path: Path) -> None:
     first, second = (_yolox(tmp_path, 1280, 736, name) for name in ("onnxruntime", "openvino"))
 
     assert first.labels == second.labels

@@ -1,4 +1,4 @@
-"""Decoding of pictures of all encodings, at the smallest sufficient scale."""
+"""Tests of the decoding of pictures of all encodings, at the smallest sufficient scale."""
 
 import struct
 import zlib
@@ -30,7 +30,7 @@ def _ramp(height: int = 48, width: int = 64) -> Bytes:
 
 @pytest.mark.parametrize("suffix", [".png", ".webp", ".jpg", ".bmp"])
 @pytest.mark.parametrize("view", [COLOUR, GREY])
-def test_every_coding_gives_the_size_and_channels_asked_for(suffix: str, view: View) -> None:
+def test_every_encoding_is_decoded_to_the_requested_channels(suffix: str, view: View) -> None:
     pixels, size = decode(_encode(_ramp(), suffix), view)
 
     assert size == (64, 48)
@@ -38,7 +38,7 @@ def test_every_coding_gives_the_size_and_channels_asked_for(suffix: str, view: V
 
 
 @pytest.mark.parametrize(("min_px", "by"), [(None, 1), (64, 1), (33, 1), (32, 2), (10, 4), (8, 8)])
-def test_a_jpeg_is_decoded_at_the_smallest_scale_that_serves(min_px: int | None, by: int) -> None:
+def test_jpeg_is_decoded_at_the_smallest_sufficient_scale(min_px: int | None, by: int) -> None:
     view = View(min_width_px=min_px)
 
     pixels, size = decode(_encode(_ramp(), ".jpg"), view)
@@ -49,7 +49,7 @@ def test_a_jpeg_is_decoded_at_the_smallest_scale_that_serves(min_px: int | None,
 
 
 @pytest.mark.parametrize(("bits", "top"), [(16, 65535), (12, 4095), (10, 1023)])
-def test_a_16_bit_camera_uses_the_whole_range_of_8(bits: int, top: int) -> None:
+def test_high_bit_depth_is_scaled_to_the_full_8_bit_range(bits: int, top: int) -> None:
     ramp = np.linspace(0, top, 64)[None, :].repeat(48, axis=0).astype(np.uint16)
 
     pixels, _ = decode(_encode(ramp, ".png"), GREY, depth_bits=bits)
@@ -70,7 +70,9 @@ def test_a_16_bit_camera_uses_the_whole_range_of_8(bits: int, top: int) -> None:
     ],
 )
 @pytest.mark.parametrize("view", [COLOUR, GREY])
-def test_raw_pictures_with_padded_rows(name: str, channels: int, depth: int, view: View) -> None:
+def test_raw_pictures_with_padded_rows_are_decoded(
+    name: str, channels: int, depth: int, view: View
+) -> None:
     step = 16 * channels * depth + 5
     content = memoryview(bytes([128]) * (step * 10))
 
@@ -81,14 +83,14 @@ def test_raw_pictures_with_padded_rows(name: str, channels: int, depth: int, vie
     assert np.abs(pixels.astype(int) - 128).max() <= 1
 
 
-def test_red_is_red_whatever_the_order_in_the_log() -> None:
+def test_rgb_and_bgr_pictures_decode_to_equal_colours() -> None:
     rgb = Encoded("raw", memoryview(bytes([200, 10, 20]) * 4), (2, 2, 6, "rgb8"))
     bgr = Encoded("raw", memoryview(bytes([20, 10, 200]) * 4), (2, 2, 6, "bgr8"))
 
     assert (decode(rgb, COLOUR)[0] == decode(bgr, COLOUR)[0]).all()
 
 
-def test_exif_does_not_turn_a_picture() -> None:
+def test_exif_orientation_is_ignored() -> None:
     jpeg = bytes(_encode(_ramp(), ".jpg").content)
     tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
     exif = b"Exif\0\0" + tiff
@@ -100,7 +102,7 @@ def test_exif_does_not_turn_a_picture() -> None:
     assert pixels.shape == (48, 64, 3)
 
 
-def test_a_bomb_is_refused_by_its_header() -> None:
+def test_oversized_picture_is_refused_by_its_header() -> None:
     png = bytearray(_encode(_ramp(), ".png").content)
     png[16:24] = struct.pack(">II", 60_000, 60_000)
     png[29:33] = struct.pack(">I", zlib.crc32(bytes(png[12:29])))
@@ -122,9 +124,7 @@ def test_a_bomb_is_refused_by_its_header() -> None:
     suffix=st.sampled_from([".png", ".jpg", ".webp"]),
 )
 @settings(max_examples=60, deadline=None)
-def test_a_damaged_picture_is_reported_or_still_a_picture(
-    where: int, flip: int, suffix: str
-) -> None:
+def test_damaged_picture_is_refused_or_decoded(where: int, flip: int, suffix: str) -> None:
     whole = _encode(_ramp(), suffix)
     damaged = bytearray(whole.content)
     damaged[where % len(damaged)] ^= flip
@@ -139,7 +139,7 @@ def test_a_damaged_picture_is_reported_or_still_a_picture(
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])
-def test_a_cut_picture_is_refused(suffix: str, fraction: float) -> None:
+def test_truncated_picture_is_refused(suffix: str, fraction: float) -> None:
     whole = _encode(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8), suffix)
     cut = whole.content[: int(len(whole.content) * fraction)]
 
@@ -148,11 +148,11 @@ def test_a_cut_picture_is_refused(suffix: str, fraction: float) -> None:
 
 
 @pytest.mark.parametrize("coding", ["h264", "tiff", "png"])
-def test_what_is_not_decoded_says_so(coding: str) -> None:
+def test_unsupported_picture_is_refused(coding: str) -> None:
     with pytest.raises(LogError, match=f"{coding} picture without a size, or not decoded here"):
         size_of(Encoded(coding, memoryview(b"\0" * 64)))
 
 
-def test_a_raw_picture_shorter_than_its_size_is_refused() -> None:
+def test_raw_picture_shorter_than_its_size_is_refused() -> None:
     with pytest.raises(LogFormatError, match="fewer bytes than its size needs"):
         decode(Encoded("raw", memoryview(bytes(20)), (16, 10, 16, "mono8")), GREY)

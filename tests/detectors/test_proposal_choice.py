@@ -1,4 +1,4 @@
-"""The selection of proposals is equal to torchvision's."""
+"""Tests of the selection of proposals against torchvision's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE_PX = (96, 128)
     st.integers(0, 1000),
     st.floats(5.0, 60.0),
 )
-def test_the_boxes_and_their_order_are_torchvisions(
+def test_selected_boxes_and_their_order_match_torchvision(
     counts: list[int], max_count: int, floor: float, seed: int, spread_px: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -41,7 +41,7 @@ def test_the_boxes_and_their_order_are_torchvisions(
     assert torch.equal(ours, theirs[0])
 
 
-def test_a_floor_leaves_the_first_of_those_there_are_without_it() -> None:
+def test_objectness_threshold_keeps_the_highest_ranked_proposals() -> None:
     network = build_network(plan_of()).eval()
     rng = np.random.default_rng(3)
     corners = rng.uniform(0.0, 90.0, (80, 2)).astype(np.float32)

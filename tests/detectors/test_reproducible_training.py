@@ -1,4 +1,4 @@
-"""The same seed yields the same weights, bit for bit, in separate processes."""
+"""Tests that the same seed yields the same weights, bit for bit, in separate processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ for line in ({ROAD!r}, {MASKS!r}):
 
 
 def _road_set(folder: Path, numbers: list[int]) -> None:
-    """Pictures and masks, created in this order, which is often that of the folder's entries."""
+    """Write pictures and masks in this order, which is often that of the folder's entries."""
     for name in ("images", "masks"):
         (folder / "set" / name).mkdir(parents=True)
     for number in numbers:
@@ -43,7 +43,7 @@ def _road_set(folder: Path, numbers: list[int]) -> None:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Two processes, each of which trained both networks."""
+    """Folders of two processes that each train both networks."""
     made = []
     for hash_seed, numbers in ((1, [0, 1, 2, 3]), (2, [3, 1, 0, 2])):
         folder = tmp_path_factory.mktemp("trained")
@@ -58,33 +58,33 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("network", ["road", "mask-rcnn"])
-def test_two_trainings_are_the_same_bytes(folders: list[Path], network: str) -> None:
+def test_two_trainings_write_identical_files(folders: list[Path], network: str) -> None:
     one, other = (folder.joinpath(f"{network}.safetensors").read_bytes() for folder in folders)
 
     assert one == other
 
 
-def test_words_are_written_in_one_order() -> None:
+def test_metadata_order_does_not_change_the_file() -> None:
     tensors = {"b": torch.ones(3), "a": torch.zeros(2, dtype=torch.float16)}
-    words = {name: name for name in "zyxwvu"}
-    backwards = dict(reversed(words.items()))
+    metadata = {name: name for name in "zyxwvu"}
+    reversed_metadata = dict(reversed(metadata.items()))
 
-    assert serialised(tensors, words) == serialised(tensors, backwards)
+    assert serialised(tensors, metadata) == serialised(tensors, reversed_metadata)
 
 
-def test_words_of_any_kind_and_weights_come_back(tmp_path: Path) -> None:
+def test_metadata_and_weights_survive_a_round_trip(tmp_path: Path) -> None:
     from safetensors import safe_open
 
-    words = {"b": 'é"\\\n\u2028', "a": "x" * 101}
+    metadata = {"b": 'é"\\\n\u2028', "a": "x" * 101}
     path = tmp_path / "w.safetensors"
-    path.write_bytes(serialised({"t": torch.arange(5.0)}, words))
+    path.write_bytes(serialised({"t": torch.arange(5.0)}, metadata))
 
     with safe_open(path, "pt") as file:
-        assert file.metadata() == words
+        assert file.metadata() == metadata
         np.testing.assert_array_equal(file.get_tensor("t").numpy(), np.arange(5.0))
 
 
-def test_what_decides_the_bits_is_named() -> None:
+def test_platform_facts_that_determine_the_bits_are_recorded() -> None:
     found = decides_bits(torch.device("cpu"))
 
     assert found["on.torch"] == torch.__version__.partition("+")[0]
@@ -92,7 +92,7 @@ def test_what_decides_the_bits_is_named() -> None:
     assert found["on.is_reproducible"] == "bit for bit"
 
 
-def test_the_setting_is_taken_back() -> None:
+def test_deterministic_setting_is_restored() -> None:
     before = torch.are_deterministic_algorithms_enabled()
     with reproducible(torch.device("cpu")):
         assert torch.are_deterministic_algorithms_enabled()

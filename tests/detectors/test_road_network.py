@@ -1,4 +1,4 @@
-"""The road network: it learns, resumes after an interruption, and rejects other files."""
+"""Tests of the road network: training, resumption, checkpoints, and commands."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CPU = torch.device("cpu")
 
 
 def scenes(n: int, seed: int = 0) -> tuple[Bytes, Bytes]:
-    """Grey trapezoids on green, as the simplest road."""
+    """Draw grey trapezoids on green, as the simplest road."""
     rng = np.random.default_rng(seed)
     pixels = np.zeros((n, 48, 80, 3), np.uint8)
     road = np.zeros((n, 48, 80), np.uint8)
@@ -40,7 +40,7 @@ def scenes(n: int, seed: int = 0) -> tuple[Bytes, Bytes]:
 
 
 @pytest.mark.slow
-def test_it_learns_what_road_looks_like() -> None:
+def test_training_raises_the_iou_on_held_out_pictures() -> None:
     training = RoadTraining(RoadSchedule(steps=60, batch=6, warm_up=5), CPU)
     held = scenes(6, seed=1)
     before = road_score(training.network, *held, CPU)
@@ -54,7 +54,7 @@ def test_it_learns_what_road_looks_like() -> None:
 
 
 @pytest.mark.slow
-def test_going_on_after_an_interruption_is_as_if_there_was_none(tmp_path: Path) -> None:
+def test_resumed_training_matches_uninterrupted_training(tmp_path: Path) -> None:
     pixels, road = scenes(8)
     whole = RoadTraining(RoadSchedule(steps=6, batch=2), CPU)
     for _ in whole.steps(pixels, road):
@@ -74,21 +74,21 @@ def test_going_on_after_an_interruption_is_as_if_there_was_none(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("content", [b"", b"\x80\x04K\x01.", b"\x10" + b"\0" * 7 + b'{"a":1}'])
-def test_a_file_that_is_no_state_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_invalid_state_file_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "state").write_bytes(content)
 
     with pytest.raises(SchemaError, match="state: cannot resume from it"):
         RoadTraining(RoadSchedule(), CPU).resume(tmp_path / "state")
 
 
-def test_a_state_of_another_seed_is_refused(tmp_path: Path) -> None:
+def test_state_of_another_seed_is_refused(tmp_path: Path) -> None:
     RoadTraining(RoadSchedule(seed=1), CPU).save(tmp_path / "state")
 
     with pytest.raises(UsageError, match="of seed 1, not 2; use --seed 1"):
         RoadTraining(RoadSchedule(seed=2), CPU).resume(tmp_path / "state")
 
 
-def test_weights_come_back_as_they_were_written(tmp_path: Path) -> None:
+def test_road_checkpoint_survives_a_round_trip(tmp_path: Path) -> None:
     network = RoadNetwork().eval()
     save_road(tmp_path / "r.safetensors", network, RoadFacts(width_px=80, height_px=48))
 
@@ -100,7 +100,7 @@ def test_weights_come_back_as_they_were_written(tmp_path: Path) -> None:
         torch.testing.assert_close(again.network(pictures), network(pictures), atol=0.02, rtol=0.02)
 
 
-def test_files_that_are_no_road_networks_are_refused(tmp_path: Path) -> None:
+def test_invalid_checkpoints_and_settings_are_refused(tmp_path: Path) -> None:
     whole = tmp_path / "r.safetensors"
     save_road(whole, RoadNetwork(), RoadFacts(width_px=80, height_px=48))
     cut = tmp_path / "cut.safetensors"
@@ -136,7 +136,7 @@ def masks(frames: list[Frame]) -> list[RoadMask]:
     return given
 
 
-def test_any_picture_gives_a_mask_of_the_networks_size() -> None:
+def test_every_picture_size_yields_a_road_mask() -> None:
     rng = np.random.default_rng(0)
     frames = [
         Frame(1, "a", rng.integers(0, 255, (360, 640, 3), dtype=np.uint8), (1280, 720)),
@@ -151,7 +151,7 @@ def test_any_picture_gives_a_mask_of_the_networks_size() -> None:
         assert min(fractions.left, fractions.straight, fractions.right) >= 0.0
 
 
-def test_the_embedded_network_is_small_and_says_how_it_was_made() -> None:
+def test_embedded_road_network_is_small_and_documented() -> None:
     facts = load_road(embedded_path()).facts
 
     assert embedded_path().stat().st_size < 2_000_000
@@ -170,7 +170,7 @@ def folder(at: Path, n: int) -> Path:
 
 
 @pytest.mark.slow
-def test_own_pictures_with_masks_train_too(
+def test_train_road_accepts_a_folder_of_pictures_and_masks(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = folder(tmp_path / "own", 11)
@@ -204,7 +204,7 @@ def test_own_pictures_with_masks_train_too(
     assert run(argv) == 1  # it already exists
 
 
-def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Path) -> None:
+def test_picture_with_missing_or_mismatched_mask_is_refused(tmp_path: Path) -> None:
     data = folder(tmp_path / "own", 2)
     cv2.imwrite(str(data / "masks" / "01.png"), np.zeros((4, 4), np.uint8))
     with pytest.raises(Exception, match=r"01.png: 80 x 48 pixels, but its mask has 4 x 4"):
@@ -216,7 +216,7 @@ def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("flags", "says"),
+    ("flags", "message"),
     [
         (["--layouts", "A"], "only for scoring"),
         (["--layouts", "L1", "--val-layouts", "L1"], "also in --layouts"),
@@ -230,15 +230,15 @@ def test_a_picture_without_its_mask_or_of_another_size_is_reported(tmp_path: Pat
         ([], "expected --layouts"),
     ],
 )
-def test_wrong_usage_is_reported(
-    flags: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_invalid_flags_are_reported(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["train", "road", *flags, "-o", str(tmp_path / "o.safetensors")]) == 2
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[str]) -> None:
+def test_train_road_measures_a_network_without_training(capsys: pytest.CaptureFixture[str]) -> None:
     measure = ["train", "road", "--measure", "embedded"]
 
     assert run([*measure, "--test-layouts", "L640", "--per-layout", "2", "--json"]) == 0
@@ -250,12 +250,12 @@ def test_a_network_is_measured_without_training(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_a_device_that_is_not_there_is_reported() -> None:
+def test_unavailable_device_is_reported() -> None:
     with pytest.raises(VehicleError, match="detector road: device cuda: not available"):
         build(device="cuda")
 
 
-def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
+def test_unwritable_output_is_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert run(["train", "road", "--layouts", "L1", "-o", "/proc/nowhere/o.safetensors"]) == 1

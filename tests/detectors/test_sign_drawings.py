@@ -1,4 +1,4 @@
-"""The sign drawings do not depend on OpenCV's version and fonts."""
+"""Tests that sign drawings do not depend on OpenCV's version and fonts."""
 
 import hashlib
 
@@ -6,19 +6,19 @@ from crosscue.datasets.scenes.rendering.signs import WIDTH_M, sign
 from crosscue.detectors.signs.templates import KINDS, draw, drawings
 
 
-def test_drawings_of_the_detector_have_the_same_bytes_under_every_opencv() -> None:
+def test_detector_drawings_do_not_depend_on_the_opencv_version() -> None:
     grey = b"".join(one.grey.tobytes() for one in drawings())
 
     assert hashlib.sha256(grey).hexdigest()[:12] == "43c98c5fd7d6"
 
 
-def test_drawings_at_other_heights_have_the_same_bytes_under_every_opencv() -> None:
+def test_drawings_at_other_heights_do_not_depend_on_the_opencv_version() -> None:
     grey = b"".join(draw(kind, height).grey.tobytes() for kind in KINDS for height in (31, 97, 256))
 
     assert hashlib.sha256(grey).hexdigest()[:12] == "f1dc178b82bd"
 
 
-def test_signs_of_simulated_scenes_have_the_same_bytes_under_every_opencv() -> None:
+def test_simulated_signs_do_not_depend_on_the_opencv_version() -> None:
     pixels = b"".join(sign(name).tobytes() for name in WIDTH_M)
 
     assert hashlib.sha256(pixels).hexdigest()[:12] == "67df02364021"

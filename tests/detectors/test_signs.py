@@ -1,4 +1,4 @@
-"""Sign detection: signs are found, distinguished and not duplicated; thresholds by labels."""
+"""Tests of sign detection and of the choice of its threshold from labels."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ def _signs(grey: Bytes, **changes: object) -> Detections:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", AMERICAN)
-def test_each_american_sign_is_found_where_it_is_and_called_what_it_is(kind: Kind) -> None:
+def test_each_american_sign_is_located_and_classified(kind: Kind) -> None:
     hits = 0
     for seed in range(8):
         grey, box = scene(kind, seed)
@@ -48,7 +48,7 @@ def test_each_american_sign_is_found_where_it_is_and_called_what_it_is(kind: Kin
 @pytest.mark.parametrize(
     ("kind", "other"), [("one way left", "one way right"), ("one way right", "one way left")]
 )
-def test_a_left_arrow_is_never_a_right_one(kind: Kind, other: Kind) -> None:
+def test_one_way_arrows_are_not_confused(kind: Kind, other: Kind) -> None:
     for seed in range(8):
         grey, box = scene(kind, seed)
         found = _signs(grey)
@@ -57,7 +57,7 @@ def test_a_left_arrow_is_never_a_right_one(kind: Kind, other: Kind) -> None:
 
 
 @pytest.mark.parametrize("height_px", [40, 150, 220, 320])
-def test_a_sign_is_found_however_near_it_is(height_px: int) -> None:
+def test_sign_is_found_at_every_height(height_px: int) -> None:
     drawing = draw("do not enter", height_px).grey
     grey = clutter(7, (1280, 720))
     h, w = drawing.shape
@@ -70,13 +70,13 @@ def test_a_sign_is_found_however_near_it_is(height_px: int) -> None:
     assert overlaps(box, found.boxes_px).max() > 0.5
 
 
-def test_clutter_without_signs_has_no_arrows() -> None:
+def test_clutter_yields_no_one_way_signs() -> None:
     labels = [label for seed in range(10) for label in _signs(clutter(9000 + seed)).labels]
 
     assert not [label for label in labels if label.startswith("one way")]
 
 
-def test_nothing_is_found_in_the_cropped_part() -> None:
+def test_sign_in_the_cropped_part_is_not_found() -> None:
     grey, box = scene("do not enter", 3, height_px=80)
     bottom = 1.0 - (box[1] + 5) / grey.shape[0]
 
@@ -86,18 +86,18 @@ def test_nothing_is_found_in_the_cropped_part() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (20, 20), (40, 300)])
-def test_pictures_too_small_or_flat_give_nothing(shape: tuple[int, int]) -> None:
+def test_small_or_uniform_pictures_yield_no_signs(shape: tuple[int, int]) -> None:
     assert len(_signs(np.full(shape, 90, np.uint8))) == 0
 
 
-def test_a_setting_that_is_none_is_refused() -> None:
+def test_unknown_setting_is_refused() -> None:
     with pytest.raises(VehicleError, match="detector signs: ratoi: no such setting; did you mean"):
         build(ratoi=0.8)
 
 
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10_000))
-def test_the_ratio_test_agrees_with_opencv(seed: int) -> None:
+def test_ratio_test_matches_opencv(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.integers(0, 256, (7, 32), np.uint8)
     drawn = rng.integers(0, 256, (9, 32), np.uint8)
@@ -112,7 +112,7 @@ def test_the_ratio_test_agrees_with_opencv(seed: int) -> None:
 
 
 @pytest.mark.parametrize("max_count", [100, 20_000])
-def test_points_are_those_of_upright_orb_whether_or_not_it_must_choose(max_count: int) -> None:
+def test_points_match_upright_orb_at_any_limit(max_count: int) -> None:
     grey = clutter(5)
     orb = cv2.ORB.create(
         nfeatures=max_count, nlevels=1, edgeThreshold=8, patchSize=16, fastThreshold=6
@@ -131,7 +131,7 @@ def test_points_are_those_of_upright_orb_whether_or_not_it_must_choose(max_count
 
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 10_000), reach=st.integers(0, 3))
-def test_a_window_counts_each_drawn_point_once(seed: int, reach: int) -> None:
+def test_window_counts_each_template_point_once(seed: int, reach: int) -> None:
     rng = np.random.default_rng(seed)
     cells, drawn = rng.integers(-2, 9, (40, 2)), np.sort(rng.integers(0, 6, 40))
 
@@ -143,7 +143,7 @@ def test_a_window_counts_each_drawn_point_once(seed: int, reach: int) -> None:
             assert counts[row, column] == len(set(drawn[near].tolist()))
 
 
-def test_a_true_sign_counts_once_and_the_best_takes_it() -> None:
+def test_each_true_sign_matches_only_its_best_detection() -> None:
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [50, 50, 60, 60]], np.float64)
 
     judged = judge(boxes, np.array([0.5, 0.9, 0.7]), boxes[:1], 0.4)
@@ -152,7 +152,7 @@ def test_a_true_sign_counts_once_and_the_best_takes_it() -> None:
     assert judged.signs == 1
 
 
-def test_the_threshold_is_the_lowest_that_keeps_the_precision() -> None:
+def test_threshold_is_the_lowest_that_meets_the_precision() -> None:
     judged = Judged(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
 
     assert threshold_for(judged, 0.95) == 0.8
@@ -162,7 +162,7 @@ def test_the_threshold_is_the_lowest_that_keeps_the_precision() -> None:
     assert threshold_for(Judged(np.array([0.9]), np.array([False]), 1), 0.95) is None
 
 
-def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
+def test_fit_signs_measures_on_frames_not_used_for_the_choice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rows = ["picture,label,x0,y0,x1,y1"]
@@ -188,7 +188,7 @@ def test_fit_signs_chooses_on_some_frames_and_measures_on_others(
 
 
 def coco(folder: Path, seeds: range) -> Path:
-    """Alternating left and right one-way signs, as a COCO file with its folder of pictures."""
+    """Write a COCO file and pictures with alternating left and right one-way signs."""
     kinds: tuple[Kind, Kind] = ("one way left", "one way right")
     (folder / "images").mkdir(parents=True)
     images, annotations = [], []
@@ -212,7 +212,7 @@ def coco(folder: Path, seeds: range) -> Path:
     return folder / "coco.json"
 
 
-def test_several_labels_share_a_threshold_and_coco_files_serve_too(
+def test_fit_signs_accepts_several_labels_and_coco_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fitted, other = coco(tmp_path / "a", range(4)), coco(tmp_path / "b", range(4, 8))
@@ -226,7 +226,7 @@ def test_several_labels_share_a_threshold_and_coco_files_serve_too(
 
 
 def drive(folder: Path, seeds: range) -> Path:
-    """A drive with a sign in every second picture, and its truth."""
+    """Write a drive with a sign in every second picture, and its ground truth."""
     folder.mkdir()
     times = [1_700_000_000_000_000_000 + 10**8 * i for i in range(len(seeds))]
     pictures, images, annotations = [], [], []
@@ -261,7 +261,7 @@ def drive(folder: Path, seeds: range) -> Path:
 
 
 @pytest.mark.slow
-def test_drives_measure_a_threshold_with_an_interval_by_drive(
+def test_fit_signs_on_drives_reports_an_interval_by_drive(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fitted = coco(tmp_path / "a", range(4))
@@ -279,7 +279,7 @@ def test_drives_measure_a_threshold_with_an_interval_by_drive(
     assert 0.0 <= low <= whole["recall"] <= high <= 1.0
 
 
-def test_a_drive_without_objects_is_reported(
+def test_drive_without_an_objects_file_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = drive(tmp_path / "d", range(2))
@@ -289,9 +289,7 @@ def test_a_drive_without_objects_is_reported(
     assert "objects.json: " in capsys.readouterr().err
 
 
-def test_a_given_threshold_is_measured_not_chosen(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fixed_threshold_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fitted = str(coco(tmp_path / "a", range(4)))
 
     assert run(["fit", "signs", fitted, "--label", "one way left", "--threshold", "0.99"]) == 0
@@ -301,7 +299,7 @@ def test_a_given_threshold_is_measured_not_chosen(
     assert "recall    0.00 (0 of 2; " in reported
 
 
-def test_signs_too_low_to_matter_are_neither_found_nor_missed() -> None:
+def test_signs_below_the_min_height_are_ignored() -> None:
     truth = np.array([[0, 0, 10, 8], [50, 50, 60, 70]], np.float64)
     boxes = np.vstack([truth, [[90, 90, 99, 99]]])
 
@@ -313,7 +311,7 @@ def test_signs_too_low_to_matter_are_neither_found_nor_missed() -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"images": [], "annotations": [], "categories": []}'])
-def test_a_file_that_is_no_coco_is_reported(
+def test_invalid_coco_file_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
 ) -> None:
     (tmp_path / "coco.json").write_text(text)
@@ -324,7 +322,7 @@ def test_a_file_that_is_no_coco_is_reported(
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "message"),
     [
         ("a.png,stop,1,2,x,4", "labels.csv:2: expected four numbers"),
         ("a.png,stop,9,2,3,4", "expected x0 < x1"),
@@ -332,18 +330,18 @@ def test_a_file_that_is_no_coco_is_reported(
         ("labels.csv,stop,1,2,3,4", "not a JPEG, PNG or WebP picture"),
     ],
 )
-def test_labels_that_do_not_fit_are_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, said: str
+def test_invalid_label_rows_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, message: str
 ) -> None:
     labels = tmp_path / "labels.csv"
     labels.write_text(f"picture,label,x0,y0,x1,y1\n{row}\n")
 
     assert run(["fit", "signs", str(labels), "--label", "stop"]) == 4
 
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_a_picture_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_truncated_picture_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, coded = cv2.imencode(".jpg", scene(AMERICAN[0], 3).grey)
     (tmp_path / "cut.jpg").write_bytes(coded.tobytes()[:2000])
     labels = tmp_path / "labels.csv"
@@ -354,21 +352,21 @@ def test_a_picture_cut_short_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [("none.csv", "none.csv: No such file"), ("wild.csv", "wild.csv: is not text")],
 )
-def test_a_file_of_labels_that_is_none_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, said: str
+def test_missing_or_binary_label_file_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, message: str
 ) -> None:
     (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
 
     assert run(["fit", "signs", str(tmp_path / name), "--label", "stop"]) == 4
     reported = capsys.readouterr().err
-    assert said in reported
+    assert message in reported
     assert reported.count(str(tmp_path)) == 1
 
 
-def test_a_real_no_entry_sign_is_found_in_a_photo() -> None:
+def test_real_no_entry_sign_is_found_in_a_photo() -> None:
     path = shared("signs", "no_entry", "images", "NoEntry10.png")
     grey = np.asarray(cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), 0), np.uint8)
 

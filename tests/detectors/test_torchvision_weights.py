@@ -1,4 +1,4 @@
-"""Weights of torchvision's networks: recognised by their tensors, with torchvision's results."""
+"""Tests of torchvision weights: recognition by their tensors, and torchvision's results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MEAN = "head.classification_head.module_list.0.0.1.running_mean"
 
 
 def _picture() -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """Blocks of colour, 200 x 120, blue green red."""
+    """Draw blocks of colour, 200 x 120, in BGR order."""
     coarse = np.random.default_rng(2).integers(0, 256, (12, 20, 3), np.uint8)
     return np.asarray(np.kron(coarse, np.ones((10, 10, 1))), np.uint8)
 
@@ -72,7 +72,7 @@ FILES: tuple[tuple[ArchitectureName, str], ...] = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("architecture", "file"), FILES)
-def test_boxes_and_masks_are_those_of_torchvision_itself(
+def test_boxes_and_masks_match_torchvision(
     tmp_path: Path, architecture: ArchitectureName, file: str
 ) -> None:
     first = ARCHITECTURES[architecture].first_class
@@ -89,18 +89,18 @@ def test_boxes_and_masks_are_those_of_torchvision_itself(
     np.testing.assert_array_equal(found.scores, theirs["scores"].astype(np.float64))
     assert list(found.labels) == [NAMES[i - first] for i in theirs["labels"]]
     for text, mask, box in zip(found.masks, theirs.get("masks", []), theirs["boxes"], strict=False):
-        want = mask[0] > 0.5
+        expected = mask[0] > 0.5
         # Torchvision's masks extend a pixel beyond their box, crosscue's do not.
         x0, y0 = np.floor(box[:2]).astype(int)
         x1, y1 = np.ceil(box[2:]).astype(int)
-        ours = rle.decode(text, (200, 120)) if text else np.zeros_like(want)
-        np.testing.assert_array_equal(ours[y0:y1, x0:x1], want[y0:y1, x0:x1])
+        ours = rle.decode(text, (200, 120)) if text else np.zeros_like(expected)
+        np.testing.assert_array_equal(ours[y0:y1, x0:x1], expected[y0:y1, x0:x1])
     assert any(found.masks) == ("masks" in theirs)
 
 
 @pytest.mark.slow
-def test_weights_whose_normalisation_was_frozen_add_nothing_to_variances(tmp_path: Path) -> None:
-    """Equal to torchvision, for its COCO weights and for fine-tuned ones."""
+def test_frozen_batch_norm_weights_use_a_zero_epsilon(tmp_path: Path) -> None:
+    """Detections match torchvision for its COCO weights and for fine-tuned ones."""
     from torchvision.ops import misc
 
     model = network("fasterrcnn_resnet50_fpn", min_size=SIZE[1], max_size=SIZE[0])
@@ -126,19 +126,19 @@ def test_weights_whose_normalisation_was_frozen_add_nothing_to_variances(tmp_pat
 
 
 @pytest.mark.parametrize("architecture", get_args(ArchitectureName))
-def test_each_network_is_known_by_its_tensors(
+def test_each_architecture_is_recognised_by_its_tensors(
     tmp_path: Path, architecture: ArchitectureName, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from crosscue.detectors.catalog.recognise_weights import recognise_weights
 
     path = tmp_path / "my.pth"
     torch.save(hollow(architecture, 4), path)
-    has_a_twin = "mobilenet_v3_large" in architecture and "ssd" not in architecture
-    if has_a_twin:
+    is_ambiguous = "mobilenet_v3_large" in architecture and "ssd" not in architecture
+    if is_ambiguous:
         with pytest.raises(crosscue.UsageError, match="same tensors; choose one with --kind"):
             recognise_weights(path, None)
 
-    _, guess = recognise_weights(path, architecture if has_a_twin else None)
+    _, guess = recognise_weights(path, architecture if is_ambiguous else None)
 
     assert guess.network is not None
     assert guess.network["architecture"] == architecture
@@ -150,7 +150,7 @@ def test_each_network_is_known_by_its_tensors(
     assert size == wanted
 
 
-def test_nested_and_prefixed_weights_are_found_and_reported(tmp_path: Path) -> None:
+def test_nested_and_prefixed_weights_are_recognised(tmp_path: Path) -> None:
     from crosscue.detectors.catalog.recognise_weights import recognise_weights
 
     state = {
@@ -167,21 +167,21 @@ def test_nested_and_prefixed_weights_are_found_and_reported(tmp_path: Path) -> N
     )
 
 
-def test_coco_s_classes_are_known_and_others_are_asked_for(
+def test_coco_class_names_are_known_and_others_are_required(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "my.pth"
-    for classes, said in ((91, None), (4, "3 classes without names")):
+    for classes, message in ((91, None), (4, "3 classes without names")):
         torch.save(hollow("ssdlite320_mobilenet_v3_large", classes), path)
         state = run(["model", "init", str(path), "--overwrite"])
         error = capsys.readouterr().err
-        if said is None:
+        if message is None:
             assert state == 0
             card = read_card(tmp_path / "my.toml")
             assert card.output.classes[2] == "car"
         else:
             assert state == 2
-            assert said in error
+            assert message in error
     names = class_names(tmp_path, ("__background__", *NAMES))
     args = ["model", "init", str(path), "--overwrite", "--class-names", str(names)]
     assert run(args) == 0
@@ -189,8 +189,8 @@ def test_coco_s_classes_are_known_and_others_are_asked_for(
     assert run(["model", "check", str(tmp_path / "my.toml")]) == 0
 
 
-class _Runs:
-    """A pickle that creates a file when it is read."""
+class _Malicious:
+    """Object that creates a folder when it is unpickled."""
 
     def __init__(self, place: Path) -> None:
         self.place = place
@@ -200,11 +200,11 @@ class _Runs:
 
 
 def _with_code(folder: Path) -> object:
-    return {"model": _Runs(folder / "made_by_a_pickle")}
+    return {"model": _Malicious(folder / "made_by_a_pickle")}
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (_with_code, "holds code or objects other than tensors (posix.mkdir)"),
         (lambda folder: argparse.Namespace(epoch=1), "other than tensors (argparse.Namespace)"),
@@ -228,8 +228,8 @@ def _with_code(folder: Path) -> object:
         ),
     ],
 )
-def test_what_is_no_network_of_torchvision_s_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: Any, said: str
+def test_unsupported_weights_are_refused_on_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: Any, message: str
 ) -> None:
     path = tmp_path / "my.pth"
     torch.save(content(tmp_path), path)
@@ -237,13 +237,13 @@ def test_what_is_no_network_of_torchvision_s_is_one_line(
     assert run(["model", "init", str(path)]) in (1, 2)
 
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1
     assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]
 
 
-def _bomb() -> bytes:
-    """An archive of zeros that declares an unpacked size above the limit."""
+def _oversized_archive() -> bytes:
+    """Build an archive of zeros that declares an unpacked size above the limit."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data.pkl", b"\0" * 1000)
@@ -254,29 +254,27 @@ def _bomb() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("my.pth", b"", "not a complete weights file"),
         ("my.pth", b"half of it", "not a complete weights file"),
-        ("my.pth", _bomb(), "unpacks to 3,221,225,472 bytes"),
+        ("my.pth", _oversized_archive(), "unpacks to 3,221,225,472 bytes"),
         ("my.safetensors", b"half of it", "not a safetensors file"),
     ],
 )
-def test_a_damaged_file_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes, said: str
+def test_damaged_weights_are_refused_on_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes, message: str
 ) -> None:
     (tmp_path / name).write_bytes(content)
 
     assert run(["model", "init", str(tmp_path / name)]) in (1, 2)
 
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1
 
 
-def test_a_torchscript_archive_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_torchscript_archive_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "my.pt"
     with zipfile.ZipFile(path, "w") as archive:
         for name in ("data.pkl", "constants.pkl", "version"):
@@ -287,7 +285,7 @@ def test_a_torchscript_archive_is_refused(
     assert "TorchScript archive carries code" in capsys.readouterr().err
 
 
-def test_weights_of_our_own_training_need_no_card(
+def test_crosscue_checkpoint_is_refused_because_it_needs_no_card(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from crosscue.detectors.networks.mask_rcnn.checkpoint import embedded_path
@@ -301,7 +299,7 @@ def test_weights_of_our_own_training_need_no_card(
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ('"car", ', "", "its head has 3 classes and the background, the card lists 2"),
         (
@@ -319,8 +317,8 @@ def test_weights_of_our_own_training_need_no_card(
         ('colour = "rgb"', 'colour = "bgr"', 'need colour = "rgb"'),
     ],
 )
-def test_a_card_that_does_not_fit_its_weights_is_one_line(
-    tmp_path: Path, old: str, new: str, said: str
+def test_card_that_contradicts_its_weights_is_refused(
+    tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     torch.save(hollow("ssdlite320_mobilenet_v3_large", 4), tmp_path / "my.pth")
     card = crosscue.draft_card(tmp_path / "my.pth", class_names=NAMES).path
@@ -331,11 +329,11 @@ def test_a_card_that_does_not_fit_its_weights_is_one_line(
     with pytest.raises(crosscue.VehicleError) as error:
         build(card=str(card))
 
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_weights_that_are_not_finite_are_never_run(tmp_path: Path) -> None:
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     state = hollow("ssdlite320_mobilenet_v3_large", 4)
     state[MEAN] = torch.full((672,), torch.nan)
     torch.save(state, tmp_path / "my.pth")

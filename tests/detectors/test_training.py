@@ -1,4 +1,4 @@
-"""Training on COCO annotations: reading, samples, and resumption after a kill."""
+"""Tests of training on COCO annotations: reading, samples, resumption, and commands."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _bars(folder: Path, count: int = 4) -> LabelledSet:
 
 
 def _changed(folder: Path, **rows: Any) -> LabelledSet:
-    """A set of bars, with other top-level entries."""
+    """Write a dataset of bars with changed top-level entries, and read it."""
     path = write_bars(folder / "set", 2)
     tree = json.loads(path.read_text())
     for name, value in rows.items():
@@ -46,7 +46,7 @@ def _changed(folder: Path, **rows: Any) -> LabelledSet:
 
 
 def _with(row: dict[str, Any]) -> Any:
-    """A change that updates the first annotation with ``row``."""
+    """Return a change that updates the first row with ``row``."""
     return lambda rows: [{**rows[0], **row}, *rows[1:]]
 
 
@@ -78,7 +78,7 @@ def _with(row: dict[str, Any]) -> Any:
         ),
     ],
 )
-def test_an_annotation_that_cannot_be_used_is_left_out_and_counted(
+def test_unusable_annotation_is_dropped_and_counted(
     tmp_path: Path, row: dict[str, Any], reason: str
 ) -> None:
     labelled = _changed(tmp_path, annotations=_with(row))
@@ -87,7 +87,7 @@ def test_an_annotation_that_cannot_be_used_is_left_out_and_counted(
     assert sum(len(picture.objects) for picture in labelled.pictures) == 3
 
 
-def test_a_box_that_sticks_out_is_cut_off_at_the_edge(tmp_path: Path) -> None:
+def test_box_beyond_the_picture_is_clipped_and_counted(tmp_path: Path) -> None:
     labelled = _changed(tmp_path, annotations=_with({"bbox": [-10, -5, 30, 300]}))
 
     assert labelled.pictures[0].objects[0].box_px == (0.0, 0.0, 20.0, 96.0)
@@ -95,7 +95,7 @@ def test_a_box_that_sticks_out_is_cut_off_at_the_edge(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "message"),
     [
         ({"annotations": []}, "no usable annotation of car"),
         ({"images": []}, "none of its pictures"),
@@ -104,15 +104,15 @@ def test_a_box_that_sticks_out_is_cut_off_at_the_edge(tmp_path: Path) -> None:
         ({"images": [7]}, "images: expected a list"),
     ],
 )
-def test_a_set_without_anything_to_learn_from_is_refused(
-    tmp_path: Path, change: dict[str, Any], why: str
+def test_dataset_without_usable_annotations_is_refused(
+    tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(SchemaError, match=why):
+    with pytest.raises(SchemaError, match=message):
         _changed(tmp_path, **change)
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"no json", b"[" * 100_000, b"\xff\xfe"])
-def test_a_file_that_is_no_coco_file_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_invalid_coco_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "coco.json"
     path.write_bytes(content)
 
@@ -129,7 +129,7 @@ def test_a_file_that_is_no_coco_file_is_refused(tmp_path: Path, content: bytes) 
         (7, "pictures without a name or size"),
     ],
 )
-def test_a_picture_that_is_not_in_the_folder_is_left_out(
+def test_picture_not_in_the_folder_is_dropped_and_counted(
     tmp_path: Path, name: object, reason: str
 ) -> None:
     labelled = _changed(tmp_path, images=_with({"file_name": name}))
@@ -138,7 +138,7 @@ def test_a_picture_that_is_not_in_the_folder_is_left_out(
     assert labelled.left_out == {reason: 1, "annotations of other pictures": 2}
 
 
-def test_a_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> None:
+def test_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> None:
     labelled = _changed(tmp_path, images=_with({"width": 130, "height": 97}))
     sampler = Sampler(labelled, plan_of(), WINDOW, 0)
 
@@ -147,7 +147,7 @@ def test_a_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.02, 0.5, 0.98])
-def test_a_picture_cut_short_is_not_learnt_from(tmp_path: Path, fraction: float) -> None:
+def test_truncated_picture_is_refused(tmp_path: Path, fraction: float) -> None:
     labelled = _bars(tmp_path)
     path = labelled.pictures[0].path
     content = path.read_bytes()
@@ -157,19 +157,19 @@ def test_a_picture_cut_short_is_not_learnt_from(tmp_path: Path, fraction: float)
         read_picture(labelled.pictures[0])
 
 
-def test_all_spellings_of_a_mask_mean_the_same_pixels(tmp_path: Path) -> None:
+def test_all_mask_encodings_decode_to_the_same_pixels(tmp_path: Path) -> None:
     mask = np.zeros((96, 128), np.bool_)
     mask[20:50, 30:90] = True
     text = rle.encode(mask, (0, 0), (128, 96))
-    spellings = (
+    encodings = (
         [[30, 20, 90, 20, 90, 50, 30, 50]],
         {"size": [96, 128], "counts": text.decode()},
         {"size": [96, 128], "counts": rle.runs(text).tolist()},
     )
-    for number, spelling in enumerate(spellings):
+    for number, encoding in enumerate(encodings):
         labelled = _changed(
             tmp_path / str(number),
-            annotations=_with({"segmentation": spelling, "bbox": [30, 20, 60, 30]}),
+            annotations=_with({"segmentation": encoding, "bbox": [30, 20, 60, 30]}),
         )
         got = mask_of(labelled.pictures[0].objects[0], (128, 96))
         assert not labelled.left_out
@@ -179,7 +179,7 @@ def test_all_spellings_of_a_mask_mean_the_same_pixels(tmp_path: Path) -> None:
 @pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
-def test_in_a_sample_every_box_encloses_its_mask_and_shows_its_object(
+def test_sample_boxes_enclose_their_masks_and_objects(
     tmp_path_factory: pytest.TempPathFactory, number: int
 ) -> None:
     labelled = _bars(tmp_path_factory.mktemp("bars"), 1)
@@ -202,7 +202,7 @@ def _training(folder: Path, schedule: Schedule) -> tuple[Training, Sampler]:
 
 
 @pytest.mark.slow
-def test_a_network_learns(tmp_path: Path) -> None:
+def test_training_lowers_the_loss(tmp_path: Path) -> None:
     training, sampler = _training(tmp_path, Schedule(16, batch=2, rate=2e-3, warm_up=4))
 
     losses = [loss for _, loss in training.steps(sampler)]
@@ -211,7 +211,7 @@ def test_a_network_learns(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_going_on_after_a_kill_ends_as_if_none_had_come(tmp_path: Path) -> None:
+def test_resumed_training_equals_uninterrupted_training(tmp_path: Path) -> None:
     schedule = Schedule(4, batch=2, warm_up=1)
     whole, sampler = _training(tmp_path / "a", schedule)
     expected = [loss for _, loss in whole.steps(sampler)]
@@ -232,7 +232,7 @@ def test_going_on_after_a_kill_ends_as_if_none_had_come(tmp_path: Path) -> None:
         assert torch.equal(value, later.averaged.state_dict()[name])
 
 
-def test_a_state_of_another_training_or_none_is_refused(tmp_path: Path) -> None:
+def test_state_of_other_settings_or_damaged_state_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "state.safetensors"
     one, _ = _training(tmp_path / "a", Schedule(4, batch=2))
     one.save(path, {})
@@ -246,7 +246,7 @@ def test_a_state_of_another_training_or_none_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_losses_that_are_no_numbers_end_the_training(tmp_path: Path) -> None:
+def test_nan_loss_ends_the_training(tmp_path: Path) -> None:
     training, sampler = _training(tmp_path, Schedule(40, batch=1))
     with torch.no_grad():
         training.network.rpn.head.cls_logits.bias.fill_(float("nan"))
@@ -269,7 +269,7 @@ def _perfect(labelled: LabelledSet) -> list[Detections]:
     return found
 
 
-def test_average_precision_is_all_for_the_truth_itself_and_nothing_for_nothing(
+def test_average_precision_is_100_for_ground_truth_and_0_for_no_detections(
     tmp_path: Path,
 ) -> None:
     labelled = _bars(tmp_path)
@@ -285,7 +285,7 @@ def test_average_precision_is_all_for_the_truth_itself_and_nothing_for_nothing(
     assert none["box"] == none["mask"] == 0.0
 
 
-def test_a_second_detection_of_the_same_object_is_wrong(tmp_path: Path) -> None:
+def test_duplicate_detection_is_a_false_positive(tmp_path: Path) -> None:
     labelled = _bars(tmp_path)
     one = _perfect(labelled)[0]
     doubled = Detections(
@@ -303,7 +303,7 @@ def test_a_second_detection_of_the_same_object_is_wrong(tmp_path: Path) -> None:
     assert (len(rows.scores), int(rows.is_right.sum()), rows.signs) == (4, 2, 8)
 
 
-def test_calibration_finds_the_law_that_scores_follow() -> None:
+def test_calibration_recovers_the_logistic_parameters() -> None:
     rng = np.random.default_rng(0)
     scores = rng.uniform(0.02, 0.98, 20_000)
     logit = np.log(scores / (1.0 - scores))
@@ -315,14 +315,14 @@ def test_calibration_finds_the_law_that_scores_follow() -> None:
     assert by.offset == pytest.approx(-1.0, abs=0.06)
 
 
-def test_too_few_detections_leave_scores_as_they_are() -> None:
+def test_too_few_detections_leave_scores_uncalibrated() -> None:
     rows = Judged(np.linspace(0.1, 0.9, 25), np.ones(25, np.bool_), 25)
 
     assert (fitted(rows).slope, fitted(rows).offset) == (1.0, 0.0)
 
 
 @pytest.mark.slow
-def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
+def test_train_commands_produce_a_checkpoint_from_simulated_pictures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames, out = tmp_path / "frames", tmp_path / "mine.safetensors"
@@ -369,7 +369,7 @@ def test_from_simulated_pictures_to_a_checkpoint_by_commands_alone(
 
 
 @pytest.mark.parametrize("layout", ["A", "H", "A-C", "L", "L9-L3", "L1-A", "L-1", "L0-L999999999"])
-def test_nothing_is_rendered_for_training_of_what_is_scored(
+def test_train_frames_refuses_scored_and_invalid_layouts(
     tmp_path: Path, layout: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["train", "frames", layout, "-o", str(tmp_path / "x")]) == 2
@@ -378,7 +378,7 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
 
 
 @pytest.mark.parametrize(
-    ("flags", "why"),
+    ("flags", "message"),
     [
         (["-o", "x.pth"], "ends in .safetensors"),
         (["--steps", "0"], "--steps: expected 1 or more"),
@@ -393,8 +393,8 @@ def test_nothing_is_rendered_for_training_of_what_is_scored(
         (["--crop-top", "0.6", "--crop-bottom", "0.6"], "less than a tenth"),
     ],
 )
-def test_wrong_flags_are_reported_before_any_work(
-    tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_flags_are_reported_before_training(
+    tmp_path: Path, flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
     base = [
@@ -409,10 +409,10 @@ def test_wrong_flags_are_reported_before_any_work(
     ]
 
     assert run([*base, *flags]) == 2
-    assert why in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
+def test_unwritable_output_is_reported_before_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
@@ -425,7 +425,7 @@ def test_a_place_that_cannot_be_written_to_is_reported_before_any_work(
 
 
 @pytest.mark.slow
-def test_a_network_is_measured_without_training(
+def test_train_mask_rcnn_measures_a_network_without_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     frames = tmp_path / "frames"
@@ -460,7 +460,7 @@ def test_a_network_is_measured_without_training(
 
 
 @pytest.mark.parametrize(
-    ("flags", "why"),
+    ("flags", "message"),
     [
         (["--subset", "9"], "expected A:B:N"),
         (["--subset", "::0"], "expected A:B:N"),
@@ -468,8 +468,8 @@ def test_a_network_is_measured_without_training(
         (["--proposals", "0"], "expected 1 to 2000"),
     ],
 )
-def test_a_measurement_of_nothing_is_refused(
-    tmp_path: Path, flags: list[str], why: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_measurement_flags_are_refused(
+    tmp_path: Path, flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 4)
     torch_file = tmp_path / "bars.safetensors"
@@ -486,10 +486,10 @@ def test_a_measurement_of_nothing_is_refused(
     ]
 
     assert run([*base, *flags]) == 2
-    assert why in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_what_is_of_no_wanted_class_is_looked_at_too_but_not_learnt_as_one(tmp_path: Path) -> None:
+def test_objects_of_other_classes_are_sampled_without_labels(tmp_path: Path) -> None:
     labelled = _changed(
         tmp_path,
         images=lambda rows: rows[:1],

@@ -1,4 +1,4 @@
-"""All candidates of cues are counted: used, or skipped with a reason."""
+"""Tests of the tally of candidates: each is counted as used, or as skipped with a reason."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -26,7 +26,7 @@ VEHICLE = Vehicle(
     cues=Cues(own={"crossing": OwnCue(labels=("zebra",), score=0.3)}),
     cars=Cars(kind="pairs"),
 )
-FOLLOWED = VEHICLE.model_copy(
+TRACKED = VEHICLE.model_copy(
     update={"cars": Cars(kind="tracks"), "camera": Camera(focal_px=500.0, center_px=(320.0, 200.0))}
 )
 LABELS = ("traffic light", "stop sign", "car", "zebra", "one way left", "dog")
@@ -34,12 +34,12 @@ BOX = st.tuples(st.sampled_from(LABELS), st.floats(0.0, 1.0), st.floats(5.0, 300
 FRAMES = st.lists(st.lists(BOX, max_size=5), min_size=1, max_size=4)
 
 
-def _found(t_ns: int, *things: tuple[str, float, float]) -> Detections:
-    """Objects 40 px high at the left, each with a label, score and width."""
-    boxes = np.array([(5.0, 5.0, 5.0 + width, 45.0) for _, _, width in things]).reshape(-1, 4)
-    scores = np.array([score for _, score, _ in things], np.float64)
-    labels = tuple(label for label, _, _ in things)
-    return Detections(t_ns, (640, 480), boxes, scores, labels, (b"",) * len(things))
+def _found(t_ns: int, *found: tuple[str, float, float]) -> Detections:
+    """Build objects 40 px high at the left, each with a label, score and width."""
+    boxes = np.array([(5.0, 5.0, 5.0 + width, 45.0) for _, _, width in found]).reshape(-1, 4)
+    scores = np.array([score for _, score, _ in found], np.float64)
+    labels = tuple(label for label, _, _ in found)
+    return Detections(t_ns, (640, 480), boxes, scores, labels, (b"",) * len(found))
 
 
 def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
@@ -47,7 +47,7 @@ def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
     return CuePass(vehicle, tally=tally), tally
 
 
-def test_lights_below_the_threshold_are_counted_with_the_best_score_of_all() -> None:
+def test_lights_below_threshold_are_counted_with_their_max_score() -> None:
     cues, tally = _pass(Vehicle(version=1, cues=Cues(traffic_light_score=0.9)))
     for t, score in enumerate((0.41, 0.62, 0.3)):
         cues(Seen(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
@@ -58,7 +58,7 @@ def test_lights_below_the_threshold_are_counted_with_the_best_score_of_all() -> 
     assert lights.setting == "[cues] traffic_light_score"
 
 
-def test_a_car_is_skipped_for_the_first_rule_that_it_does_not_meet() -> None:
+def test_car_of_a_pair_is_skipped_for_the_first_rule_it_fails() -> None:
     cues, tally = _pass()
     standing = ("car", 0.99, 100.0)
     cues(Seen(0, objects=(_found(0, standing, ("car", 0.5, 100.0), ("car", 0.99, 50.0)),)))
@@ -74,18 +74,18 @@ def test_a_car_is_skipped_for_the_first_rule_that_it_does_not_meet() -> None:
     }
 
 
-def test_a_car_that_is_followed_is_skipped_for_its_first_reason_too() -> None:
-    cues, tally = _pass(FOLLOWED)
+def test_tracked_car_is_skipped_for_the_first_rule_it_fails() -> None:
+    cues, tally = _pass(TRACKED)
     for _ in range(2):
-        things = ("car", 0.99, 100.0), ("car", 0.5, 100.0), ("car", 0.99, 640.0)
-        cues(Seen(0, objects=(_found(0, *things),)), Motion(0.0, 0.0, 0.0, 0.1))
+        found = ("car", 0.99, 100.0), ("car", 0.5, 100.0), ("car", 0.99, 640.0)
+        cues(Seen(0, objects=(_found(0, *found),)), Motion(0.0, 0.0, 0.0, 0.1))
 
     cars = tally.by_cue["parked_right"]
     assert (cars.seen, cars.used) == (6, 0)
     assert cars.skipped == {BELOW_SCORE: 2, CUT_OR_FAR: 2, TOO_FEW_FRAMES: 2}
 
 
-def test_a_region_with_too_little_road_is_counted_and_one_without_is_not() -> None:
+def test_region_with_too_little_road_is_counted_as_skipped() -> None:
     cues, tally = _pass()
     cues(Seen(0, road=RoadFractions(left=0.13, straight=0.5, right=0.0)))
 
@@ -95,9 +95,9 @@ def test_a_region_with_too_little_road_is_counted_and_one_without_is_not() -> No
     assert tally.by_cue["road_right"].seen == 0
 
 
-@given(FRAMES, FRAMES, st.sampled_from([VEHICLE, FOLLOWED]))
+@given(FRAMES, FRAMES, st.sampled_from([VEHICLE, TRACKED]))
 @settings(max_examples=60, deadline=None)
-def test_used_and_skipped_add_up_for_every_cue(
+def test_used_and_skipped_candidates_add_up_for_every_cue(
     objects: list[list[tuple[str, float, float]]],
     signs: list[list[tuple[str, float, float]]],
     vehicle: Vehicle,
@@ -114,9 +114,9 @@ def test_used_and_skipped_add_up_for_every_cue(
         assert one.seen == one.used + sum(one.skipped.values())
         assert all(number > 0 for number in one.skipped.values())
         assert one.used == counted.get(name, 0)
-    looked = {
+    evaluated = {
         name
         for name, cue in CUES.items()
         if cue.observed_by not in ("road", "mobileye") and cue.group != "cars_past"
     }
-    assert set(tally.by_cue) == looked | {"crossing"}
+    assert set(tally.by_cue) == evaluated | {"crossing"}

@@ -1,4 +1,4 @@
-"""Tracking of cars on the road: a standing car never crosses, for any motion of the camera."""
+"""Tests of car tracking: a stationary car never counts as crossing, however the camera moves."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WAY_M = 0.8
 
 @dataclass(frozen=True)
 class Car:
-    """A car seen from the side, as a rectangle across the road; it can move."""
+    """Car seen from the side, as a rectangle across the road; it can move."""
 
     ahead_m: float
     right_m: float
@@ -50,7 +50,7 @@ def drive(
     seed: int = 0,
     tracks: CarTracks | None = None,
 ) -> Iterator[list[CarMotion]]:
-    """Motions of the cars after each frame of a drive."""
+    """Simulate a drive and yield the motions of the cars after each frame."""
     rng = np.random.default_rng(seed)
     tracks = tracks or CarTracks(CAMERA, RULES)
     x = y = heading = time_s = 0.0
@@ -70,7 +70,7 @@ def drive(
 def board(
     car: Car, time_s: float, eye: tuple[float, float, float]
 ) -> tuple[tuple[float, float, float, float], int] | None:
-    """A car's box in the picture, if it is in front of the camera."""
+    """Return a car's box in the picture and its nose, if it is in front of the camera."""
     at = car.ahead_m + car.ahead_mps * time_s, -car.right_m - car.right_mps * time_s
     east, north = at[0] - eye[0], at[1] - eye[1]
     depth = east * math.cos(eye[2]) + north * math.sin(eye[2])
@@ -90,7 +90,7 @@ def found(boxes: np.ndarray[tuple[int, int], np.dtype[np.float64]], noses: list[
 
 
 def mask(box: np.ndarray[tuple[int], np.dtype[np.float64]], nose: int) -> bytes:
-    """A wedge whose lower end is the nose; empty if the nose is unknown."""
+    """Draw a wedge with its lower end at the nose; empty if the nose is unknown."""
     x0, y0, x1, y1 = (round(value) for value in box.tolist())
     if not nose or min(x0, y0) < 0 or x1 >= SIZE[0] or y1 >= SIZE[1]:
         return b""
@@ -121,16 +121,16 @@ standing = st.builds(
 
 @settings(max_examples=200, deadline=None)
 @given(steps=ego_motions, car=standing)
-def test_a_standing_car_never_crosses_whatever_the_ego_vehicle_does(
-    steps: list[Motion], car: Car
-) -> None:
+def test_stationary_car_never_crosses_for_any_ego_motion(steps: list[Motion], car: Car) -> None:
     for cars in drive([car], steps):
         assert not crossing(cars, RULES)
 
 
 @settings(max_examples=60, deadline=None)
 @given(steps=ego_motions, car=standing, seed=st.integers(0, 99))
-def test_nor_does_it_when_its_box_trembles(steps: list[Motion], car: Car, seed: int) -> None:
+def test_stationary_car_with_jittering_box_never_crosses(
+    steps: list[Motion], car: Car, seed: int
+) -> None:
     one = replace(car, height_m=CAR_HEIGHT_M)
 
     for cars in drive([one], steps, jitter_px=0.7, seed=seed):
@@ -140,7 +140,7 @@ def test_nor_does_it_when_its_box_trembles(steps: list[Motion], car: Car, seed: 
 @pytest.mark.parametrize("way_m", [0.0, 0.5, 1.5])
 @pytest.mark.parametrize("turned_rad", [0.0, 0.01])
 @pytest.mark.parametrize("right_mps", [-9.0, -6.0, 6.0, 9.0])
-def test_a_crossing_car_does_and_to_the_side_it_goes_to(
+def test_moving_car_counts_as_crossing_to_its_side(
     right_mps: float, turned_rad: float, way_m: float
 ) -> None:
     car = Car(38.0, -0.5 * right_mps, right_mps)
@@ -153,7 +153,7 @@ def test_a_crossing_car_does_and_to_the_side_it_goes_to(
     assert not parked(last, RULES)
 
 
-def test_the_mirror_image_of_a_drive_has_the_mirror_image_of_its_cars() -> None:
+def test_mirrored_drive_has_mirrored_car_speeds() -> None:
     steps = steady(8, turned_rad=0.01)
     mirrored = [one._replace(turned_rad=-one.turned_rad) for one in steps]
 
@@ -164,13 +164,13 @@ def test_the_mirror_image_of_a_drive_has_the_mirror_image_of_its_cars() -> None:
 
 
 @pytest.mark.parametrize("ahead_mps", [-14.0, 8.0, 14.0])
-def test_oncoming_and_outgoing_cars_do_not_cross(ahead_mps: float) -> None:
+def test_oncoming_and_outgoing_cars_neither_cross_nor_park(ahead_mps: float) -> None:
     for cars in drive([Car(45.0, -3.5, ahead_mps=ahead_mps)], steady(12)):
         assert not crossing(cars, RULES)
         assert not parked(cars, RULES)
 
 
-def test_a_car_that_comes_out_from_behind_another_does_not_cross() -> None:
+def test_growing_box_of_an_occluded_car_does_not_cross() -> None:
     tracks = CarTracks(CAMERA, RULES)
     for i in range(10):
         box = np.array([[600.0, 350.0, 640.0 + 8.0 * i, 380.0]])
@@ -178,7 +178,7 @@ def test_a_car_that_comes_out_from_behind_another_does_not_cross() -> None:
         assert not crossing(cars, RULES)
 
 
-def test_fewer_than_three_frames_say_nothing() -> None:
+def test_fewer_than_three_frames_yield_no_cue() -> None:
     first, second, *_ = drive([Car(30.0, 0.0, 8.0), Car(30.0, 9.0, nose=1)], steady(3, 0.0))
 
     assert not first
@@ -188,7 +188,7 @@ def test_fewer_than_three_frames_say_nothing() -> None:
 
 
 @pytest.mark.parametrize("nose", [-1, 1])
-def test_a_parked_car_counts_at_the_intersection_alone(nose: int) -> None:
+def test_parked_car_counts_only_at_the_intersection(nose: int) -> None:
     steps = steady(10)
     *_, last = drive([Car(40.0, 2.0, nose=nose)], steps)
     ahead_m = 40.0 - 10 * WAY_M
@@ -205,7 +205,7 @@ def test_a_parked_car_counts_at_the_intersection_alone(nose: int) -> None:
 
 @pytest.mark.parametrize("right_m", [-20.0, 20.0])
 @pytest.mark.parametrize(("right_mps", "is_parked"), [(0.0, True), (2.5, False), (-2.5, False)])
-def test_more_frames_show_that_a_far_car_aside_stands(
+def test_distant_parked_car_is_recognised_over_more_frames(
     right_m: float, right_mps: float, is_parked: bool
 ) -> None:
     tracks = CarTracks(CAMERA, RULES)
@@ -217,8 +217,8 @@ def test_more_frames_show_that_a_far_car_aside_stands(
 
 
 @given(bearing=st.floats(-0.9, 0.9))
-def test_a_car_along_the_street_is_not_parked_across_it(bearing: float) -> None:
-    # Length of its outline at this bearing: its length is foreshortened, its width is not.
+def test_car_parallel_to_the_street_is_not_parked(bearing: float) -> None:
+    # Length of the outline at this bearing: the car's length is foreshortened, its width is not.
     long = (CAR_LENGTH_M * abs(bearing) + 1.8) / CAR_HEIGHT_M
     car = CarMotion(1, 10, 30.0, bearing, 0.0, 0.1, 0.0, 0.5, True, long, 1.0)
 
@@ -226,7 +226,7 @@ def test_a_car_along_the_street_is_not_parked_across_it(bearing: float) -> None:
 
 
 def past(car: Car, steps: Sequence[Motion], place: Place | None) -> Ways | None:
-    """Counts of cars past the intersection after the last step."""
+    """Count the cars past the intersection after the last step."""
     tracks = CarTracks(CAMERA, RULES)
     for _ in drive([car], steps, tracks=tracks):
         pass
@@ -236,7 +236,7 @@ def past(car: Car, steps: Sequence[Motion], place: Place | None) -> Ways | None:
 @pytest.mark.parametrize("way_m", [0.0, 0.5])
 @pytest.mark.parametrize("height_m", [1.4, CAR_HEIGHT_M, 1.8])
 @pytest.mark.parametrize("ahead_mps", [-12.0, 12.0])
-def test_oncoming_and_outgoing_cars_count_past_the_intersection_alone(
+def test_oncoming_and_outgoing_cars_count_only_past_the_intersection(
     ahead_mps: float, height_m: float, way_m: float
 ) -> None:
     car = Car(80.0 - 2.0 * ahead_mps, -3.5, 0.0, ahead_mps, height_m=height_m)
@@ -250,22 +250,20 @@ def test_oncoming_and_outgoing_cars_count_past_the_intersection_alone(
     assert past(car, steps, None) is None
 
 
-def test_a_car_aside_shows_by_its_bearing_that_it_comes_sooner_than_by_its_growth() -> None:
+def test_bearing_shows_an_oncoming_car_earlier_than_growth() -> None:
     tracks = CarTracks(CAMERA, RULES)
     car = Car(90.0, -9.0, ahead_mps=-10.0)
     *_, free = drive([car], steady(10, 0.3), jitter_px=0.5, tracks=tracks)
 
-    (by_growth,), (by_bearing,) = free, tracks.longer()
+    (from_growth,), (from_bearing,) = free, tracks.longer()
 
-    assert abs(by_growth.ahead_mps) < 2.0 * by_growth.ahead_sd_mps
-    assert by_bearing.ahead_mps == pytest.approx(-10.0, abs=2.0 * by_bearing.ahead_sd_mps)
-    assert by_bearing.ahead_mps < -2.0 * by_bearing.ahead_sd_mps
+    assert abs(from_growth.ahead_mps) < 2.0 * from_growth.ahead_sd_mps
+    assert from_bearing.ahead_mps == pytest.approx(-10.0, abs=2.0 * from_bearing.ahead_sd_mps)
+    assert from_bearing.ahead_mps < -2.0 * from_bearing.ahead_sd_mps
 
 
 @pytest.mark.parametrize(("long", "oncoming"), [(1.2, 1), (0.85, 0)])
-def test_a_box_narrower_than_high_is_a_part_of_a_car_and_does_not_come(
-    long: float, oncoming: int
-) -> None:
+def test_box_narrower_than_high_does_not_count_as_oncoming(long: float, oncoming: int) -> None:
     tracks = CarTracks(CAMERA, RULES)
     for way_m in range(30):
         height_px = 704.0 * CAR_HEIGHT_M / (80.0 - way_m)
@@ -277,7 +275,7 @@ def test_a_box_narrower_than_high_is_a_part_of_a_car_and_does_not_come(
 
 
 @pytest.mark.parametrize("scores", [(0.9, 0.4, 0.4, 0.9), (0.4, 0.4, 0.4, 0.9)])
-def test_an_unsure_box_carries_on_a_car_that_a_sure_one_began(scores: tuple[float, ...]) -> None:
+def test_low_score_box_continues_but_does_not_start_a_track(scores: tuple[float, ...]) -> None:
     tracks = CarTracks(CAMERA, RULES)
     now: list[CarMotion] = []
     for score in scores:
@@ -294,7 +292,7 @@ def test_an_unsure_box_carries_on_a_car_that_a_sure_one_began(scores: tuple[floa
     ("focal_px", "past_within_m", "outgoing"),
     [(704.0, None, 0), (2000.0, None, 1), (2000.0, 120.0, 0)],
 )
-def test_a_car_goes_far_away_where_the_camera_resolves_it(
+def test_outgoing_car_counts_within_the_resolved_distance(
     focal_px: float, past_within_m: float | None, outgoing: int
 ) -> None:
     camera = CAMERA.model_copy(update={"focal_px": focal_px})
@@ -310,16 +308,16 @@ def test_a_car_goes_far_away_where_the_camera_resolves_it(
 
 @settings(max_examples=100, deadline=None)
 @given(steps=ego_motions, car=standing)
-def test_a_standing_car_neither_comes_nor_goes(steps: list[Motion], car: Car) -> None:
+def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[Motion], car: Car) -> None:
     assert not sum(past(car, steps, Place(1.0, 2.0, 0.1)) or ())
 
 
-def test_a_car_that_turns_off_or_drives_on_another_road_shows_nothing() -> None:
+def test_turning_crossing_and_lateral_cars_do_not_count_past() -> None:
     for car in (Car(60.0, -5.0, 8.0, -8.0), Car(60.0, 20.0, 0.0, -10.0), Car(50.0, 0.0, 9.0)):
         assert past(car, steady(15), Place(5.0, 10.0, 1.0)) == Ways(0, 0)
 
 
-def test_a_car_behind_another_is_not_further_away_than_it_seems() -> None:
+def test_overlapped_box_with_a_higher_bottom_is_hidden() -> None:
     near, behind, aside = (600, 350, 680, 400), (640, 352, 700, 380), (690, 352, 740, 380)
 
     boxes = np.array([near, behind, aside], np.float64)
@@ -339,21 +337,21 @@ def cues(steps: Sequence[Motion | None], vehicle: Vehicle = VEHICLE) -> CuePass:
     return one
 
 
-def test_below_two_frames_a_second_the_cue_says_that_it_cannot_be_computed() -> None:
+def test_car_cues_below_two_frames_per_second_are_noted_as_missing() -> None:
     slow = [Motion(5.0, 0.0, 0.0, 0.51)] * 4
 
     assert cues(slow).notes() == {"crossing and parked cars: frames further than 0.5 s apart": 4}
     assert not cues([Motion(5.0, 0.0, 0.0, 0.5)] * 4).notes()
 
 
-def test_without_odometry_or_focal_length_it_cannot_either() -> None:
-    (why,) = cues([None, None]).not_followed
-    assert why == "no odometry, so the camera's own motion is unknown"
-    (why,) = cues([None], Vehicle(version=1)).not_followed
-    assert why == "camera.focal_px is not set"
+def test_missing_odometry_or_focal_length_is_reported() -> None:
+    (reason,) = cues([None, None]).not_followed
+    assert reason == "no odometry, so the camera's own motion is unknown"
+    (reason,) = cues([None], Vehicle(version=1)).not_followed
+    assert reason == "camera.focal_px is not set"
 
 
-def test_the_default_is_the_published_pairs_only_for_simulated_cars() -> None:
+def test_car_rules_default_to_pairs_only_for_the_simulated_car() -> None:
     assert Vehicle(version=1, name="Golf").cars.kind == "tracks"
     assert Vehicle(version=1, name=SIMULATED_CAR).cars.kind == "pairs"
     assert Vehicle(version=1, name=SIMULATED_CAR, cars=RULES).cars.kind == "tracks"

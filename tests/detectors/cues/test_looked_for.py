@@ -1,4 +1,4 @@
-"""A cue that no detector can report is not evaluated, which differs from a count of zero."""
+"""Tests that a cue without a capable detector is not evaluated, rather than counted as zero."""
 
 from pathlib import Path
 
@@ -41,13 +41,13 @@ def _counts(labels: tuple[str, ...] | None, *found: str) -> dict[str, int]:
     return dict(CuePass(VEHICLE)(seen).counts)
 
 
-def test_only_cues_with_a_label_that_can_be_reported_are_looked_for() -> None:
+def test_only_cues_of_reportable_labels_are_evaluated() -> None:
     assert _counts(("dog", "traffic light")) == {"traffic_light": 0}
     assert _counts(("zebra",)) == {"crossing": 0}
     assert _counts(()) == {}
 
 
-def test_a_detector_that_does_not_say_may_report_anything() -> None:
+def test_detector_without_labels_evaluates_all_box_cues() -> None:
     of_boxes = {name for name, cue in CUES.items() if cue.observed_by in ("objects", "signs")}
 
     assert of_boxes >= CONTROLS | SIGNS
@@ -63,16 +63,16 @@ def test_a_detector_that_does_not_say_may_report_anything() -> None:
         ("no entry", "do_not_enter"),
     ],
 )
-def test_sign_cues_take_their_labels_from_any_detector(label: str, cue: str) -> None:
+def test_sign_cues_accept_labels_of_any_detector(label: str, cue: str) -> None:
     assert _counts((label, "car"), label) == {cue: 1}
 
 
-def test_one_detector_that_does_not_say_makes_all_unknown() -> None:
+def test_labels_are_unknown_if_one_detector_lists_none() -> None:
     assert all_labels([("car",), None]) is None
     assert all_labels([("car",), ("stop sign", "car")]) == frozenset({"car", "stop sign"})
 
 
-def test_detectors_of_crosscue_say_what_they_report(tmp_path: Path) -> None:
+def test_built_in_detectors_list_their_labels(tmp_path: Path) -> None:
     signs = make(Choice("signs", "signs"))
     card = make(Choice("yolox", "model", {"card": str(yolox_card(tmp_path))}))
 
@@ -88,13 +88,13 @@ def _row(role: str, labels: tuple[str, ...] | None) -> DetectorRow:
     return DetectorRow(name=role, identity="0", kind="", role=role, labels=labels, settings={})
 
 
-def test_every_cue_without_a_row_has_its_reason() -> None:
+def test_every_cue_that_is_not_evaluated_has_a_reason() -> None:
     lights = [_row("objects", ("traffic light",))]
-    why = not_looked_for({"traffic_light"}, lights, VEHICLE.cue_labels())
-    assert set(why) == {*CUES, "crossing"} - {"traffic_light"}
-    assert {why[cue] for cue in SIGNS | {"stop_sign", "parked_left", "crossing"}} == {NO_LABEL}
-    assert why["road_left"] == NO_ROAD
-    assert why["lanes_past"] == NO_MOBILEYE
+    reason = not_looked_for({"traffic_light"}, lights, VEHICLE.cue_labels())
+    assert set(reason) == {*CUES, "crossing"} - {"traffic_light"}
+    assert {reason[cue] for cue in SIGNS | {"stop_sign", "parked_left", "crossing"}} == {NO_LABEL}
+    assert reason["road_left"] == NO_ROAD
+    assert reason["lanes_past"] == NO_MOBILEYE
 
     only_road = not_looked_for((), [_row("road", ())], VEHICLE.cue_labels())
     assert {only_road[cue] for cue in CONTROLS | SIGNS} == {NO_OBJECTS}
@@ -114,12 +114,12 @@ def test_every_cue_without_a_row_has_its_reason() -> None:
         ([{}], False),
     ],
 )
-def test_parked_cars_are_not_looked_for_where_every_car_is_a_box(
+def test_parked_cars_are_not_evaluated_without_masks_of_cars(
     found: list[dict[str, tuple[str, ...]]], is_without: bool
 ) -> None:
     rows = [_row("objects", ("car",)).model_copy(update=labels) for labels in found]
     without = needing_masks(rows, VEHICLE.cars.labels)
 
     assert without == (PARKED if is_without else frozenset())
-    why = not_looked_for((), rows, VEHICLE.cue_labels(), without=without)
-    assert {why[cue] for cue in PARKED} == {NO_MASKS if is_without else NEVER}
+    reason = not_looked_for((), rows, VEHICLE.cue_labels(), without=without)
+    assert {reason[cue] for cue in PARKED} == {NO_MASKS if is_without else NEVER}

@@ -1,4 +1,4 @@
-"""Counts of lane lines and vehicles past an intersection, from a Mobileye's bus."""
+"""Tests of the counts of lane lines and vehicles past an intersection, from a Mobileye bus."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def state(
     [
         (obstacle(40.0, 2.0), 1),
         (obstacle(22.0, 2.0), 0),  # still within the intersection
-        (obstacle(40.0, -9.0), 0),  # in a lot beside the road
+        (obstacle(40.0, -9.0), 0),  # in a parking lot next to the road
         (obstacle(40.0, 9.0), 0),
         (obstacle(40.0, 0.0, kind=3), 0),  # a pedestrian
         (obstacle(40.0, 0.0, age=1), 0),  # seen for the first time
     ],
 )
-def test_a_vehicle_counts_past_the_end_and_on_the_road(row: list[float], count: int) -> None:
+def test_vehicle_counts_past_the_intersection_and_on_the_road(row: list[float], count: int) -> None:
     assert past_counts(state([row]), 20.0, PAST) == {"vehicles_past": count}
 
 
@@ -81,21 +81,21 @@ def test_a_vehicle_counts_past_the_end_and_on_the_road(row: list[float], count: 
         (lane(NAN, c0_m=NAN, quality=0), 0),  # no marking on this side
     ],
 )
-def test_a_line_counts_when_it_reaches_past_the_end(row: list[float], count: int) -> None:
+def test_lane_line_counts_if_it_extends_past_the_intersection(row: list[float], count: int) -> None:
     assert past_counts(state(lanes=[row]), 20.0, PAST) == {"lanes_past": count}
 
 
 @pytest.mark.parametrize("end_m", [None, 0.0, -3.0])
-def test_without_a_range_nothing_is_said(end_m: float | None) -> None:
+def test_counts_are_missing_without_a_valid_range(end_m: float | None) -> None:
     assert past_counts(state([obstacle(40.0, 0.0)], [lane(60.0)]), end_m, PAST) == {}
 
 
-def test_a_device_that_says_nothing_is_neutral_and_one_that_sees_nothing_is_not() -> None:
+def test_missing_data_yields_no_counts_and_empty_data_yields_zero() -> None:
     assert past_counts(state(), 20.0, PAST) == {}
     assert past_counts(state([], []), 20.0, PAST) == {"vehicles_past": 0, "lanes_past": 0}
 
 
-def test_a_start_stands_for_an_end_by_the_intersections_length() -> None:
+def test_intersection_end_is_its_start_plus_its_length() -> None:
     assert end_of(30.0, is_end=True, past=PAST) == 30.0
     assert end_of(30.0, is_end=False, past=Past(intersection_length_m=12.0)) == 42.0
 
@@ -107,7 +107,7 @@ rows = st.lists(
 
 @given(found=rows, near=st.floats(1, 90), further=st.floats(0, 40))
 @settings(max_examples=60, deadline=None)
-def test_a_further_end_never_has_more_vehicles_past_it_and_sides_are_alike(
+def test_vehicles_past_decrease_with_range_and_are_symmetric(
     found: list[list[float]], near: float, further: float
 ) -> None:
     one = np.array(found).reshape(-1, 8)
@@ -117,8 +117,8 @@ def test_a_further_end_never_has_more_vehicles_past_it_and_sides_are_alike(
     assert (vehicles_past(one, near, PAST) == vehicles_past(mirrored, near, PAST)).all()
 
 
-def said(n: int, rng: np.random.Generator) -> Samples:
-    """Ten bursts per second, each with a row without a position and up to three vehicles."""
+def simulated_bursts(n: int, rng: np.random.Generator) -> Samples:
+    """Simulate 10 bursts per second, each with a row without position and up to three vehicles."""
     t_ns, values = [], []
     for burst in range(n):
         for row in [[burst, *[NAN] * 7], *[obstacle(9.0, 1.0, burst=burst)] * rng.integers(0, 4)]:
@@ -129,8 +129,8 @@ def said(n: int, rng: np.random.Generator) -> Samples:
 
 @given(seed=st.integers(0, 999), t_ns=st.integers(0, 3 * S))
 @settings(max_examples=60, deadline=None)
-def test_what_comes_later_changes_nothing(seed: int, t_ns: int) -> None:
-    whole = said(30, np.random.default_rng(seed))
+def test_state_depends_only_on_earlier_bursts(seed: int, t_ns: int) -> None:
+    whole = simulated_bursts(30, np.random.default_rng(seed))
     known = whole.take(whole.t_ns <= t_ns)
 
     of_whole = state_at(whole, None, t_ns, PAST).obstacles
@@ -144,14 +144,14 @@ def test_what_comes_later_changes_nothing(seed: int, t_ns: int) -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.55, 5.0])
-def test_a_device_that_fell_silent_is_forgotten(late_s: float) -> None:
-    whole = said(3, np.random.default_rng(1))
+def test_state_is_missing_after_the_device_stops(late_s: float) -> None:
+    whole = simulated_bursts(3, np.random.default_rng(1))
 
     assert state_at(whole, None, round((0.2 + late_s) * S), PAST).obstacles is None
 
 
-def test_a_burst_that_is_not_whole_yet_is_not_looked_at() -> None:
-    whole = said(2, np.random.default_rng(3))
+def test_incomplete_burst_is_not_used() -> None:
+    whole = simulated_bursts(2, np.random.default_rng(3))
 
     early = state_at(whole, None, S // 10 + 20_000_000, PAST).obstacles
 
@@ -181,31 +181,31 @@ def samples_from(log: MemoryLog, vehicle: Vehicle) -> tuple[dict[Signal, Samples
     return joined, ledger
 
 
-def in_bits(drive: Block, rows_each: int) -> list[Block]:
+def in_parts(drive: Block, rows_each: int) -> list[Block]:
     return [drive.take(slice(i, i + rows_each)) for i in range(0, len(drive), rows_each)]
 
 
-def test_the_bus_gives_the_same_samples_however_it_is_cut_and_the_last_burst_too() -> None:
+def test_bus_samples_do_not_depend_on_block_boundaries() -> None:
     drive = random_drive(40, np.random.default_rng(5))
     topic = Topic("can1", "crosscue/CanFrames", "columns")
     vehicle = vehicle_of('[mobileye]\nbus = "can1"\nx_m = 1.9\n')
 
     whole, ledger = samples_from(MemoryLog((topic,), [drive]), vehicle)
-    cut, _ = samples_from(MemoryLog((topic,), in_bits(drive, 7)), vehicle)
+    cut, _ = samples_from(MemoryLog((topic,), in_parts(drive, 7)), vehicle)
 
     assert ledger.is_whole
     assert set(np.unique(whole[Signal.MOBILEYE_OBSTACLES].values[:, 0])) == set(range(40))
     for signal in MOBILEYE_SIGNALS:
-        one, other = as_set(whole[signal]), as_set(cut[signal])
+        one, other = sorted_rows(whole[signal]), sorted_rows(cut[signal])
         np.testing.assert_array_equal(one, other)
 
 
-def as_set(samples: Samples) -> Floats:
+def sorted_rows(samples: Samples) -> Floats:
     table = np.column_stack([samples.t_ns.astype(float), samples.values])
     return table[np.lexsort(np.nan_to_num(table, nan=-1e9).T[::-1])]
 
 
-def test_messages_give_the_same_obstacles_as_the_bus() -> None:
+def test_ros_messages_yield_the_same_obstacles_as_the_bus() -> None:
     drive = random_drive(40, np.random.default_rng(6))
     topics = tuple(Topic(name, kind, "columns") for name, kind in TOPIC_TYPES.items())
     mounting = "[mobileye]\nx_m = 1.9\n"
@@ -225,7 +225,7 @@ def test_messages_give_the_same_obstacles_as_the_bus() -> None:
 
 
 @pytest.mark.parametrize("bus", ["", 'bus = "/not/there"\n'])
-def test_a_log_without_a_device_is_no_error(bus: str) -> None:
+def test_missing_device_is_recorded_in_the_plan(bus: str) -> None:
     planned = plan(
         [(0, Topic("gyro", "sensor_msgs/msg/Imu", "columns"))], vehicle_of(f"[mobileye]\n{bus}")
     )
@@ -233,7 +233,7 @@ def test_a_log_without_a_device_is_no_error(bus: str) -> None:
     assert "mobileye.bus" in planned.missing[Signal.MOBILEYE_OBSTACLES]
 
 
-def test_two_devices_are_told_apart_by_how_their_topics_begin() -> None:
+def test_two_devices_are_distinguished_by_their_topic_prefix() -> None:
     topics = [
         (0, Topic(f"/{device}/obstacle_data", "mobileye_560_660_msgs/msg/ObstacleData", "cdr"))
         for device in ("front", "rear")
@@ -254,7 +254,7 @@ def windows_of(folder: Path, vehicle: Vehicle) -> list[Window]:
 
 
 @pytest.mark.slow
-def test_on_a_simulated_drive_lines_and_vehicles_past_it_are_counted(tmp_path: Path) -> None:
+def test_lines_and_vehicles_past_are_counted_on_a_simulated_drive(tmp_path: Path) -> None:
     """L303 has a road ahead with cars on it; both cues are positive before the intersection."""
     tiny = SceneSettings(layout="L303", camera=replace(Camera(), width_px=192, height_px=108))
     files = write_scene(tmp_path, tiny)

@@ -1,4 +1,4 @@
-"""Fractions of road in regions: invariant to scale, and exchanged by a mirror image."""
+"""Tests of the fractions of road in regions of the picture."""
 
 import numpy as np
 import pytest
@@ -19,14 +19,14 @@ def _mask(road: NDArray[np.bool_]) -> RoadMask:
     return RoadMask(0, size, rle.encode(road, (0, 0), size), size)
 
 
-def test_a_picture_full_of_road_is_all_road_and_an_empty_one_none() -> None:
+def test_full_road_mask_has_fraction_one_and_empty_mask_zero() -> None:
     full = road_fractions(_mask(np.ones((90, 160), np.bool_)), Regions())
 
     assert full == RoadFractions(1.0, 1.0, 1.0)
     assert road_fractions(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadFractions(0, 0, 0)
 
 
-def test_fractions_are_plain_numbers_as_a_manifest_takes_them() -> None:
+def test_fractions_are_plain_floats() -> None:
     found = road_fractions(_mask(np.eye(90, 160, dtype=np.bool_)), Regions())
 
     assert [type(one) for one in (found.left, found.straight, found.right)] == [float] * 3
@@ -34,7 +34,7 @@ def test_fractions_are_plain_numbers_as_a_manifest_takes_them() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 999))
-def test_the_mirror_image_swaps_left_and_right(seed: int) -> None:
+def test_mirrored_mask_swaps_left_and_right_fractions(seed: int) -> None:
     road = np.random.default_rng(seed).random((90, 160)) < 0.3
 
     seen = road_fractions(_mask(road), Regions())
@@ -45,7 +45,7 @@ def test_the_mirror_image_swaps_left_and_right(seed: int) -> None:
 
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
-def test_a_finer_picture_of_the_same_road_gives_the_same_fractions(factor: int) -> None:
+def test_fractions_do_not_depend_on_the_mask_resolution(factor: int) -> None:
     road = np.zeros((100, 200), np.bool_)
     road[55:70, 10:30] = True
     finer = np.kron(road, np.ones((factor, factor), np.bool_)).astype(np.bool_)
@@ -56,11 +56,11 @@ def test_a_finer_picture_of_the_same_road_gives_the_same_fractions(factor: int) 
     assert coarse.left == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_share_of_exactly_the_limit_is_not_more() -> None:
+def test_fraction_equal_to_the_threshold_is_not_positive() -> None:
     assert RoadFractions(0.2, 0.21, 0.19).positive(0.2) == (False, True, False)
 
 
-def test_a_square_region_holds_its_pixels_and_no_others() -> None:
+def test_square_region_contains_exactly_its_pixels() -> None:
     inside = region_mask(((0.25, 0.5), (0.75, 0.5), (0.75, 1.0), (0.25, 1.0)), (4, 8))
 
     assert inside.sum() == 8
@@ -68,13 +68,13 @@ def test_a_square_region_holds_its_pixels_and_no_others() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("left = [[0.0, 0.5], [0.2, 0.5]]", "regions.left"),
         ("left = [[0.0, 0.5], [0.2, 1.5], [0.2, 0.9]]", "less than or equal to 1"),
         ("lefd = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.9]]", "did you mean left?"),
     ],
 )
-def test_a_region_that_is_none_is_refused(text: str, said: str) -> None:
-    with pytest.raises(VehicleError, match=said.replace("?", r"\?")):
+def test_invalid_region_is_refused(text: str, message: str) -> None:
+    with pytest.raises(VehicleError, match=message.replace("?", r"\?")):
         parse(f"version = 1\n[regions]\n{text}\n", "v.toml")

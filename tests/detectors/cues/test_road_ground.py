@@ -1,4 +1,4 @@
-"""Ground regions: the ego road is not a side road; regions too far away are not seen."""
+"""Tests of road regions on the ground: the ego road is not a side road; far ones are not seen."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DEPTH_M = 16.0
 def pictured(
     right_m: float, left_m: float, place: Place | None = None, *, legs: str = "", ahead: bool = True
 ) -> RoadMask:
-    """A level road of given width about the ego vehicle, with side roads at a place."""
+    """Draw a level road of given width about the ego vehicle, with side roads at a place."""
     width, height = MASK
     y, x = np.mgrid[0:height, 0:width] + 0.5
     scale = SIZE[0] / width
@@ -65,9 +65,7 @@ def at(start_m: float, sd_m: float = 1.0) -> Place:
 
 
 @given(ahead_m=st.floats(3.0, 80.0), left_m=st.floats(-30.0, 30.0))
-def test_a_point_on_the_ground_is_projected_where_the_camera_sees_it(
-    ahead_m: float, left_m: float
-) -> None:
+def test_ground_point_is_projected_by_the_pinhole_model(ahead_m: float, left_m: float) -> None:
     level = CAMERA.model_copy(update={"pitch_rad": 0.0})
 
     ((x, y),) = (
@@ -78,7 +76,7 @@ def test_a_point_on_the_ground_is_projected_where_the_camera_sees_it(
     assert y == pytest.approx(340.0 + 900.0 * 1.5 / ahead_m)
 
 
-def test_a_turned_camera_has_its_regions_at_the_same_places_on_the_ground() -> None:
+def test_rotated_camera_keeps_its_regions_on_the_ground() -> None:
     turns = {"yaw_rad": 0.1, "pitch_rad": 0.05, "roll_rad": -0.08}
     found = []
     for camera in (CAMERA, CAMERA.model_copy(update=turns)):
@@ -97,12 +95,12 @@ def test_a_turned_camera_has_its_regions_at_the_same_places_on_the_ground() -> N
     left_m=st.floats(1.5, 11.0),
     off_m=st.floats(-3.0, 3.0),
 )
-def test_a_wide_road_of_ones_own_never_votes_for_a_side(
+def test_wide_ego_road_has_no_side_fraction(
     start_m: float, right_m: float, left_m: float, off_m: float
 ) -> None:
-    believed = at(start_m + off_m)
+    estimated = at(start_m + off_m)
 
-    fractions = ground_fractions(pictured(right_m, left_m), CAMERA, GROUND, believed)
+    fractions = ground_fractions(pictured(right_m, left_m), CAMERA, GROUND, estimated)
 
     for fraction in (fractions.left, fractions.right):
         assert math.isnan(fraction) or fraction < 0.05
@@ -111,11 +109,11 @@ def test_a_wide_road_of_ones_own_never_votes_for_a_side(
 @pytest.mark.parametrize("start_m", [10.0, 16.0, 24.0])
 @pytest.mark.parametrize("legs", ["", "left", "right", "left right"])
 @pytest.mark.parametrize("off_m", [-2.0, 0.0, 2.0])
-def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, off_m: float) -> None:
+def test_side_road_counts_only_on_its_side(legs: str, start_m: float, off_m: float) -> None:
     place = at(start_m)
-    believed = at(start_m + off_m)
+    estimated = at(start_m + off_m)
 
-    fractions = ground_fractions(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, believed)
+    fractions = ground_fractions(pictured(3.0, 6.0, place, legs=legs), CAMERA, GROUND, estimated)
 
     for side in ("left", "right"):
         fraction = getattr(fractions, side)
@@ -126,7 +124,7 @@ def test_a_leg_votes_for_its_side_and_for_no_other(legs: str, start_m: float, of
 
 
 @pytest.mark.parametrize("ahead", [False, True])
-def test_straight_is_the_lane_beyond_the_intersection(ahead: bool) -> None:
+def test_straight_fraction_measures_the_lane_beyond_the_intersection(ahead: bool) -> None:
     place = at(12.0)
 
     fractions = ground_fractions(pictured(3.0, 6.0, place, ahead=ahead), CAMERA, GROUND, place)
@@ -134,7 +132,7 @@ def test_straight_is_the_lane_beyond_the_intersection(ahead: bool) -> None:
     assert fractions.straight == pytest.approx(float(ahead), abs=0.1)
 
 
-def test_the_mirror_image_has_mirrored_fractions() -> None:
+def test_mirrored_scene_has_mirrored_fractions() -> None:
     place = at(16.0)
     one = ground_fractions(pictured(3.0, 6.0, place, legs="left"), CAMERA, GROUND, place)
     other = ground_fractions(pictured(6.0, 3.0, place, legs="right"), CAMERA, GROUND, place)
@@ -145,16 +143,16 @@ def test_the_mirror_image_has_mirrored_fractions() -> None:
 @pytest.mark.parametrize(
     "place",
     [None, at(-8.0), at(80.0), at(16.0, sd_m=8.0)],
-    ids=["no range", "behind", "too far", "place unsure"],
+    ids=["no range", "behind", "too far", "place uncertain"],
 )
-def test_what_is_not_resolved_is_not_seen(place: Place | None) -> None:
+def test_unresolved_side_regions_are_nan(place: Place | None) -> None:
     fractions = ground_fractions(pictured(3.0, 6.0), CAMERA, GROUND, place)
 
     assert math.isnan(fractions.left)
     assert math.isnan(fractions.right)
 
 
-def test_a_coarse_segmentation_sees_less_far() -> None:
+def test_coarse_mask_does_not_resolve_a_distant_region() -> None:
     fine = pictured(30.0, 30.0)
     coarse = replace(
         fine, mask=rle.encode(np.ones((9, 16), np.bool_), (0, 0), (16, 9)), mask_size_px=(16, 9)
@@ -164,7 +162,7 @@ def test_a_coarse_segmentation_sees_less_far() -> None:
     assert math.isnan(ground_fractions(coarse, CAMERA, GROUND, at(16.0)).left)
 
 
-def test_a_region_that_is_not_seen_says_nothing_and_is_counted() -> None:
+def test_unseen_region_yields_no_count_and_is_tallied() -> None:
     vehicle = Vehicle(version=1, camera=CAMERA)
     tally = CueTally(vehicle)
     cues = CuePass(vehicle, tally=tally)
@@ -182,7 +180,7 @@ def test_a_region_that_is_not_seen_says_nothing_and_is_counted() -> None:
     assert isinstance(seen.road, RoadFractions)
 
 
-def test_the_default_is_the_ground_unless_a_region_is_drawn_or_the_car_is_simulated() -> None:
+def test_regions_default_to_ground_unless_drawn_or_simulated() -> None:
     drawn = "[regions]\nleft = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.6]]\n"
 
     assert parse("version = 1", "a.toml").regions.kind == "ground"
@@ -190,6 +188,6 @@ def test_the_default_is_the_ground_unless_a_region_is_drawn_or_the_car_is_simula
     assert Vehicle(version=1, name=SIMULATED_CAR).regions.kind == "picture"
 
 
-def test_a_region_whose_far_end_is_nearer_is_refused() -> None:
+def test_region_with_reversed_ends_is_refused() -> None:
     with pytest.raises(VehicleError, match="aside_m: expected the nearer end first"):
         parse("version = 1\n[regions]\naside_m = [25.0, 12.0]\n", "a.toml")

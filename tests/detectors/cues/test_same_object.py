@@ -1,4 +1,4 @@
-"""An object that several detectors find counts once, with the better score."""
+"""Tests that an object found by several detectors counts once, with the better score."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 
 VEHICLE = Vehicle(version=1, cars=Cars(labels=("car", "truck")))
 MEANING = meanings(VEHICLE)
-Thing = tuple[str, float, float]
-THINGS = st.lists(
+Object = tuple[str, float, float]
+OBJECTS = st.lists(
     st.tuples(
         st.sampled_from(("car", "truck", "stop sign", "no entry", "do not enter", "dog")),
         st.floats(0.0, 1.0),
@@ -28,50 +28,55 @@ THINGS = st.lists(
 )
 
 
-def found(*things: Thing) -> Detections:
-    """Boxes of 20 x 10 px, each with a label, a score and a left edge."""
+def found(*things: Object) -> Detections:
+    """Build boxes of 20 x 10 px, each with a label, a score and a left edge."""
     boxes = np.array([(x, 5.0, x + 20.0, 15.0) for _, _, x in things]).reshape(-1, 4)
     scores = np.array([score for _, score, _ in things], np.float64)
     labels = tuple(label for label, _, _ in things)
     return Detections(0, (640, 480), boxes, scores, labels, (b"",) * len(things))
 
 
-def again(*results: Detections, calibrated: tuple[bool, ...] | None = None) -> list[list[int]]:
+def duplicates(*results: Detections, calibrated: tuple[bool, ...] | None = None) -> list[list[int]]:
     flags = calibrated or (False,) * len(results)
     return [one.tolist() for one in same_objects(results, MEANING, flags)]
 
 
-def test_the_higher_score_is_kept() -> None:
+def test_detection_of_the_higher_score_is_kept() -> None:
     low, high = found(("car", 0.6, 10.0)), found(("car", 0.8, 11.0))
 
-    assert again(low, high) == [[1], [KEPT]]
-    assert again(high, low) == [[KEPT], [0]]
+    assert duplicates(low, high) == [[1], [KEPT]]
+    assert duplicates(high, low) == [[KEPT], [0]]
 
 
-def test_a_calibrated_score_is_kept_before_a_higher_one() -> None:
+def test_calibrated_score_is_kept_before_a_higher_one() -> None:
     low, high = found(("car", 0.6, 10.0)), found(("car", 0.8, 11.0))
 
-    assert again(low, high, calibrated=(True, False)) == [[KEPT], [0]]
-    assert again(low, high, calibrated=(True, True)) == [[1], [KEPT]]
+    assert duplicates(low, high, calibrated=(True, False)) == [[KEPT], [0]]
+    assert duplicates(low, high, calibrated=(True, True)) == [[1], [KEPT]]
 
 
-def test_labels_that_one_cue_counts_mean_the_same_and_others_do_not() -> None:
-    assert again(found(("truck", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[1], [KEPT]]
-    assert again(found(("no entry", 0.6, 0.0)), found(("do not enter", 0.8, 0.0))) == [[1], [KEPT]]
-    assert again(found(("dog", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[KEPT], [KEPT]]
+def test_labels_of_one_cue_mean_the_same_object() -> None:
+    assert duplicates(found(("truck", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[1], [KEPT]]
+    assert duplicates(found(("no entry", 0.6, 0.0)), found(("do not enter", 0.8, 0.0))) == [
+        [1],
+        [KEPT],
+    ]
+    assert duplicates(found(("dog", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[KEPT], [KEPT]]
     assert meanings(Vehicle(version=1)).get("truck") is None
 
 
-def test_one_detection_stands_for_one_of_each_detector() -> None:
+def test_one_detection_replaces_at_most_one_per_detector() -> None:
     pair = found(("car", 0.7, 10.0), ("car", 0.6, 14.0))
 
-    assert again(pair) == [[KEPT, KEPT]]
-    assert again(found(("car", 0.9, 12.0)), pair) == [[KEPT], [0, KEPT]]
-    assert again(found(("car", 0.9, 10.0), ("car", 0.8, 14.0)), pair) == [[KEPT, KEPT], [0, 0]]
+    assert duplicates(pair) == [[KEPT, KEPT]]
+    assert duplicates(found(("car", 0.9, 12.0)), pair) == [[KEPT], [0, KEPT]]
+    assert duplicates(found(("car", 0.9, 10.0), ("car", 0.8, 14.0)), pair) == [[KEPT, KEPT], [0, 0]]
 
 
-@given(st.lists(THINGS, min_size=1, max_size=3))
-def test_what_is_left_out_overlaps_with_what_its_detector_keeps(results: list[list[Thing]]) -> None:
+@given(st.lists(OBJECTS, min_size=1, max_size=3))
+def test_dropped_detection_overlaps_a_kept_one_of_the_other_detector(
+    results: list[list[Object]],
+) -> None:
     boxes = [found(*things) for things in results]
     same = same_objects(boxes, MEANING, (False,) * len(boxes))
 
@@ -90,8 +95,8 @@ def test_what_is_left_out_overlaps_with_what_its_detector_keeps(results: list[li
             assert kept
 
 
-@given(THINGS)
-def test_a_second_detector_that_finds_the_same_changes_nothing(things: list[Thing]) -> None:
+@given(OBJECTS)
+def test_identical_second_detector_is_dropped_completely(things: list[Object]) -> None:
     one = found(*things)
 
     first, second = same_objects((one, one), MEANING, (False, False))
@@ -100,7 +105,7 @@ def test_a_second_detector_that_finds_the_same_changes_nothing(things: list[Thin
     assert (second == 0).all()
 
 
-def test_what_is_left_out_is_counted_with_its_reason() -> None:
+def test_duplicate_detection_is_tallied_with_its_reason() -> None:
     tally = CueTally(VEHICLE)
     cues = CuePass(VEHICLE, tally=tally)
     light, weaker = found(("traffic light", 0.95, 10.0)), found(("traffic light", 0.7, 10.0))

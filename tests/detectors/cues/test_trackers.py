@@ -1,4 +1,4 @@
-"""Crossing and parked cars: the dissertation's rules of shape, association, motion and nose."""
+"""Tests of crossing and parked cars by the dissertation's rules for pairs of detections."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ RULES = Cars(score=0.95)
 def _car(
     x: int, nose: int, t_ns: int, y: int = 60, length: int = 90, score: float = 0.99
 ) -> Detections:
-    """A car with a lower end (its nose) at the left (-1) or right (1)."""
+    """Build a car with a lower end (its nose) at the left (-1) or right (1)."""
     height = 30
     profile = np.full(length, height)
     quarter = length // 3
@@ -55,17 +55,17 @@ def _sides(before: CarShapes, now: CarShapes) -> tuple[Sides, Sides]:
     return cross_traffic(pairs, RULES), parked_cars(pairs, RULES)
 
 
-def test_a_car_that_moves_left_is_cross_traffic_to_the_left() -> None:
+def test_car_moving_left_is_cross_traffic_to_the_left() -> None:
     before, now = _shapes(_car(200, 1, 0)), _shapes(_car(190, 1, 10**8))
 
     assert _sides(before, now) == (Sides(1, 0), Sides(0, 0))
 
 
-@pytest.mark.parametrize(("nose", "want"), [(-1, Sides(1, 0)), (1, Sides(0, 1))])
-def test_a_car_that_stands_says_where_its_lower_end_points(nose: int, want: Sides) -> None:
+@pytest.mark.parametrize(("nose", "expected"), [(-1, Sides(1, 0)), (1, Sides(0, 1))])
+def test_parked_car_counts_on_the_side_of_its_nose(nose: int, expected: Sides) -> None:
     before, now = _shapes(_car(200, nose, 0)), _shapes(_car(200, nose, 10**8))
 
-    assert _sides(before, now) == (Sides(0, 0), want)
+    assert _sides(before, now) == (Sides(0, 0), expected)
 
 
 @settings(deadline=None, max_examples=40)
@@ -75,7 +75,7 @@ def test_a_car_that_stands_says_where_its_lower_end_points(nose: int, want: Side
     dy=st.integers(-8, 8),
     nose=st.sampled_from([-1, 1]),
 )
-def test_the_mirror_image_says_the_other_side(x: int, dx: int, dy: int, nose: int) -> None:
+def test_mirrored_pair_counts_on_the_other_side(x: int, dx: int, dy: int, nose: int) -> None:
     before, now = _car(x, nose, 0), _car(x + dx, nose, 10**8, y=60 + dy)
 
     seen = _sides(_shapes(before), _shapes(now))
@@ -85,7 +85,7 @@ def test_the_mirror_image_says_the_other_side(x: int, dx: int, dy: int, nose: in
 
 
 @pytest.mark.parametrize(
-    ("second", "why"),
+    ("second", "reason"),
     [
         (_car(221, 1, 10**8), "moved by more than 5 % of the width"),
         (_car(190, 1, 10**8, length=100), "grew by more than 3 %"),
@@ -95,11 +95,11 @@ def test_the_mirror_image_says_the_other_side(x: int, dx: int, dy: int, nose: in
         (_car(190, 1, 10**8, length=60), "not longer than twice its height"),
     ],
 )
-def test_it_is_not_the_same_car_when(second: Detections, why: str) -> None:
-    assert len(pair_cars(_shapes(_car(200, 1, 0)), _shapes(second), RULES).nose) == 0, why
+def test_cars_are_not_paired_across_a_failed_rule(second: Detections, reason: str) -> None:
+    assert len(pair_cars(_shapes(_car(200, 1, 0)), _shapes(second), RULES).nose) == 0, reason
 
 
-def test_a_car_that_comes_down_the_picture_neither_crosses_nor_stands() -> None:
+def test_car_moving_down_the_picture_neither_crosses_nor_parks() -> None:
     before, now = _shapes(_car(200, 1, 0)), _shapes(_car(202, 1, 10**8, y=68))
 
     assert _sides(before, now) == (Sides(0, 0), Sides(0, 0))
@@ -112,7 +112,7 @@ def test_each_car_is_paired_once() -> None:
     assert len(pair_cars(before, now, RULES).nose) == 1
 
 
-def test_a_car_without_a_mask_has_no_nose() -> None:
+def test_car_without_mask_has_no_nose() -> None:
     bare = replace(_car(200, 1, 0), masks=(b"",))
     later = replace(bare, t_ns=10**8)
 
@@ -120,7 +120,7 @@ def test_a_car_without_a_mask_has_no_nose() -> None:
     assert _sides(_shapes(bare), _shapes(later)) == (Sides(0, 0), Sides(0, 0))
 
 
-def test_a_box_has_no_nose() -> None:
+def test_rectangular_profile_has_no_nose() -> None:
     assert nose_of(np.full(40, 12.0)) == 0
 
 
@@ -132,7 +132,9 @@ def test_a_box_has_no_nose() -> None:
     y=st.integers(0, 6),
     seed=st.integers(0, 999),
 )
-def test_runs_come_back_as_they_went(h: int, w: int, x: int, y: int, seed: int) -> None:
+def test_run_length_encoding_survives_a_round_trip(
+    h: int, w: int, x: int, y: int, seed: int
+) -> None:
     mask = np.random.default_rng(seed).random((h, w)) < 0.6
     size = (w + x + seed % 3, h + y + seed % 2)
     whole = np.zeros((size[1], size[0]), np.bool_)
@@ -145,7 +147,7 @@ def test_runs_come_back_as_they_went(h: int, w: int, x: int, y: int, seed: int) 
     np.testing.assert_allclose(rle.column_heights_px(text, size), whole.sum(axis=0))
 
 
-def test_runs_are_written_as_coco_writes_them() -> None:
+def test_run_length_encoding_matches_coco() -> None:
     corner = np.array([[True]])
 
     assert rle.encode(corner, (0, 0), (2, 2)) == b"013"  # none, one, three
@@ -153,13 +155,13 @@ def test_runs_are_written_as_coco_writes_them() -> None:
     assert rle.encode(corner, (0, 40), (1, 41)) == b"X11"
 
 
-def test_a_mask_outside_its_picture_is_refused() -> None:
+def test_mask_outside_its_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="not inside 4 x 4"):
         rle.encode(np.ones((2, 2), np.bool_), (3, 0), (4, 4))
 
 
 @pytest.mark.parametrize("size", [(8, 9), (8, 7), (9, 8)])
-def test_a_mask_of_a_picture_of_another_size_is_refused(size: tuple[int, int]) -> None:
+def test_mask_of_another_picture_size_is_refused(size: tuple[int, int]) -> None:
     full = rle.encode(np.ones((8, 8), np.bool_), (0, 0), (8, 8))
 
     for read in (rle.decode, rle.column_heights_px):
@@ -168,6 +170,6 @@ def test_a_mask_of_a_picture_of_another_size_is_refused(size: tuple[int, int]) -
 
 
 @pytest.mark.parametrize("text", [b"", b"\x00", b"o", b"zzzz", b"0" * 3 + b"\xff"])
-def test_bytes_that_are_no_mask_are_refused(text: bytes) -> None:
+def test_invalid_mask_bytes_are_refused(text: bytes) -> None:
     with pytest.raises(ValueError, match="mask"):
         rle.decode(text, (8, 8))

@@ -1,7 +1,7 @@
-"""Decoding of each layout from constant tensors with known boxes, in a non-square input.
+"""Tests of the decoding of each layout from constant tensors, for a non-square input.
 
-The table's law: every decoder has a sample here; it gives the sample's boxes; it refuses outputs of
-another shape in words; and ``recognise`` finds it from the file's declared shapes.
+Every decoder of the table has a sample with known boxes. It returns these boxes, refuses outputs of
+another shape with a message, and ``recognise`` finds it from the shapes that a file declares.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _built(decoder: type[BoxOutput]) -> tuple[BoxOutput, Sample]:
     return decoder.model_validate({"classes": CLASSES, **sample.settings}), sample
 
 
-def test_the_known_box_is_the_best(decoder: type[BoxOutput]) -> None:
+def test_best_candidate_is_the_sample_box(decoder: type[BoxOutput]) -> None:
     output, sample = _built(decoder)
 
     found = output.candidates(sample.outputs, SIZE)
@@ -37,7 +37,7 @@ def test_the_known_box_is_the_best(decoder: type[BoxOutput]) -> None:
     assert (np.delete(found.scores, best) < 0.3).all()
 
 
-def test_masks_lie_over_the_input(decoder: type[BoxOutput]) -> None:
+def test_masks_cover_the_network_input(decoder: type[BoxOutput]) -> None:
     output, sample = _built(decoder)
     found = output.candidates(sample.outputs, SIZE)
 
@@ -49,7 +49,7 @@ def test_masks_lie_over_the_input(decoder: type[BoxOutput]) -> None:
         np.testing.assert_array_equal(columns, np.arange(len(columns)) < int(middle))
 
 
-def test_another_shape_is_refused_in_words(decoder: type[BoxOutput]) -> None:
+def test_output_of_another_shape_is_refused(decoder: type[BoxOutput]) -> None:
     output, sample = _built(decoder)
     for name in sample.outputs:
         changed = {**sample.outputs, name: np.zeros((1, 5, 11, 2, 2))}
@@ -58,7 +58,7 @@ def test_another_shape_is_refused_in_words(decoder: type[BoxOutput]) -> None:
             output.candidates(changed, SIZE)
 
 
-def test_an_output_that_is_missing_is_named(decoder: type[BoxOutput]) -> None:
+def test_missing_output_is_refused(decoder: type[BoxOutput]) -> None:
     output, _ = _built(decoder)
 
     with pytest.raises(ValueError, match="expected"):
@@ -74,7 +74,7 @@ def interface(sample: Sample, names: tuple[str, ...] = CLASSES) -> Interface:
     )
 
 
-def test_it_is_recognised_and_what_it_guesses_decodes_the_sample(decoder: type[BoxOutput]) -> None:
+def test_recognised_settings_decode_the_sample(decoder: type[BoxOutput]) -> None:
     _, sample = _built(decoder)
 
     guess = decoder.recognise(interface(sample))

@@ -1,4 +1,4 @@
-"""Projection of the ground for a camera mounted at any angle."""
+"""Tests of the projection of the ground for a camera mounted at any angle."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plane(yaw_rad: float = 0.0, pitch_rad: float = 0.0, roll_rad: float = 0.0) -
 
 
 @given(angles, angles, angles, st.floats(5.0, 80.0), st.floats(-0.5, 0.5))
-def test_to_the_picture_and_back_is_the_same_point(
+def test_unprojection_inverts_projection(
     yaw: float, pitch: float, roll: float, ahead_m: float, slope: float
 ) -> None:
     ground = np.array([[1.7 + ahead_m, ahead_m * slope]])
@@ -44,13 +44,13 @@ def test_to_the_picture_and_back_is_the_same_point(
 
 
 @given(angles, angles, angles)
-def test_the_mounting_is_a_turn_as_scipy_has_it(yaw: float, pitch: float, roll: float) -> None:
+def test_mounting_rotation_matches_scipy(yaw: float, pitch: float, roll: float) -> None:
     expected = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
 
     np.testing.assert_allclose(turned(yaw, pitch, roll), expected, atol=1e-12)
 
 
-def test_signs_are_those_of_the_vehicle_file() -> None:
+def test_mounting_angle_signs_match_the_vehicle_file() -> None:
     """A camera that points to the left sees objects ahead on its right, and so on."""
     x, y = plane().ahead_px()
 
@@ -62,7 +62,7 @@ def test_signs_are_those_of_the_vehicle_file() -> None:
 
 
 @given(angles, angles, angles, st.floats(-1.0, 1.0))
-def test_the_horizon_is_where_the_ground_ends(
+def test_horizon_is_the_projection_of_distant_ground(
     yaw: float, pitch: float, roll: float, bearing: float
 ) -> None:
     mounted = plane(yaw, pitch, roll)
@@ -72,6 +72,6 @@ def test_the_horizon_is_where_the_ground_ends(
     assert mounted.horizon_px(np.array([x]))[0] == pytest.approx(y, abs=1e-6)
 
 
-def test_nothing_on_the_ground_lies_above_the_horizon_or_behind() -> None:
+def test_points_above_horizon_or_behind_are_nan() -> None:
     assert np.isnan(plane().unproject(np.array([[640.0, 340.0], [0.0, 20.0]]))).all()
     assert np.isnan(plane().project(np.array([[-5.0, 0.0]]))).all()

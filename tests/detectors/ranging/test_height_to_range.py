@@ -1,4 +1,4 @@
-"""Curves from heights to ranges: exact without errors, and robust to wrong masks."""
+"""Tests of the curves from heights to ranges: exact without errors, robust to wrong masks."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ TRUE: dict[Family, tuple[float, ...]] = {
 
 
 def pairs(family: Family, seed: int, sd: float, pairs: int = 300) -> tuple[Floats, Floats]:
-    """Heights of 12 to 400 px and ranges of a true curve, with a relative error of ``sd``."""
+    """Draw heights of 12 to 400 px, and ranges of a true curve with a relative error of ``sd``."""
     rng = np.random.default_rng(seed)
     height_px = np.exp(rng.uniform(np.log(12.0), np.log(400.0), pairs))
     curve = RangeCurve(family=family, parameters=TRUE[family], residual_sd_m=1.0)
@@ -24,7 +24,7 @@ def pairs(family: Family, seed: int, sd: float, pairs: int = 300) -> tuple[Float
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_pairs_without_errors_give_the_curve_exactly(family: Family) -> None:
+def test_pairs_without_errors_recover_the_curve_exactly(family: Family) -> None:
     found = fit_range(*pairs(family, 1, 0.0), family)
 
     assert found.curve.parameters == pytest.approx(TRUE[family], rel=1e-6)
@@ -32,7 +32,7 @@ def test_pairs_without_errors_give_the_curve_exactly(family: Family) -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_pairs_with_the_errors_of_one_scale_are_all_used(family: Family) -> None:
+def test_pairs_with_equal_errors_match_least_squares_without_outliers(family: Family) -> None:
     height_px, range_m = pairs(family, 2, 0.05)
     models = {
         "pinhole": lambda h, a: a / h,
@@ -49,7 +49,7 @@ def test_pairs_with_the_errors_of_one_scale_are_all_used(family: Family) -> None
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("family", FAMILIES)
-def test_wrong_masks_do_not_sway_it_and_are_counted(family: Family, seed: int) -> None:
+def test_outlying_heights_are_rejected_and_counted(family: Family, seed: int) -> None:
     height_px, range_m = pairs(family, seed, 0.04)
     clean = fit_range(height_px, range_m, family)
     rng = np.random.default_rng(100 + seed)
@@ -67,7 +67,7 @@ def test_wrong_masks_do_not_sway_it_and_are_counted(family: Family, seed: int) -
     assert found.curve.residual_sd_m < 1.3 * clean.curve.residual_sd_m
 
 
-def test_pairs_that_lie_on_no_curve_are_refused() -> None:
+def test_pairs_on_no_common_curve_are_refused() -> None:
     height_px = np.array([10.0, 10.0, 10.0, 200.0])
     range_m = np.array([30.0, 30.0, 30.0, 90.0])
 

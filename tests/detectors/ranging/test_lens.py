@@ -1,4 +1,4 @@
-"""Lit lenses and housings seen from behind are distinguished, in drawings and real pictures."""
+"""Tests that lit lenses and housings seen from behind are distinguished."""
 
 from collections import Counter
 from dataclasses import replace
@@ -20,7 +20,7 @@ BOX = np.array([20.0, 10.0, 44.0, 62.0])
 
 
 def housing(lit: str | None, at: int = 0) -> Bytes:
-    """A dark housing of three lenses before a pale wall."""
+    """Draw a dark housing of three lenses in front of a pale wall."""
     picture = np.full((80, 64, 3), WALL, np.uint8)
     picture[10:62, 20:44] = (45, 40, 38)
     for i in range(3):
@@ -30,28 +30,28 @@ def housing(lit: str | None, at: int = 0) -> Bytes:
 
 
 @pytest.mark.parametrize(("colour", "at"), [("red", 0), ("yellow", 1), ("green", 2)])
-def test_a_lit_lens_is_found_wherever_it_is(colour: str, at: int) -> None:
+def test_lit_lens_is_found_at_each_position(colour: str, at: int) -> None:
     assert lens_of(housing(colour, at), BOX) == colour
 
 
-def test_a_housing_from_behind_is_dark_also_before_a_coloured_wall() -> None:
+def test_housing_from_behind_is_dark_before_a_coloured_wall() -> None:
     behind = housing(None)
     assert lens_of(behind, BOX) == "dark"
 
-    # A wide box shows a red wall on either side, which is high and narrow, and no lens.
+    # A wide box shows a strip of red wall on either side, too high and narrow for a lens.
     red = behind.copy()
     red[:, :20], red[:, 44:] = BGR["red"], BGR["red"]
     assert lens_of(red, BOX + np.array([-3.0, 0.0, 3.0, 0.0])) == "dark"
 
 
-def test_a_spot_too_small_or_too_large_for_a_lens_is_none() -> None:
+def test_spot_too_small_or_large_for_a_lens_is_dark() -> None:
     for across in (1, 30):
         picture = housing(None)
         cv2.circle(picture, (32, 36), across, BGR["red"], -1)
         assert lens_of(picture, BOX) == "dark"
 
 
-def test_what_is_too_small_or_grey_or_outside_says_nothing() -> None:
+def test_small_grey_or_outside_box_has_an_unknown_lens() -> None:
     picture = housing("red")
 
     assert lens_of(picture, BOX * 0.2) == "unknown"
@@ -59,7 +59,7 @@ def test_what_is_too_small_or_grey_or_outside_says_nothing() -> None:
     assert lens_of(picture, BOX + 200.0) == "unknown"
 
 
-def test_only_lights_are_looked_at_in_the_pixels_that_there_are_and_the_cache_keeps_it(
+def test_lenses_are_set_only_for_lights_and_survive_the_cache(
     tmp_path: Path,
 ) -> None:
     boxes = np.array([2.0 * BOX, 2.0 * BOX])
@@ -81,17 +81,17 @@ def test_only_lights_are_looked_at_in_the_pixels_that_there_are_and_the_cache_ke
 
 
 @pytest.mark.parametrize("colour", ["red", "yellow", "green"])
-def test_real_lit_lights_are_seldom_another_colour(colour: Lens) -> None:
+def test_real_lit_lights_are_rarely_classified_as_another_colour(colour: Lens) -> None:
     """60 crops each from LISA, all lit, 32 px across and distorted: a difficult case."""
     files = sorted((shared("signs/traffic_light_state_crops") / colour).glob("*.jpg"))
-    found = Counter(_whole(cv2.imread(str(file))) for file in files)
+    found = Counter(_lens_of_crop(cv2.imread(str(file))) for file in files)
 
     assert len(files) == 60
     assert found[colour] >= 30
     assert len(files) - found[colour] - found["dark"] <= 6
 
 
-def _whole(picture: object) -> Lens:
+def _lens_of_crop(picture: object) -> Lens:
     pixels = np.asarray(picture, np.uint8)
     return lens_of(pixels, np.array([0.0, 0.0, pixels.shape[1], pixels.shape[0]]))
 
@@ -109,7 +109,7 @@ def _whole(picture: object) -> Lens:
         (79, (919, 330, 941, 375), "green"),
     ],
 )
-def test_lights_of_a_real_crossing_as_seen_by_eye(
+def test_lenses_of_a_real_intersection_match_manual_labels(
     frame: int, box: tuple[int, int, int, int], lens: Lens
 ) -> None:
     folder = shared("sequences/pandaset_002") / "camera/front_camera"

@@ -1,4 +1,4 @@
-"""Tracking of objects over frames: each track has only the heights of its object."""
+"""Tests of object tracks over frames: each track has only the heights of its object."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ Light = tuple[float, float, float, float]
 """Range at the start, metres to the right and up, height."""
 NEAR: Light = (57.0, -5.0, 5.0, 1.3)
 FAR: Light = (84.0, 0.0, 5.0, 1.0)
-BESIDE: Light = (84.0, 4.0, 5.0, 1.5)
+NEXT_TO_FAR: Light = (84.0, 4.0, 5.0, 1.5)
 
 
 def tracks() -> ObjectTracks:
@@ -39,12 +39,12 @@ def take(
     return followed(motion, boxes, boxes[:, 3] - boxes[:, 1])
 
 
-def test_several_lights_are_several_tracks_with_a_range_each() -> None:
+def test_several_lights_have_separate_tracks_and_ranges() -> None:
     followed = tracks()
     rng = np.random.default_rng(4)
     for gone_m in range(40):
         order = rng.permutation(3)
-        now = take(followed, [(NEAR, FAR, BESIDE)[i] for i in order], float(gone_m))
+        now = take(followed, [(NEAR, FAR, NEXT_TO_FAR)[i] for i in order], float(gone_m))
 
     assert [one.seen for one in now] == [40, 40, 40]
     assert sorted(one.range_m for one in now) == pytest.approx([18.0, 45.0, 45.0], rel=0.06)
@@ -52,13 +52,13 @@ def test_several_lights_are_several_tracks_with_a_range_each() -> None:
     assert heights == pytest.approx([1.0, 1.3, 1.5], rel=0.06)
 
 
-def test_a_near_light_narrows_the_size_of_a_far_one_of_its_make() -> None:
+def test_near_light_narrows_the_size_of_a_far_one_of_the_same_make() -> None:
     near: Light = (45.0, -5.0, 5.0, 1.5)
     far: Light = (140.0, 2.0, 5.0, 1.5)
-    alone, beside = tracks(), tracks()
+    alone, together = tracks(), tracks()
     for gone_m in range(25):
         (one,) = take(alone, [far], float(gone_m))
-        both = take(beside, [near, far], float(gone_m))
+        both = take(together, [near, far], float(gone_m))
 
     true_m = 140.0 - 24.0
     shared = max(both, key=lambda track: track.range_m)
@@ -67,7 +67,7 @@ def test_a_near_light_narrows_the_size_of_a_far_one_of_its_make() -> None:
     assert shared.alone == one.alone
 
 
-def test_a_light_not_seen_for_some_frames_is_the_same_afterwards() -> None:
+def test_light_missed_for_some_frames_keeps_its_track() -> None:
     followed = tracks()
     for gone_m in range(20):
         seen = [FAR] if gone_m % 5 < 2 else []
@@ -79,7 +79,7 @@ def test_a_light_not_seen_for_some_frames_is_the_same_afterwards() -> None:
     assert track.height_px == pytest.approx(FOCAL_PX / 65.0, rel=0.1)
 
 
-def test_a_light_that_is_gone_is_dropped() -> None:
+def test_track_of_a_lost_light_is_dropped() -> None:
     followed = tracks()
     take(followed, [FAR], 0.0)
 
@@ -89,7 +89,7 @@ def test_a_light_that_is_gone_is_dropped() -> None:
     assert left[-1] == 0
 
 
-def test_a_turn_of_the_car_makes_no_new_object() -> None:
+def test_turn_of_the_car_starts_no_new_track() -> None:
     followed = tracks()
     for i in range(12):
         box = box_of(FAR, 0.0, turned_rad=0.04 * i)
@@ -99,7 +99,7 @@ def test_a_turn_of_the_car_makes_no_new_object() -> None:
     assert [one.seen for one in now] == [12]
 
 
-def test_two_boxes_of_one_object_are_counted_and_make_one_track() -> None:
+def test_two_boxes_of_one_object_make_one_track() -> None:
     followed = tracks()
     box = box_of(FAR, 0.0)
     boxes = np.array([box, box + 1.0])
@@ -124,9 +124,7 @@ def test_two_boxes_of_one_object_are_counted_and_make_one_track() -> None:
         (["dark"] * 8 + ["yellow"] * 2, Facing.EGO),
     ],
 )
-def test_facing_is_said_of_many_frames_and_only_with_enough(
-    lenses: list[str], facing: Facing
-) -> None:
+def test_facing_requires_enough_consistent_frames(lenses: list[str], facing: Facing) -> None:
     followed = tracks()
     for gone_m, lens in enumerate(lenses):
         box = box_of(FAR, float(gone_m))[None, :]
@@ -135,7 +133,7 @@ def test_facing_is_said_of_many_frames_and_only_with_enough(
     assert track.facing is facing
 
 
-def test_without_odometry_only_the_size_speaks() -> None:
+def test_range_without_odometry_relies_on_the_size_prior() -> None:
     followed = tracks()
     for gone_m in range(20):
         (track,) = take(followed, [FAR], float(gone_m), Motion(None, 0.0, 0.0, 0.1))
@@ -148,7 +146,7 @@ def test_without_odometry_only_the_size_speaks() -> None:
     assert np.sqrt(track.var_m2) == pytest.approx(size.spread * track.range_m, rel=0.2)
 
 
-def test_an_odometer_that_errs_makes_the_range_less_sure() -> None:
+def test_odometry_error_raises_the_range_variance() -> None:
     exact, loose = tracks(), tracks()
     for gone_m in range(30):
         (one,) = take(exact, [FAR], float(gone_m))

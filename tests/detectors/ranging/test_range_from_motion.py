@@ -1,6 +1,6 @@
-"""Range and height from growth: exact without errors, and consistent with errors.
+"""Tests of range and height from growth: exact without errors, and consistent with errors.
 
-Tracks are simulated by the model itself: sizes from the prior, errors of successive frames alike.
+Tracks are simulated by the model itself: sizes from the prior, correlated errors of the frames.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ LIGHT = SizePrior(1.2, 0.25)
 NO_ERRORS = HeightErrors(fraction=1e-5, edges_px=0.0)
 
 
-def alike(travelled_m: Floats, over_m: float, rng: np.random.Generator) -> Floats:
-    """Standard normal errors with autocorrelation exp(-distance / over_m)."""
+def correlated_errors(travelled_m: Floats, over_m: float, rng: np.random.Generator) -> Floats:
+    """Draw standard normal errors with autocorrelation exp(-distance / over_m)."""
     errors = [float(rng.normal())]
     for step_m in np.abs(np.diff(travelled_m)).tolist():
         rho = float(np.exp(-step_m / over_m))
@@ -31,20 +31,18 @@ def alike(travelled_m: Floats, over_m: float, rng: np.random.Generator) -> Float
 def track(
     travelled_m: Floats, rng: np.random.Generator, size: SizePrior = LIGHT
 ) -> tuple[Floats, float]:
-    """Heights of one simulated track, and its true range at the end."""
+    """Simulate the heights of one track, and return them with its true range at the end."""
     errors = HeightErrors()
     last_m = float(np.exp(rng.uniform(np.log(15.0), np.log(120.0))))
     height_m = np.exp(size.log_mean + np.sqrt(size.log_var) * rng.normal())
     true_px = FOCAL_PX * height_m / (last_m + travelled_m[-1] - travelled_m)
     sd = np.hypot(errors.fraction, errors.edges_px / true_px)
-    return true_px * np.exp(sd * alike(travelled_m, errors.resemble_m, rng)), last_m
+    return true_px * np.exp(sd * correlated_errors(travelled_m, errors.resemble_m, rng)), last_m
 
 
 @pytest.mark.parametrize("height_m", [0.7, 1.2, 1.7])
 @pytest.mark.parametrize("last_m", [4.0, 35.0, 90.0])
-def test_a_track_without_errors_gives_range_and_height_exactly(
-    height_m: float, last_m: float
-) -> None:
+def test_track_without_errors_yields_exact_range_and_height(height_m: float, last_m: float) -> None:
     travelled_m = np.linspace(3.0, 28.0, 60)
     height_px = FOCAL_PX * height_m / (last_m + travelled_m[-1] - travelled_m)
 
@@ -54,7 +52,7 @@ def test_a_track_without_errors_gives_range_and_height_exactly(
     assert found.height_m == pytest.approx(height_m, rel=2e-3)
 
 
-def test_a_car_that_stands_knows_the_size_table_and_no_more() -> None:
+def test_stationary_car_has_the_range_of_the_size_prior() -> None:
     height_px = np.full(200, 30.0)
 
     found = range_from_motion(np.zeros(200), height_px, FOCAL_PX, LIGHT)
@@ -66,7 +64,7 @@ def test_a_car_that_stands_knows_the_size_table_and_no_more() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gone_m", "step_m"), [(0.0, 0.0), (5.0, 0.3), (20.0, 0.3), (40.0, 0.7)])
-def test_the_interval_holds_the_truth_as_often_as_it_says(gone_m: float, step_m: float) -> None:
+def test_range_interval_has_its_nominal_coverage(gone_m: float, step_m: float) -> None:
     rng = np.random.default_rng(7)
     travelled_m = np.arange(0.0, gone_m + 1e-9, step_m) if step_m else np.zeros(10)
     pairs = [track(travelled_m, rng) for _ in range(1000)]
@@ -85,7 +83,7 @@ def _sigmas(found: MotionRange, true_m: float) -> float:
     return float((found.mean_m - true_m) / np.sqrt(found.var_m2))
 
 
-def test_it_becomes_surer_as_the_car_moves_and_the_range_falls() -> None:
+def test_range_and_variance_fall_as_the_car_approaches() -> None:
     travelled_m = np.arange(0.0, 45.0, 0.5)
     height_px = FOCAL_PX * 1.3 / (60.0 - travelled_m)
 
@@ -98,7 +96,7 @@ def test_it_becomes_surer_as_the_car_moves_and_the_range_falls() -> None:
     assert found[-1].mean_m == pytest.approx(60.0 - travelled_m[88], rel=0.03)
 
 
-def test_boxes_over_two_lights_sway_it_little() -> None:
+def test_outlying_box_heights_change_the_range_little() -> None:
     travelled_m = np.arange(0.0, 40.0, 0.5)
     height_px = FOCAL_PX * 1.3 / (60.0 - travelled_m)
     height_px[::7] *= 1.8
@@ -108,7 +106,7 @@ def test_boxes_over_two_lights_sway_it_little() -> None:
     assert found.mean_m == pytest.approx(60.0 - travelled_m[-1], rel=0.05)
 
 
-def test_reverse_makes_it_further_away() -> None:
+def test_range_increases_in_reverse() -> None:
     travelled_m = np.concatenate((np.arange(0.0, 20.0, 0.5), np.arange(20.0, 2.0, -0.5)))
     height_px = FOCAL_PX * 1.2 / (50.0 - travelled_m)
 
@@ -128,7 +126,7 @@ def test_reverse_makes_it_further_away() -> None:
         ([0.0], [30.0], 0.0),
     ],
 )
-def test_looks_that_cannot_be_are_refused(
+def test_invalid_observations_are_refused(
     travelled_m: list[float], height_px: list[float], focal_px: float
 ) -> None:
     with pytest.raises(ValueError, match="expected"):

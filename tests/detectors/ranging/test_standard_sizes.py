@@ -1,4 +1,4 @@
-"""Size priors of lights, from the aspect of the box and from others of the same make."""
+"""Tests of the size priors of lights, from the box's aspect and from lights of the same make."""
 
 import numpy as np
 import pytest
@@ -13,11 +13,11 @@ from crosscue.detectors.ranging.standard_sizes import (
 )
 
 
-def test_the_proportions_are_of_all_lights() -> None:
+def test_housing_proportions_sum_to_one() -> None:
     assert sum(one.proportion for one in HOUSINGS.values()) == pytest.approx(1.0)
 
 
-def test_a_light_twice_as_high_as_wide_has_a_backplate_and_one_three_times_has_none() -> None:
+def test_aspect_distinguishes_lights_with_and_without_backplate() -> None:
     with_plate, bare, unknown = light_size(2.1), light_size(3.0), light_size()
 
     assert with_plate.mean_m == pytest.approx(1.27, abs=0.05)
@@ -27,36 +27,36 @@ def test_a_light_twice_as_high_as_wide_has_a_backplate_and_one_three_times_has_n
 
 
 @pytest.mark.parametrize("aspect", [0.3, 1.0, 2.16, 3.05, 8.0])
-def test_the_spread_holds_the_sizes_that_such_a_box_may_be_of(aspect: float) -> None:
+def test_size_prior_covers_the_sizes_of_every_aspect(aspect: float) -> None:
     size = light_size(aspect)
 
     for height_m in (1.07, 1.32):
         assert abs(height_m - size.mean_m) < 2.0 * size.spread * size.mean_m
 
 
-def test_a_shape_that_is_of_no_light_says_nothing() -> None:
+def test_implausible_aspect_does_not_change_the_prior() -> None:
     assert light_size(0.2).mean_m == pytest.approx(light_size().mean_m, rel=1e-6)
 
 
-def test_a_sign_has_one_size_whatever_its_box() -> None:
+def test_stop_sign_size_does_not_depend_on_the_aspect() -> None:
     assert size_of("stop_sign", 2.0) == size_of("stop_sign") == STOP_SIGN
     assert size_of("traffic_light", 2.0) == light_size(2.0)
 
 
-def test_others_of_a_make_narrow_a_size_as_much_as_they_are_worth() -> None:
+def test_lights_of_the_same_make_narrow_a_size_by_their_variance() -> None:
     size = light_size(2.1)
     alone = shared_size(size, [])
-    unsure = shared_size(size, [(0.2, 0.5)])
-    sure = shared_size(size, [(0.2, 1e-6)])
+    uncertain = shared_size(size, [(0.2, 0.5)])
+    certain = shared_size(size, [(0.2, 1e-6)])
 
     assert alone.mean_m == pytest.approx(size.mean_m)
     assert alone.spread == pytest.approx(size.spread)
-    assert size.mean_m < unsure.mean_m < sure.mean_m
-    assert unsure.spread > sure.spread > SAME_MAKE
-    assert np.log(sure.mean_m / size.mean_m) == pytest.approx(0.2, abs=0.05)
+    assert size.mean_m < uncertain.mean_m < certain.mean_m
+    assert uncertain.spread > certain.spread > SAME_MAKE
+    assert np.log(certain.mean_m / size.mean_m) == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_size_given_others_is_off_by_as_much_as_it_says() -> None:
+def test_shared_size_is_consistent_with_its_variance() -> None:
     rng = np.random.default_rng(11)
     size = SizePrior(1.27, 0.14)
     own_var = SAME_MAKE**2

@@ -14,13 +14,13 @@ FOCAL_PX, SIZE_PX = 600.0, (640, 400)
 CENTER_PX = (320.0, 200.0)
 
 
-def street(camera: Floats, looks: Rotation) -> Bytes:
-    """Points in space (x right, y down, z ahead), projected to a camera at a position."""
+def street(camera: Floats, camera_rotation: Rotation) -> Bytes:
+    """Draw points in space (x right, y down, z ahead) as seen by a camera at a position."""
     rng = np.random.default_rng(4)
     dots = np.stack(
         [rng.uniform(-12, 12, 400), rng.uniform(-6, 3, 400), rng.uniform(8, 40, 400)], 1
     )
-    seen = looks.inv().apply(dots - camera)
+    seen = camera_rotation.inv().apply(dots - camera)
     picture = np.zeros(SIZE_PX[::-1], np.uint8)
     for (x, y, z), grey in zip(seen, rng.integers(80, 255, 400), strict=True):
         if z > 1.0:
@@ -31,12 +31,10 @@ def street(camera: Floats, looks: Rotation) -> Bytes:
 
 
 @pytest.mark.parametrize(("left_deg", "below_deg"), [(0.0, 0.0), (2.0, 0.0), (-1.0, 3.0)])
-def test_the_axis_is_beside_and_below_the_way_by_its_mounting(
-    left_deg: float, below_deg: float
-) -> None:
+def test_camera_axis_offset_matches_its_mounting(left_deg: float, below_deg: float) -> None:
     # A positive rotation about y (down) turns z towards x, to the right; about x, upwards.
-    looks = Rotation.from_euler("yx", [-left_deg, -below_deg], degrees=True)
-    before, after = (street(np.array([0.0, 0.0, z]), looks) for z in (0.0, 0.7))
+    camera_rotation = Rotation.from_euler("yx", [-left_deg, -below_deg], degrees=True)
+    before, after = (street(np.array([0.0, 0.0, z]), camera_rotation) for z in (0.0, 0.7))
 
     found = travel_between(before, after, FOCAL_PX, CENTER_PX)
 
@@ -46,7 +44,7 @@ def test_the_axis_is_beside_and_below_the_way_by_its_mounting(
     assert np.rad2deg(found.turned_rad) == pytest.approx(0.0, abs=0.1)
 
 
-def test_a_turn_to_the_left_is_positive() -> None:
+def test_left_turn_is_positive() -> None:
     ahead = Rotation.identity()
     later = Rotation.from_euler("y", -1.0, degrees=True)
 
@@ -58,7 +56,7 @@ def test_a_turn_to_the_left_is_positive() -> None:
     assert np.rad2deg(found.turned_rad) == pytest.approx(1.0, abs=0.15)
 
 
-def test_nothing_is_said_of_pictures_without_points_or_motion() -> None:
+def test_pictures_without_points_or_motion_yield_none() -> None:
     black = np.zeros(SIZE_PX[::-1], np.uint8)
     still = street(np.zeros(3), Rotation.identity())
 

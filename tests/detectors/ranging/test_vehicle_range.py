@@ -1,4 +1,4 @@
-"""Range of one detection: exact on level ground, consistent, and validated on real boxes."""
+"""Tests of the range of one detection: exact on level ground, and consistent."""
 
 import math
 
@@ -27,31 +27,31 @@ SIZE = (1920, 1080)
 
 
 def edge_px(range_m: float, camera: GroundCamera = CAMERA, pitch_rad: float = 0.0) -> float:
-    """Row in which a point of level ground appears."""
+    """Return the row of a point on level ground."""
     angle = math.atan(camera.height_m / range_m) - pitch_rad
     return CENTER_Y_PX + camera.focal_px * math.tan(angle)
 
 
 def slope(bottom_px: float) -> float:
-    """Slope of the ray through a row of a level camera."""
+    """Return the slope of the ray through a row of a level camera."""
     return (bottom_px - CENTER_Y_PX) / CAMERA.focal_px
 
 
 @pytest.mark.parametrize("range_m", [4.0, 17.0, 40.0])
-def test_a_point_of_level_ground_has_its_range_exactly(range_m: float) -> None:
+def test_range_of_a_point_on_level_ground_is_exact(range_m: float) -> None:
     found = ground_range(slope(edge_px(range_m)), 60.0, CAMERA)
 
     assert found is not None
     assert found.mean_m == pytest.approx(range_m, rel=1e-9)
 
 
-def test_an_edge_at_the_horizon_says_nothing_and_size_alone_speaks() -> None:
+def test_range_of_an_edge_at_the_horizon_relies_on_size() -> None:
     for bottom_px in (500.0, 540.0, 545.0):
         assert ground_range(slope(bottom_px), 20.0, CAMERA) is None
         assert vehicle_range(slope(bottom_px), 20.0, CAMERA, CAR) == size_range(20.0, 1500.0, CAR)
 
 
-def test_near_the_ground_decides_and_far_away_the_size() -> None:
+def test_near_range_relies_on_ground_and_far_range_on_size() -> None:
     tall = SizePrior(1.65, 0.15)
     for range_m, nearer in ((8.0, "ground"), (60.0, "size")):
         height_px = 1500.0 * 2.0 / range_m
@@ -66,7 +66,7 @@ def test_near_the_ground_decides_and_far_away_the_size() -> None:
 
 
 @pytest.mark.parametrize("range_m", [10.0, 20.0, 35.0])
-def test_the_interval_holds_the_truth_as_often_as_it_says(range_m: float) -> None:
+def test_range_interval_has_its_nominal_coverage(range_m: float) -> None:
     rng = np.random.default_rng(3)
     inside = 0
     for _ in range(2000):
@@ -99,7 +99,9 @@ BOX = np.array([900.0, 300.0, 914.0, 330.0])
         (FOCAL, 1500.0 * 1.26 / 30.0 + 1.5, 0.15 * 63.0),
     ],
 )
-def test_a_default_is_used_where_no_curve_is_fitted(text: str, range_m: float, sd_m: float) -> None:
+def test_default_range_is_used_without_a_fitted_curve(
+    text: str, range_m: float, sd_m: float
+) -> None:
     found = detection_range(vehicle(text), "traffic light", BOX, 30.0, SIZE)
 
     assert found is not None
@@ -108,11 +110,11 @@ def test_a_default_is_used_where_no_curve_is_fitted(text: str, range_m: float, s
 
 
 @pytest.mark.parametrize("text", ["", FOCAL + "[ranges]\nkind = 'curve'\n"])
-def test_without_a_camera_or_by_choice_there_is_no_default(text: str) -> None:
+def test_default_range_is_missing_without_camera_or_when_disabled(text: str) -> None:
     assert detection_range(vehicle(text), "traffic light", BOX, 30.0, SIZE) is None
 
 
-def test_a_fitted_curve_leaves_all_else_as_it_was() -> None:
+def test_fitted_curve_disables_defaults_of_other_labels() -> None:
     box = np.array([900.0, 500.0, 980.0, edge_px(30.0)])
 
     assert detection_range(vehicle(FOCAL + CURVE), "car", box, 80.0, SIZE) is None
@@ -121,7 +123,7 @@ def test_a_fitted_curve_leaves_all_else_as_it_was() -> None:
     assert found.mean_m == pytest.approx(31.5, rel=0.05)
 
 
-def test_the_camera_s_own_pitch_is_taken_into_account() -> None:
+def test_range_accounts_for_the_camera_pitch() -> None:
     level = np.array([900.0, 500.0, 980.0, edge_px(12.0)])
     tilted = np.array([900.0, 300.0, 980.0, edge_px(12.0, pitch_rad=0.1)])
 
@@ -139,7 +141,7 @@ def test_the_camera_s_own_pitch_is_taken_into_account() -> None:
 
 
 @pytest.mark.parametrize(("yaw", "roll"), [(0.1, 0.0), (0.0, 0.05), (-0.1, 0.03)])
-def test_a_turned_camera_sees_the_same_range(yaw: float, roll: float) -> None:
+def test_range_does_not_depend_on_camera_yaw_and_roll(yaw: float, roll: float) -> None:
     found = []
     for turns in ("", f"yaw_rad = {yaw}\nroll_rad = {roll}\n"):
         car = vehicle(FOCAL + turns)
@@ -158,7 +160,7 @@ def test_a_turned_camera_sees_the_same_range(yaw: float, roll: float) -> None:
         ("bus", (900.0, 500.0, 1300.0, 1080.0)),
     ],
 )
-def test_what_has_no_size_or_is_cut_has_no_range(
+def test_object_without_size_or_at_the_picture_edge_has_no_range(
     label: str, box: tuple[float, float, float, float]
 ) -> None:
     assert detection_range(vehicle(FOCAL), label, np.array(box), 100.0, SIZE) is None
