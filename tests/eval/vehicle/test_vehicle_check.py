@@ -12,9 +12,11 @@ import pytest
 import crosscue
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.cli import run
-from crosscue.eval.vehicle.check import Checked, check
+from crosscue.eval.vehicle.check import Checked, _normalized, check
 from crosscue.eval.vehicle.ground_picture import draw_ground
 from crosscue.replay.base import EVERYTHING, Block, Table, Topic
+from crosscue.replay.vehicle.drafting.series import Series
+from crosscue.replay.vehicle.pose import Odometry
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block
 from support.pandaset_drive import pandaset_drive
@@ -50,6 +52,7 @@ def test_consistent_signals_have_no_contradictions() -> None:
     by_name = {row.signal: row for row in found.signals}
     assert by_name["yaw_rate"].count == 400
     assert by_name["yaw_rate"].rate_hz == pytest.approx(20.0)
+    assert by_name["yaw_rate"].low == pytest.approx(-math.degrees(0.3), rel=0.01)
     assert by_name["yaw_rate"].high == pytest.approx(math.degrees(0.3), rel=0.01)
     assert "the course of GNSS fix" in by_name["yaw_rate"].agrees
 
@@ -64,6 +67,15 @@ def test_inconsistent_speeds_are_a_contradiction() -> None:
     found = checked_signals(wheel_scale=1.6).contradictions
 
     assert any(text.startswith("wheel_speeds: contradicts") for text in found)
+
+
+def test_steering_is_compared_without_offset_at_a_ratio_of_15() -> None:
+    odometry = Odometry(steering_ratio=30.0, steering_offset_rad=0.1)
+    wheel = Series.of("steering", np.array([0, 1], np.int64), np.array([0.1, 0.5]))
+
+    found = _normalized(wheel, Vehicle(version=1, odometry=odometry))
+
+    np.testing.assert_allclose(found.values, [0.0, 0.2], atol=1e-12)
 
 
 def test_horizon_is_the_limit_of_a_level_road() -> None:
@@ -113,6 +125,16 @@ def test_intrinsics_of_other_pictures_are_contradictions(
     # The generated pictures are tiny, with the published intrinsics of 1920 x 1080.
     assert any(message in text for text in found.contradictions)
     assert f"WRONG    {found.contradictions[0]}" in repr(found)
+
+
+def test_published_focal_length_is_not_a_contradiction(tmp_path: Path) -> None:
+    drive = pandaset_drive(tmp_path / "002")
+
+    found = crosscue.check_vehicle(drive, write_vehicle(tmp_path / "car.toml", "focal_px = 1970.0"))
+
+    # The generated pictures are tiny: their size contradicts, the published length does not.
+    assert found.contradictions
+    assert not any("publishes" in text for text in found.contradictions)
 
 
 def test_check_page_and_json_have_equal_content(
