@@ -54,6 +54,12 @@ NAMES: Final = {
     "fraction": r"(^|_)(?<!dead_end_)(?<!row_)(?<!column_)shares?(_at|_by_cluster)?$|[a-z]Shares$",
     "repair": r"(^|_)mend(s|ed|ing)?(_|$)",
     "overconfident": r"(^|_)(over|under)_sure(_|$)",
+    "a test's name without article or pronoun": r"^test_(an?|the|it|what|which|whatever)_",
+    "a noun": r"^test_\w*_(what|whatever|nobody)_",
+    "states, reports, requires": r"^test_\w*_(says?|said|knows|hears|speaks|wants)(_|$)",
+    "unsupported, unrelated": r"^test_\w*_foreign(_|$)",
+    "selected, requested": r"^test_\w*_asked_for(_|$)",
+    "is missing, is invalid": r"^test_\w*_is_none(_|$)",
 }
 """Recommended words, and patterns of the words in identifiers that they replace."""
 
@@ -134,5 +140,8 @@ def test_documentation_uses_terms_of_style_guide() -> None:
 def test_replaced_terms_are_found() -> None:
     assert list(_replaced("a.py:1", "the reader tells of two losses", PHRASES))
     assert list(_replaced("a.py:1", "MOST_BYTES", NAMES))
+    assert list(_replaced("a.py:1", "test_a_line_says_what_it_says", NAMES))
+    assert list(_replaced("a.py:1", "test_log_knows_its_time", NAMES))
+    assert not list(_replaced("a.py:1", "test_log_is_read_completely", NAMES))
     assert not list(_replaced("a.py:1", "cannot tell one from the other", PHRASES))
     assert not list(_replaced("a.py:1", "told apart by their order", PHRASES))

@@ -44,7 +44,7 @@ def test_incomplete_run_is_listed(runs: Path) -> None:
     assert runs / "b" in runs_of([str(runs)])
 
 
-def test_a_run_named_twice_is_refused(runs: Path) -> None:
+def test_run_named_twice_is_refused(runs: Path) -> None:
     with pytest.raises(CrosscueError, match="named twice"):
         runs_of([str(runs / "b"), str(runs)])
 
