@@ -330,7 +330,7 @@ def test_invalid_coco_file_is_reported(
         ("labels.csv,stop,1,2,3,4", "not a JPEG, PNG or WebP picture"),
     ],
 )
-def test_invalid_label_rows_are_reported(
+def test_invalid_label_rows_are_reported_on_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, message: str
 ) -> None:
     labels = tmp_path / "labels.csv"
@@ -338,7 +338,9 @@ def test_invalid_label_rows_are_reported(
 
     assert run(["fit", "signs", str(labels), "--label", "stop"]) == 4
 
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
 
 
 def test_truncated_picture_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -164,17 +164,19 @@ def test_truncated_file_is_refused_and_unchanged(
     assert cut.read_bytes() == whole[: int(fraction * len(whole))]
 
 
-def test_newer_file_version_is_refused(grid: Path, tmp_path: Path) -> None:
+def test_newer_file_version_is_refused_and_unchanged(grid: Path, tmp_path: Path) -> None:
     path = tmp_path / "new.sqlite"
     path.write_bytes(grid.read_bytes())
     later = sqlite3.connect(path)
     later.execute("PRAGMA user_version = 7")
     later.close()
+    before = path.read_bytes()
 
     with pytest.raises(LogFormatError, match="version 7, this crosscue reads 1"):
         LandmarkDatabase(path)
     with pytest.raises(LogFormatError, match="version 7"):
         LandmarkWriter(path, "orb")
+    assert path.read_bytes() == before
 
 
 def test_other_missing_and_non_sqlite_files_are_refused(tmp_path: Path) -> None:
