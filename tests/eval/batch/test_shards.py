@@ -43,6 +43,7 @@ def slurm_array(number: int, first: int, last: int, step: int, count: int) -> di
         ("auto", slurm_array(0, 0, 3, 1, 4), Shard(1, 4)),
         ("auto", slurm_array(9, 1, 9, 4, 3), Shard(3, 3)),
         ("auto", slurm_array(5, 5, 5, 1, 1), Shard(1, 1)),
+        ("auto", {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "4"}, Shard(3, 4)),
     ],
 )
 def test_shard_option_is_read(text: str, variables: Mapping[str, str], shard: Shard) -> None:

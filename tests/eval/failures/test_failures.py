@@ -14,9 +14,11 @@ import pytest
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.failures.approach_level import flips_without_truth
+from crosscue.eval.failures.frame_level import wrong_ranges
 from crosscue.eval.failures.order import cause_groups, diverse, ranked
 from crosscue.eval.failures.record import Failure, distance_bin, read_failures, write_failures
 from crosscue.eval.scoring.columns import BeliefRows
+from crosscue.eval.scoring.scene.ranges import RangeJudged
 from crosscue.replay.base import AnnotationError, UnreadableRunError, UsageError
 from support.scene_run import scene_run
 from support.scoring import at, truth_folder
@@ -88,6 +90,27 @@ def test_overconfident_range_is_a_failure(tmp_path: Path) -> None:
         3,
     )
     assert wrong.severity == pytest.approx(25.0 / (2.0 * math.log(2.0)))
+
+
+@pytest.mark.parametrize(
+    ("error_m", "cause"),
+    [(0.9, "too far"), (-0.9, "too near"), (0.7, "interval too narrow"), (0.19, None)],
+)
+def test_range_failure_is_blamed_on_range_or_interval(error_m: float, cause: str | None) -> None:
+    rows = {"t_ns": np.array([at(3)]), "approach": np.array([7]), "true_m": np.array([8.0])}
+    judged = RangeJudged(
+        "drive",
+        "start",
+        **rows,
+        error_m=np.array([error_m]),
+        var_m2=np.array([0.01]),
+        left_out={},
+        controls={},
+    )
+
+    found = [one.cause for one in wrong_ranges([judged], {}, "run")]
+
+    assert found == ([] if cause is None else [cause])
 
 
 def test_run_without_truth_reports_only_flipped_beliefs(

@@ -160,6 +160,15 @@ def test_unbalanced_account_raises_an_error(stage: str, by: int, what: str) -> N
         check(wrong)
 
 
+def test_account_is_complete_only_without_losses_in_every_stage() -> None:
+    complete = log_account("a", "/t", used=7, skipped={"dull": 2})
+    lost = log_account("a", "/t", used=7, dropped={"cut": 1})
+
+    assert account([complete], {"/cam": line(5, 4, {"dull": 1})}).is_whole
+    assert not account([lost], {"/cam": line(5, 5, {})}).is_whole
+    assert not account([complete], {"/cam": line(5, 4, {}, {"not decoded": 1})}).is_whole
+
+
 def test_sum_of_accounts_adds_rows_and_keeps_losses() -> None:
     both = summed([_account(), _account()])
 
