@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -9,6 +10,7 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.catalog.compare import compare_runs, open_scored, read_tolerance
+from crosscue.eval.runs.account import Account, line
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.by_drive import table_of
 from crosscue.replay.base import UsageError
@@ -167,6 +169,18 @@ def test_tables_of_different_rows_or_columns_report_the_difference(tmp_path: Pat
     assert found["frames"].what == "different number of rows"
     assert found["cues"].what == "different columns: count int64 and nothing"
     assert found["range"].what == "only in the first run"
+
+
+@pytest.mark.parametrize("lossy", ["a", "b"])
+def test_losses_in_either_run_exit_3(tmp_path: Path, lossy: str) -> None:
+    lost = Account(
+        reading=(), detecting={"/cam": line(5, 4, {}, {"cut": 1})}, estimating={}, is_whole=False
+    )
+    for name in ("a", "b"):
+        changes: dict[str, Any] = {"account": lost} if name == lossy else {}
+        run_folder(tmp_path / name, None, **changes)
+
+    assert cli.run(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "-q"]) == 3
 
 
 def test_damaged_scores_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
