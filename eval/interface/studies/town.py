@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from crosscue.eval.studies.page import Table
     from crosscue.eval.studies.town.field_study import FieldRun
+    from crosscue.eval.studies.town.run import Made
     from crosscue.eval.studies.town.settings import FieldStudy
-    from crosscue.eval.studies.town.whole import Made
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -55,13 +55,13 @@ class StudyResult:
     @property
     def page(self) -> Path:
         """The page with tables and figures."""
-        from crosscue.eval.studies.town.whole import PAGE
+        from crosscue.eval.studies.town.run import PAGE
 
         return self.folder / PAGE
 
     def as_dict(self) -> object:
         """Return the JSON output of ``crosscue study range``: the summary in its folder."""
-        from crosscue.eval.studies.town.whole import SUMMARY
+        from crosscue.eval.studies.town.run import SUMMARY
 
         return json_tree((self.folder / SUMMARY).read_text(encoding="utf-8"))
 
@@ -129,7 +129,7 @@ def run_study(
     Raises:
         RunError: The folder contains another study's results.
     """
-    from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, finish_range
+    from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
     from crosscue.eval.studies.town.work import default_workers
 
     folder = Path(output)

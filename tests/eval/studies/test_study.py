@@ -36,13 +36,13 @@ from crosscue.eval.studies.town.range_study import (
     summarise,
 )
 from crosscue.eval.studies.town.replayed import through_log
+from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.settings import (
     FieldStudy,
     LandmarkStudy,
     RangeStudy,
     load_study,
 )
-from crosscue.eval.studies.town.whole import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.drive import Keys, Result, drive_many
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
