@@ -244,20 +244,23 @@ def create(path: Path, *, overwrite: bool) -> RunFolder:
 
 @contextmanager
 def created(path: Path, *, overwrite: bool) -> Iterator[RunFolder]:
-    """Create a run folder as ``create`` does, and remove a new one again if it stays empty.
+    """Create a run folder as ``create`` does, and empty it again if no result gets into it.
 
     Raises:
         RunError: As for ``create``.
         OutputError: As for ``create``.
     """
     is_new = not path.exists()
+    was_empty = is_new or (path.is_dir() and not any(path.iterdir()))
     run = create(path, overwrite=overwrite)
     try:
         yield run
     except BaseException:
-        if is_new:
-            # The folder is kept if an interrupted run has left files.
-            with suppress(OSError):
+        # Files of an interrupted run are kept. A description alone would only block the next run.
+        with suppress(OSError):
+            if was_empty and [entry.name for entry in path.iterdir()] == [INPUT]:
+                run.file(INPUT).unlink()
+            if is_new:
                 path.rmdir()
         raise
 

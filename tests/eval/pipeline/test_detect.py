@@ -141,6 +141,21 @@ def test_detector_of_installed_package_is_selected_by_entry_point_name(
     assert "detector 'owm': no such name; did you mean own?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("exists", [False, True])
+@pytest.mark.parametrize("command", ["detect", "replay"])
+def test_command_runs_after_its_misspelt_detector_is_corrected(
+    command: str, exists: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, output = str(_folder(tmp_path)), tmp_path / "run"
+    if exists:
+        output.mkdir()
+
+    line = [command, log, "-o", str(output), "--no-cache", "-q", "--detectors"]
+    assert run([*line, "signss"]) == 2
+    assert output.exists() == exists
+    assert run([*line, "signs"]) == 0, capsys.readouterr().err
+
+
 def test_second_run_reads_cache_and_writes_same_detections(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
