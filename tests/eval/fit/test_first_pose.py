@@ -16,8 +16,8 @@ from crosscue.datasets.geodesy import (
 )
 from crosscue.datasets.truth.truth import load
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.eval.fit.first_pose import with_start
-from crosscue.eval.fit.gnss_truth import write_gnss_truth
+from crosscue.eval.fit.first_pose import with_start, with_start_of
+from crosscue.eval.fit.gnss_truth import _between_positions, write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
@@ -91,6 +91,15 @@ def test_start_settings_of_the_vehicle_file_are_kept(vehicle: Vehicle) -> None:
     assert with_start([straight_drive()], vehicle, EVERYTHING) == vehicle
 
 
+def test_estimate_keeps_the_first_pose_of_a_run_unless_the_vehicle_file_has_one() -> None:
+    own, bare = Vehicle(version=1, start=Start(heading_rad=0.3)), Vehicle(version=1)
+    run = with_start([straight_drive()], bare, EVERYTHING)
+
+    assert with_start_of(run, bare).start == run.start
+    assert with_start_of(run, own) == own
+    assert with_start_of(own, bare) == bare
+
+
 def test_stationary_car_gets_no_heading_from_gnss() -> None:
     assert with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING) == Vehicle(version=1)
 
@@ -118,6 +127,17 @@ def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
     assert truth.origin is not None
     assert truth.origin.latitude_deg == pytest.approx(PLACE[0])
     np.testing.assert_allclose(heading_rad(track), HEADING_RAD, atol=1e-4)
+
+
+def test_course_between_positions_is_tangent_to_the_path() -> None:
+    angle = 0.05 * np.arange(40) - 2.5
+    xyz_m = np.column_stack([30 + 20 * np.cos(angle), 20 * np.sin(angle) - 10, np.zeros(40)])
+    t_ns = np.arange(40, dtype=np.int64) * (SECOND // 2)
+
+    course = _between_positions(t_ns, xyz_m, min_speed_mps=1.0)
+
+    np.testing.assert_allclose(course[2:-2], angle[2:-2] + math.pi / 2, atol=1e-9)
+    assert np.isnan(_between_positions(t_ns, xyz_m, min_speed_mps=3.0)).all()
 
 
 def test_truth_file_determines_first_pose_in_its_map(tmp_path: Path) -> None:
