@@ -38,6 +38,9 @@ EMBEDDED: Final = "mask-rcnn,road,signs"
 _EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoint", None)}
 """Setting that selects a network, and its default, which selects the embedded one."""
 
+_WEIGHTS: Final = (".onnx", ".pt", ".pth", ".safetensors", ".tflite", ".xml")
+"""Endings of files with weights, which need a card."""
+
 _PARTS: Final = ("view", "identity", "__call__")
 """Attributes that every ``Detector`` has."""
 
@@ -101,6 +104,11 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
         choice = Choice(choice.name, "model", {**choice.settings, "card": card})
     place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
     module, colon, factory = place.partition(":")
+    if not colon and choice.kind.endswith(_WEIGHTS):
+        raise UsageError(
+            f"detector {choice.kind!r}: expected a model card (.toml); write one with crosscue model "
+            "init, or name a checkpoint of crosscue train under [detectors.NAME] of a vehicle file"
+        )
     if not colon:
         names = known({})
         close = difflib.get_close_matches(choice.kind, names, n=1)

@@ -115,6 +115,12 @@ def test_unfetched_model_is_reported_with_the_fetch_command(cache: Path) -> None
     assert message in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["my.onnx", "nets/own.safetensors", "weights.pth"])
+def test_weights_in_place_of_a_detector_are_answered_with_how_to_name_them(name: str) -> None:
+    with pytest.raises(UsageError, match=r"expected a model card.*crosscue model init.*detectors"):
+        make(Choice(name, name))
+
+
 def test_misspelled_model_name_suggests_the_nearest() -> None:
     with pytest.raises(UsageError, match="did you mean yolox-nano"):
         places.card_path("yolo-nano")
