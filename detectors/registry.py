@@ -107,7 +107,8 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
     if not colon and choice.kind.endswith(_WEIGHTS):
         raise UsageError(
             f"detector {choice.kind!r}: expected a model card (.toml); write one with crosscue "
-            "model init, or name a checkpoint of crosscue train under [detectors.NAME] of a vehicle file"
+            "model init, or name a checkpoint of crosscue train under [detectors.NAME] of a "
+            "vehicle file"
         )
     if not colon:
         names = known({})
