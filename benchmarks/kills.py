@@ -153,7 +153,7 @@ def after_kill(run: Path, right: dict[str, str]) -> str:
         return "left: not a run"
     if manifest.stage != "estimate":
         return "left: only detected"
-    return "left: whole" if contents(run) == right else "LEFT: TAKEN FOR WHOLE"
+    return "left: complete" if contents(run) == right else "LEFT: TAKEN AS COMPLETE"
 
 
 if __name__ == "__main__":

@@ -178,7 +178,7 @@ def real_street(data: Path) -> None:
     folder = data / "sequences" / "kitti_seq2_right_turn_98deg"
     strangers = sorted((data / "place_recognition").rglob("*.jpg"))
     if not folder.is_dir():
-        print(f"\nreal pictures: not at hand ({folder})")
+        print(f"\nreal pictures: not available ({folder})")
         return
     pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
     places = np.column_stack([pose[:, 2, 3], -pose[:, 0, 3]])

@@ -130,7 +130,7 @@ def place_of(run: RunFolder, row: LogRow) -> Path | str:
         )
     gone = f"{places[0]} is gone" if run.logs is None else f"{wanted} is not in {run.logs}"
     raise UnreadableRunError(
-        f"{run.path}: its log {gone}; say where it is with --logs DIR, or replay again"
+        f"{run.path}: its log {gone}; name its folder with --logs DIR, or replay again"
     )
 
 

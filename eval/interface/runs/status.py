@@ -80,7 +80,7 @@ class BatchStatus:
 
 def _heard(one: DriveStatus) -> str:
     """Return the time since the last sign of a stale drive's worker, and what to do."""
-    when = f"last heard of {_duration(one.silent_s)} ago; " if math.isfinite(one.silent_s) else ""
+    when = f"last update {_duration(one.silent_s)} ago; " if math.isfinite(one.silent_s) else ""
     return f"{when}replay again"
 
 

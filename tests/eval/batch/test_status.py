@@ -90,7 +90,7 @@ def test_drive_of_a_dead_worker_is_stale(
     monkeypatch.setattr(status, "STALE_S", 60.0)
     os.utime(entry_path(later), (1.0e9, 1.0e9))
     assert states(folder)["later"] == "stale"
-    assert "later: its worker on another-machine is gone, last heard of" in repr(
+    assert "later: its worker on another-machine is gone, last update" in repr(
         crosscue.batch_status(folder)
     )
     assert run(["status", str(folder), "-q"]) == 3

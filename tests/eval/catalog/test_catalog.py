@@ -134,7 +134,7 @@ def test_condition_or_query_selects_runs(runs: Path, query: str, named: list[str
     ("query", "message"),
     [
         ("select name from runs", r"no column run in the result \(name\)"),
-        ("select 'x' as run", "column run holds 'x', which is no run of"),
+        ("select 'x' as run", "column run holds 'x', which is not a run of"),
         ("vehcle = 'car'", r"no column vehcle; did you mean vehicle\?"),
     ],
 )

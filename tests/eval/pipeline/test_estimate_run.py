@@ -226,7 +226,7 @@ def test_estimate_refuses_missing_or_changed_log(
     assert "has changed since" in capsys.readouterr().err
     (copy / "drive.mcap").unlink()
     assert run(["estimate", str(copy / "run")]) == 4
-    assert "is gone; say where it is with --logs DIR" in capsys.readouterr().err
+    assert "is gone; name its folder with --logs DIR" in capsys.readouterr().err
 
 
 def test_replay_without_detectors_succeeds_and_reports_it(

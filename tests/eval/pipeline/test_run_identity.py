@@ -146,7 +146,7 @@ def test_moved_logs_are_accepted_and_changed_logs_refused(
     moved.parent.mkdir(parents=True)
     log.rename(moved)
     assert run(estimate) == 4
-    assert "is gone; say where it is with --logs DIR" in capsys.readouterr().err
+    assert "is gone; name its folder with --logs DIR" in capsys.readouterr().err
     shutil.copy(drives / "D-1" / "drive.mcap", log)
     assert run(estimate) == 4
     assert "has changed since" in capsys.readouterr().err

@@ -186,7 +186,7 @@ def test_missing_log_is_an_error_unless_images_are_left_out(
     assert cli.run(argv) == 4
     printed = capsys.readouterr().err
     assert printed.count("\n") == 1
-    assert "drive.mcap is gone; say where it is with --logs DIR" in printed
+    assert "drive.mcap is gone; name its folder with --logs DIR" in printed
     assert "--without-images" in printed
     assert not run.file("score").exists()
 

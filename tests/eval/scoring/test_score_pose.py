@@ -282,7 +282,7 @@ def test_recording_stores_encoded_pictures_unchanged(tmp_path: Path) -> None:
 
     save_recording(run, tmp_path / "drive.rrd")
     log.unlink()
-    with pytest.raises(RunError, match="is gone; say where it is with --logs DIR"):
+    with pytest.raises(RunError, match="is gone; name its folder with --logs DIR"):
         save_recording(run, tmp_path / "without.rrd")
     save_recording(replace(run, without_images=True), tmp_path / "without.rrd")
 
