@@ -123,8 +123,8 @@ class Catalog:
         strange = [run for run in named if run not in there]
         if strange:
             raise UsageError(
-                f"query: column run holds {strange[0]!r}, which is not a run of {self._places.name}; "
-                "select the column run of a table"
+                f"query: column run holds {strange[0]!r}, which is not a run of "
+                f"{self._places.name}; select the column run of a table"
             )
         return tuple(named)
 
