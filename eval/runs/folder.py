@@ -198,7 +198,7 @@ class RunFolder(TableFolder):
         found = self.manifest()
         if isinstance(found, MergedManifest):
             raise RunError(
-                f"{self.path}: contains merged tables of drives; give one of the runs next to it"
+                f"{self.path}: contains tables of many drives; give one of the runs next to it"
             )
         if isinstance(found, DecodeManifest):
             raise RunError(f"{self.path}: holds tables of crosscue decode; give a run of replay")
