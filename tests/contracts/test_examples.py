@@ -9,7 +9,9 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import pytest
@@ -65,6 +67,13 @@ OPTIONS: Final = {
 def of_kind(kind: str) -> list[Code]:
     """Blocks of one language that no test runs."""
     return [code for code in CODE if code.kind == kind and (code.page, kind) not in EXECUTED]
+
+
+@cache
+def commands_on(page: str) -> list[tuple[Code, list[str]]]:
+    """Program and arguments of every command that the blocks of a page run."""
+    with TemporaryDirectory() as folder:
+        return commands_of([code for code in CODE if code.page == page], Path(folder))
 
 
 def words_of(text: str) -> list[str]:
@@ -129,10 +138,10 @@ def test_executed_blocks_are_read_by_their_test(page: str, kind: str) -> None:
 
 @pytest.mark.parametrize("page", SHELL_PAGES)
 def test_commands_on_page_are_accepted_by_parser(
-    page: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    page: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blocks = [code for code in CODE if code.page == page]
-    found = commands_of(blocks, tmp_path)
+    found = commands_on(page)
 
     faults = [
         f"{code.place}: {' '.join(command)}: {fault}"
@@ -146,9 +155,9 @@ def test_commands_on_page_are_accepted_by_parser(
 
 
 @pytest.mark.parametrize("page", SHELL_PAGES)
-def test_commands_on_page_write_to_different_outputs(page: str, tmp_path: Path) -> None:
+def test_commands_on_page_write_to_different_outputs(page: str) -> None:
     written: dict[str, str] = {}
-    for code, (program, *command) in commands_of([c for c in CODE if c.page == page], tmp_path):
+    for code, (program, *command) in commands_on(page):
         names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]
         if program != "crosscue" or not names:
             continue
@@ -161,15 +170,13 @@ def test_commands_on_page_write_to_different_outputs(page: str, tmp_path: Path) 
             written[place] = code.place
 
 
-def test_other_programs_on_a_page_exist(tmp_path: Path) -> None:
+def test_other_programs_on_a_page_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    for number, page in enumerate(SHELL_PAGES):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        for code, (program, *words) in commands_of([c for c in CODE if c.page == page], folder):
+    for page in SHELL_PAGES:
+        for code, (program, *words) in commands_on(page):
             if program == "make":
                 assert words[0] in targets, code.place
             elif program == "pip":
@@ -271,10 +278,8 @@ def test_documented_default_settings_equal_defaults() -> None:
 def test_queries_in_examples_run(tmp_path: Path) -> None:
     runs = crosscue.catalog(runs_below(tmp_path / "runs"))
     queries = 0
-    for number, page in enumerate(SHELL_PAGES):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        for _, (program, *words) in commands_of([c for c in CODE if c.page == page], folder):
+    for page in SHELL_PAGES:
+        for _, (program, *words) in commands_on(page):
             if program == "crosscue" and words[0] == "query":
                 runs.query(words[2])
                 queries += 1
