@@ -94,7 +94,10 @@ def check_signals(
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
             hint = f"did you mean {close[0]}?" if close else "look it up in the DBC file"
-            raise VehicleError(f"{key} = {name!r}: no such signal in {vehicle.can.dbc}; {hint}")
+            # A damaged file is the likelier reason than a misspelt name.
+            doubts = "".join(f"; {notice}" for notice in database.notices[:1])
+            files = ", ".join(vehicle.can.dbc)
+            raise VehicleError(f"{key} = {name!r}: no such signal in {files}; {hint}{doubts}")
         if of in signals:
             message, _, signal = name.partition(".")
             pairs.add((message, signal))

@@ -148,7 +148,7 @@ def test_path_that_is_not_a_log_is_refused(
     ("text", "status", "message"),
     [
         ("", 4, "car.dbc:1: empty"),
-        ("BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0", 2, "no such signal in"),
+        ("BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0", 2, "the file is truncated"),
         ("\0\0\0", 4, "car.dbc:1: contains zero bytes"),
     ],
     ids=["empty", "cut", "binary"],
