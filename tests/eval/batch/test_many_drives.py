@@ -209,11 +209,11 @@ from pathlib import Path
 from crosscue.eval.cli import _guarded
 from crosscue.eval.batch.jobs import run_many
 from crosscue.eval.batch.processes import Processes
-from support.drive_work import letters, made_jobs
+from support.drive_work import letters, write_jobs
 import argparse, types
 
 def run(args):
-    run_many(made_jobs(Path(sys.argv[1]), ["slow", "slow", "slow"]), letters, Processes(2))
+    run_many(write_jobs(Path(sys.argv[1]), ["slow", "slow", "slow"]), letters, Processes(2))
     return 0
 
 if __name__ == "__main__":
