@@ -23,7 +23,7 @@ from crosscue.eval.scoring.gates import load_gates
 from crosscue.replay.plugins import GROUPS
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.catalog_runs import runs_below
-from support.pages import ROOT, Code, code_of_notebooks, code_of_pages, commands_of
+from support.pages import PAGES, ROOT, Code, code_of_notebooks, code_of_pages, commands_of
 from support.public_calls import faults_in
 
 CODE: Final = code_of_pages()
@@ -93,12 +93,17 @@ def commands_in(words: list[str]) -> list[str]:
     return [name for name in cli.COMMANDS if words and name.split()[0] == words[0]]
 
 
+def name_of(command: list[str]) -> str:
+    """Return the longest command name with which a command line begins, or an empty text."""
+    names = (name for name in cli.COMMANDS if command[: len(name.split())] == name.split())
+    return max(names, key=len, default="")
+
+
 def fault_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """Return the error of a complete command line, or an empty text if its parser accepts it."""
-    names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]
-    if not names:
+    name = name_of(command)
+    if not name:
         return f"no command {command[:2]}"
-    name = max(names, key=len)
     try:
         given = vars(cli.parser_of(name)[1].parse_args(command[len(name.split()) :]))
     except SystemExit:
@@ -158,11 +163,10 @@ def test_commands_on_page_are_accepted_by_parser(
 def test_commands_on_page_write_to_different_outputs(page: str) -> None:
     written: dict[str, str] = {}
     for code, (program, *command) in commands_on(page):
-        names = [name for name in cli.COMMANDS if command[: len(name.split())] == name.split()]
-        if program != "crosscue" or not names:
+        name = name_of(command)
+        if program != "crosscue" or not name:
             continue
-        parser = cli.parser_of(name := max(names, key=len))[1]
-        given = vars(parser.parse_args(command[len(name.split()) :]))
+        given = vars(cli.parser_of(name)[1].parse_args(command[len(name.split()) :]))
         place = str(given.get("output"))
         # A fit adds to the vehicle file that it read; commands without --overwrite may write again.
         if place not in (str(given.get("vehicle")), "None") and given.get("overwrite") is False:
@@ -230,6 +234,17 @@ def test_options_in_inline_code_exist() -> None:
 
     unknown = named.keys() - OPTIONS - OTHERS.keys()
     assert {option: named[option] for option in unknown} == {}
+
+
+def test_options_of_other_programs_are_still_named() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in PAGES]
+    texts += [
+        path.read_text(encoding="utf-8")
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+    ]
+
+    assert [option for option in OTHERS if not any(option in text for text in texts)] == []
 
 
 def test_options_in_messages_exist() -> None:

@@ -15,6 +15,7 @@ from markdown_it import MarkdownIt
 ROOT: Final = Path(__file__).parents[2]
 PAGES: Final = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs").glob("*/*.md")),
     *sorted((ROOT / "detectors").rglob("*.md")),
     *sorted((ROOT / "datasets").rglob("*.md")),
