@@ -2,8 +2,9 @@
 
 ``{crosscue-names}`` prints every public name in a line, ``{crosscue-commands}`` the help of every
 command, ``{crosscue-settings} MODULE:CLASS`` every field of a settings file with its type, default
-and meaning, ``{crosscue-tables}`` every column of the tables in a run folder. Nothing on these
-pages is written by hand, so none of it can be stale.
+and meaning, ``{crosscue-tables}`` every column of the tables in a run folder, and
+``{crosscue-columns}`` every column that a query can use. Nothing of it is written by hand, so none
+can be outdated.
 """
 
 from __future__ import annotations
@@ -171,6 +172,23 @@ class Tables(SphinxDirective):
         return found
 
 
+class Columns(SphinxDirective):
+    """``{crosscue-columns}``: the columns of the tables that ``crosscue query`` reads."""
+
+    def run(self) -> list[nodes.Node]:
+        """One section for each table."""
+        from crosscue.eval.catalog.query.columns import INDEXED, OWN
+
+        found: list[nodes.Node] = []
+        for name, columns in {**INDEXED, **OWN}.items():
+            block = nodes.section(ids=[nodes.make_id(f"columns {name}")])
+            block += nodes.title(text=name)
+            rows = [(column, one.kind, one.meaning) for column, one in columns.items()]
+            block += _table(("column", "type", "meaning"), rows)
+            found.append(block)
+        return found
+
+
 def _schemas() -> dict[str, pa.Schema]:
     from crosscue.eval.pipeline import detect
     from crosscue.eval.pipeline.scene import stage as scene
@@ -203,6 +221,7 @@ def _row(cells: tuple[str, ...], *, is_head: bool = False) -> nodes.row:
 
 def setup(app: Sphinx) -> dict[str, object]:
     """Register the directives."""
+    app.add_directive("crosscue-columns", Columns)
     app.add_directive("crosscue-commands", Commands)
     app.add_directive("crosscue-names", Names)
     app.add_directive("crosscue-settings", SettingsFile)

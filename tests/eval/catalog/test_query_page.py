@@ -1,4 +1,4 @@
-"""The page on queries: its queries run, and its columns are those of the catalog."""
+"""The queries of the page on queries run and return what they should."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,6 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.eval.catalog.query.columns import INDEXED, OWN
 from crosscue.eval.runs.account import Account, Line
 from support.catalog_runs import add_run, runs_below
 from support.manifests import detected
@@ -79,14 +78,3 @@ def test_queries_of_the_page_return_expected_rows(catalog: crosscue.Catalog) -> 
         {"stage": "detecting", "stream": "front", "reason": "cut", "rows": 3, "runs": 1}
     ]
     assert [(row["route"], row["approaches"]) for row in rows(10)] == [("north", 2)]
-
-
-def test_every_column_is_documented_on_the_page() -> None:
-    page = PAGE.read_text(encoding="utf-8")
-
-    for table, columns in {**INDEXED, **OWN}.items():
-        lines = [f"| `{name}` | {one.kind} | {one.meaning} |" for name, one in columns.items()]
-        assert (
-            "\n".join([f"### {table}", "", "| column | type | meaning |", "|---|---|---|", *lines])
-            in page
-        )
