@@ -24,7 +24,7 @@ from crosscue.replay.readers.mcap.damage.find import (
     is_doubtful,
     verified_head,
 )
-from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync, is_exact
+from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync, is_definition
 
 from .bytes import ByteFile
 from .records import (
@@ -320,7 +320,7 @@ class Walk:
 
     def _is_unknown_kind(self, at: int, length: int) -> bool:
         """Return whether a record of an unknown kind is genuine, and not a damaged message."""
-        if self._resync.is_message(at, length):
+        if self._resync.is_hidden(at, length):
             return False
         return self._before is None or self._resync.continues(at + PREFIX.size + length, 1)
 
@@ -380,7 +380,9 @@ class Walk:
             BrokenRecordError: The run starts with such a message.
         """
         for found in rows.definitions:
-            if not self._resync.is_message(at + found.at, len(found.content)) or is_exact(found):
+            is_hidden = self._resync.is_hidden(at + found.at, len(found.content))
+            if not is_hidden or is_definition(found):
+                self._resync.plausible.declare(found)
                 continue
             if not found.at:
                 raise BrokenRecordError(f"a record of kind {found.opcode:#04x} cannot be read")

@@ -170,6 +170,17 @@ def test_unknown_record_kinds_are_ignored_with_notice(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
 
 
+def test_unknown_record_kinds_are_ignored_in_recording_without_chunks(tmp_path: Path) -> None:
+    odd = record(0x99, b"a private record of its application")
+    parts = [odd, *DEFINITIONS, odd, message(1, 1, b"x"), odd, message(2, 2, b"y"), odd]
+    path = stored(tmp_path / "x.mcap", McapFile(parts, summary=False))
+
+    reading = read_back(path)
+
+    assert reading.messages == {"/a": [message_read(1, b"x")], "/b": [message_read(2, b"y")]}
+    assert reading.ledger.is_whole
+
+
 def test_wrong_message_index_is_ignored_with_notice(tmp_path: Path) -> None:
     chunk = ChunkOf([*DEFINITIONS, *(message(1, i, b"%d" % i) for i in range(20))])
     coded = bytearray(McapFile([chunk]).coded())

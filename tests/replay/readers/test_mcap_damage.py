@@ -385,6 +385,34 @@ def test_flipped_byte_outside_chunks_drops_at_most_two_messages(
         assert is_annotated or not (is_checked or is_lost), at
 
 
+@pytest.mark.parametrize("kind", [3, 4, 0x85])
+@pytest.mark.parametrize("is_padded", [True, False])
+def test_message_whose_kind_was_damaged_is_lost_and_reported(
+    kind: int, is_padded: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.mcap"
+    named = [schema(1), channel(1, 1, "/a"), schema(2, ""), channel(2, 2, "/b", "")]
+    if is_padded:
+        named = [record(one[0], one[9:] + b"\x01\xff\xff") for one in DEFINITIONS]
+    for sequence in (0, 1, 8, 20, 300, 70_000):
+        records = list(named)
+        for one in messages_on_both_channels(30, 1_790_000_000_000_000_000):
+            records.append(one[:11] + struct.pack("<I", sequence) + one[15:])
+        coded = bytearray(McapFile(records, summary=False).coded())
+        path.write_bytes(coded)
+        sound = read_back(path)
+        assert sound.count() == 30
+        assert sound.ledger.is_whole
+
+        coded[coded.index(records[20])] = kind
+        path.write_bytes(coded)
+
+        reading = read_back(path)
+
+        assert 1 <= (messages_of(sound) - messages_of(reading)).total() <= 2, sequence
+        assert not reading.ledger.is_whole, sequence
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_overwritten_span_outside_chunks_drops_only_overlapped_messages(
     tmp_path: Path, seed: int

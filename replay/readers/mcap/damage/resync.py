@@ -3,7 +3,7 @@
 A record is accepted only together with its successors: ``LINKS`` consecutive records must be
 plausible, or fewer that end exactly where a known record starts. A message is plausible if its
 channel is known and its log time is within the recording. A schema or channel is plausible if its
-fields fill the record exactly.
+fields fill the record exactly, or are legible (``is_definition``).
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ from crosscue.replay.readers.mcap.records import (
     PREFIX,
     SCHEMA,
     BrokenRecordError,
+    Fields,
     Heads,
     check_metadata,
     heads_at,
-    read_channel,
     read_chunk_head,
-    read_schema,
 )
 
 LINKS: Final = 3
@@ -66,11 +65,15 @@ class Plausible:
         self._met: tuple[int, int] | None = None
         self._is_close = False
 
+    def declare(self, found: Definition) -> None:
+        """Learn the number of a channel."""
+        if found.opcode == CHANNEL and len(found.content) >= 2:
+            self._channels[int.from_bytes(found.content[:2], "little")] = True
+
     def learn(self, rows: Rows) -> None:
         """Learn from the channels and messages of a run."""
         for found in rows.definitions:
-            if found.opcode == CHANNEL and len(found.content) >= 2:
-                self._channels[int.from_bytes(found.content[:2], "little")] = True
+            self.declare(found)
         if len(rows) and self._declared is None:
             middle = int(np.sort(rows.log)[len(rows) // 2])
             near = rows.log[_within(rows.log, middle - DAY_NS, middle + DAY_NS)]
@@ -78,6 +81,11 @@ class Plausible:
         if len(rows):
             apart = rows.log.astype(np.float64) - rows.publish.astype(np.float64)
             self._is_close = bool(2 * np.count_nonzero(np.abs(apart) <= DAY_NS) > len(rows))
+
+    @property
+    def has_channels(self) -> bool:
+        """True if a channel is known."""
+        return bool(self._channels.any())
 
     @property
     def is_declared(self) -> bool:
@@ -99,7 +107,7 @@ class Plausible:
         """
         first, last = self.span()
         is_plausible: NDArray[np.bool_] = _within(heads.log, first, last)
-        if self._channels.any():
+        if self.has_channels:
             is_plausible &= self._channels[heads.channel]
         if self._is_close:
             is_plausible &= _within(heads.publish, first - DAY_NS, last + DAY_NS)
@@ -149,6 +157,13 @@ class Resync:
             return False
         head = heads_at(np.frombuffer(raw, dtype=np.uint8), np.zeros(1, np.int64))
         return bool(self.plausible.messages(head)[0])
+
+    def is_hidden(self, at: int, length: int) -> bool:
+        """Return whether a record of another kind may be a message whose kind was damaged.
+
+        Only messages of a known channel count: none can precede the first channel.
+        """
+        return self.plausible.has_channels and self.is_message(at, length)
 
     def continues(self, at: int, links: int = LINKS) -> bool:
         """Return whether ``links`` plausible records, or fewer up to an anchor, start at ``at``."""
@@ -243,7 +258,7 @@ class Resync:
             return False
         content = self._file.read(at + PREFIX.size, length).tobytes()
         if opcode != METADATA:
-            return is_exact(Definition(at, opcode, content))
+            return is_definition(Definition(at, opcode, content))
         try:
             check_metadata(content)
         except BrokenRecordError:
@@ -267,21 +282,24 @@ def _kinds(window: NDArray[np.uint8], limit_at: int, first: int, last: int) -> N
     return at
 
 
-def is_exact(found: Definition) -> bool:
-    """Return whether the fields of a schema or channel fill its record exactly."""
+def is_definition(found: Definition) -> bool:
+    """Return whether a record is a schema or channel, and not a message whose kind was damaged.
+
+    Its fields fill the record exactly; or, because the format may be extended by fields at the
+    record's end, they end inside it and are legible text. A message read by these fields has its
+    sequence number and times as lengths and names, which are neither.
+    """
+    fields = Fields(found.content)
     try:
-        return _fills(found)
-    except BrokenRecordError:
+        number = fields.number(2)
+        if found.opcode == CHANNEL:
+            fields.take(2)
+        name, encoding = (bytes(fields.take(fields.number(4))) for _ in range(2))
+        fields.take(fields.number(4))
+        if found.opcode == SCHEMA and not number:
+            return False
+        if fields.at == len(found.content):
+            return True
+        return bool(name) and (name + encoding).decode().isprintable()
+    except (BrokenRecordError, UnicodeDecodeError):
         return False
-
-
-def _fills(found: Definition) -> bool:
-    if found.opcode == CHANNEL:
-        channel = read_channel(found.content)
-        texts = len(channel.topic.encode()) + len(channel.message_encoding.encode())
-        rest = len(found.content) - 16 - texts
-        declared = found.content[12 + texts : 16 + texts]
-        return bool(channel.topic) and rest == int.from_bytes(declared, "little")
-    schema = read_schema(found.content)
-    texts = len(schema.name.encode()) + len(schema.encoding.encode())
-    return bool(schema.id and schema.name) and len(found.content) == 14 + texts + len(schema.text)
