@@ -40,6 +40,7 @@ from crosscue.eval.runs.folder import (
     DetectorRow,
     DetectTimings,
     RunFolder,
+    Timings,
     account,
     clear,
     detecting_of,
@@ -48,6 +49,7 @@ from crosscue.eval.runs.folder import (
     reading_of,
     staged,
     write_manifest,
+    write_timings,
 )
 from crosscue.eval.runs.logs import input_of, is_simulated, log_names, log_rows
 from crosscue.eval.runs.tables.labelled import LabelledSink
@@ -174,7 +176,8 @@ def detect_into(
         )
         write_skipped(run, [reading.ledger], made.reading, timeline=reading.timeline)
         seconds = time.monotonic() - began
-        manifest = _manifest(reading, choices, runner.counts, tables, made, seconds)
+        write_timings(run, _timings(seconds, runner.counts))
+        manifest = _manifest(reading, choices, runner.counts, tables, made)
         write_manifest(run, manifest)
     return DetectOutcome(
         run,
@@ -269,7 +272,6 @@ def _manifest(
     counts: Counts,
     tables: _Tables,
     made: Account,
-    seconds: float,
 ) -> DetectManifest:
     """Return the manifest of the detect stage."""
     extractor, vehicle = reading.extractor, reading.vehicle
@@ -286,9 +288,6 @@ def _manifest(
         account=made,
         counts=DetectCounts(
             frames=counts.frames,
-            decoded=counts.decoded,
-            ran=counts.ran,
-            from_cache=counts.from_cache,
             objects=tables.objects,
             cues=tables.cue_frames,
         ),
@@ -299,8 +298,15 @@ def _manifest(
             *_without_masks(tables.boxes_only, vehicle),
             *tables.notices,
         ),
-        timings=DetectTimings(seconds=seconds),
     )
+
+
+def _timings(seconds: float, counts: Counts) -> Timings:
+    """Return the wall time of the detect stage and how much of its work the cache has saved."""
+    detect = DetectTimings(
+        seconds=seconds, decoded=counts.decoded, ran=counts.ran, from_cache=counts.from_cache
+    )
+    return Timings(seconds=seconds, detect=detect)
 
 
 def _declared(topic: Topic, selection: Selection) -> int | None:

@@ -23,18 +23,19 @@ from crosscue.eval.runs.folder import (
     DetectManifest,
     EstimateCounts,
     EstimateManifest,
-    EstimateTimings,
     LandmarksUsed,
     LogRow,
     PoseSummary,
     RunFolder,
     SceneSummary,
+    Timings,
     account,
     candidate_rows,
     joined_accounts,
     part_of,
     reading_of,
     write_manifest,
+    write_timings,
 )
 from crosscue.eval.runs.logs import log_names, log_rows, relative
 from crosscue.eval.runs.tables import measurements
@@ -121,8 +122,10 @@ def estimate_into(
     detect_s = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began + detect_s
     rows = _hashed(logs, run, found) if reported is None else tuple(reported)
-    timings = EstimateTimings(seconds=seconds, detect_seconds=detect_s)
-    write_manifest(run, _manifest(run, reading, results, rows, timings))
+    detecting = None if found is None else run.timings()
+    detect = None if detecting is None else detecting.detect
+    write_timings(run, Timings(seconds=seconds, detect=detect))
+    write_manifest(run, _manifest(run, reading, results, rows))
     return Outcome(
         run,
         reading.ledgers,
@@ -216,7 +219,6 @@ def _manifest(
     reading: _Reading,
     results: _Results,
     rows: tuple[LogRow, ...],
-    timings: EstimateTimings,
 ) -> EstimateManifest:
     """Return the manifest of the run."""
     tally, scene, landmarks = results.tally, results.scene, reading.landmarks
@@ -237,7 +239,6 @@ def _manifest(
         ),
         scene=None if scene is None else scene_summary(scene),
         detect=reading.found,
-        timings=timings,
     )
 
 

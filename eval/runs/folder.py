@@ -57,7 +57,6 @@ from .manifest import (
     DriveManifest,
     EstimateCounts,
     EstimateManifest,
-    EstimateTimings,
     LandmarksUsed,
     LogRow,
     Manifest,
@@ -68,6 +67,7 @@ from .manifest import (
     PoseSummary,
     SceneSummary,
     TimeSegments,
+    Timings,
     json_schema,
     parse_manifest,
     part_of,
@@ -83,6 +83,7 @@ __all__ = [
     "OWN_FRAME",
     "STAGED",
     "TAGS",
+    "TIMINGS",
     "UNATTRIBUTED",
     "Account",
     "ApproachRow",
@@ -95,7 +96,6 @@ __all__ = [
     "DriveManifest",
     "EstimateCounts",
     "EstimateManifest",
-    "EstimateTimings",
     "LandmarksUsed",
     "Line",
     "LogRow",
@@ -110,6 +110,7 @@ __all__ = [
     "SummedAccount",
     "TableFolder",
     "TimeSegments",
+    "Timings",
     "account",
     "account_lines",
     "candidate_lines",
@@ -133,6 +134,7 @@ __all__ = [
     "summed",
     "write_input",
     "write_manifest",
+    "write_timings",
 ]
 
 MANIFEST: Final = "manifest.json"
@@ -144,6 +146,8 @@ FAILURE: Final = "failure.log"
 MAX_MANIFEST_BYTES: Final = 256 << 20
 TAGS: Final = "tags.json"
 """The user's tags of a run, see ``tags``; they are kept when the run is made again."""
+TIMINGS: Final = "timings.json"
+"""What took how long; a run without this file is complete."""
 STAGED: Final = ".new"
 """Folder inside a run with the files that will replace it when they are complete."""
 
@@ -187,6 +191,14 @@ class RunFolder(TableFolder):
             raise UnreadableRunError(
                 f"{path}: unreadable ({error}); run crosscue replay again"
             ) from None
+
+    def timings(self) -> Timings | None:
+        """Read how long the run took; None if that is missing, damaged or of another version."""
+        try:
+            content = read_at_most(self.file(TIMINGS), MAX_MANIFEST_BYTES)
+            return None if content is None else Timings.model_validate_json(content)
+        except (OSError, ValueError):
+            return None
 
     def drive_manifest(self) -> DriveManifest:
         """Read the manifest of a run of one drive.
@@ -495,6 +507,11 @@ def _started(pid: int) -> str:
 def write_manifest(run: RunFolder, content: Manifest) -> None:
     """Write the manifest; call it last, because a folder with a manifest is a finished run."""
     write_text(run.file(MANIFEST), strict_json(content.as_json()) + "\n")
+
+
+def write_timings(run: RunFolder, content: Timings) -> None:
+    """Write ``timings.json``; the manifest has no times, so that the same input has the same."""
+    write_text(run.file(TIMINGS), strict_json(content.as_json()) + "\n")
 
 
 def write_input(run: RunFolder, content: Mapping[str, object]) -> None:

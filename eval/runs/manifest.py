@@ -26,7 +26,7 @@ from .account import Account, SummedAccount
 from .candidates import CandidateRow
 from .record import Record
 
-FORMAT_VERSION: Final = 6
+FORMAT_VERSION: Final = 7
 LINE: Final = 100
 """Max characters of a printed field."""
 OWN_FRAME: Final = "no start heading and no compass: the map's x axis points where the car did"
@@ -142,20 +142,10 @@ class DetectCounts(Record):
     """Numbers of frames, detections and cues."""
 
     frames: int
-    decoded: int
-    ran: dict[str, int]
-    """Number of frames by detector."""
-    from_cache: dict[str, int]
     objects: dict[str, int]
     """Number of detections by detector and label."""
     cues: dict[str, int]
     """Number of frames in which each cue was positive."""
-
-
-class DetectTimings(Record):
-    """Wall time of the detect stage."""
-
-    seconds: float
 
 
 class EstimateCounts(Record):
@@ -215,15 +205,8 @@ class SceneSummary(Record):
     """Candidates of each cue's range by outcome."""
 
 
-class EstimateTimings(Record):
-    """Wall time of the estimate stage."""
-
-    seconds: float
-    detect_seconds: float
-
-
 class _Versioned(Record):
-    format_version: Literal[6] = FORMAT_VERSION
+    format_version: Literal[7] = FORMAT_VERSION
     versions: dict[str, str]
     """Versions of crosscue, Python and the libraries that results depend on."""
 
@@ -266,7 +249,6 @@ class DetectManifest(_Drive):
     """Index in ``logs`` of the camera's log, from 0."""
     detectors: tuple[DetectorRow, ...]
     counts: DetectCounts
-    timings: DetectTimings
 
     @property
     def detected(self) -> DetectManifest | None:
@@ -286,7 +268,6 @@ class EstimateManifest(_Drive):
     scene: SceneSummary | None
     detect: DetectManifest | None
     """The detect part; None if no detector ran."""
-    timings: EstimateTimings
 
     @property
     def detected(self) -> DetectManifest | None:
@@ -318,7 +299,7 @@ class MergedDrive(Record):
 class MergedManifest(Record):
     """Many drives as one folder of tables."""
 
-    format_version: Literal[6] = FORMAT_VERSION
+    format_version: Literal[7] = FORMAT_VERSION
     stage: Literal["merged"] = "merged"
     tables: tuple[str, ...]
     drives: tuple[MergedDrive, ...]
@@ -342,6 +323,26 @@ class DecodeManifest(_Versioned):
     settings: Settings
     account: Account
     time: TimeSegments
+
+
+class DetectTimings(Record):
+    """Wall time and work of the detect stage, which depend on the detection cache."""
+
+    seconds: float
+    decoded: int
+    """Number of frames whose pictures were decoded."""
+    ran: dict[str, int]
+    """Number of frames by detector."""
+    from_cache: dict[str, int]
+
+
+class Timings(Record):
+    """Content of ``timings.json``: what differs between runs of the same input."""
+
+    seconds: float
+    """Wall time of the command that finished the run."""
+    detect: DetectTimings | None = None
+    """The detect stage, which may have run earlier; None if no detector ran."""
 
 
 DriveManifest: TypeAlias = DetectManifest | EstimateManifest

@@ -15,7 +15,6 @@ import pyarrow as pa
 from crosscue.eval.batch.jobs import Job
 from crosscue.eval.runs.account import LogAccount, account
 from crosscue.eval.runs.folder import clear, create, locked, write_manifest
-from crosscue.eval.runs.manifest import EstimateTimings
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.replay.base import LogFormatError
 from crosscue.replay.errors import LossWarning
@@ -59,10 +58,7 @@ def letters(job: Job) -> Letters:
             _obey(word, log)
         write_manifest(
             run,
-            estimated(
-                account=account([_account(log, word)]),
-                timings=EstimateTimings(seconds=time.monotonic(), detect_seconds=0.0),
-            ),
+            estimated(account=account([_account(log, word)])),
         )
     status = 3 if word == "loss" else 0
     return Letters(len(word), status, os.getpid(), os.environ.get("OMP_NUM_THREADS", ""))

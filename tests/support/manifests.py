@@ -10,10 +10,8 @@ from crosscue.eval.runs.manifest import (
     DetectCounts,
     DetectManifest,
     DetectorRow,
-    DetectTimings,
     EstimateCounts,
     EstimateManifest,
-    EstimateTimings,
     Part,
     PoseSummary,
     TimeSegments,
@@ -48,7 +46,6 @@ def estimated(**changes: Any) -> EstimateManifest:
         "pose": PoseSummary(rows=0, travelled_m=0.0, major_axis_m=None),
         "scene": None,
         "detect": None,
-        "timings": EstimateTimings(seconds=1.0, detect_seconds=0.0),
     }
     return EstimateManifest(**{**content, **changes})
 
@@ -71,8 +68,7 @@ def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectMa
             )
             for name, role in detectors.items()
         ),
-        "counts": DetectCounts(frames=0, decoded=0, ran={}, from_cache={}, objects={}, cues={}),
-        "timings": DetectTimings(seconds=1.0),
+        "counts": DetectCounts(frames=0, objects={}, cues={}),
     }
     return DetectManifest(**{**content, **changes})
 

@@ -6,12 +6,14 @@ import hashlib
 import json
 from pathlib import Path
 
-NO_RESULTS = {".drives", "failure.log"}
+from crosscue.eval.runs.folder import TIMINGS
+
+NO_RESULTS = {".drives", "failure.log", TIMINGS}
 """Files that depend on the time and place of processing."""
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """Map relative names to hashes; manifests are hashed without timings and paths of logs."""
+    """Map relative names to hashes, without the paths of logs, which depend on the run's place."""
     return {
         path.relative_to(folder).as_posix(): _hash(path)
         for path in sorted(folder.rglob("*"))
@@ -22,11 +24,11 @@ def tree(folder: Path) -> dict[str, str]:
 def _hash(path: Path) -> str:
     content = path.read_bytes()
     if path.name == "manifest.json":
-        content = json.dumps(_without_timings(json.loads(content)), sort_keys=True).encode()
+        content = json.dumps(_without_paths(json.loads(content)), sort_keys=True).encode()
     return hashlib.sha256(content).hexdigest()
 
 
-def _without_timings(value: object) -> object:
+def _without_paths(value: object) -> object:
     if isinstance(value, dict):
-        return {k: _without_timings(v) for k, v in value.items() if k not in ("timings", "path")}
-    return [_without_timings(one) for one in value] if isinstance(value, list) else value
+        return {k: _without_paths(v) for k, v in value.items() if k != "path"}
+    return [_without_paths(one) for one in value] if isinstance(value, list) else value

@@ -63,7 +63,7 @@ INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
         "start_ns": Column("BIGINT", "drive time at which the drive starts"),
         "end_ns": Column("BIGINT", "drive time at which it ends"),
         "made_at": Column("TIMESTAMP", "when the run was finished, UTC"),
-        "seconds": Column("DOUBLE", "wall time of the run"),
+        "seconds": Column("DOUBLE", "wall time of the run; null without timings.json"),
         "travelled_m": Column("DOUBLE", "length of the track; null without estimate"),
         "frames": Column("BIGINT", "number of camera frames; null without detectors"),
         "approaches": Column("BIGINT", "number of approaches that the run found"),

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, TAGS
+from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, TAGS, TIMINGS
 from crosscue.replay.base import UnreadableRunError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ DEPTH: Final = 6
 """Max depth of runs below the searched folder, local or on a store."""
 SCORED: Final = "metrics.json"
 SCORE: Final = "score"
-BESIDE: Final = (TAGS, FAILURE)
+BESIDE: Final = (TAGS, FAILURE, TIMINGS)
 """Files of a run that are not tables."""
 
 Stamp: TypeAlias = tuple[int, int, int, int]
@@ -70,7 +70,7 @@ class LocalRuns:
             yield from _below(str(self.folder), "", DEPTH)
 
     def files(self, run: str) -> list[str]:
-        """Return the names of a run's tables, then of its score's tables, tags and failure log.
+        """Return the names of a run's tables, then of those of its score, and what is beside them.
 
         Raises:
             OSError: The folder cannot be listed.

@@ -16,11 +16,13 @@ from crosscue.eval.runs.folder import (
     FORMAT_VERSION,
     MANIFEST,
     TAGS,
+    TIMINGS,
     Account,
     LogRow,
     PoseSummary,
     SceneSummary,
     TimeSegments,
+    Timings,
 )
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tags import parse_tags
@@ -40,10 +42,6 @@ NOT_A_RUN: Final = frozenset({"merged", "decode"})
 class _Head(BaseModel):
     format_version: Any = None
     stage: str = ""
-
-
-class _Timings(BaseModel):
-    seconds: float
 
 
 class _Counts(BaseModel):
@@ -69,7 +67,6 @@ class _Manifest(BaseModel):
     time: TimeSegments
     account: Account
     notices: tuple[str, ...]
-    timings: _Timings
     pose: PoseSummary | None = None
     scene: SceneSummary | None = None
     detect: _Detect | None = None
@@ -97,7 +94,7 @@ def rows_of(
         found: The run.
         name: Name of its folder.
         head: Content of ``manifest.json``, or of a failed run's ``failure.log``.
-        files: Paths of its tables, its score's tables, tags and failure log, in its folder.
+        files: Paths of its tables, those of its score, and what is beside them.
         read: Function that reads one of these files.
 
     Raises:
@@ -123,7 +120,8 @@ def rows_of(
     failure = _failure(read(FAILURE)) if FAILURE in files else {}
     return RunRows(
         _run_row(found, name, manifest, detect, files, tags, results)
-        | {"error": failure.get("error")},
+        | {"error": failure.get("error")}
+        | {"seconds": _seconds(read(TIMINGS)) if TIMINGS in files else None},
         _approaches(run, manifest, results, tags),
         _dropped(run, manifest.account),
     )
@@ -180,7 +178,6 @@ def _run_row(
         "start_ns": segments[0].start_ns if segments else None,
         "end_ns": segments[-1].end_ns if segments else None,
         "made_at": _made_at(found),
-        "seconds": manifest.timings.seconds,
         "travelled_m": None if manifest.pose is None else manifest.pose.travelled_m,
         "frames": None if detect is None else detect.counts.frames,
         "approaches": 0 if manifest.scene is None else len(manifest.scene.approaches),
@@ -197,6 +194,14 @@ def _run_row(
 def _made_at(found: Found) -> datetime | None:
     made_us = found.made_ns // 1000
     return _EPOCH + timedelta(microseconds=made_us) if made_us else None
+
+
+def _seconds(content: bytes) -> float | None:
+    """Return the wall time of a run; None if its record is damaged, which no result depends on."""
+    try:
+        return Timings.model_validate_json(content).seconds
+    except ValidationError:
+        return None
 
 
 def _failure(content: bytes) -> dict[str, str]:

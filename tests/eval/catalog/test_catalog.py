@@ -8,7 +8,14 @@ import pytest
 import crosscue
 from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.runs.account import Account, Line
-from crosscue.eval.runs.folder import MANIFEST, RunFolder, create
+from crosscue.eval.runs.folder import (
+    MANIFEST,
+    TIMINGS,
+    RunFolder,
+    Timings,
+    create,
+    write_timings,
+)
 from crosscue.replay.base import UnreadableRunError, UsageError
 from support.catalog_runs import add_run, approach_row, runs_below, scene
 
@@ -162,19 +169,36 @@ def test_merged_run_is_not_counted_again(tmp_path: Path) -> None:
 def test_unreadable_runs_are_left_out_and_reported(tmp_path: Path) -> None:
     add_run(tmp_path / "good", "good")
     manifest = add_run(tmp_path / "other", "other").file(MANIFEST)
-    manifest.write_text(manifest.read_text().replace('"format_version": 6', '"format_version": 5'))
+    manifest.write_text(manifest.read_text().replace('"format_version": 7', '"format_version": 6'))
     add_run(tmp_path / "half", "half").file(MANIFEST).unlink()
-    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 6, "stage"')
+    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 7, "stage"')
 
     found = crosscue.catalog(tmp_path)
 
     assert [path.name for path in found.runs] == ["good"]
     assert found.left_out.keys() == {"other", "half", "torn"}
-    assert "format 5, this crosscue reads 6; replay again" in found.left_out["other"]
+    assert "format 6, this crosscue reads 7; replay again" in found.left_out["other"]
     assert "cut short" in found.left_out["half"]
     assert "unreadable" in found.left_out["torn"]
     listed = found.query("select run, reason from left_out").to_pylist()
     assert {row["run"]: row["reason"] for row in listed} == found.left_out
+
+
+def test_wall_time_comes_from_timings_file_which_may_be_missing_or_damaged(tmp_path: Path) -> None:
+    for name in ("timed", "without", "torn"):
+        write_timings(add_run(tmp_path / name, name), Timings(seconds=2.5))
+    (tmp_path / "without" / TIMINGS).unlink()
+    (tmp_path / "torn" / TIMINGS).write_text('{"seconds"')
+
+    found = crosscue.catalog(tmp_path)
+
+    rows = found.query("select run, seconds, exit_status from runs").to_pylist()
+    assert {row["run"]: row["seconds"] for row in rows} == {
+        "timed": 2.5,
+        "without": None,
+        "torn": None,
+    }
+    assert not found.left_out
 
 
 def test_damaged_table_is_left_out_but_its_run_is_kept(tmp_path: Path) -> None:

@@ -1,0 +1,149 @@
+"""The same input yields the same bytes, whatever the circumstances of the process that wrote them.
+
+Each test compares whole run folders, file by file. Only ``NOT_COMPARED`` is left out.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from crosscue.eval.runs.folder import LOCK, MANIFEST, TIMINGS, RunFolder
+from support.gap_drive import Clock, write_drive
+
+pytestmark = pytest.mark.slow
+NOT_COMPARED: Final[Mapping[str, str]] = {
+    TIMINGS: "how long it took, and how much was read from the cache",
+    LOCK: "names the process that is writing; gone when the run is finished",
+}
+DRIVES: Final = ("A", "B")
+HERE: Final = {"PYTHONHASHSEED": "1", "TZ": "UTC", "LC_ALL": "C.UTF-8", "COLUMNS": "80"}
+"""Circumstances of the expected files."""
+ELSEWHERE: Final = {"PYTHONHASHSEED": "2", "TZ": "Asia/Kolkata", "LC_ALL": "C", "COLUMNS": "190"}
+VARIED: Final[Mapping[str, tuple[Mapping[str, str], str, bool]]] = {
+    "other hash seed, time zone, locale and terminal": (ELSEWHERE, "1", False),
+    "two drives in parallel, warm cache": (HERE, "2", True),
+}
+"""Circumstances, number of workers, and whether the detection cache is filled already."""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short drives, each in a folder of its own with its vehicle file."""
+    folder = tmp_path_factory.mktemp("place")
+    for i, name in enumerate(DRIVES):
+        write_drive(folder / "drives" / name, Clock(), seconds=8 + 2 * i)
+        (folder / "drives" / name / "car.toml").rename(folder / "drives" / name / "vehicle.toml")
+    return folder
+
+
+def _lines(workers: str) -> list[list[str]]:
+    """Return the commands that write each kind of run folder, next to the folder of drives."""
+    log, truth = "../drives/A/drive.mcap", "../drives/A/truth.json"
+    vehicle = ["--vehicle", "../drives/A/vehicle.toml"]
+    return [
+        ["replay", "../drives", "-o", "batch", "--workers", workers, "--draw", "2"],
+        ["detect", log, "-o", "detect", *vehicle],
+        ["replay", "../drives/A", "-o", "replay"],
+        ["replay", "../drives/A", "-o", "estimate"],
+        ["estimate", "estimate"],
+        ["decode", log, "-o", "decode", *vehicle],
+        ["merge", "batch", "-o", "merge"],
+        ["score", "replay", "--truth", truth],
+    ]
+
+
+def _run(folder: Path, lines: Sequence[Sequence[str]], environment: Mapping[str, str]) -> None:
+    """Run command lines in one new process, in ``folder``; each must succeed."""
+    folder.mkdir(exist_ok=True)
+    script = (
+        "import json, sys\nfrom crosscue.eval.cli import run\nif __name__ == '__main__':\n"
+        "    for line in json.loads(sys.argv[1]):\n"
+        "        status = run([*line, '-q'])\n        assert status == 0, (line, status)\n"
+    )
+    given = {**os.environ, **HERE, **environment, "XDG_CACHE_HOME": str(folder.parent / "cache")}
+    given["PYTHONPATH"] = os.pathsep.join(sys.path)
+    subprocess.run(
+        [sys.executable, "-c", script, json.dumps(lines)], env=given, cwd=folder, check=True
+    )
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    """Return the content of each file below a folder by its name."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in NOT_COMPARED
+    }
+
+
+def _different(there: Path, here: Path) -> list[str]:
+    """Return the names of files that are missing or different."""
+    a, b = _files(there), _files(here)
+    return sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
+
+
+@pytest.fixture(scope="module")
+def expected(place: Path) -> Path:
+    """Run folders made by each command, with an empty detection cache."""
+    shutil.rmtree(place / "cache", ignore_errors=True)
+    _run(place / "first", _lines("1"), {})
+    return place / "first"
+
+
+@pytest.mark.parametrize("what", VARIED)
+def test_run_folders_have_same_bytes_in_other_circumstances(
+    place: Path, expected: Path, what: str
+) -> None:
+    environment, workers, is_warm = VARIED[what]
+    if not is_warm:
+        shutil.rmtree(place / "cache")
+    _run(place / "again", _lines(workers), environment)
+    different = _different(expected, place / "again")
+    shutil.rmtree(place / "again")
+
+    assert not different
+
+
+def test_resumed_run_has_same_bytes(place: Path, expected: Path) -> None:
+    log, vehicle = "../drives/A/drive.mcap", "../drives/A/vehicle.toml"
+    resume = ["replay", log, "--vehicle", vehicle, "--resume", "-o"]
+    shutil.copytree(expected / "detect", place / "resumed" / "after_detect")
+    shutil.copytree(expected / "replay", place / "resumed" / "without_manifest")
+    shutil.rmtree(place / "resumed" / "without_manifest" / "score")
+    (place / "resumed" / "without_manifest" / MANIFEST).unlink()
+    names = ("after_detect", "without_manifest")
+    _run(place / "resumed", [[*resume, name] for name in names], {})
+    shutil.rmtree(expected / "replay" / "score")
+
+    for name in names:
+        assert not _different(expected / "replay", place / "resumed" / name)
+    assert not _different(expected / "replay", expected / "estimate")
+
+
+def test_manifest_has_no_times_and_timings_file_has_them(expected: Path) -> None:
+    found = {path.parent.name for path in expected.rglob(TIMINGS)}
+    for path in expected.rglob(MANIFEST):
+        assert not {"timings", "ran", "from_cache", "decoded"} & _keys(json.loads(path.read_text()))
+    timed = RunFolder(expected / "estimate").timings()
+
+    assert {"detect", "replay", "estimate"} < found
+    assert timed is not None
+    assert timed.seconds > 0.0
+    assert timed.detect is not None
+    assert timed.detect.from_cache == {"grey": 80}
+
+
+def _keys(tree: object) -> set[str]:
+    """Return all names of fields in a JSON document."""
+    if isinstance(tree, dict):
+        return set(tree).union(*map(_keys, tree.values()))
+    return set().union(*map(_keys, tree)) if isinstance(tree, list) else set()
