@@ -58,10 +58,10 @@ def build() -> Bright:
 
 
 def contents(run: Path) -> dict[str, str]:
-    """Return the hash of each file by its name, except of the manifest, which has timings."""
+    """Return the hash of each file by its name, except of its timings."""
     found = {}
     for path in sorted(run.rglob("*")):
-        if path.is_file() and path.name != "manifest.json" and not path.name.startswith("."):
+        if path.is_file() and path.name != "timings.json" and not path.name.startswith("."):
             found[str(path.relative_to(run))] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
 
