@@ -14,7 +14,6 @@ from crosscue.fusion.belief import published_message_model
 from crosscue.fusion.calibrated import CalibratedMessageModel, cue_messages_of
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.fit.message_fit import fit_messages, log_odds_of
-from crosscue.fusion.independence import effective_sample_fraction
 from crosscue.fusion.situation import Situation
 from crosscue.replay.base import VehicleError
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
@@ -44,27 +43,95 @@ def road(count: int, moved_m: float = 1.0) -> Situation:
     return situation({"road_left": count}, moved_m=moved_m)
 
 
-def test_first_observation_sends_full_log_likelihood_ratio() -> None:
-    assert left_messages(road(1)) == [pytest.approx(math.log(P / Q))]
-    assert left_messages(road(0)) == [pytest.approx(math.log((1 - P) / (1 - Q)))]
+SIDE, AWAY = math.log(6.0), math.log(4.0 / 9.0)
+"""Messages of a first positive and negative observation: 0.6 / 0.1, and (1 - 0.6) / (1 - 0.1)."""
 
 
-def test_repeated_observation_sends_markov_chain_ratio() -> None:
-    rho = math.exp(-1.0 / FADE)
-
-    _, stays = left_messages(road(1), road(1))
-    _, stays_away = left_messages(road(0), road(0))
-
-    assert stays == pytest.approx(math.log((P + (1 - P) * rho) / (Q + (1 - Q) * rho)))
-    assert stays_away == pytest.approx(math.log((1 - P * (1 - rho)) / (1 - Q * (1 - rho))))
+def fades(many: float) -> float:
+    """Return a distance of several fading lengths of the cue ``road_left``."""
+    return many * FADE
 
 
-def test_appearing_cue_sends_full_ratio_after_short_distance() -> None:
-    assert left_messages(road(0), road(1, 0.1))[1] == pytest.approx(math.log(P / Q))
+def test_messages_are_ratios_of_markov_chains() -> None:
+    """After a distance with a correlation of 1/3, half of a frame is independent.
+
+    It stays positive at 0.6 + 0.4 / 3 = 11/15 with the feature and at 0.1 + 0.9 / 3 = 2/5 without
+    it: 11/6. It stays negative at 1 - 0.6 * 2/3 = 3/5 and 1 - 0.1 * 2/3 = 14/15: 9/14. A change
+    counts fully at first, and by half this soon after the last change in the same direction.
+    """
+    third = fades(math.log(3.0))
+    stays = left_messages(road(1), road(1, third))
+    away = left_messages(road(0), road(0, third))
+    flickers = left_messages(*(road(n, third / 2.0) for n in (1, 0, 1, 0)))
+
+    assert stays == pytest.approx([SIDE, math.log(11 / 6)])
+    assert away == pytest.approx([AWAY, math.log(9 / 14)])
+    assert flickers == pytest.approx([SIDE, AWAY, 0.5 * SIDE, 0.5 * AWAY])
+    assert left_messages(road(0), road(1, 0.1))[1] == pytest.approx(SIDE)
+    assert left_messages(road(1), road(1, 500.0))[1] == pytest.approx(SIDE)
 
 
-def test_observations_far_apart_are_independent() -> None:
-    assert left_messages(road(1), road(1, 500.0))[1] == pytest.approx(math.log(P / Q))
+def test_time_replaces_distance_for_moving_objects() -> None:
+    """The fade is 2 s: a correlation of 1/3 after 2 log 3 s, in two steps of which one is silent.
+
+    Neither the distance nor a frame in which the cue was not evaluated counts.
+    """
+    traffic = {"cross_traffic_left": 1}
+    first, silent, again = left_messages(
+        *(
+            situation(counts, moved_m=100.0, passed_s=math.log(3.0))
+            for counts in (traffic, {}, traffic)
+        )
+    )
+
+    assert (first, silent, again) == pytest.approx((SIDE, 0.0, math.log(11 / 6)))
+
+
+def test_near_and_far_have_their_own_rates_and_published_messages() -> None:
+    """Far, 0.6 / 0.1 and exponent 1/2; near, 0.8 / 0.2 and 0.4 / 0.1 for two cues of one feature.
+
+    Where ``road_left`` has no rates for near, its published message counts: 0.77 / 0.23. A one-way
+    sign to the right excludes left; without rates, it sends 0.05 / 0.95 at any distance.
+    """
+
+    def rates(cue: str, near: bool, there: float, absent: float) -> Rates:
+        return Rates(cue=cue, feature="left", near=near, if_there=there, if_not=absent)
+
+    learned = Calibrated(
+        exponents={"left": 0.5},
+        rates=(
+            rates("parked_left", False, 0.6, 0.1),
+            rates("parked_left", True, 0.8, 0.2),
+            rates("cross_traffic_left", True, 0.4, 0.1),
+            rates("road_left", False, 0.5, 0.25),
+        ),
+    )
+    parked = {"parked_left": 1}
+    seen = {"far": 6.0, "near": 4.0}
+    for distance, ratio in seen.items():
+        at = situation(parked, near=distance == "near")
+        assert left_messages(at, learned=learned) == pytest.approx([0.5 * math.log(ratio)])
+    both = situation({**parked, "cross_traffic_left": 1}, near=True)
+    assert left_messages(both, learned=learned) == pytest.approx([0.5 * math.log(16.0)])
+    for near, ratio in ((False, 2.0), (True, 0.77 / 0.23)):
+        both = situation({"road_left": 1, "one_way_right": 1}, near=near)
+        expected = 0.5 * (math.log(ratio) + math.log(0.05 / 0.95))
+        assert left_messages(both, learned=learned) == pytest.approx([expected])
+
+
+def test_published_message_counts_new_objects_fully_and_others_by_independence() -> None:
+    """The default fade is 10 m: after 10 log 3 m, half. A new identity counts as the first."""
+    model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, LEARNED))
+    moved_m = 10.0 * math.log(3.0)
+    signs = [
+        situation({"stop_sign": 1}, objects={"stop_sign": ids}, moved_m=moved_m)
+        for ids in ((1,), (1,), (2,), (1,))
+    ]
+
+    sent = [model(one)[0] for one in signs]
+
+    published = math.log(0.97 / 0.03)
+    assert sent == pytest.approx([published, 0.5 * published, published, 0.5 * published])
 
 
 @settings(max_examples=40, deadline=None)
@@ -101,36 +168,6 @@ def test_without_identities_only_highest_count_adds_new_objects() -> None:
 
     assert one == two == pytest.approx(math.log(P / Q))
     assert one_again == two_again == 0.0
-
-
-def test_cross_traffic_counts_again_after_time_while_car_stands() -> None:
-    def traffic(passed_s: float) -> Situation:
-        return situation({"cross_traffic_left": 1}, moved_m=0.0, passed_s=passed_s)
-
-    _, soon, late = left_messages(traffic(0.0), traffic(0.1), traffic(60.0))
-
-    assert 0.0 < soon < 0.2
-    assert late == pytest.approx(math.log(P / Q))
-
-
-def test_unlearned_edge_sends_discounted_published_message() -> None:
-    model = CalibratedMessageModel(len(GRAPH.features), cue_messages_of(GRAPH, LEARNED))
-    sign = situation({"stop_sign": 1}, moved_m=2.0)
-    published = math.log(0.97 / 0.03)
-
-    first, second = (model(sign)[0] for _ in range(2))
-
-    assert first == pytest.approx(published)
-    assert second == pytest.approx(published * effective_sample_fraction(2.0 / 10.0))
-
-
-def test_feature_exponent_scales_all_its_messages() -> None:
-    half = LEARNED.model_copy(update={"exponents": {"left": 0.5}})
-    observations = (road(1), road(1), situation({"one_way_right": 1}))
-
-    assert left_messages(*observations, learned=half) == pytest.approx(
-        [0.5 * x for x in left_messages(*observations)]
-    )
 
 
 def test_gate_applies_to_learned_messages() -> None:

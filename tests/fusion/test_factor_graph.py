@@ -29,7 +29,7 @@ from crosscue.fusion.factor_graph import (
     probability,
 )
 from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.fusion import Fusion, usual_cues
+from crosscue.replay.vehicle.fusion import Fade, Fusion, usual_cues
 from support.fusion import graphs, graphs_with_counts, other_side, situation
 
 FEW_EXAMPLES = settings(max_examples=60, deadline=None)
@@ -175,10 +175,20 @@ def test_probability_inverts_log_odds(p: float) -> None:
     assert probability(log_odds(p)) == pytest.approx(p, rel=1e-9)
 
 
+def test_log_odds_of_three_quarters_are_log_three() -> None:
+    assert log_odds(0.75) == pytest.approx(math.log(3.0))
+    assert probability(math.log(3.0)) == pytest.approx(0.75)
+
+
 @pytest.mark.parametrize("bad", [0.0, 1.0, -0.1, math.nan])
 def test_log_odds_refuse_probability_outside_open_interval(bad: float) -> None:
-    with pytest.raises(ValueError, match="expected inside"):
+    with pytest.raises(ValueError, match=rf"^probability: expected inside \(0, 1\), got {bad}$"):
         log_odds(bad)
+
+
+def test_probability_is_limited_at_log_odds_of_thirty() -> None:
+    assert probability(1e9) == pytest.approx(1.0 / (1.0 + math.exp(-30.0)), abs=1e-16)
+    assert probability(-1e9) == pytest.approx(1.0 / (1.0 + math.exp(30.0)), abs=1e-16)
 
 
 @FEW_EXAMPLES
@@ -240,17 +250,31 @@ def test_only_four_cues_send_messages_before_presence_is_established() -> None:
 
 
 @pytest.mark.parametrize(
-    ("odds", "expected"),
-    [((2.3, 0, 0, 0), True), ((0, 2.3, 0, 0), True), ((0, 0, 2.3, 0), True), ((0, 0, 0, 9), False)],
+    ("odds", "was", "withdrawn", "expected"),
+    [
+        # Established above 0.9; log(0.9 / 0.1) is 2.1972, and equality is not above.
+        ((log_odds(0.9), 0, 0, 0), False, None, False),
+        ((2.2, 0, 0, 0), False, None, True),
+        ((0, 2.2, 0, 0), False, None, True),
+        ((0, 0, 2.2, 0), False, None, True),
+        ((0, 0, 0, 9), False, None, False),
+        # Never withdrawn by default; else at 0.5 or below, that is at log odds of 0.
+        ((-5, -5, -5, -5), True, None, True),
+        ((0.1, -5, -5, 9), True, 0.5, True),
+        ((0, 0, 0, 9), True, 0.5, False),
+        ((0.1, 0, 0, 0), False, 0.5, False),
+    ],
 )
 def test_presence_is_established_by_intersection_left_or_right(
-    odds: tuple[float, float, float, float], expected: bool
+    odds: tuple[float, float, float, float], was: bool, withdrawn: float | None, expected: bool
 ) -> None:
-    assert establish(Belief(odds), DEFAULT_GRAPH, 0.9).is_established is expected
+    after = establish(Belief(odds, was), DEFAULT_GRAPH, 0.9, withdrawn)
+
+    assert after == Belief(odds, expected)
 
 
-def test_established_presence_is_not_withdrawn() -> None:
-    assert establish(Belief((-5.0, -5.0, -5.0, -5.0), True), DEFAULT_GRAPH, 0.9).is_established
+def test_messages_add_to_log_odds_and_leave_presence() -> None:
+    assert multiply(Belief((1.0, -2.0), True), (0.5, 0.25)) == Belief((1.5, -1.75), True)
 
 
 def test_default_graph_has_three_components_as_published() -> None:
@@ -263,6 +287,31 @@ def test_default_graph_has_three_components_as_published() -> None:
     assert sorted(map(sorted, parts)) == [["intersection"], ["left", "right"], ["straight"]]
 
 
+def test_graph_is_that_of_the_vehicle_file_without_unused_entries() -> None:
+    cue = {"precision": 0.8, "supports": ("left", "up"), "excludes": ("right",)}
+    options = {"can_start": True, "per_detection": True, "absence_counts": True}
+    persistence = {"seen_frames": 2, "of_frames": 7, "within_m": 30.0, "fade": {"time_s": 4.0}}
+    settings = Fusion.model_validate(
+        {
+            "features": {"up": {"prior": 0.2, "establishes": True}, "left": {"use": False}},
+            "cues": {"zebra": cue | options | persistence, "stop_sign": {"use": False}},
+        }
+    )
+
+    graph = graph_of(settings)
+
+    names = ("intersection", "right", "straight", "up")
+    assert graph.feature_names == names
+    assert graph.features[-1] == Feature("up", 0.2, True)
+    assert {node.name for node in graph.cues} == {*CUES, "zebra"} - {"stop_sign"}
+    fade = Fade(time_s=4.0)
+    assert graph.cues[-1] == CueNode("zebra", 0.8, True, True, True, 2, 7, 30.0, fade)
+    assert [edge for edge in graph.edges if edge.cue == "zebra"] == [
+        Edge("zebra", "up"),
+        Edge("zebra", "right", False),
+    ]
+
+
 def test_default_graph_has_every_cue_of_cue_table() -> None:
     assert [*usual_cues()] == [*CUES]
 
@@ -272,23 +321,31 @@ def test_graph_without_cue_drops_only_that_cue() -> None:
 
     assert {c.name for c in DEFAULT_GRAPH.cues} - {c.name for c in less.cues} == {"stop_sign"}
     assert probabilities_after(less, [{"stop_sign": 1, "road_left": 1}])["intersection"] == 0.5
-    with pytest.raises(ValueError, match="no cue 'stop_sgn'; there are: stop_sign"):
+    there_are = ", ".join(node.name for node in DEFAULT_GRAPH.cues)
+    with pytest.raises(ValueError, match=f"^no cue 'stop_sgn'; there are: {there_are}$"):
         DEFAULT_GRAPH.without("stop_sgn")
 
 
 @pytest.mark.parametrize(
     ("edges", "match"),
     [
-        ((Edge("z", "nowhere"),), "no feature 'nowhere'; there are: f"),
-        ((Edge("nobody", "f"),), "no cue 'nobody'; there are: z"),
-        ((Edge("z", "f"), Edge("z", "f", False)), "joined twice"),
+        ((Edge("z", "nowhere"),), "no feature 'nowhere'; there are: f, g"),
+        ((Edge("nobody", "f"),), "no cue 'nobody'; there are: z, y"),
+        (
+            (Edge("z", "f"), Edge("z", "f", False)),
+            "edges: a cue and a feature are joined twice; keep one edge",
+        ),
     ],
 )
 def test_invalid_edges_are_refused(edges: tuple[Edge, ...], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        FactorGraph((Feature("f"),), (CueNode("z", 0.9),), edges)
+    with pytest.raises(ValueError, match=f"^{match}$"):
+        FactorGraph((Feature("f"), Feature("g")), (CueNode("z", 0.9), CueNode("y", 0.9)), edges)
 
 
-def test_duplicate_feature_name_is_refused() -> None:
-    with pytest.raises(ValueError, match="feature 'f' appears twice"):
-        FactorGraph((Feature("f"), Feature("f")), (), ())
+@pytest.mark.parametrize(
+    ("features", "cues", "match"),
+    [("gfgf", "", "feature 'f'"), ("f", "zyzy", "cue 'y'"), ("ff", "zz", "feature 'f'")],
+)
+def test_duplicate_names_are_refused(features: str, cues: str, match: str) -> None:
+    with pytest.raises(ValueError, match=f"^{match} appears twice; name each once$"):
+        FactorGraph(tuple(map(Feature, features)), tuple(CueNode(name, 0.9) for name in cues), ())

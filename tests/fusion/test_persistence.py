@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -11,10 +13,18 @@ from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches, Step, message_models_of
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
-from crosscue.fusion.factor_graph import graph_of, log_odds
+from crosscue.fusion.factor_graph import (
+    CueNode,
+    Edge,
+    FactorGraph,
+    Feature,
+    graph_of,
+    log_odds,
+)
 from crosscue.fusion.intersection_range import Reference
-from crosscue.fusion.persistence import Persistence, PersistentMessageModel
-from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
+from crosscue.fusion.persistence import Confirmed, Persistence, PersistentMessageModel
+from crosscue.fusion.situation import Situation
+from crosscue.replay.vehicle.fusion import Fade, Fusion, RangeFilter
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
 from support.fusion import NONE_SEEN, SECOND_NS, situation
 
@@ -77,29 +87,104 @@ def test_cue_sends_no_message_until_seen_in_three_of_five_frames(positive: list[
     assert (max_deviation(steps) > 0.0) == enough
 
 
-@given(copies=st.integers(0, 50), seconds=st.floats(0.01, 10.0), cue=st.sampled_from(CUES))
-def test_copies_of_frame_send_zero_messages(copies: int, seconds: float, cue: str) -> None:
-    once, again = (PersistentMessageModel(GRAPH, FUSION.dissent) for _ in range(2))
-    first = situation({cue: 3}, passed_s=seconds)
-    copy = situation({cue: 3}, new_picture=False, passed_s=seconds)
+HAND_GRAPH = FactorGraph(
+    (Feature("left"), Feature("right")),
+    (
+        CueNode("road", 0.75, can_start=True, absence_counts=True, within_m=30.0),
+        CueNode("traffic", 0.75, fade=Fade(time_s=2.0)),
+        CueNode("arrow", 0.9, absence_counts=True, seen_frames=2, of_frames=3),
+    ),
+    (
+        Edge("road", "left"),
+        Edge("traffic", "left"),
+        Edge("arrow", "right"),
+        Edge("arrow", "left", False),
+    ),
+)
+"""Messages of log 3 and log 9; distances fade over 10 m and times over 2 s."""
+LOG_3 = math.log(3.0)
+THIRD = 10.0 * LOG_3
+"""Distance with a correlation of 1/3, after which a frame counts as half an independent one."""
 
-    messages = once(first)
 
-    assert again(first) == messages
-    for _ in range(copies):
-        assert again(copy) == [0.0] * len(messages)
+def hand_messages(*situations: Situation) -> list[Any]:
+    """Return the messages to left and right, with a dissent of 1/4."""
+    model = PersistentMessageModel(HAND_GRAPH, 0.25)
+    return [pytest.approx([one / LOG_3 for one in model(situation)]) for situation in situations]
 
 
-@given(copies=st.integers(1, 20))
-def test_copies_of_frame_do_not_confirm_cue(copies: int) -> None:
-    persistence = Persistence(GRAPH)
+def test_frames_count_as_fraction_of_independent_ones_and_dissent_likewise() -> None:
+    """After two such distances, (1 - 1/9) / (1 + 1/9) = 4/5; positives and dissent are apart.
 
-    persistence({"stop_sign": 1})
-    for _ in range(copies):
-        observed = persistence({"stop_sign": 1}, is_new_picture=False)
+    A repeated picture and a frame far away or without the cue send nothing, but their distance
+    counts.
+    """
 
-    assert observed.silent == {"stop_sign": "seen in 1 of 3 frames needed"}
-    assert observed.counts == {}
+    def road(count: int, near: bool = True) -> Situation:
+        return situation({"road": count}, near=near, moved_m=THIRD)
+
+    repeated = situation({"road": 1}, new_picture=False, moved_m=THIRD)
+    unseen = situation({}, moved_m=THIRD)
+    assert hand_messages(road(1), road(1), road(0), road(1), road(0)) == [
+        [1.0, 0.0],
+        [0.5, 0.0],
+        [-1.0, 0.0],
+        [0.8, 0.0],
+        [-0.8, 0.0],
+    ]
+    assert hand_messages(road(1), repeated, road(1)) == [[1.0, 0.0], [0.0, 0.0], [0.8, 0.0]]
+    assert hand_messages(road(1), unseen, road(1)) == [[1.0, 0.0], [0.0, 0.0], [0.8, 0.0]]
+    assert hand_messages(road(0), road(0, False), road(0)) == [
+        [-1.0, 0.0],
+        [0.0, 0.0],
+        [-0.8, 0.0],
+    ]
+
+
+def test_moving_objects_count_by_time() -> None:
+    """A correlation of 1/3 over 2 log 3 s; the distance does not matter."""
+    traffic = [
+        situation({"traffic": 3}, moved_m=100.0, passed_s=LOG_3 * scale) for scale in (1, 2, 2)
+    ]
+
+    assert hand_messages(*traffic) == [[1.0, 0.0], [0.5, 0.0], [0.5, 0.0]]
+
+
+def test_messages_of_several_cues_add_and_only_direct_edges_dissent() -> None:
+    """9/10 is log 9 = 2 log 3, for right and against left."""
+    every = {"road": 1, "traffic": 1, "arrow": 1}
+
+    assert hand_messages(situation(every)) == [[0.0, 2.0]]
+    assert hand_messages(situation(dict.fromkeys(every, 0), near=True)) == [[-1.0, -1.0]]
+
+
+def test_cue_without_message_reports_reason_of_newest_frame() -> None:
+    model = PersistentMessageModel(HAND_GRAPH, 0.25)
+    far = replace(situation({"road": 1, "traffic": 0, "arrow": 0}), range_m=30.001)
+
+    assert model(far) == [0.0, 0.0]
+    assert model.silent == {"road": "intersection further than 30 m"}
+    shut = situation({"arrow": 1, "traffic": 0, "road": 1}, established=False)
+    assert model(replace(shut, range_m=30.0)) == pytest.approx([LOG_3, 0.0])
+    assert model.silent == {"arrow": "no intersection established"}
+    assert model(situation({"arrow": 1}, new_picture=False)) == [0.0, 0.0]
+    assert model.silent == {}
+
+
+def test_cue_is_confirmed_by_two_of_three_new_pictures() -> None:
+    """1 0 0 1 has one positive among the last three; 1 0 0 1 1 has two."""
+    persistence = Persistence(HAND_GRAPH)
+    seen = [
+        persistence({"arrow": count, "unknown": 1}, is_new_picture=is_new)
+        for count, is_new in ((1, True), (1, False), (0, True), (0, True), (1, True), (2, True))
+    ]
+
+    rare = Confirmed({}, {"arrow": "seen in 1 of 2 frames needed"})
+    absent = Confirmed({"arrow": 0}, {})
+    assert seen == [rare, rare, absent, absent, rare, Confirmed({"arrow": 2}, {})]
+    persistence.restart()
+    assert persistence({"arrow": 2}) == rare
+    assert persistence({"road": 1, "arrow": 2}) == Confirmed({"road": 1, "arrow": 2}, {})
 
 
 @given(frames=st.integers(2, 400), way_m=st.floats(0.0, 80.0))
@@ -116,24 +201,6 @@ def test_evidence_over_distance_is_bounded_for_any_number_of_frames(
 
     # Continuous observation counts as half as many independent ones as there are fading lengths.
     assert message * (1.0 - 1e-9) <= total <= message * (1.0 + way_m / 20.0) + 1e-9
-
-
-@given(many=st.integers(1, 20), cue=st.sampled_from(CUES))
-def test_several_detections_in_frame_count_as_one(many: int, cue: str) -> None:
-    one, all_of_them = (PersistentMessageModel(GRAPH, FUSION.dissent) for _ in range(2))
-
-    assert one(situation({cue: 1})) == all_of_them(situation({cue: many}))
-
-
-@given(over_m=st.floats(0.1, 300.0), cue=st.sampled_from(CUES))
-def test_cue_sends_no_message_beyond_validated_range(over_m: float, cue: str) -> None:
-    model = PersistentMessageModel(GRAPH, FUSION.dissent)
-    limit_m = FUSION.cues[cue].within_m
-
-    far = replace(situation({cue: 1}), range_m=limit_m + over_m)
-    assert model(far) == [0.0] * len(GRAPH.features)
-    assert model.silent == {cue: f"intersection further than {limit_m:g} m"}
-    assert any(model(replace(far, range_m=limit_m)))
 
 
 def test_continuous_cue_beyond_validated_range_reports_reason() -> None:

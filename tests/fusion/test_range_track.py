@@ -1,0 +1,225 @@
+"""The track of a range: every rule with numbers worked out by hand, and laws of following."""
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.fusion.intersection_range import RangeBelief
+from crosscue.fusion.range_track import (
+    NOTHING,
+    RangeTrack,
+    Verdict,
+    advance,
+    follow,
+    measure,
+    predict_without_odometry,
+)
+from crosscue.replay.vehicle.fusion import RangeFilter
+
+SETTINGS = RangeFilter()
+PENDING = RangeTrack(None, RangeBelief(60.0, 2.0), 1, 2.0)
+"""One first measurement, 2 m ago."""
+RIVALLED = RangeTrack(RangeBelief(50.0, 4.0), RangeBelief(80.0, 9.0), 2, 1.0)
+
+
+def belief(track: RangeTrack) -> RangeBelief:
+    assert track.belief is not None
+    return track.belief
+
+
+def test_advance_subtracts_distance_and_adds_its_length_to_unseen_distance() -> None:
+    """In reverse, 50 + 3, 80 + 3, and |-3| + 1; both variances grow by 0.5."""
+    after = RangeTrack(RangeBelief(53.0, 4.5), RangeBelief(83.0, 9.5), 2, 4.0)
+
+    assert advance(RIVALLED, -3.0, 0.5, SETTINGS) == after
+    assert advance(NOTHING, -3.0, 0.5, SETTINGS) == NOTHING
+
+
+def test_belief_is_dropped_above_maximum_sd() -> None:
+    """The maximum is 20 m: 399 + 1 = 20^2 is kept, 399 + 1.001 is not."""
+    track = RangeTrack(RangeBelief(50.0, 399.0))
+
+    assert advance(track, 2.0, 1.0, SETTINGS) == RangeTrack(RangeBelief(48.0, 400.0), unseen_m=2.0)
+    assert advance(track, 2.0, 1.001, SETTINGS) == NOTHING
+
+
+def test_first_measurement_is_forgotten_beyond_five_metres() -> None:
+    """2 + 3 = 5 m is not beyond; 2 + 3.001 m is."""
+    after = RangeTrack(None, RangeBelief(57.0, 2.1), 1, 5.0)
+
+    assert advance(PENDING, 3.0, 0.1, SETTINGS) == after
+    assert advance(PENDING, 3.001, 0.1, SETTINGS) == NOTHING
+
+
+def test_unknown_distance_adds_to_sd_of_belief() -> None:
+    """(2 + 3)^2 = 25 for the belief; the rival's variance grows by the same 21."""
+    wide = RangeTrack(RangeBelief(50.0, 25.0), RangeBelief(80.0, 30.0), 2, 4.0)
+
+    assert predict_without_odometry(RIVALLED, 3.0, SETTINGS) == wide
+    first = RangeTrack(None, RangeBelief(60.0, 4.0), 1, 1.0)
+    after = RangeTrack(None, RangeBelief(60.0, 25.0), 1, 4.0)
+    assert predict_without_odometry(first, 3.0, SETTINGS) == after
+    assert predict_without_odometry(NOTHING, 3.0, SETTINGS) == NOTHING
+
+
+@pytest.mark.parametrize(
+    ("unseen_m", "fade_m", "sensor_var_m2"),
+    [(math.log(3.0), 1.0, 1.0), (2.0 * math.log(3.0), 2.0, 1.0), (5.0, 0.0, 2.0)],
+)
+def test_measurement_counts_as_independent_fraction(
+    unseen_m: float, fade_m: float, sensor_var_m2: float
+) -> None:
+    """A correlation of 1/3 is worth (1 - 1/3) / (1 + 1/3) = 1/2, which doubles the variance to 2.
+
+    Then K = 6 / (6 + 2) = 3/4: 20 + 3/4 (24 - 20) = 23 and 6 (1 - 3/4) = 1.5. With no fade, a
+    measurement is independent.
+    """
+    settings = RangeFilter(fade_m=fade_m, begin_after=2)
+    near = RangeBelief(20.0, 6.0)
+
+    taken, verdict = measure(RangeTrack(near, None, 3, unseen_m), 24.0, sensor_var_m2, settings, 0)
+    began, first = measure(RangeTrack(None, near, 1, unseen_m), 24.0, sensor_var_m2, settings, 0)
+
+    assert (verdict, first) == (Verdict.TAKEN, Verdict.BEGAN)
+    for track in (taken, began):
+        assert track == RangeTrack(track.belief)
+        assert track.belief == pytest.approx((23.0, 1.5))
+
+
+def test_measurement_at_same_place_changes_nothing() -> None:
+    track = RangeTrack(RangeBelief(40.0, 2.9))
+
+    again, verdict = measure(track, 42.0, 2.9, SETTINGS, 20.0)
+
+    assert verdict is Verdict.TAKEN
+    assert again.belief == pytest.approx(track.belief)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_gate_rejects_normalised_innovation_above_sixteen(sign: float) -> None:
+    """8^2 / (3 + 1) = 16 is inside; 8.001^2 / 4 is not."""
+    track = RangeTrack(RangeBelief(40.0, 3.0), unseen_m=7.0)
+    ungated = RangeFilter(gate_nis=None)
+    far_m = 40.0 + sign * 8.001
+
+    assert measure(track, 40.0 + sign * 8.0, 1.0, SETTINGS, 20.0)[1] is Verdict.TAKEN
+    assert measure(track, far_m, 1.0, ungated, 20.0)[1] is Verdict.TAKEN
+    assert follow(track, 40.0 + sign * 8.0, 1.0, 1.0, SETTINGS)[1] is Verdict.TAKEN
+    assert follow(track, far_m, 1.0, 1.0, ungated)[1] is Verdict.TAKEN
+    restarted = RangeTrack(RangeBelief(far_m, 1.0))
+    assert follow(track, far_m, 1.0, 1.0, SETTINGS) == (restarted, Verdict.RESTARTED)
+    after = RangeTrack(track.belief, RangeBelief(far_m, 1.0), 1, 7.0)
+    assert measure(track, far_m, 1.0, SETTINGS, 20.0) == (after, Verdict.REFUSED)
+
+
+@pytest.mark.parametrize(
+    ("rival", "seen", "mean_m", "after", "verdict"),
+    [
+        # It agrees: 80 + 1/2 (84 - 80), 2 (1 - 1/2), regardless of the fade.
+        (RangeBelief(80.0, 2.0), 3, 20.1, (RangeBelief(82.0, 1.0), 4), Verdict.REFUSED),
+        (RangeBelief(80.0, 2.0), 4, 20.1, (RangeBelief(82.0, 1.0), 0), Verdict.RESTARTED),
+        # Within 20 m, it belongs to the next intersection.
+        (RangeBelief(80.0, 2.0), 4, 20.0, (RangeBelief(82.0, 1.0), 5), Verdict.REFUSED),
+        # 84 and 120 disagree, so the count begins again.
+        (RangeBelief(120.0, 2.0), 4, 20.1, (RangeBelief(84.0, 2.0), 1), Verdict.REFUSED),
+        # Without a belief, the second measurement begins; a contradictory one waits.
+        (RangeBelief(80.0, 2.0), 1, None, (RangeBelief(82.0, 1.0), 0), Verdict.BEGAN),
+        (RangeBelief(120.0, 2.0), 1, None, (RangeBelief(84.0, 2.0), 1), Verdict.WAITS),
+        (None, 0, None, (RangeBelief(84.0, 2.0), 1), Verdict.WAITS),
+    ],
+)
+def test_measurements_that_agree_with_each_other_begin_or_replace_range(
+    rival: RangeBelief | None,
+    seen: int,
+    mean_m: float | None,
+    after: tuple[RangeBelief, int],
+    verdict: Verdict,
+) -> None:
+    """The measurement is 84 m with variance 2; a range begins with two and is replaced by five."""
+    before = None if mean_m is None else RangeBelief(mean_m, 1.0)
+    # Forty metres are many fading lengths, so a first measurement counts fully.
+    track, found = measure(RangeTrack(before, rival, seen, 40.0), 84.0, 2.0, SETTINGS, 20.0)
+
+    assert found is verdict
+    if verdict in (Verdict.BEGAN, Verdict.RESTARTED):
+        assert track == RangeTrack(after[0])
+    else:
+        unseen_m = 0.0 if before is None else 40.0
+        assert track == RangeTrack(before, *after, unseen_m)
+
+
+def test_rival_counts_fully_at_standstill_unlike_first_measurements() -> None:
+    """At the place of the last one, only a rejected measurement has its full weight."""
+    rival = RangeBelief(80.0, 2.0)
+
+    track, _ = measure(RangeTrack(RangeBelief(40.0, 1.0), rival, 1), 84.0, 2.0, SETTINGS, 20.0)
+    first, _ = measure(RangeTrack(None, rival, 1), 84.0, 2.0, SETTINGS, 20.0)
+
+    assert track.rival == RangeBelief(82.0, 1.0)
+    assert first.belief == pytest.approx(rival)
+
+
+@pytest.mark.parametrize(
+    ("way_m", "before_var_m2", "var_m2", "mean_m", "after_m2"),
+    [
+        # Gain 1/2: 9/4 + 4/4 + 2 / 4 * 4.
+        (10.0 * math.log(2.0), 9.0, 4.0, 47.0, 5.25),
+        # Gain 3/4: 4 / 16 + 9 * 9/16 + 2 * 3/16 * 4; the covariance is the smaller variance.
+        (10.0 * math.log(4.0), 4.0, 9.0, 45.5, 6.8125),
+        (0.0, 9.0, 4.0, 50.0, 9.0),
+    ],
+)
+def test_correction_by_tracker_depends_on_distance(
+    way_m: float, before_var_m2: float, var_m2: float, mean_m: float, after_m2: float
+) -> None:
+    """The gain is 1 - exp(-way / 10); with gain g, 50 + g (44 - 50)."""
+    track = RangeTrack(RangeBelief(50.0, before_var_m2), unseen_m=3.0)
+
+    after, verdict = follow(track, 44.0, var_m2, way_m, SETTINGS)
+
+    assert verdict is Verdict.TAKEN
+    assert after == RangeTrack(after.belief)
+    assert after.belief == pytest.approx((mean_m, after_m2))
+
+
+def test_tracker_range_begins_or_is_adopted_at_once_without_take_up_distance() -> None:
+    at_once = SETTINGS.model_copy(update={"take_up_m": 0.0})
+    adopted = RangeTrack(RangeBelief(44.0, 4.0))
+
+    assert follow(NOTHING, 44.0, 4.0, 0.0, SETTINGS) == (adopted, Verdict.BEGAN)
+    assert follow(RangeTrack(RangeBelief(50.0, 9.0)), 44.0, 4.0, 0.0, at_once)[0] == adopted
+
+
+@pytest.mark.parametrize("correction_m", [-9.0, 5.0, 9.9])
+def test_correction_within_take_up_distance_never_increases_range(correction_m: float) -> None:
+    track, _ = follow(NOTHING, 80.0, 100.0, 0.0, SETTINGS)
+    ranges = [belief(track).mean_m]
+    for i in range(1, 120):
+        way_m = (0.0, 0.3, 1.1)[i % 3]
+        gone_m = sum((0.0, 0.3, 1.1)[k % 3] for k in range(1, i + 1))
+        track = advance(track, way_m, 0.0, SETTINGS)
+        track, _ = follow(track, 80.0 + correction_m - gone_m, 100.0, way_m, SETTINGS)
+        ranges.append(belief(track).mean_m)
+
+    assert (np.diff(ranges) <= 1e-12).all()
+    assert ranges[-1] == pytest.approx(80.0 + correction_m - gone_m, abs=0.1)
+
+
+@pytest.mark.parametrize("take_up_m", [0.0, 3.0, 10.0, 40.0])
+def test_followed_range_errors_match_reported_variance(take_up_m: float) -> None:
+    """The tracker's range is the mean of all measurements so far, so later ones are better."""
+    rng = np.random.default_rng(5)
+    settings = SETTINGS.model_copy(update={"take_up_m": take_up_m, "gate_nis": None})
+    squares = []
+    for _ in range(2000):
+        true_m, sum_m, track = 80.0, 0.0, NOTHING
+        for n in range(1, 31):
+            if n > 1:
+                true_m -= 1.0
+                track = advance(track, 1.0, 0.0, settings)
+            sum_m += rng.normal(0.0, 6.0)
+            track, _ = follow(track, true_m + sum_m / n, 36.0 / n, 1.0, settings)
+        squares.append((belief(track).mean_m - true_m) ** 2 / belief(track).var_m2)
+
+    assert float(np.mean(squares)) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 2000))
