@@ -270,7 +270,7 @@ class TemporalFilter:
         """Log likelihoods of all evaluated cues."""
         settings = self.model.settings
         at = np.searchsorted(np.array(settings.edges_m[1:-1]), self.centers_m(), side="right")
-        nowhere, by_distance = 0.0, np.zeros(self.model.chains[0].ahead.shape[1:])
+        nowhere, by_distance = 0.0, np.zeros((len(settings.edges_m) - 1, len(self.model.ways)))
         heard: dict[str, bool] = {}
         for chain in self.model.chains:
             count = counts.get(chain.cue)
@@ -328,8 +328,6 @@ class TemporalFilter:
     def _spread(self) -> None:
         cell_m = self.model.settings.cell_m
         side = min(self._var_m2 / (2.0 * cell_m**2), MAX_SPREAD)
-        if side <= 0.0:
-            return
         self._var_m2 -= side * 2.0 * cell_m**2
         self.nowhere = _blurred(self.nowhere[:, None], side)[:, 0]
         self.ahead = _blurred(self.ahead, side)

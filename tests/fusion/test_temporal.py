@@ -17,7 +17,15 @@ from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.evidence import FrameEvidence, SignRange
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.intersection_range import Reference
-from crosscue.fusion.temporal import MeasuredRange, TemporalFilter, temporal_model
+from crosscue.fusion.situation import Situation
+from crosscue.fusion.temporal import (
+    MeasuredRange,
+    TemporalFilter,
+    ranges_to_start,
+    temporal_model,
+    update_with,
+    ways_of,
+)
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
@@ -150,16 +158,230 @@ def detection_probability(
 def test_filter_equals_sum_over_all_state_paths(exponent: float) -> None:
     frames: list[Frame] = [
         ({"sign": 0, "road": 1}, 0.0, []),
-        ({"sign": 1}, 1.9, [MeasuredRange(4.5, 2.0)]),
+        ({"road": 1}, 1.0, [MeasuredRange(4.5, 2.0)]),
         ({"sign": 2, "road": 0}, 2.0, [MeasuredRange(1.0, 1.0)]),
     ]
     about = learned(exponent=exponent)
     belief = TemporalFilter(temporal_model(GRAPH, about))
 
     for counts, moved_m, ranges in frames:
-        belief.update(counts, ranges, moved_m, 0.0, 0.1)
+        belief.update(counts, ranges, moved_m, 0.0, 0.5)
 
     np.testing.assert_allclose(belief.probabilities(), enumerated(about, frames), rtol=1e-10)
+
+
+def hand_filter(**changes: object) -> TemporalFilter:
+    """Return a filter with five cells of 2 m from -2 m, with masses that can be added by hand."""
+    belief = TemporalFilter(temporal_model(GRAPH, learned(**changes)))
+    belief.nowhere = np.array([0.1, 0.0, 0.0, 0.0, 0.1])
+    belief.ahead = np.array([[0.2, 0.1], [0.1, 0.0], [0.0, 0.1], [0.0, 0.0], [0.3, 0.0]])
+    return belief
+
+
+def test_prior_is_uniform_over_cells_ahead_of_the_axle() -> None:
+    """Of centres at 0, 2, 4, 6 and 8 m, four are ahead: 0.4 / 4, and 0.6 / 4 * 0.75 for left."""
+    about = learned(behind_m=1.0, ways={"left": 0.6, "none": 0.2})
+    belief = TemporalFilter(temporal_model(GRAPH, about))
+
+    assert belief.centers_m().tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+    assert belief.nowhere == pytest.approx([0.0, 0.1, 0.1, 0.1, 0.1])
+    assert belief.ahead[:, 0] == pytest.approx([0.0] + [0.1125] * 4)
+    assert belief.ahead[:, 1] == pytest.approx([0.0] + [0.0375] * 4)
+    assert belief.probabilities() == pytest.approx([0.6, 0.45])
+    assert belief.distance_m() == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(("edge_m", "cells"), [(0.5, 2), (2.0, 2), (3.0, 2), (3.1, 3)])
+def test_cells_cover_the_visible_distance_and_number_at_least_two(
+    edge_m: float, cells: int
+) -> None:
+    about = learned(edges_m=(0.0, edge_m), behind_m=1.0, chains=())
+
+    assert temporal_model(GRAPH, about).cells == cells
+
+
+def test_forward_cell_passes_nearest_and_brings_new_intersections() -> None:
+    """A tenth (2 m of 20 m) of 0.2 comes within reach, 70 % of it with a left road.
+
+    The 0.3 passed are spread over five cells; the rest moves one cell nearer.
+    """
+    belief = hand_filter()
+
+    belief.update({}, moved_m=2.0)
+
+    assert belief.nowhere == pytest.approx([0.06, 0.06, 0.06, 0.15, 0.15])
+    assert belief.ahead[:, 0] == pytest.approx([0.1, 0.0, 0.0, 0.3, 0.014])
+    assert belief.ahead[:, 1] == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.006])
+    assert belief.centers_m()[0] == -1.0
+
+
+def test_all_mass_comes_within_reach_where_intersections_are_dense() -> None:
+    belief = hand_filter(spacing_m=1.0)
+
+    belief.update({}, moved_m=2.0)
+
+    assert belief.nowhere == pytest.approx([0.06] * 5)
+    assert belief.ahead[-1] == pytest.approx([0.14, 0.06])
+
+
+def test_reverse_moves_mass_away_and_furthest_cell_out_of_reach() -> None:
+    """After -1 m, the remainder is +1 m; the 0.3 out of reach are spread over five cells.
+
+    Another metre forward completes the cell, and the remainder is 0 again.
+    """
+    belief = hand_filter()
+
+    belief.update({}, moved_m=-1.0)
+
+    assert belief.nowhere == pytest.approx([0.16, 0.16, 0.06, 0.06, 0.06])
+    assert belief.ahead[:, 0] == pytest.approx([0.0, 0.2, 0.1, 0.0, 0.0])
+    assert belief.ahead[:, 1] == pytest.approx([0.0, 0.1, 0.0, 0.1, 0.0])
+    assert belief.centers_m()[0] == -2.0
+    belief.update({}, moved_m=1.0)
+    assert belief.centers_m()[0] == -1.0
+    belief.update({}, moved_m=-5.0)
+    assert belief.centers_m()[0] == -2.0
+
+
+def test_variance_of_distance_spreads_mass_over_neighbours() -> None:
+    """1 m2 moves 1 / (2 * 2^2) = 1/8 to either side, and the end cells keep their part.
+
+    4 m2 move a quarter at most, twice: the second time without further variance.
+    """
+    belief = hand_filter()
+    belief.update({}, moved_var_m2=1.0)
+
+    assert belief.nowhere == pytest.approx([0.0875, 0.0125, 0.0, 0.0125, 0.0875])
+    assert belief.ahead[:, 0] == pytest.approx([0.1875, 0.1, 0.0125, 0.0375, 0.2625])
+    wide, step = hand_filter(), hand_filter()
+    wide.update({}, moved_var_m2=4.0)
+    for _ in range(2):
+        wide.update({})
+    for var_m2 in (2.0, 2.0):
+        step.update({}, moved_var_m2=var_m2)
+    assert wide.ahead == pytest.approx(step.ahead)
+    assert wide.nowhere == pytest.approx([0.0625, 0.03125, 0.0125, 0.03125, 0.0625])
+
+
+def test_repeated_small_variances_add_up() -> None:
+    """The remainder of 4 m2 after a quarter, 2 m2, is added to the next 1 m2 and 1 m2."""
+    once, twice = hand_filter(), hand_filter()
+
+    once.update({}, moved_var_m2=4.0)
+    once.update({}, moved_var_m2=0.0)
+    twice.update({}, moved_var_m2=3.0)
+    twice.update({}, moved_var_m2=1.0)
+
+    assert once.ahead == pytest.approx(twice.ahead)
+
+
+def test_range_weighs_cells_by_gaussian_of_range_and_cell_or_uniform_strays() -> None:
+    """Cells of 3 m add 3^2 / 12 = 0.75 to 1.25 m2; centres at 0 and 3 m, and 5 % strays."""
+    about = learned(edges_m=(0.0, 4.5), behind_m=1.5, cell_m=3.0, chains=())
+    belief = TemporalFilter(temporal_model(GRAPH, about))
+    belief.nowhere, belief.ahead = np.array([0.25, 0.25]), np.array([[0.25, 0.0], [0.25, 0.0]])
+
+    belief.update({}, [MeasuredRange(0.0, 1.25)])
+
+    peak, stray = 0.95 / math.sqrt(4.0 * math.pi), 0.05 / 150.0
+    at, off = peak + stray, peak * math.exp(-9.0 / 4.0) + stray
+    assert belief.nowhere == pytest.approx([0.5 * at / (at + off), 0.5 * off / (at + off)])
+    assert belief.ahead[:, 0] == pytest.approx(belief.nowhere)
+
+
+def test_cue_is_evaluated_after_either_step_and_not_before() -> None:
+    """Steps of 0.5 s or 1.5 m in either direction: a quarter of a second twice, 1 m and -0.5 m."""
+    belief = TemporalFilter(temporal_model(GRAPH, learned()))
+    belief.update({"sign": 1})
+    for frames in ([{"passed_s": 0.25}] * 2, [{"moved_m": 1.0}, {"moved_m": -0.5}]):
+        before = belief.probabilities()[0]
+        belief.update({"sign": 1})
+        belief.update({"sign": 1}, **frames[0])
+        assert belief.probabilities()[0] == pytest.approx(before)
+        belief.update({"sign": 1}, **frames[1])
+        assert belief.probabilities()[0] > before + 1e-6
+
+
+def test_probabilities_stay_a_billionth_from_zero_and_one() -> None:
+    belief = hand_filter()
+    belief.ahead *= 0.0
+    assert belief.probabilities().tolist() == [1e-9, 1e-9]
+    belief.ahead[2] = 1.0, 0.0
+    assert belief.probabilities().tolist() == [1.0 - 1e-9, 1.0 - 1e-9]
+
+
+def test_unfitted_chains_are_even_and_a_model_without_chains_is_silent() -> None:
+    """A cue with no chain for a state says nothing about it; without any chain, none does."""
+    only = chain("road", (0.7, 0.4), (0.9, 0.7), (0.4, 0.2), ("intersection", "left"))
+    (road,) = temporal_model(GRAPH, learned(chains=(only,))).chains
+    silent = TemporalFilter(temporal_model(GRAPH, learned(chains=())))
+
+    silent.update({"sign": 1, "road": 1})
+
+    assert road.nowhere.tolist() == [0.5, 0.5, 0.5]
+    assert road.ahead[:, :, 0].tolist() == [[0.7, 0.4], [0.4, 0.2], [0.9, 0.7]]
+    assert road.ahead[:, :, 1].tolist() == [[0.5, 0.5]] * 3
+    assert silent.probabilities() == pytest.approx(silent.model.usual)
+
+
+def test_graph_without_intersection_is_refused() -> None:
+    graph = FactorGraph((Feature("left"), Feature("up")), (), ())
+
+    with pytest.raises(ValueError, match=r"^no feature 'intersection'; there are: left, up$"):
+        temporal_model(graph, learned())
+
+
+def test_names_of_outgoing_roads_are_joined_by_plus() -> None:
+    assert (ways_of("none"), ways_of("left+right")) == ((), ("left", "right"))
+
+
+@pytest.mark.parametrize(
+    ("since_m", "fade_m", "expected"),
+    [
+        # A correlation of 1/3 doubles the variances; a light is 16 m further, with s.d. 16 / 4.
+        (2.0 * math.log(3.0), 2.0, ((40.0, 8.0), (44.0, 34.0))),
+        (0.0, 0.0, ((40.0, 4.0), (44.0, 25.0))),
+        (0.0, 2.0, ()),
+        # At a thousandth of an independent range, 2 artanh(0.001), it still counts.
+        (2.0 * math.atanh(0.001), 1.0, ((40.0, 4000.0), (44.0, 9016.0))),
+        (2.0 * math.atanh(0.00099), 1.0, ()),
+    ],
+)
+def test_ranges_to_start_have_variances_of_independent_ones(
+    since_m: float, fade_m: float, expected: tuple[tuple[float, float], ...]
+) -> None:
+    measured = {Reference.START: (40.0, 4.0), Reference.END: (60.0, 9.0)}
+
+    found = ranges_to_start(measured, since_m, fade_m, 16.0)
+
+    assert list(found) == [pytest.approx(one) for one in expected]
+
+
+def test_filter_receives_all_of_a_situation(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[object] = []
+
+    def update(_filter: TemporalFilter, *values: object, is_new_picture: bool) -> None:
+        seen.extend([*values, is_new_picture])
+
+    belief = hand_filter()
+    monkeypatch.setattr(TemporalFilter, "update", update)
+    ranges = ((5.0, 2.0), (6.0, 3.0))
+    update_with(
+        belief,
+        Situation(
+            {"sign": 2},
+            True,
+            is_new_picture=False,
+            moved_m=9.0,
+            passed_s=0.3,
+            advanced_m=-1.5,
+            advanced_var_m2=0.7,
+            ranges=ranges,
+        ),
+    )
+
+    expected = [MeasuredRange(*one) for one in ranges]
+    assert seen == [{"sign": 2}, expected, -1.5, 0.7, 0.3, False]
 
 
 STEPS = st.lists(
