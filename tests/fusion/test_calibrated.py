@@ -231,23 +231,6 @@ def test_fit_recovers_true_fade_length() -> None:
     assert sum(one.is_learned for one in fit.fades) == 3
 
 
-def test_exponents_of_independent_cues_are_near_one() -> None:
-    exponents = fit_messages(annotated(3, 200), GRAPH).calibrated.exponents
-
-    assert set(exponents) == {"left", "straight"}
-    assert all(0.7 <= value <= 1.0 for value in exponents.values())
-
-
-def test_redundant_cues_lower_exponent() -> None:
-    twins = annotated(4, 200)
-    for one in twins:
-        assert isinstance(one.counts, dict)
-        one.counts["parked_left"] = one.counts["road_left"]
-        one.counts["cross_traffic_left"] = one.counts["road_left"]
-
-    assert fit_messages(twins, GRAPH).calibrated.exponents["left"] < 0.6
-
-
 def test_calibrated_model_beats_source_on_held_out_simulated_approaches() -> None:
     learned = fit_messages(annotated(5, 100), GRAPH).calibrated
     ours = theirs = 0.0
@@ -266,15 +249,6 @@ def test_calibrated_model_beats_source_on_held_out_simulated_approaches() -> Non
         theirs += float(np.logaddexp(0.0, -source if is_left else source).mean())
 
     assert ours < 0.5 * theirs
-
-
-def test_feature_present_in_all_approaches_is_not_learned() -> None:
-    always = [one for one in annotated(7, 60) if one.features["left"]]
-
-    fit = fit_messages(always, GRAPH)
-
-    assert "left" not in fit.calibrated.exponents
-    assert not any(one.feature == "left" for one in fit.calibrated.rates)
 
 
 @pytest.mark.parametrize(

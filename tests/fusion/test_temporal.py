@@ -293,12 +293,12 @@ def test_cue_is_evaluated_after_either_step_and_not_before() -> None:
     """Steps of 0.5 s or 1.5 m in either direction: a quarter of a second twice, 1 m and -0.5 m."""
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
     belief.update({"sign": 1})
-    for frames in ([{"passed_s": 0.25}] * 2, [{"moved_m": 1.0}, {"moved_m": -0.5}]):
+    for moves, passed_s in (((0.0, 0.0), 0.25), ((1.0, -0.5), 0.0)):
         before = belief.probabilities()[0]
         belief.update({"sign": 1})
-        belief.update({"sign": 1}, **frames[0])
+        belief.update({"sign": 1}, moved_m=moves[0], passed_s=passed_s)
         assert belief.probabilities()[0] == pytest.approx(before)
-        belief.update({"sign": 1}, **frames[1])
+        belief.update({"sign": 1}, moved_m=moves[1], passed_s=passed_s)
         assert belief.probabilities()[0] > before + 1e-6
 
 
