@@ -214,9 +214,10 @@ def test_only_sign_opens_approach_within_ten_metres_after_intersection() -> None
 
 
 def test_approach_opens_at_once_after_one_that_did_not_pass() -> None:
-    stale = [established(), frame(1, 30.001), frame(2, 0.0, road_left=1)]
-
-    assert [one.approach for one in run_steps(stale)] == [1, None, 2]
+    """Neither an approach out of reach nor a stale one is followed by a rest."""
+    for first, moved_m in ((established(sign(150.0)), -0.001), (established(), 30.001)):
+        steps = run_steps([first, frame(1, moved_m), frame(2, 0.0, road_left=1)])
+        assert [one.approach for one in steps] == [1, None, 2]
 
 
 @pytest.mark.parametrize(
@@ -366,7 +367,107 @@ def test_posterior_of_tracker_is_followed_for_either_reference() -> None:
     start, end = followed.ranges
     assert (start.range_m + way_m, start.var_m2, start.measured_m) == pytest.approx((57, 5.25, 2))
     assert (end.range_m + way_m, end.var_m2, end.measured_m) == pytest.approx((82, 5.25, 3))
-    assert loop.counts["ranges restarted"] == 0
+    for i, range_m in ((2, 120.0), (3, 40.0)):
+        jumped = replace(first[0], range_m=range_m)
+        (row, _) = loop(replace(frame(i, 0.0), posteriors=(jumped,))).ranges
+        assert row.range_m == range_m
+    assert loop.counts["ranges restarted"] == 2
+
+
+def test_step_holds_evidence_and_beliefs_of_its_frame() -> None:
+    """Nothing opens an approach before the stop sign; evidence out of order has no belief."""
+    loop = approaches()
+    unseen = FrameEvidence(0, 0.0, 0.0, (), {})
+    seen = frame(1, stop_sign=1)
+
+    steps = run_steps([unseen, seen, seen, seen, replace(seen, t_ns=FRAME_NS - 1)], loop)
+
+    belief = {"intersection": pytest.approx(0.97), "left": 0.5, "right": 0.5, "straight": 0.5}
+    assert steps == [
+        Step(0, None, {}),
+        Step(FRAME_NS, 1, seen.counts, (), belief, True),
+        Step(FRAME_NS, None, {}),
+        Step(FRAME_NS, None, {}),
+        Step(FRAME_NS - 1, None, {}),
+    ]
+    refused = {"evidence refused: repeated": 2, "evidence refused: out of order": 1}
+    assert loop.counts == {"approaches opened": 1, "approaches established": 1, **refused}
+
+
+def test_restart_after_gap_forgets_approach_time_and_rest_distance() -> None:
+    """The road opens an approach at once, at an earlier time and less than 10 m after the end."""
+    loop = approaches()
+    run_steps([established(light(10.0)), frame(1, 11.0), frame(2, 1.5)], loop)
+    loop.restart()
+    first, last = run_steps([frame(0, road_left=1), frame(1, stop_sign=1)], loop)
+    loop.restart()
+
+    assert (first.approach, last.approach) == (2, 2)
+    assert loop.counts["approaches closed: passed"] == 1
+    assert loop.counts["approaches closed: a gap in time"] == 1
+    assert loop.counts["approaches established"] == 2
+
+
+@pytest.mark.parametrize(
+    ("travelled_m", "var_m2"),
+    [
+        (None, 0.0),
+        (math.nan, 0.0),
+        (math.inf, 0.0),
+        (1.0, math.nan),
+        (1.0, -1.0),
+        (1.0, math.inf),
+    ],
+)
+def test_missing_or_invalid_odometry_widens_ranges_until_they_are_dropped(
+    travelled_m: float | None, var_m2: float
+) -> None:
+    """15 m/s add 1.5 m to each s.d. per frame: 2.1 + 12 * 1.5 and 1 + 13 * 1.5 exceed 20 m."""
+    loop = approaches()
+    run_steps([established(sign(50.0, 2.1), light(60.0, 1.0))], loop)
+    gap = [FrameEvidence(i * FRAME_NS, travelled_m, var_m2, (), NONE_SEEN) for i in range(1, 14)]
+
+    steps = run_steps(gap, loop)
+
+    start, end = steps[0].ranges
+    assert (start.range_m, start.var_m2) == pytest.approx((50.0, 3.6**2))
+    assert (end.range_m, end.var_m2) == pytest.approx((60.0, 2.5**2))
+    assert [len(one.ranges) for one in steps] == [2] * 11 + [1, 0]
+    assert steps[-1].approach == 1
+    assert loop.counts["odometry missing"] == 13
+    assert loop.counts["ranges dropped: too uncertain"] == 2
+
+
+def test_waiting_refused_and_restarted_ranges_are_counted() -> None:
+    """A range begins with two measurements, and three that are refused replace it.
+
+    Those of the start, 60 m ahead, belong to the next intersection within 65 m. Of 3 + 3 of the
+    end, the third and the sixth replace it.
+    """
+    settings = RangeFilter(sd_fraction=0.0, fade_m=0.0, restart_after=3)
+    loop = approaches(Fusion(dissent_within_m=65.0), settings)
+    pairs = [(60.0, 70.0)] * 2 + [(100.0, 110.0)] * 3 + [(100.0, 150.0)] * 3
+    frames = [
+        replace(frame(i, 0.0), signs=(sign(start_m), light(end_m)))
+        for i, (start_m, end_m) in enumerate(pairs)
+    ]
+
+    start, end = run_steps(frames, loop)[-1].ranges
+
+    assert (start.range_m, start.measured_m) == (pytest.approx(60.0), None)
+    assert (end.range_m, end.measured_m) == (pytest.approx(150.0), 150.0)
+    assert loop.counts == {
+        "approaches opened": 1,
+        "ranges waiting for a second observation": 2,
+        "ranges refused: outside the gate": 6 + 4,
+        "ranges restarted": 2,
+    }
+
+
+def test_opposite_turns_of_a_bend_cancel() -> None:
+    bend = [replace(frame(i, 0.0), turned_rad=r) for i, r in ((1, 0.7), (2, -0.7), (3, 0.7))]
+
+    assert run_steps([established(), *bend])[-1].approach == 1
 
 
 def test_crawling_car_keeps_one_approach_until_passed() -> None:
@@ -499,8 +600,9 @@ def test_other_reference_is_used_when_preferred_one_is_unknown() -> None:
     seen = [replace(frame(0), signs=(light(50.0),)), replace(frame(1), signs=(sign(30.0),))]
     run_steps(seen, past=past)
     run_steps(seen, approaches(Fusion(reference="end")), past=past)
+    run_steps(seen[1:], approaches(Fusion(reference="end")), past=past)
 
-    assert asked == ["end", "start", "end", "end"]
+    assert asked == ["end", "start", "end", "end", "start"]
 
 
 def test_start_and_end_references_are_filtered_independently() -> None:
@@ -516,61 +618,6 @@ def test_start_and_end_references_are_filtered_independently() -> None:
         for row in one.ranges
     }
     assert {row.reference: (row.range_m, row.var_m2) for row in last.ranges} == alone
-
-
-def test_range_outside_gate_is_refused_and_counted() -> None:
-    loop = approaches()
-    run_steps(drive(60.0, 41.0, {"stop_sign": (60.0, 1)}), loop)
-
-    step = loop(replace(frame(100, 1.0), signs=(sign(90.0),)))
-
-    assert loop.counts["ranges refused: outside the gate"] == 1
-    assert step.ranges[0].measured_m is None
-    assert step.ranges[0].range_m == pytest.approx(40.0)
-
-
-def test_repeated_or_late_evidence_is_refused_and_counted() -> None:
-    clean, dirty = approaches(), approaches()
-    good = list(drive(50.0, 10.0, {"stop_sign": (50.0, 1), "road_right": (20.0, 1)}))
-    wrong = frame(0, 30.0, road_left=1)
-
-    expected = run_steps(good, clean)
-    taken = []
-    for one in good:
-        taken.append(dirty(one))
-        assert dirty(replace(wrong, t_ns=one.t_ns)).probabilities == {}
-        assert dirty(replace(wrong, t_ns=one.t_ns - 1)).approach is None
-
-    assert taken == expected
-    assert dirty.counts["evidence refused: repeated"] == len(good)
-    assert dirty.counts["evidence refused: out of order"] == len(good)
-
-
-@pytest.mark.parametrize(
-    ("travelled_m", "var_m2"), [(math.nan, 0.0), (math.inf, 0.0), (1.0, math.nan), (1.0, -1.0)]
-)
-def test_invalid_odometry_counts_as_missing(travelled_m: float, var_m2: float) -> None:
-    loop = approaches()
-    run_steps(drive(50.0, 30.0, {"stop_sign": (50.0, 1)}), loop)
-
-    step = loop(FrameEvidence(100 * FRAME_NS, travelled_m, var_m2, (), NONE_SEEN))
-
-    assert loop.counts["odometry missing"] == 1
-    assert all(math.isfinite(row.range_m + row.var_m2) for row in step.ranges)
-
-
-def test_long_odometry_gap_drops_range_and_then_closes_approach() -> None:
-    loop = approaches()
-    run_steps(drive(50.0, 30.0, {"stop_sign": (50.0, 1)}), loop)
-    gap = [FrameEvidence((21 + i) * FRAME_NS, None, 0.0, (), NONE_SEEN) for i in range(200)]
-
-    taken = run_steps(gap, loop)
-
-    assert taken[0].ranges
-    assert not any(one.ranges for one in taken[14:])
-    assert taken[14].approach == 1
-    assert loop.counts["ranges dropped: too uncertain"] == 1
-    assert taken[-1].approach is None
 
 
 def test_signs_alone_update_range_without_odometry() -> None:

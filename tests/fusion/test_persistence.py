@@ -24,7 +24,7 @@ from crosscue.fusion.factor_graph import (
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.persistence import Confirmed, Persistence, PersistentMessageModel
 from crosscue.fusion.situation import Situation
-from crosscue.replay.vehicle.fusion import Fade, Fusion, RangeFilter
+from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle
 from support.fusion import NONE_SEEN, SECOND_NS, situation
 
@@ -213,6 +213,67 @@ def test_continuous_cue_beyond_validated_range_reports_reason() -> None:
 
     assert max_deviation(steps) == 0.0
     assert steps[-1].not_believed == {"stop_sign": "intersection further than 100 m"}
+
+
+def test_cue_is_silent_in_approach_until_seen_in_three_pictures() -> None:
+    """A repeated picture is none; the count of a cue past the intersection is held likewise.
+
+    A frame without an approach tells why, and a restart forgets.
+    """
+    fusion = Fusion.model_validate(
+        {"kind": "persistent", "cues": {"stop_sign": {"seen_frames": 1}}}
+    )
+    loop = Approaches(graph_of(fusion), fusion, RangeFilter())
+    frames = frames_of("traffic_light", [1, 1, 1, 1])
+    frames[1] = replace(frames[1], is_new_picture=False)
+
+    def past(_best: object, _reference: object) -> Mapping[str, int]:
+        return {"lanes_past": 1}
+
+    steps = [loop(frame, past) for frame in frames]
+    loop.restart()
+    again = loop(replace(frames[0], counts={"traffic_light": 1, "stop_sign": 1}), past)
+
+    waits = {n: f"seen in {n} of 3 frames needed" for n in (1, 2)}
+    assert [step.not_believed for step in steps] == [
+        {"traffic_light": waits[1]},
+        {"traffic_light": waits[1]},
+        {"traffic_light": waits[2]},
+        {"lanes_past": waits[1]},
+    ]
+    assert [step.approach for step in (*steps, again)] == [None, None, None, 1, 2]
+    assert again.not_believed == {"traffic_light": waits[1], "lanes_past": waits[1]}
+    assert loop.counts["traffic_light not believed: seen in 1 of 3 frames needed"] == 3
+    assert loop.counts["lanes_past not believed: seen in 1 of 3 frames needed"] == 2
+
+
+def test_each_approach_has_new_message_model_of_its_kind() -> None:
+    rates = (Rates(cue="road_left", feature="left", near=False, if_there=0.6, if_not=0.1),)
+    learned = {"kind": "calibrated", "calibrated": Calibrated(rates=rates)}
+    away, road = replace(situation({"road_left": 0}), may_dissent=True), {"road_left": 1}
+    place = GRAPH.feature_names.index("left")
+
+    for changes, dissent, support in (
+        ({"kind": "persistent", "dissent": 0.25}, -LOG_3, log_odds(0.77)),
+        ({"kind": "source", "dissent": 0.25}, -LOG_3, log_odds(0.77)),
+        ({"kind": None, "dissent": 0.25}, -LOG_3, log_odds(0.77)),
+        (learned, math.log(0.4 / 0.9), math.log(6.0)),
+    ):
+        create = message_models_of(GRAPH, Fusion().model_copy(update=changes))
+        for _ in range(2):
+            assert create()(away)[place] == pytest.approx(dissent)
+            assert create()(situation(road))[place] == pytest.approx(support)
+
+
+@pytest.mark.parametrize(
+    ("kind", "command"), [("calibrated", "messages"), ("temporal", "temporal")]
+)
+def test_kind_without_its_fit_is_refused(kind: str, command: str) -> None:
+    fusion = Fusion().model_copy(update={"kind": kind})
+    wanted = f"^fusion.{kind}: expected what crosscue fit {command} wrote, got None$"
+
+    with pytest.raises(ValueError, match=wanted):
+        Approaches(GRAPH, fusion, RangeFilter())
 
 
 @pytest.mark.parametrize(

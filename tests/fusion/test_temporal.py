@@ -505,6 +505,60 @@ def test_presence_is_established_with_hysteresis_and_withdrawn_without_cues() ->
         assert intersection > 0.5 or not step.established
 
 
+def test_filter_of_a_drive_receives_situations_inside_and_outside_approaches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ranges of signs that the gate takes, to the start: a light's is 16 m shorter.
+
+    After 2 log 3 m with a fade of 2 m, half a range is independent: 4 / 0.5, and 9 / 0.5 + 4^2.
+    """
+    seen: list[tuple[TemporalFilter, Situation]] = []
+
+    def record(over_drive: TemporalFilter, situation: Situation) -> None:
+        seen.append((over_drive, situation))
+
+    monkeypatch.setattr("crosscue.fusion.approaches.update_with", record)
+    monkeypatch.setattr("crosscue.fusion.temporal.update_with", record)
+    fusion = Fusion().model_copy(
+        update=TEMPORAL | {"temporal": learned(), "length_m": 16.0, "rest_m": 0.0}
+    )
+    about = RangeFilter(sd_fraction=0.0, begin_after=1, fade_m=2.0, gate_nis=16.0)
+    loop = Approaches(GRAPH, fusion, about)
+    moved_m = 2.0 * math.log(3.0)
+
+    def evidence(number: int, moved_m: float, *ranges: tuple[Reference, float]) -> FrameEvidence:
+        variances = {Reference.START: 4.0, Reference.END: 9.0}
+        signs = tuple(SignRange(ref, range_m, variances[ref]) for ref, range_m in ranges)
+        return FrameEvidence(number * 10**8, moved_m, 0.5, signs, {"road": 0})
+
+    start, end = Reference.START, Reference.END
+    for one in (
+        evidence(0, 0.0),
+        evidence(1, 1.0, (start, 50.0), (end, 66.0)),
+        evidence(2, moved_m / 2),
+        evidence(3, moved_m / 2, (start, 90.0), (end, 66.0 - moved_m)),
+        evidence(4, 0.0),
+    ):
+        loop(one)
+    loop.restart()
+    loop(evidence(0, 1.0, (end, 66.0)))
+
+    assert [situation.ranges for _, situation in seen] == [
+        (),
+        ((50.0, 4.0), (50.0, 25.0)),
+        (),
+        (pytest.approx((50.0 - moved_m, 34.0)),),
+        (),
+        ((50.0, 25.0),),
+    ]
+    outside = seen[0][1]
+    assert outside == Situation({"road": 0}, False)
+    assert [one.is_established for _, one in seen] == [False] * 6
+    assert [one.advanced_m for _, one in seen] == [0.0, 1.0, moved_m / 2, moved_m / 2, 0.0, 0.0]
+    assert len({id(over_drive) for over_drive, _ in seen[:-1]}) == 1
+    assert seen[-1][0] is not seen[0][0]
+
+
 SEQUENCE = st.lists(
     st.tuples(
         st.dictionaries(st.sampled_from(["sign", "road"]), st.integers(0, 2)),
