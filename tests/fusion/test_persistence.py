@@ -162,6 +162,7 @@ def test_cue_without_message_reports_reason_of_newest_frame() -> None:
     model = PersistentMessageModel(HAND_GRAPH, 0.25)
     far = replace(situation({"road": 1, "traffic": 0, "arrow": 0}), range_m=30.001)
 
+    assert model.silent == {}
     assert model(far) == [0.0, 0.0]
     assert model.silent == {"road": "intersection further than 30 m"}
     shut = situation({"arrow": 1, "traffic": 0, "road": 1}, established=False)
@@ -175,7 +176,7 @@ def test_cue_is_confirmed_by_two_of_three_new_pictures() -> None:
     """1 0 0 1 has one positive among the last three; 1 0 0 1 1 has two."""
     persistence = Persistence(HAND_GRAPH)
     seen = [
-        persistence({"arrow": count, "unknown": 1}, is_new_picture=is_new)
+        persistence({"unknown": 1, "arrow": count}, is_new_picture=is_new)
         for count, is_new in ((1, True), (1, False), (0, True), (0, True), (1, True), (2, True))
     ]
 

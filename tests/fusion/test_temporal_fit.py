@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
-from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, filtered, fit_temporal
-from crosscue.fusion.temporal import MeasuredRange, temporal_model
+from crosscue.fusion.fit.temporal_fit import (
+    EXPONENTS,
+    LAPSES,
+    AnnotatedDrive,
+    filtered,
+    fit_temporal,
+    log_loss,
+)
+from crosscue.fusion.temporal import MeasuredRange, TemporalFilter, temporal_model
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
 GRAPH: Final = FactorGraph(
@@ -27,6 +34,193 @@ GRAPH: Final = FactorGraph(
         Edge("unseen", "left"),
     ),
 )
+PAIR: Final = FactorGraph(GRAPH.features, GRAPH.cues[:2], GRAPH.edges[:2])
+
+
+def hand_drive(
+    place: str,
+    sign: list[int],
+    start_m: list[float],
+    *,
+    left: bool | None = None,
+    ranges_m: tuple[float, ...] = (),
+    advanced_m: list[float] | None = None,
+    passed_s: list[float] | None = None,
+    road: list[int] | None = None,
+) -> AnnotatedDrive:
+    """Return a drive with a step of 2 m per frame, to an intersection if ``start_m`` is finite."""
+    n = len(sign)
+    is_ahead = bool(np.isfinite(start_m).all())
+    features = {"intersection": is_ahead} | ({} if left is None else {"left": left})
+    counts = {"sign": sign} | ({} if road is None else {"road": road})
+    return AnnotatedDrive(
+        np.array([2.0] * n if advanced_m is None else advanced_m),
+        np.zeros(n),
+        np.zeros(n) if passed_s is None else np.array(passed_s),
+        np.array(start_m, np.float64),
+        {name: np.array(count, np.int64) for name, count in counts.items()},
+        (tuple(MeasuredRange(range_m, 4.0) for range_m in ranges_m), *[()] * (n - 1)),
+        features,
+        place,
+    )
+
+
+NONE_AHEAD: Final = [float("nan")] * 4
+SEEN: Final = hand_drive(
+    "a",
+    # Only frames 0, 2, 3 and 5 are steps: after 1 and -0.5 m, after half a second, after 1.5 m.
+    [1, 0, 1, 0, 1, 1],
+    [45.0, 44.0, 43.0, 9.0, 9.0, 0.0],
+    left=True,
+    ranges_m=(51.0, 51.01),
+    advanced_m=[0.0, 1.0, -0.5, 0.0, 0.0, 1.5],
+    passed_s=[0.0, 0.0, 0.0, 0.5, 0.25, 0.0],
+)
+UNSEEN: Final = hand_drive("b", [0, 1, -1, 0], NONE_AHEAD, left=False, ranges_m=(30.0,))
+
+
+def test_chains_are_frequencies_shrunk_towards_more_general_ones() -> None:
+    """The sign is positive at 45 and 43 m, not at 9 m, and again at 0 m; elsewhere 0 1 - 0.
+
+    Overall it is positive in (4 + 20 / 2) / (7 + 20) = 14/27, stays so in (1 + 10) / 22, and
+    appears in (2 + 10) / 22. A more special frequency has its own steps and 20 of the more general
+    one: without an intersection (1 + 20 * 0.5185) / 23 and (1 + 20 * 0.5455) / 21; ahead at all
+    distances (3 + 20 * 0.5185) / 24 = 0.5571; within 10 m (1 + 20 * 0.5571) / 22, and in 35 to 50 m
+    (2 + 20 * 0.5571) / 22.
+    """
+    learned = fit_temporal([SEEN, UNSEEN], PAIR)
+
+    nowhere, ahead = learned.temporal.chains
+    assert nowhere == chain_of("sign", (), (0.4943,), (0.5,), (0.5671,))
+    assert ahead == chain_of(
+        "sign",
+        ("intersection",),
+        (0.5519, 0.5571, 0.5571, 0.5974, 0.5571),
+        (0.4762, 0.5, 0.5, 0.5238, 0.5),
+        (0.5877, 0.5671, 0.5671, 0.5671, 0.5671),
+    )
+    assert (learned.drives, learned.places, learned.steps) == (2, 2, 8)
+    # One of two places is an intersection, with a left road; 6 m is not above 3 * 2 m.
+    assert learned.temporal.ahead == 0.5
+    assert learned.temporal.ways == {"left": 0.75, "none": 0.25}
+    assert learned.temporal.stray == 0.5
+    # One half of the places has no intersection, so nothing can be validated.
+    assert (learned.temporal.exponent, learned.temporal.lapse) == (1.0, 0.0)
+    assert learned.log_scores == {}
+    assert learned.model.settings == learned.temporal
+
+
+def test_chains_of_a_direction_depend_on_whether_its_road_is_there() -> None:
+    """A road is positive with left and not without it, both at 10 m and thus from 10 to 20 m.
+
+    Of all, (3 + 10) / 26 = 1/2 are positive; with left (3 + 10) / 23 = 0.5652 and without it
+    10 / 23 = 0.4348, and from 10 to 20 m (3 + 20 * 0.5652) / 23 and 20 * 0.4348 / 23. Beyond 80 m,
+    and where left is unknown, nothing is counted for them.
+    """
+    at, road = [10.0] * 3, [1, 1, 1]
+    some = [
+        hand_drive("a", [-1] * 3, at, left=True, road=road),
+        hand_drive("b", [-1] * 3, at, left=False, road=[0, 0, 0]),
+        hand_drive("c", [-1] * 2, [80.0, 80.0], left=True, road=[1, 0]),
+        hand_drive("d", [-1] * 2, [5.0, 5.0], road=[1, 0]),
+    ]
+
+    chains = fit_temporal(some, PAIR).temporal.chains
+
+    assert [(one.cue, one.there, one.missing) for one in chains] == [
+        ("road", (), ()),
+        ("road", ("intersection", "left"), ()),
+        ("road", ("intersection",), ("left",)),
+    ]
+    nowhere, there, missing = chains
+    assert nowhere.first == (0.5,)
+    assert there.first == (0.5652, 0.6219, 0.5652, 0.5652, 0.5652)
+    assert missing.first == (0.4348, 0.3781, 0.4348, 0.4348, 0.4348)
+
+
+def test_frequencies_stay_0_002_away_from_zero_and_one() -> None:
+    """After 10,000 positive steps, a frequency is 0.998, and after as many negative ones 0.002."""
+    for value, rate in ((1, 0.998), (0, 0.002)):
+        long = hand_drive("a", [value] * 10_000, [5.0] * 10_000, left=True)
+        chains = fit_temporal([long, UNSEEN], PAIR).temporal.chains
+        assert chains[1].first[0] == rate
+
+
+def test_log_loss_is_mean_over_frames_and_known_features() -> None:
+    """-log of 1/2, 1/4 and 1 - 1/4 twice: (3 log 2 + 2 log(4/3)) / 4; unknown left, 3 log 2 / 2."""
+    beliefs = np.array([[0.5, 0.25], [0.25, 0.25]])
+    known = hand_drive("a", [0, 0], [5.0, 4.0], left=False)
+    unknown = hand_drive("a", [0, 0], [5.0, 4.0])
+
+    assert log_loss(known, PAIR, beliefs) == pytest.approx(
+        (3.0 * np.log(2.0) + 2.0 * np.log(4.0 / 3.0)) / 4.0
+    )
+    assert log_loss(unknown, PAIR, beliefs) == pytest.approx(1.5 * np.log(2.0))
+
+
+def test_exponent_and_lapse_have_lowest_log_score_on_the_other_half_of_the_places() -> None:
+    """Places a and c validate the fit of b and d, and the other way round."""
+    some = [
+        hand_drive("a", [1, 1, 0, 1], [40.0, 30.0, 20.0, 10.0], left=True, road=[1, 0, 1, 1]),
+        hand_drive("b", [1, 0, 1, 1], [40.0, 30.0, 20.0, 10.0], left=False, road=[0, 0, 1, 0]),
+        hand_drive("c", [0, 0, 0, 1], NONE_AHEAD, left=False, road=[0, 1, 0, 0]),
+        hand_drive("d", [0, 0, 1, 0], NONE_AHEAD, left=False, road=[0, 0, 0, 0]),
+    ]
+    halves = [some[0], some[2]], [some[1], some[3]]
+
+    learned = fit_temporal(some, PAIR)
+
+    assert len(learned.log_scores) == len(EXPONENTS) * len(LAPSES)
+    for exponent, lapse in ((1.0, 0.0), (0.25, 0.05)):
+        losses = []
+        for half, other in (halves, halves[::-1]):
+            changes = {"exponent": exponent, "lapse": lapse}
+            about = fit_temporal(other, PAIR).temporal.model_copy(update=changes)
+            model = temporal_model(PAIR, about)
+            losses += [log_loss(one, PAIR, filtered(one, model)) for one in half]
+        assert learned.log_scores[exponent, lapse] == pytest.approx(np.mean(losses))
+    best = min(learned.log_scores.values())
+    assert learned.log_scores[learned.temporal.exponent, learned.temporal.lapse] == best
+
+
+def test_filtered_probabilities_are_those_of_the_drive() -> None:
+    """Each frame's distance, variance, time, ranges and evaluated cues reach the filter."""
+    model = temporal_model(PAIR, fit_temporal([SEEN, UNSEEN], PAIR).temporal)
+    drive = AnnotatedDrive(
+        np.array([0.0, 3.0, -1.0]),
+        np.array([0.0, 4.0, 1.0]),
+        np.array([0.0, 0.0, 0.5]),
+        np.array([20.0, 17.0, 18.0]),
+        {"sign": np.array([1, -1, 0])},
+        ((), (MeasuredRange(17.0, 1.0),), ()),
+        {},
+        "a",
+    )
+    belief = TemporalFilter(model)
+    expected = []
+    for counts, ranges, moved_m, var_m2, passed_s in (
+        ({"sign": 1}, [], 0.0, 0.0, 0.0),
+        ({}, [MeasuredRange(17.0, 1.0)], 3.0, 4.0, 0.0),
+        ({"sign": 0}, [], -1.0, 1.0, 0.5),
+    ):
+        belief.update(counts, ranges, moved_m, var_m2, passed_s)
+        expected.append(belief.probabilities())
+
+    np.testing.assert_array_equal(filtered(drive, model), expected)
+    none = hand_drive("a", [], [])
+    assert filtered(none, model).shape == (0, 2)
+
+
+def chain_of(
+    cue: str,
+    there: tuple[str, ...],
+    first: tuple[float, ...],
+    stays: tuple[float, ...],
+    appears: tuple[float, ...],
+) -> CueChain:
+    return CueChain(cue=cue, there=there, first=first, stays=stays, appears=appears)
+
+
 STAYS, APPEARS = 0.8, 0.15
 
 

@@ -153,13 +153,13 @@ def test_gate_accepts_up_to_its_normalised_innovation_squared(
 ) -> None:
     """Equal variances halve the innovation and the variance.
 
-    4 + 4 and 9 + 9 m2 at (4, 6) m give 16 / 8 + 36 / 18 = 4; a heading or speed 2 away with
-    0.5 + 0.5 gives 4, too.
+    4 + 4 and 9 + 9 m2 at (4, 6) m give 16 / 8 + 36 / 18 = 4; a heading or speed 3 away with
+    1.125 + 1.125 gives 9 / 2.25 = 4, too.
     """
-    before = PoseBelief(7, np.array([1.0, 2.0, 0.25, 3.0]), np.diag([4.0, 9.0, 0.5, 0.5]))
+    before = PoseBelief(7, np.array([1.0, 2.0, -1.0, 3.0]), np.diag([4.0, 9.0, 1.125, 1.125]))
     measured = [
-        (update_heading(before, 2.25, 0.5, gate_nis), [2.0], [2]),
-        (update_speed(before, 5.0, 0.5, gate_nis), [2.0], [3]),
+        (update_heading(before, 2.0, 1.125, gate_nis), [3.0], [2]),
+        (update_speed(before, 6.0, 1.125, gate_nis), [3.0], [3]),
     ]
     if is_position:
         xy_m, cov_m2 = np.array([5.0, 8.0]), np.diag([4.0, 9.0])
