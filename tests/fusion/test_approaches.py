@@ -11,7 +11,7 @@ import pytest
 
 from crosscue.fusion.approaches import Approaches, Step, no_past_cues
 from crosscue.fusion.evidence import FrameEvidence, PastCues, RangePosterior, SignRange
-from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.factor_graph import graph_of, log_odds, probability
 from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
@@ -382,7 +382,8 @@ def test_step_holds_evidence_and_beliefs_of_its_frame() -> None:
 
     steps = run_steps([unseen, seen, seen, seen, replace(seen, t_ns=FRAME_NS - 1)], loop)
 
-    belief = {"intersection": pytest.approx(0.97), "left": 0.5, "right": 0.5, "straight": 0.5}
+    belief = {"left": 0.5, "right": 0.5, "straight": 0.5}
+    belief["intersection"] = probability(log_odds(0.97))
     assert steps == [
         Step(0, None, {}),
         Step(FRAME_NS, 1, seen.counts, (), belief, True),
@@ -454,8 +455,8 @@ def test_waiting_refused_and_restarted_ranges_are_counted() -> None:
 
     start, end = run_steps(frames, loop)[-1].ranges
 
-    assert (start.range_m, start.measured_m) == (pytest.approx(60.0), None)
-    assert (end.range_m, end.measured_m) == (pytest.approx(150.0), 150.0)
+    assert (start.range_m, start.measured_m) == (60.0, None)
+    assert (end.range_m, end.measured_m) == (150.0, 150.0)
     assert loop.counts == {
         "approaches opened": 1,
         "ranges waiting for a second observation": 2,

@@ -23,7 +23,6 @@ from crosscue.fusion.fit.fade_fit import (
     fit_fade,
 )
 from crosscue.fusion.fit.message_fit import Side, _exponents, _rate, fit_messages, log_odds_of
-from crosscue.replay.base import Floats
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
 ROAD = CueNode("road", 0.7, can_start=True)
@@ -53,7 +52,7 @@ def approach(
     features = {name: value for name, value in (("left", left), ("up", up)) if value is not None}
     counts = {"road": road} | ({} if arrow is None else {"arrow": arrow})
     return AnnotatedApproach(
-        10.0 * LOG_3 * np.arange(n) if way_m is None else np.array(way_m, np.float64),
+        np.array([10.0 * LOG_3 * i for i in range(n)] if way_m is None else way_m, np.float64),
         np.zeros(n) if time_s is None else np.array(time_s, np.float64),
         np.array([False] * n if near is None else near, np.bool_),
         np.array([True] * n if established is None else established, np.bool_),
@@ -85,6 +84,13 @@ OTHER_PLACES = [
 UNKNOWN = approach([1, 1, 1], place="g", left=None)
 
 
+def assert_side(
+    found: Side, rates: tuple[float, ...], frames: int, observations: float, hits: float
+) -> None:
+    assert found.rates == pytest.approx(rates)
+    assert found[1:] == pytest.approx((frames, observations, hits))
+
+
 def test_rates_weigh_frames_by_independence_and_places_equally() -> None:
     """The second of two frames with a correlation of 1/3 counts half.
 
@@ -97,15 +103,15 @@ def test_rates_weigh_frames_by_independence_and_places_equally() -> None:
     far = _rate(some, ROAD, "left", False, USUAL_FADE)
     near = _rate(some, ROAD, "left", True, USUAL_FADE)
 
-    assert far.there == Side(pytest.approx((1.0, 0.5, 1 / 3)), 6, pytest.approx(5.0), 3.0)
+    assert_side(far.there, (1.0, 0.5, 1 / 3), 6, 5.0, 3.0)
     assert far.there.places == 3
-    assert far.missing == Side(pytest.approx((0.0, 0.0, 2 / 3)), 5, pytest.approx(4.0), 1.0)
+    assert_side(far.missing, (0.0, 0.0, 2 / 3), 5, 4.0, 1.0)
     assert far.rates is not None
     assert (far.rates.if_there, far.rates.if_not) == pytest.approx((95 / 168, 23 / 84))
     assert (far.rates.cue, far.rates.feature, far.rates.near) == ("road", "left", False)
     assert (near.cue, near.feature, near.near, near.rates) == ("road", "left", True, None)
-    assert near.there == Side((1.0,), 1, pytest.approx(0.5), pytest.approx(0.5))
-    assert near.missing == Side((), 0, 0.0, 0.0)
+    assert_side(near.there, (1.0,), 1, 0.5, 0.5)
+    assert_side(near.missing, (), 0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("left_out", ["a", "d", "c"])
@@ -132,8 +138,8 @@ def test_frames_count_by_time_where_fade_is_a_time() -> None:
     far = _rate([timed, still], ROAD, "left", False, Fade(time_s=2.0))
     near = _rate([timed, still], ROAD, "left", True, Fade(time_s=2.0))
 
-    assert far.there == Side(pytest.approx((1 / 1.5, 1.0)), 4, pytest.approx(2.5), 2.0)
-    assert near.there == Side((), 1, 0, 0)
+    assert_side(far.there, (1 / 1.5, 1.0), 4, 2.5, 2.0)
+    assert_side(near.there, (), 1, 0, 0)
 
 
 def test_exponent_minimises_log_loss_of_places_with_log_normal_prior() -> None:
@@ -180,18 +186,18 @@ def test_log_odds_of_approach_are_sums_of_its_messages() -> None:
     assert log_odds_of(approach([]), GRAPH, learned).shape == (0, 2)
 
 
-def markov_approaches(positions: Floats, *, is_time: bool) -> list[AnnotatedApproach]:
-    """Return 32 approaches with three frames that keep their value with a correlation of 1/2.
+def markov_approaches(step: float, *, is_time: bool) -> list[AnnotatedApproach]:
+    """Return 32 approaches of three frames whose value has a correlation of 1/2 after a step.
 
     9 of 32 are +++, 3 ++-, 1 +-+ and 3 +--, and as many are their opposites. 16 more have two
     frames at one place, which agree.
     """
     patterns = [((1, 1, 1), 9), ((1, 1, 0), 3), ((1, 0, 1), 1), ((1, 0, 0), 3)]
     rows = [list(p) for p, many in patterns for _ in range(many)] + [[1, 1]] * 8
-    still = np.zeros(3)
+    still = np.full(3, 7.0)
     found = []
     for values in (*rows, *([1 - n for n in row] for row in rows)):
-        moved = positions if len(values) == 3 else np.zeros(2)
+        moved = np.array([7.0, 7.0 + step, 7.0 + 2.0 * step] if len(values) == 3 else [7.0, 7.0])
         way_m, time_s = (still[: len(values)], moved) if is_time else (moved, still[: len(values)])
         found.append(approach(values, way_m.tolist(), time_s=time_s.tolist()))
     return found
@@ -205,9 +211,9 @@ def test_fade_is_integral_of_correlation_over_an_approach(is_time: bool) -> None
     s (1 - 2^(-4/3)). 128 observations are positive half of the time.
     """
     scale = float((TIMES_S if is_time else WAYS_M)[20])
-    some = markov_approaches(scale * LOG_2 * np.arange(3), is_time=is_time)
+    some = markov_approaches(scale * LOG_2, is_time=is_time)
 
-    found = fit_fade([*some, approach([-1], place="empty")], GRAPH, ROAD)
+    found = fit_fade([approach([-1], place="empty"), *some], GRAPH, ROAD)
 
     length = scale * (1.0 - 2.0 ** (-4 / 3))
     fade = (found.fade.way_m, found.fade.time_s)
@@ -228,7 +234,8 @@ def test_fade_needs_twenty_positives_and_negatives_too() -> None:
     ):
         found = fit_fade(some, GRAPH, ROAD)
         assert found == FadeFit("road", found.fade, positives, observations, is_learned)
-        assert is_learned or found.fade == USUAL_FADE
+        # Alternating values have no positive correlation, and the distance is as good as the time.
+        assert found.fade == (Fade(way_m=float(WAYS_M[0])) if is_learned else USUAL_FADE)
 
 
 def test_residuals_are_from_rate_of_same_features_and_distance() -> None:
@@ -256,7 +263,9 @@ def test_equal_distances_share_a_bin_and_bins_have_equal_numbers() -> None:
     assert few.pairs.tolist() == [2.0, 1.0, 1.0]
     assert few.distance.tolist() == [1.0, 3.0, 5.0]
     assert few.correlation == pytest.approx([0.3, 0.5, 0.1])
+    # Edges at multiples of 119 / 60: 0 and 1 are below the first, and 119 is the last edge.
     assert (len(many.pairs), many.pairs.sum(), many.pairs.max()) == (61, 120.0, 2.0)
+    assert (many.pairs[0], many.pairs[-1]) == (2.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -314,7 +323,7 @@ def test_fit_of_messages_combines_fades_rates_and_exponents() -> None:
     ]
 
     few, many = fit_messages(some, GRAPH), fit_messages(some * 7, GRAPH)
-    mixed = fit_messages(markov_approaches(LOG_2 * np.arange(3), is_time=False), GRAPH)
+    mixed = fit_messages(markov_approaches(LOG_2, is_time=False), GRAPH)
 
     rates = Rates(cue="road", feature="left", near=False, if_there=0.875, if_not=0.125)
     assert few.calibrated.rates == (rates,)
