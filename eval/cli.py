@@ -1,8 +1,9 @@
 """The ``crosscue`` command: a table of commands, one boundary for errors.
 
 Only the module of the command that was asked for is imported, so ``crosscue --help`` answers at
-once. A command is one file in ``commands`` with ``add_arguments(parser)`` and ``run(args) -> int``,
-and one line in ``COMMANDS``.
+once. A command is a function of the package and one line in ``COMMANDS``; ``command_line`` makes
+its parser from the function's signature and docstring. A line with a pair is a command that is
+still written by hand, in ``commands``, with ``add_arguments(parser)`` and ``run(args) -> int``.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ import difflib
 import errno
 import io
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 
@@ -28,13 +31,13 @@ from crosscue.replay.versions import installed
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "info": ("logs.info", "list topics, counts, clocks, gaps and damage of a log"),
-    "convert": ("logs.convert", "convert a log or data set to MCAP with ROS 2 types"),
-    "seal": ("logs.seal", "write a checksum of each MiB beside a log, or verify a log with it"),
+COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
+    "info": "eval.logs.summary:info",
+    "convert": "eval.logs.convert:convert",
+    "seal": "eval.logs.seals:seal",
     "vehicle init": ("vehicle.init", "write a first vehicle file from the contents of a log"),
     "vehicle check": ("vehicle.check", "draw a vehicle file on a picture, list contradictions"),
-    "decode": ("logs.decode", "decode every topic and CAN message into a Parquet file"),
+    "decode": "eval.catalog.decoded_logs:decode",
     "detect": ("runs.detect", "run detectors on the camera images of a log"),
     "estimate": ("runs.estimate", "repeat the estimate of a run from its stored detections"),
     "replay": ("runs.replay", "detect and estimate: from a log to a run folder"),
@@ -128,7 +131,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class Command(Protocol):
-    """Interface of a module in ``commands``."""
+    """Interface of a command: of ``VerbCommand``, and of a module in ``commands``."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Declare flags."""
@@ -228,14 +231,22 @@ def run(argv: Sequence[str]) -> int:
 
 def parser_of(name: str) -> tuple[Command, argparse.ArgumentParser]:
     """The module of one command and the parser of its options."""
-    module = cast("Command", import_module(f"crosscue.eval.commands.{COMMANDS[name][0]}"))
     parser = _Parser(
         prog=f"crosscue {name}",
-        description=str(cast("object", module).__doc__),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=EXIT_STATUS,
         allow_abbrev=False,
     )
+    where = COMMANDS[name]
+    module: Command
+    if isinstance(where, str):
+        from crosscue.eval.terminal import VerbCommand
+
+        path, _, function = where.partition(":")
+        module = VerbCommand(getattr(import_module(f"crosscue.{path}"), function))
+    else:
+        module = cast("Command", import_module(f"crosscue.eval.commands.{where[0]}"))
+        parser.description = str(cast("object", module).__doc__)
     module.add_arguments(parser)
     talk = parser.add_mutually_exclusive_group()
     talk.add_argument("-q", "--quiet", action="store_true", help="print only errors")
@@ -329,7 +340,23 @@ def _unknown(argv: Sequence[str]) -> int:
 
 def _lines(names: Iterable[str]) -> list[str]:
     width = max(map(len, COMMANDS))
-    return [f"  {name:{width}}  {COMMANDS[name][1]}" for name in names]
+    return [f"  {name:{width}}  {summary_of(name)}" for name in names]
+
+
+def summary_of(name: str) -> str:
+    """Return one line on a command: the first of its function's docstring.
+
+    It is read from the source, because the list of commands is printed without any import.
+    """
+    where = COMMANDS[name]
+    if not isinstance(where, str):
+        return where[1]
+    module, _, function = where.partition(":")
+    path = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
+    text = path.read_text(encoding="utf-8")
+    found = re.search(rf'^def {function}\(.*?"""(.*?)\.?(?:"""|$)', text, re.DOTALL | re.MULTILINE)
+    assert found is not None, where
+    return found[1][:1].lower() + found[1][1:]
 
 
 def _overview() -> str:

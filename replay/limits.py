@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, TypeAlias
+
+from crosscue.replay.errors import UsageError
+from crosscue.verb import Option
 
 MIB: Final = 1 << 20
 
@@ -28,3 +32,36 @@ class Limits:
 
 
 DEFAULT_LIMITS: Final = Limits()
+
+
+def mebibytes(text: str) -> int:
+    """Return a number of MiB in bytes.
+
+    Raises:
+        UsageError: It is not a number above 0, or above 1 TiB.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and 0.0 < value <= 1 << 20):
+        raise UsageError(f"{text!r}: expected MiB, above 0 and up to {1 << 20}")
+    return max(int(value * MIB), 1)
+
+
+def limits_of(
+    *,
+    max_chunk_bytes: Annotated[
+        int, Option("--max-chunk", metavar="MIB", convert=mebibytes)
+    ] = DEFAULT_LIMITS.chunk_bytes,
+) -> Limits:
+    """Return limits for reading a log.
+
+    Args:
+        max_chunk_bytes: Largest chunk, container or page to decompress, in MiB (default: 256).
+    """
+    return replace(DEFAULT_LIMITS, chunk_bytes=max_chunk_bytes)
+
+
+LimitsGiven: TypeAlias = Annotated[Limits, Option(made_by=limits_of)]
+"""Limits, as a parameter of a verb."""

@@ -32,9 +32,9 @@ class Commands(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """One section for each command."""
-        from crosscue.eval.cli import COMMANDS
+        from crosscue.eval.cli import COMMANDS, summary_of
 
-        return [self._section(name, says) for name, (_, says) in COMMANDS.items()]
+        return [self._section(name, summary_of(name)) for name in COMMANDS]
 
     def _section(self, name: str, says: str) -> nodes.section:
         section = nodes.section(ids=[nodes.make_id(f"crosscue {name}")])
@@ -219,9 +219,19 @@ def _row(cells: tuple[str, ...], *, is_head: bool = False) -> nodes.row:
     return nodes.row("", *entries)
 
 
+def _keep_examples(
+    app: Sphinx, kind: str, name: str, found: object, options: object, lines: list[str]
+) -> None:
+    """Show the examples of a verb as they are, one command a line."""
+    for place, line in enumerate(lines):
+        if line == "Examples:":
+            lines[place] = "Examples::"
+
+
 def setup(app: Sphinx) -> dict[str, object]:
     """Register the directives."""
     app.add_directive("crosscue-columns", Columns)
+    app.connect("autodoc-process-docstring", _keep_examples, priority=400)
     app.add_directive("crosscue-commands", Commands)
     app.add_directive("crosscue-names", Names)
     app.add_directive("crosscue-settings", SettingsFile)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
+from crosscue.eval.logs.log import DriveGiven, opened, vehicle_of
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
 from crosscue.eval.runs.folder import (
@@ -17,6 +18,7 @@ from crosscue.eval.runs.folder import (
     account,
     account_lines,
     clear,
+    created,
     details_of,
     locked,
     reading_of,
@@ -38,7 +40,6 @@ from crosscue.replay.base import (
     Topic,
     name_of,
     versions,
-    visible,
 )
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
@@ -48,9 +49,11 @@ from crosscue.replay.mobileye.can.admit import all_ids
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.samples import settings_of
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.results import HIDDEN, Result, json_key
 
 if TYPE_CHECKING:
     import numpy as np
@@ -101,7 +104,7 @@ class _Table:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Decoded:
+class Decoded(Result):
     """A decoded drive; its ``repr`` lists the tables.
 
     Attributes:
@@ -112,33 +115,67 @@ class Decoded:
         details: Location and reason of the first dropped rows.
     """
 
-    path: Path
-    rows: dict[str, int]
-    account: Account
-    timeline: Timeline
-    details: list[str]
+    path: Path = field(metadata=HIDDEN)
+    rows: dict[str, int] = field(metadata=json_key("tables"))
+    account: Account = field(metadata=HIDDEN)
+    timeline: Timeline = field(metadata=HIDDEN)
+    details: list[str] = field(metadata=HIDDEN)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the object that ``crosscue decode --json`` prints."""
-        return {
-            "tables": self.rows,
-            "account": self.account.as_json(),
-            "time": time_segments(self.timeline).as_json(),
-        }
+    also: ClassVar = {"account": "account_by_stage", "time": "time"}
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield the number of rows of each table, and the account."""
         width = max(map(len, self.rows), default=0)
-        lines = [f"{name:{width}}  {count:>10,} rows" for name, count in self.rows.items()]
-        lines += map(visible, (*account_lines(self.account), *self.details))
-        notices = [text for log in self.account.reading for text in log.notices]
-        lines += [f"note     {visible(text)}" for text in notices]
-        lines += [f"note     {text}" for text in gaps_text(self.timeline.segments)]
-        return "\n".join(lines)
+        for name, count in self.rows.items():
+            yield f"{name:{width}}  {count:>10,} rows"
+        yield from (*account_lines(self.account), *self.details)
+        for log in self.account.reading:
+            yield from (f"note     {text}" for text in log.notices)
+        yield from (f"note     {text}" for text in gaps_text(self.timeline.segments))
 
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped or the logs have gaps, else 0."""
         return 3 if self.timeline.has_gaps or not self.account.is_whole else 0
+
+    @property
+    def time(self) -> object:
+        """Time segments, as in the manifest."""
+        return time_segments(self.timeline).as_json()
+
+    @property
+    def account_by_stage(self) -> object:
+        """Account, as in the manifest."""
+        return self.account.as_json()
+
+
+def decode(
+    log: DriveGiven,
+    output: Path | str,
+    vehicle: Vehicle | Path | str | None = None,
+    *,
+    overwrite: bool = False,
+) -> Decoded:
+    """Decode every topic and CAN message into a Parquet file.
+
+    Examples:
+        crosscue decode drive.mcap --vehicle car.toml -o tables
+
+    Args:
+        log: The drive, or its path; ``log.part(...)`` for a part of it.
+        output: Folder for the tables.
+        vehicle: Vehicle file: DBC files, buses, mounting (default: vehicle.toml next to the log).
+        overwrite: Replace existing tables.
+
+    Raises:
+        SchemaError: A DBC file is not valid.
+        EmptyResultError: There is no row for any table; the folder is unchanged.
+        OutputError: The folder has other contents, or cannot be written.
+    """
+    with opened(log) as drive:
+        settings = vehicle_of(drive, vehicle)
+        with created(Path(output), overwrite=overwrite) as folder:
+            return decode_tables(drive.logs, settings, folder, drive.selection)
 
 
 def decode_tables(
@@ -146,7 +183,6 @@ def decode_tables(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    on_rows: Callable[[int, int], None] = lambda _rows, _of: None,
 ) -> Decoded:
     """Write all streams of a drive as tables.
 
@@ -155,7 +191,6 @@ def decode_tables(
         vehicle: DBC files, buses and the Mobileye's mounting.
         run: Folder for the tables; cleared first.
         selection: The part of the logs to decode.
-        on_rows: Called with the number of rows read, and the number that the logs declare.
 
     Raises:
         SchemaError: A DBC file cannot be read.
@@ -178,7 +213,7 @@ def decode_tables(
                         name = file_name(block.topic, taken)
                         tables[block.topic] = _Table(new, name, stack, timeline, clock)
                     tables[block.topic].add(block)
-                    on_rows(sum(map(rows_read, ledgers)), declared)
+                    emit(Progress("decoding", sum(map(rows_read, ledgers)), declared, "rows"))
             for table in tables.values():
                 table.write()
         rows = {f"{table.name}.parquet": table.rows for table in tables.values()}

@@ -9,9 +9,9 @@ from typing import Final
 
 from crosscue.eval.interface.runs.make import replay_drive
 from crosscue.eval.interface.runs.recording import save_recording
-from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.interface.runs.score import ScoredRun, score_run
 from crosscue.eval.interface.simulate import simulate_approach
+from crosscue.eval.pipeline.run import Run
 from crosscue.replay.base import CrosscueError, UsageError, write_text
 
 REAL: Final = "pandaset_002"

@@ -20,7 +20,7 @@ from crosscue.eval.fit.landmarks.database import (
     near_of,
     read_poses,
 )
-from crosscue.eval.interface.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
 from crosscue.localization.landmarks.images import grey_of, read_picture

@@ -7,7 +7,7 @@ from typing import Any
 
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
-from crosscue.eval.interface.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, opened
 from crosscue.replay.base import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.interface.show import listing
+from crosscue.eval.logs.log import Log, opened
 from crosscue.eval.vehicle.check import Checked, Shown, check
 from crosscue.eval.vehicle.check_page import check_output, write_check
 from crosscue.eval.vehicle.mounting import estimate_mounting

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
 
 from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError, name_of
 from crosscue.replay.remote.logs import RangedLog
+from crosscue.verb import Option
 
 
 def part_of(
@@ -28,7 +31,7 @@ def part_of(
         UsageError: A time is not finite, or the time range is empty.
         MissingTopicError: No log has a topic of that name, or no log has a row.
     """
-    wanted = None if topics is None else named_topics(logs, topics, "topics")
+    wanted = None if topics is None else named_topics(logs, topics)
     if start_s is None and end_s is None:
         return Selection(wanted)
     for name, value in (("start_s", start_s), ("end_s", end_s)):
@@ -43,32 +46,38 @@ def part_of(
     return Selection(wanted, start_ns, end_ns)
 
 
-def part_in_words(
-    logs: Sequence[Log], start: str | None, end: str | None, topics: Iterable[str] | None
-) -> Selection:
-    """Parse the values of ``--from``, ``--to`` and ``--topics`` into a selection.
+@dataclass(frozen=True, slots=True)
+class LogPart:
+    """The part of a drive to read, as the command line names it.
 
-    Args:
-        logs: Open logs of one drive; seconds count from the first row of the earliest log.
-        start: Seconds, ``12.5``, or absolute nanoseconds, ``17...ns``; None for the beginning.
-        end: End of the time range, exclusive, in the same form; None for the end.
-        topics: Names of topics; None or empty for all.
-
-    Raises:
-        UsageError: A time cannot be parsed, or the time range is empty.
-        MissingTopicError: No log has a topic of that name, or no log has a row.
+    Attributes:
+        start: Start time: seconds from the first message (12.5), or absolute nanoseconds (17...ns).
+        end: End time, exclusive, in the same form.
+        topics: Read only these topics.
     """
-    wanted = named_topics(logs, topics, "--topics") if topics else None
-    if start is None and end is None:
-        return Selection(wanted)
-    start_ns = _time_ns("--from", start, logs)
-    end_ns = _time_ns("--to", end, logs)
-    if start_ns is not None and end_ns is not None and end_ns <= start_ns:
-        raise UsageError(f"--to {end}: not after --from {start}; try a later time")
-    return Selection(wanted, start_ns, end_ns)
+
+    start: Annotated[str | None, Option("--from", metavar="T")] = None
+    end: Annotated[str | None, Option("--to", metavar="T")] = None
+    topics: Sequence[str] | None = None
+
+    def selected(self, logs: Sequence[Log]) -> Selection:
+        """Return the selection of this part in open logs of one drive.
+
+        Raises:
+            UsageError: A time cannot be parsed, or the time range is empty.
+            MissingTopicError: No log has a topic of that name, or no log has a row.
+        """
+        wanted = named_topics(logs, self.topics) if self.topics else None
+        if self.start is None and self.end is None:
+            return Selection(wanted)
+        start_ns = _time_ns("start", self.start, logs)
+        end_ns = _time_ns("end", self.end, logs)
+        if start_ns is not None and end_ns is not None and end_ns <= start_ns:
+            raise UsageError(f"end: {self.end}, expected a time after the start, {self.start}")
+        return Selection(wanted, start_ns, end_ns)
 
 
-def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
+def _time_ns(name: str, text: str | None, logs: Sequence[Log]) -> int | None:
     if text is None:
         return None
     if re.fullmatch(r"-?\d+ns", text):
@@ -79,12 +88,12 @@ def _time_ns(flag: str, text: str | None, logs: Sequence[Log]) -> int | None:
         seconds = math.nan
     if not math.isfinite(seconds):
         raise UsageError(
-            f"{flag} {text}: expected seconds after the start (12.5) or absolute time (17...ns)"
+            f"{name}: {text}, expected seconds after the start (12.5) or absolute time (17...ns)"
         )
     return first_ns(logs) + round(seconds * 1e9)
 
 
-def named_topics(logs: Sequence[Log], names: Iterable[str], flag: str) -> frozenset[str]:
+def named_topics(logs: Sequence[Log], names: Iterable[str]) -> frozenset[str]:
     """Check that each name is a topic of one of the logs, and return the names.
 
     Raises:
@@ -94,7 +103,7 @@ def named_topics(logs: Sequence[Log], names: Iterable[str], flag: str) -> frozen
     wanted = frozenset(names)
     for name in sorted(wanted - known):
         raise MissingTopicError(
-            f"{flag} {name}: no such topic; there are: {', '.join(sorted(known))}"
+            f"topics: {name}, no such topic; there are: {', '.join(sorted(known))}"
         )
     return wanted
 
@@ -114,6 +123,6 @@ def first_ns(logs: Sequence[Log]) -> int:
                 break
     if not starts:
         raise MissingTopicError(
-            "--from, --to: the log holds no row, so it has no start; leave them out"
+            "start, end: the log holds no row, so it has no start; leave them out"
         )
     return min(starts)

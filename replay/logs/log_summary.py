@@ -35,6 +35,7 @@ from crosscue.replay.clocks.findings import (
     instant_text,
 )
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
 
@@ -175,11 +176,6 @@ class _CanIds:
         )
 
 
-Progress = Callable[[Iterable[Block], Callable[[], tuple[int, int]]], Iterable[Block]]
-"""Passes blocks through and displays progress; the second argument returns the numbers of rows read
-and rows declared."""
-
-
 def quick_summary(log: Log) -> LogSummary:
     """Summarise what a log declares and whether its end is missing, without reading its body."""
     ledger = Ledger(name_of(log))
@@ -190,19 +186,34 @@ def quick_summary(log: Log) -> LogSummary:
 
 
 def summarise(
-    log: Log, progress: Progress | None = None, selection: Selection = EVERYTHING
+    log: Log,
+    selection: Selection = EVERYTHING,
+    watch: Callable[[Block], None] = lambda block: None,
 ) -> LogSummary:
-    """Read a log, or a part of it, once and in bounded memory, and summarise it."""
+    """Read a log, or a part of it, once and in bounded memory, and summarise it.
+
+    Args:
+        log: The log.
+        selection: The part to read.
+        watch: Called with each block as it is read.
+    """
     ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
-    blocks: Iterable[Block] = ledger.handing_on(log.read(ledger, selection))
-    if progress is not None:
-        blocks = progress(blocks, lambda: (rows_read(ledger), rows_declared(log)))
+    blocks = _watched(ledger.handing_on(log.read(ledger, selection)), log, ledger, watch)
     for block in _decoded(log, blocks, ledger):
         clocks.see(block)
         if isinstance(block.rows, CanFrames):
             can_ids.setdefault(block.topic, _CanIds()).see(block.rows)
     ledger.check()
     return _summary(log, ledger, clocks, can_ids, is_quick=False)
+
+
+def _watched(
+    blocks: Iterable[Block], log: Log, ledger: Ledger, watch: Callable[[Block], None]
+) -> Iterator[Block]:
+    for block in blocks:
+        watch(block)
+        yield block
+        emit(Progress("reading", rows_read(ledger), rows_declared(log), "rows"))
 
 
 def together(summaries: Iterable[LogSummary]) -> Together:

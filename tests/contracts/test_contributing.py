@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from textwrap import dedent
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from crosscue.detectors.base import Choice
 from crosscue.detectors.registry import BUILTIN, make
+from crosscue.eval import cli
+from crosscue.replay.errors import UsageError
 from crosscue.replay.formats import FORMATS, Format
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.testing import check_cue, check_detector, check_reader
@@ -76,3 +81,24 @@ def test_detector_example_fulfils_contract(module: Callable[[str, str], str]) ->
     place = f"{module('example_detector', code)}:Lamp.build"
 
     check_detector(lambda: make(Choice("lamp", "lamp"), {**BUILTIN, "lamp": place}))
+
+
+def test_command_example_has_the_described_options(
+    module: Callable[[str, str], str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (code,) = _code("a command")
+    verb = vars(import_module(module("example_command", code)))["longest_gap"]
+    monkeypatch.setitem(cli.COMMANDS, "longest-gap", "eval.logs.longest_gap:longest_gap")
+    monkeypatch.setitem(
+        sys.modules, "crosscue.eval.logs.longest_gap", SimpleNamespace(longest_gap=verb)
+    )
+
+    assert cli.run(["longest-gap", "--help"]) == 0
+    help_text = capsys.readouterr().out
+    for option in ("LOG", "--from", "--to", "--topics", "--max-chunk", "--min-s S", "--json", "-q"):
+        assert option in help_text, option
+    assert cli.run(["longest-gap", "drive.mcap", "--min-s", "-1"]) == 4
+    with pytest.raises(UsageError, match=r"min_s: -1\.0, expected more than 0"):
+        verb("drive.mcap", min_s=-1.0)

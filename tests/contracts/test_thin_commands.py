@@ -1,4 +1,4 @@
-"""Every command calls public functions only, so that Python can do the same."""
+"""Every command that is written by hand calls public functions only, as Python can."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[2]
 CALLS: Final = {
-    "convert": ("convert",),
-    "seal": ("seal", "check_seal"),
-    "decode": ("decode",),
     "merge": ("merge",),
     "history": ("history",),
     "query": ("catalog",),
@@ -53,7 +50,6 @@ CALLS: Final = {
     "browse": ("browse",),
     "export": ("export",),
     "plugins": ("plugins",),
-    "info": ("open",),
     "landmarks add": (
         "add_landmarks",
         "add_landmark_images",
@@ -97,13 +93,16 @@ Constants of other modules are allowed as well, for the help."""
 
 def tree_of(command: str) -> ast.Module:
     """Return the syntax tree of a command's module."""
-    module = import_module(f"crosscue.eval.commands.{cli.COMMANDS[command][0]}")
+    where = cli.COMMANDS[command]
+    assert isinstance(where, tuple)
+    module = import_module(f"crosscue.eval.commands.{where[0]}")
     return ast.parse(inspect.getsource(module))
 
 
 def test_every_command_has_public_functions_or_reason() -> None:
     assert not CALLS.keys() & WITHOUT.keys()
-    assert CALLS.keys() | WITHOUT.keys() == cli.COMMANDS.keys()
+    by_hand = {name for name, where in cli.COMMANDS.items() if isinstance(where, tuple)}
+    assert CALLS.keys() | WITHOUT.keys() == by_hand
 
 
 @pytest.mark.parametrize("command", CALLS)

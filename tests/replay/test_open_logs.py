@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import crosscue
-from crosscue.eval.interface.logs import log as interface
+from crosscue.eval.logs import log as interface
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, Log, LogError
 from support.memory_log import MemoryLog
 

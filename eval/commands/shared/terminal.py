@@ -1,34 +1,30 @@
-"""Shared options of commands, functions that print results, and a progress line.
-
-The line shows the amount done, the rate and the time left. rich draws it on stderr and removes it
-at the end. Without a terminal on stderr, or with ``--quiet``, rich is not imported.
-"""
+"""Shared options of the commands that are written by hand."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import crosscue
+from crosscue.eval.command_line import add_parameters
+from crosscue.eval.terminal import Done as Done
+from crosscue.eval.terminal import ProgressLine as ProgressLine
+from crosscue.eval.terminal import is_shown as is_shown
+from crosscue.eval.terminal import print_json as print_json
+from crosscue.eval.terminal import warn as warn
+from crosscue.replay import limits
 from crosscue.replay.base import (
-    DEFAULT_LIMITS,
     Limits,
     OutputError,
     strict_json,
-    visible,
     write_text,
 )
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from crosscue.eval.batch.jobs import Progress as Progressed
 
 T = TypeVar("T")
@@ -128,40 +124,23 @@ def add_file_output(parser: argparse.ArgumentParser, metavar: str, what: str) ->
 
 def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--max-chunk``."""
-    parser.add_argument(
-        "--max-chunk",
-        type=_mebibytes,
-        default=DEFAULT_LIMITS.chunk_bytes,
-        metavar="MIB",
-        help="largest chunk, container or page to decompress, in MiB "
-        f"(default: {DEFAULT_LIMITS.chunk_bytes >> 20})",
-    )
+    add_parameters(parser, limits.limits_of)
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
     """Return the limits for reading a log."""
-    return replace(DEFAULT_LIMITS, chunk_bytes=args.max_chunk)
+    return limits.limits_of(max_chunk_bytes=args.max_chunk_bytes)
 
 
 @contextmanager
 def open_part(args: argparse.Namespace, logs: Sequence[Path | str]) -> Iterator[crosscue.Log]:
     """Open a drive's logs, restricted to the part that ``add_part_arguments`` selects."""
-    from crosscue.replay.logs.log_part import part_in_words
-    from crosscue.replay.logs.opening import unless_damaged
+    from crosscue.eval.logs import log
+    from crosscue.replay.logs.log_part import LogPart
 
-    with crosscue.open(*logs, limits=limits_of(args)) as log, unless_damaged(log.logs):
-        part = part_in_words(log.logs, args.start, args.end, args.topics)
-        yield replace(log, selection=part)
-
-
-def _mebibytes(text: str) -> int:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and 0.0 < value <= 1 << 20):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected MiB, above 0 and up to {1 << 20}")
-    return max(int(value * (1 << 20)), 1)
+    part = LogPart(args.start, args.end, args.topics)
+    with log.open_part(*map(str, logs), part=part, limits=limits_of(args)) as drive:
+        yield drive
 
 
 def add_logs_argument(parser: argparse.ArgumentParser) -> None:
@@ -238,16 +217,6 @@ def print_result(found: Result, args: argparse.Namespace) -> None:
         print(found)
 
 
-def print_json(value: object) -> None:
-    """Print strict JSON on stdout: sorted keys, NaN and infinities as null."""
-    print(strict_json(value))
-
-
-def warn(sentence: str) -> None:
-    """Print one line on stderr, with control characters escaped."""
-    print(f"crosscue: {visible(sentence)}", file=sys.stderr)
-
-
 def add_schema_output(parser: argparse.ArgumentParser) -> None:
     """Add ``-o`` and ``--overwrite``, for commands that print a JSON Schema."""
     parser.add_argument(
@@ -267,99 +236,6 @@ def print_schema(schema: object, args: argparse.Namespace) -> None:
         print_json(schema)
     else:
         write_text(args.output, strict_json(schema) + "\n")
-
-
-EVERY_S: Final = 0.1
-"""Shortest time between two updates of the line."""
-
-
-class Done(NamedTuple):
-    """Progress of a command.
-
-    Attributes:
-        amount: Amount done.
-        total: Amount to do; None or 0 where unknown.
-        unit: Unit of both, as a plural noun.
-    """
-
-    amount: float
-    total: float | None
-    unit: str
-
-
-class ProgressLine:
-    """Progress line of one command; a context manager, or closed by ``end``."""
-
-    def __init__(self, what: str, *, is_shown: bool) -> None:
-        """Create a line that draws nothing before the first ``at``, or unless ``is_shown``.
-
-        Args:
-            what: The text before the bar.
-            is_shown: True to draw on stderr, which must then be a terminal.
-        """
-        self.is_shown = is_shown
-        self._what = what
-        self._began = time.monotonic()
-        self._shown = -EVERY_S
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        self._unit = ""
-
-    def at(self, done: Done, what: str = "") -> None:
-        """Show the progress; ``what`` replaces the text before the bar, for another stage."""
-        now = time.monotonic()
-        if not self.is_shown or now - self._shown < EVERY_S:
-            return
-        self._shown = now
-        bar, task = self._task_for(done.unit)
-        total = done.total if done.total and done.total >= done.amount else None
-        bar.update(
-            task,
-            description=visible(what or self._what),
-            completed=done.amount,
-            total=total,
-            amount=self._amount(done._replace(total=total)),
-            left="left" if total else "",
-        )
-        # Nothing is drawn before the first progress.
-        bar.start()
-
-    def counting(self, unit: str, per: float = 1.0) -> Callable[[float, float | None], None]:
-        """Return a callback for the amount done and the total, in 1/``per`` of the shown unit."""
-
-        def count(done: float, of: float | None) -> None:
-            self.at(Done(done / per, None if of is None else of / per, unit))
-
-        return count
-
-    def end(self) -> None:
-        """Remove the line."""
-        if self._bar is not None:
-            self._bar.stop()
-        self._bar = self._task = None
-        self._began = time.monotonic()
-
-    def _amount(self, done: Done) -> str:
-        rate = done.amount / max(time.monotonic() - self._began, 1e-9)
-        of = "" if done.total is None else f" of {done.total:,.0f}"
-        return f"{done.amount:,.0f}{of} {done.unit}, {rate:,.{0 if rate >= 10 else 1}f} a second"
-
-    def _task_for(self, unit: str) -> tuple[Progress, TaskID]:
-        if self._bar is None:
-            self._bar = _new_bar()
-        if self._task is None or unit != self._unit:
-            if self._task is not None:
-                self._bar.remove_task(self._task)
-                self._began = time.monotonic()
-            self._unit = unit
-            self._task = self._bar.add_task("", total=None, amount="", left="")
-        return self._bar, self._task
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self.end()
 
 
 class DriveLine(ProgressLine):
@@ -383,11 +259,6 @@ class DrivesLine(ProgressLine):
         self.at(Done(at.done, at.total - at.earlier, "drives"), f"{self._what}{failed}")
 
 
-def is_shown(args: argparse.Namespace) -> bool:
-    """Return True unless ``--quiet`` is set or stderr is not a terminal."""
-    return not args.quiet and sys.stderr.isatty()
-
-
 def progress_line(args: argparse.Namespace, what: str) -> ProgressLine:
     """Return the progress line of a command with these arguments."""
     return ProgressLine(what, is_shown=is_shown(args))
@@ -409,21 +280,3 @@ def with_progress(
             yield item
             if line.is_shown:
                 line.at(done())
-
-
-def _new_bar() -> Progress:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[amount]}", markup=False),
-        TimeRemainingColumn(compact=True),
-        TextColumn("{task.fields[left]}"),
-        console=Console(stderr=True),
-        transient=True,
-        # Results are printed on stdout during the work; rich would redirect them to stderr.
-        redirect_stdout=False,
-        redirect_stderr=False,
-    )

@@ -12,7 +12,7 @@ from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
 from crosscue.eval.interface.runs.recording import save_recording
-from crosscue.eval.interface.runs.run import open_run
+from crosscue.eval.pipeline.run import open_run
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EmptyResultError,

@@ -22,7 +22,7 @@ from crosscue.eval.fit.detector.class_fit import (
     Judged,
     fit_class,
 )
-from crosscue.eval.interface.runs.run import Run, open_run
+from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match

@@ -10,7 +10,7 @@ from crosscue.eval.fit.landmarks.database import read_poses
 from crosscue.eval.fit.landmarks.pairs import pairs_of_drive, pairs_of_table, with_min_score
 from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
 from crosscue.eval.interface.landmarks import frames_of
-from crosscue.eval.interface.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.fit import fit_landmarks as fit_threshold
 from crosscue.replay.base import SchemaError, UsageError

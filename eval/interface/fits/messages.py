@@ -13,7 +13,7 @@ import numpy as np
 
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.fit.annotated_runs import Annotated, annotate, check_arguments, graph_of_runs
-from crosscue.eval.interface.runs.run import Run, run_given
+from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side

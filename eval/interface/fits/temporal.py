@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.eval.fit.annotated_runs import annotated_drives, check_arguments, graph_of_runs
-from crosscue.eval.interface.runs.run import Run, run_given
+from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.scoring.truth import load
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives

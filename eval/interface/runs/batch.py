@@ -18,12 +18,12 @@ from crosscue.eval.batch.jobs import (
     run_many,
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
-from crosscue.eval.interface.logs.log import open as open_drive
+from crosscue.eval.logs.log import open as open_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import FAILURE, create
 from crosscue.eval.runs.logs import files_named_in
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, versions, visible
-from crosscue.replay.logs.log_part import part_in_words
+from crosscue.replay.logs.log_part import LogPart
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
@@ -122,7 +122,7 @@ class _Work:
     def __call__(self, job: Job) -> Outcome:
         """Replay the drive into its run folder."""
         with open_drive(*job.logs, limits=self.limits) as log, unless_damaged(log.logs):
-            part = part_in_words(log.logs, self.start, self.end, self.topics)
+            part = LogPart(self.start, self.end, self.topics).selected(log.logs)
             run = replay_drive(
                 replace(log, selection=part),
                 job.run,

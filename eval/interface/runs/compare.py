@@ -7,7 +7,7 @@ from pathlib import Path
 
 from crosscue.eval.catalog import compare, many_runs
 from crosscue.eval.catalog.query.catalog import catalog
-from crosscue.eval.interface.runs.run import Run
+from crosscue.eval.pipeline.run import Run
 from crosscue.eval.report.junit import cases_text
 from crosscue.replay.base import UsageError, is_remote, write_text
 

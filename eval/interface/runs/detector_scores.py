@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.datasets.truth.box_labels import BoxLabels, class_names_given, read_box_labels
+from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.report.detector_page import write_detector_page
 from crosscue.eval.report.worst_boxes import worst_pictures
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
@@ -26,8 +27,6 @@ from crosscue.replay.base import (
     visible,
     write_text,
 )
-
-from .run import Run, open_run
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -6,19 +6,17 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from crosscue.eval.interface.logs.log import Log, opened
-from crosscue.eval.interface.runs.run import Run, run_given
+from crosscue.eval.logs.log import Log, opened, vehicle_of
+from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.runs.folder import RunFolder, created
 from crosscue.replay.base import OutputError, UsageError
 from crosscue.replay.vehicle.pose import GnssUse
-from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 if TYPE_CHECKING:
     from crosscue.detectors.base import Choice
-
-VEHICLE: Final = "vehicle.toml"
 
 
 def replay_drive(
@@ -197,17 +195,6 @@ def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choi
     sections = choices_of(vehicle)
     names = [*sections] if detectors is None else [*detectors]
     return chosen(",".join(names), sections) if names else ()
-
-
-def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
-    """Return the given settings, or those of the ``vehicle.toml`` next to the log, or defaults."""
-    if given is not None:
-        return vehicle_given(given)
-    for one in log.logs:
-        beside = (one.path if one.path.is_dir() else one.path.parent) / VEHICLE
-        if beside.is_file():
-            return load(beside)
-    return Vehicle(version=1)
 
 
 def _copied(folder: RunFolder, output: Path) -> RunFolder:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.eval.interface.runs.run import Run, run_given
+from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.runs.moments import TableFolder, approach_spans, moment_ns
 from crosscue.replay.base import UsageError
 

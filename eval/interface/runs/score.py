@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import headline, pose_summary, summary
 from crosscue.eval.report.worst_frames import worst_frames
@@ -26,8 +27,6 @@ from crosscue.eval.scoring.runs import (
 )
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError
 from crosscue.replay.processes import in_processes
-
-from .run import Run, run_given
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from crosscue.eval.catalog.find_runs import runs_of
-from crosscue.eval.interface.runs.run import Run
 from crosscue.eval.interface.runs.score import (
     Failed,
     ScoredRun,
@@ -17,6 +16,7 @@ from crosscue.eval.interface.runs.score import (
     settings_given,
     write_files,
 )
+from crosscue.eval.pipeline.run import Run
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.summary import (
     gate_lines,

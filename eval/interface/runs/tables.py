@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.eval.interface.logs.log import Log, opened
 from crosscue.eval.runs.folder import created
 from crosscue.replay.base import RunError, visible
 
-from .make import vehicle_of
-
 if TYPE_CHECKING:
-    from crosscue.eval.catalog.decoded_logs import Decoded
-    from crosscue.replay.vehicle.vehicle import Vehicle
+    pass
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -50,37 +46,6 @@ class MergedRuns:
             f"tables   {self.path}",
         ]
         return "\n".join(visible(line) for line in lines)
-
-
-def decode(
-    log: Log | Path | str,
-    output: Path | str,
-    vehicle: Vehicle | Path | str | None = None,
-    *,
-    overwrite: bool = False,
-    on_rows: Callable[[int, int], None] = lambda done, of: None,
-) -> Decoded:
-    """Write each topic, CAN message and Mobileye table of a drive as a Parquet file.
-
-    Args:
-        log: The drive, or its path; ``log.part(...)`` for a part of it.
-        output: Folder for the tables.
-        vehicle: Vehicle file with DBC files, buses and mounting; None for the ``vehicle.toml`` next
-            to the log, if it exists.
-        overwrite: Replace earlier tables.
-        on_rows: Called with the number of rows read, and the number that the logs declare.
-
-    Raises:
-        SchemaError: A DBC file is not valid.
-        EmptyResultError: There is no row for any table; the folder is unchanged.
-        OutputError: The folder has other contents, or cannot be written.
-    """
-    from crosscue.eval.catalog.decoded_logs import decode_tables
-
-    with opened(log) as drive:
-        settings = vehicle_of(drive, vehicle)
-        with created(Path(output), overwrite=overwrite) as folder:
-            return decode_tables(drive.logs, settings, folder, drive.selection, on_rows)
 
 
 def merge(

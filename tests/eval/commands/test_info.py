@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
-from crosscue.eval.interface.logs.summary import lines_of, plain
+from crosscue.eval.logs.summary import lines_of
 from crosscue.replay.base import (
     DATA,
     EVERYTHING,
@@ -30,6 +30,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.logs.log_summary import quick_summary, summarise, together
 from crosscue.replay.safe_text import cells, table, visible, wrapped
+from crosscue.results import plain
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
 from support.data import shared
 from support.gap_drive import Clock, write_drive

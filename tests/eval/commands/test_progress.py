@@ -12,13 +12,14 @@ from typing import Final
 
 import pytest
 
-from crosscue.eval.commands.shared import terminal as progress
-from crosscue.eval.commands.shared.terminal import Done, DriveLine, ProgressLine
+from crosscue.eval import terminal as progress
+from crosscue.eval.commands.shared.terminal import DriveLine
+from crosscue.eval.terminal import Done, ProgressLine
 from support.gap_drive import Clock, write_drive
 
 FRAMES: Final = 300
 COMMAND: Final = (
-    "import sys; from crosscue.eval.commands.shared import terminal; terminal.EVERY_S = 0.0; "
+    "import sys; from crosscue.eval import terminal; terminal.EVERY_S = 0.0; "
     "from crosscue.eval.cli import main; main(sys.argv[1:])"
 )
 

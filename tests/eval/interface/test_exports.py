@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 import sys
@@ -67,20 +66,6 @@ def test_every_error_is_public() -> None:
     }
 
     assert raised <= {*crosscue.__all__}
-
-
-def test_type_checking_imports_match_the_export_table() -> None:
-    """The imports under TYPE_CHECKING are those of the table."""
-    source = (ROOT / "crosscue" / "__init__.py").read_text(encoding="utf-8")
-    seen = {
-        alias.asname: f"{node.module}"
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-        if alias.asname is not None
-    }
-
-    assert seen == {name: f"crosscue.{module}" for name, module in crosscue._EXPORTS.items()}
 
 
 def test_unknown_public_name_is_an_attribute_error() -> None:

@@ -130,7 +130,7 @@ def test_log_summary_equals_output_of_info(
     printed = capsys.readouterr().out
 
     with crosscue.open(drive.log) as log:
-        summary = log.summary()
+        summary = crosscue.info(log)
 
     assert repr(summary) == printed.rstrip("\n") + "\n" * repr(summary).endswith("\n")
     assert summary.is_whole

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from enum import Enum
-from typing import Final
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Final
 
 from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
-from crosscue.replay.base import Block, Log, Selection
+from crosscue.replay.base import Log, Selection
 from crosscue.replay.clocks.findings import instant_text
 from crosscue.replay.logs.log_summary import (
     LogSummary,
-    Progress,
     Together,
     TopicSummary,
     quick_summary,
@@ -21,16 +20,19 @@ from crosscue.replay.logs.log_summary import (
     summarise,
     together,
 )
-from crosscue.replay.safe_text import table, terminal_width, visible, wrapped
+from crosscue.replay.safe_text import table, terminal_width, wrapped
 from crosscue.replay.time.scan import LogWatch, timeline_from
 from crosscue.replay.time.segments import Timeline, gaps_text
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.results import HIDDEN, Result
+
+from .log import DriveGiven, opened
 
 LOSSES_SHOWN: Final = 10
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)
-class DriveSummary:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DriveSummary(Result):
     """Topics, counts, rates, gaps, clocks and account of a drive's logs.
 
     Attributes:
@@ -41,7 +43,9 @@ class DriveSummary:
 
     logs: tuple[LogSummary, ...]
     together: Together | None
-    timeline: Timeline | None = None
+    timeline: Timeline | None = field(default=None, metadata=HIDDEN)
+
+    also: ClassVar = {"time": "time"}
 
     @property
     def has_gaps(self) -> bool:
@@ -53,23 +57,48 @@ class DriveSummary:
         """True if no row is known to be dropped."""
         return all(one.is_whole for one in self.logs)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue info``, as dictionaries, lists and scalars."""
-        reported = None if self.timeline is None else time_segments(self.timeline).as_json()
-        return {
-            "logs": [plain(one) for one in self.logs],
-            "together": plain(self.together),
-            "time": plain(reported),
-        }
+    @property
+    def exit_status(self) -> int:
+        """0 when all logs are complete, 3 when something is dropped or the drive has segments."""
+        return 0 if self.is_whole and not self.has_gaps else 3
 
-    def __repr__(self) -> str:
+    @property
+    def time(self) -> object:
+        """Time segments, as in the manifest of a run."""
+        return None if self.timeline is None else time_segments(self.timeline).as_json()
+
+    def lines(self) -> Iterator[str]:
+        """Yield tables of topics, clocks and accounts of each log."""
         width = terminal_width()
-        lines = [line for one in self.logs for line in lines_of(one, width)]
+        for one in self.logs:
+            yield from lines_of(one, width)
         if self.together is not None:
-            lines += _lines_together(self.together, width)
+            yield from _lines_together(self.together, width)
         if self.timeline is not None and self.has_gaps:
-            lines += _segments(self.timeline, width)
-        return "\n".join(lines)
+            yield from _segments(self.timeline, width)
+
+
+def info(
+    log: DriveGiven, vehicle: Vehicle | Path | str | None = None, *, quick: bool = False
+) -> DriveSummary:
+    """List topics, counts, clocks, gaps and damage of a log.
+
+    Offset and drift compare the header stamp, or else the publish time, with the log time.
+
+    Examples:
+        crosscue info drive.mcap
+        crosscue info drive.mcap can0.log --json > drive.json
+        crosscue info --quick drive.bag      only read what the file declares about itself
+        crosscue info https://host/drive.mcap --from 60 --to 62
+
+    Args:
+        log: The drive.
+        vehicle: Vehicle file: topic of wheel speeds, to find gaps.
+        quick: Print what the log declares, and whether its end is missing, without reading its
+            messages.
+    """
+    with opened(log) as drive:
+        return summary_of(drive.logs, drive.selection, vehicle_given(vehicle), quick=quick)
 
 
 def summary_of(
@@ -78,7 +107,6 @@ def summary_of(
     vehicle: Vehicle,
     *,
     quick: bool,
-    progress: Progress | None = None,
 ) -> DriveSummary:
     """Summarise logs, by reading each once or only its declarations.
 
@@ -87,40 +115,16 @@ def summary_of(
         selection: The part to read.
         vehicle: Vehicle file with the topic of wheel speeds, to find gaps.
         quick: Do not read messages.
-        progress: Wraps the iterable of blocks, to show progress.
     """
     if quick:
         return DriveSummary(tuple(map(quick_summary, logs)), None)
     planned, wheels = plan_for_time(logs, vehicle, selection)
     watches = [LogWatch(i, planned, vehicle, wheels[i]) for i in range(len(logs))]
     found = tuple(
-        summarise(log, _watched(watch, progress), selection)
-        for log, watch in zip(logs, watches, strict=True)
+        summarise(log, selection, watch.add) for log, watch in zip(logs, watches, strict=True)
     )
     timeline = timeline_from(watches, planned, vehicle)
     return DriveSummary(found, together(found) if len(found) > 1 else None, timeline)
-
-
-def _watched(watch: LogWatch, progress: Progress | None) -> Progress:
-    def see(blocks: Iterable[Block]) -> Iterator[Block]:
-        for block in blocks:
-            watch.add(block)
-            yield block
-
-    return lambda blocks, rows: see(blocks) if progress is None else progress(see(blocks), rows)
-
-
-def plain(value: object) -> object:
-    """Return a dataclass as dictionaries, lists and scalars, with control characters escaped."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Enum):
-        return plain(value.value)
-    if isinstance(value, Mapping):
-        return {visible(str(key)): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return visible(value) if isinstance(value, str) else value
 
 
 def lines_of(summary: LogSummary, width: int) -> Iterator[str]:

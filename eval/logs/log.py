@@ -6,14 +6,13 @@ import difflib
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import numpy as np
 
-from crosscue.eval.interface.show import listing
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EVERYTHING,
@@ -40,19 +39,21 @@ from crosscue.replay.base import Log as OneLog
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.packets import PacketDecoder, is_stream
-from crosscue.replay.logs.log_part import part_of
+from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.logs.log_part import LogPart, part_of
 from crosscue.replay.logs.opening import open_log as open_one
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.logs.topic_part import columns_of
+from crosscue.results import listing
+from crosscue.verb import Option
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from crosscue.eval.interface.logs.summary import DriveSummary
     from crosscue.replay.base import Bytes
-    from crosscue.replay.logs.log_summary import Progress
     from crosscue.replay.vehicle.vehicle import Vehicle
 
+VEHICLE: Final = "vehicle.toml"
 NOT_ASKED: Final = (NOT_ASKED_TIME, NOT_ASKED_TOPIC)
 
 
@@ -143,27 +144,6 @@ class Log(Closing):
         with unless_damaged(self.logs):
             return replace(self, selection=part_of(self.logs, start_s, end_s, topics))
 
-    def summary(
-        self,
-        vehicle: Vehicle | None = None,
-        *,
-        quick: bool = False,
-        progress: Progress | None = None,
-    ) -> DriveSummary:
-        """Return topics, counts, rates, gaps, clocks and account, read in one pass.
-
-        Args:
-            vehicle: Vehicle file with the topic of wheel speeds, to find gaps; None to detect the
-                topic.
-            quick: Return only what the log declares, without reading its messages.
-            progress: Wraps the iterable of blocks, to show progress.
-        """
-        from crosscue.eval.interface.logs.summary import summary_of
-        from crosscue.replay.vehicle.vehicle import Vehicle
-
-        settings = vehicle or Vehicle(version=1)
-        return summary_of(self.logs, self.selection, settings, quick=quick, progress=progress)
-
     def signals(
         self, *databases: Path | str, bus: str | None = None, messages: Sequence[str] | None = None
     ) -> Signals:
@@ -191,6 +171,38 @@ class Log(Closing):
     def __repr__(self) -> str:
         names = ", ".join(f"{name_of(log)} ({log.format})" for log in self.logs)
         return f"{names}\n{self.topics!r}"
+
+
+@contextmanager
+def open_part(*logs: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS) -> Iterator[Log]:
+    """Open a part of a drive for a ``with`` block.
+
+    Args:
+        logs: Recordings of one drive; paths or URLs.
+        part: The part to read.
+        limits: Limits for reading.
+    """
+    with open(*logs, limits=limits) as drive, unless_damaged(drive.logs):
+        yield replace(drive, selection=part.selected(drive.logs))
+
+
+def open_one_part(
+    log: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS
+) -> AbstractContextManager[Log]:
+    """Open a part of one log for a ``with`` block.
+
+    Args:
+        log: A recording, a data-set folder or a URL.
+        part: The part to read.
+        limits: Limits for reading.
+    """
+    return open_part(log, part=part, limits=limits)
+
+
+DriveGiven: TypeAlias = Annotated[Log | Path | str, Option(made_by=open_part)]
+"""A drive, as a parameter of a verb: on the command line, ``LOG...`` and the part to read."""
+LogGiven: TypeAlias = Annotated[Log | Path | str, Option(made_by=open_one_part)]
+"""One log, as a parameter of a verb."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -524,3 +536,16 @@ def _warn(ledger: Ledger, topic: str) -> None:
         if reason not in NOT_ASKED:
             text = f"{ledger.log}: {topic}: {count} rows skipped: {reason}"
             warnings.warn(text, LossWarning, stacklevel=4)
+
+
+def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
+    """Return the given settings, or those of the ``vehicle.toml`` next to the log, or defaults."""
+    from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
+
+    if given is not None:
+        return vehicle_given(given)
+    for one in log.logs:
+        beside = (one.path if one.path.is_dir() else one.path.parent) / VEHICLE
+        if beside.is_file():
+            return load(beside)
+    return Vehicle(version=1)

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Annotated, ClassVar, Final
 
-from crosscue.eval.interface.logs.log import NOT_ASKED, Log, opened
-from crosscue.eval.interface.show import listing
 from crosscue.eval.pipeline.empty_result import empty_result
 from crosscue.replay.base import Ledger, LogError, OutputError, Topic, UsageError, visible
+from crosscue.replay.ledger import Detail
 from crosscue.replay.logs.opening import open_log
+from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import terminal_width, wrapped
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter
 from crosscue.replay.write.mcap import Compression
+from crosscue.results import HIDDEN, Result, json_key, listing
+from crosscue.verb import Option
 
+from .log import NOT_ASKED, Log, LogGiven, opened
+
+SHOWN: Final = 20
 HEAD: Final = ("topic", "type", "found", "written", "skipped", "dropped")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Converted:
+class Converted(Result):
     """Result of a conversion; its repr is a table of topics.
 
     Attributes:
@@ -32,15 +38,26 @@ class Converted:
         types: ROS 2 type by topic name in the file.
         kept: Number of messages by topic name in the log.
         ledger: Account of every row of the log.
+        salvage: True to print all damaged places.
     """
 
     log: str
-    path: Path
-    size_bytes: int
-    written: Counter[str]
-    types: Mapping[str, str]
-    kept: Counter[str]
-    ledger: Ledger
+    path: Path = field(metadata=json_key("output"))
+    size_bytes: int = field(metadata=json_key("bytes"))
+    written: Counter[str] = field(metadata=HIDDEN)
+    types: Mapping[str, str] = field(metadata=HIDDEN)
+    kept: Counter[str] = field(metadata=HIDDEN)
+    ledger: Ledger = field(metadata=HIDDEN)
+    salvage: bool = field(metadata=HIDDEN)
+
+    also: ClassVar = {
+        "integrity": "integrity",
+        "is_whole": "is_whole",
+        "notices": "notices",
+        "written": "messages_by_topic",
+        "topics": "accounts",
+        "details": "places",
+    }
 
     @property
     def is_whole(self) -> bool:
@@ -48,63 +65,50 @@ class Converted:
         return _is_whole(self.ledger)
 
     @property
+    def exit_status(self) -> int:
+        """0 when every selected row is in the file, 3 when some are dropped or skipped."""
+        return 0 if self.is_whole else 3
+
+    @property
+    def integrity(self) -> str:
+        """What was verified of the log."""
+        return self.ledger.integrity
+
+    @property
     def notices(self) -> tuple[str, ...]:
         """Remarks of the reader on the log."""
         return tuple(visible(notice) for notice in self.ledger.notices)
 
     @property
-    def places(self) -> list[dict[str, object]]:
-        """Return the places where rows were dropped or skipped, with reasons."""
-        return [
-            {
-                "topic": visible(detail.topic),
-                "reason": detail.reason,
-                "detail": visible(detail.detail),
-                "count": detail.count,
-                "t_ns": detail.t_ns,
-                "is_dropped": detail.is_dropped,
-            }
-            for detail in self.ledger.details
-        ]
-
-    @property
-    def places_text(self) -> list[str]:
-        """Return the same as ``places``, one line each."""
-        lines = []
-        for detail in self.ledger.details:
-            verb = "dropped" if detail.is_dropped else "skipped"
-            count = "?" if detail.count is None else detail.count
-            text = f"{detail.topic}: {count} {verb}: {detail.reason}; {detail.detail}"
-            lines.append(visible(text.rstrip("; ")))
-        return lines
-
-    def as_dict(self) -> dict[str, object]:
-        """Return counts and account, without places, as dictionaries, lists and scalars."""
+    def messages_by_topic(self) -> dict[str, dict[str, object]]:
+        """Type and number of messages of each topic in the file."""
         return {
-            "log": self.log,
-            "output": str(self.path),
-            "bytes": self.size_bytes,
-            "integrity": self.ledger.integrity,
-            "is_whole": self.is_whole,
-            "written": {
-                visible(name): {"type": self.types[name], "messages": count}
-                for name, count in self.written.items()
-            },
-            "topics": {
-                visible(name): {
-                    "declared": account.declared,
-                    "found": account.found,
-                    "written": self.kept[name],
-                    "skipped": dict(account.skipped),
-                    "dropped": dict(account.dropped),
-                    "dropped_unknown": account.dropped_unknown,
-                }
-                for name, account in self.ledger.accounts.items()
-            },
-            "notices": list(self.notices),
+            name: {"type": self.types[name], "messages": count}
+            for name, count in self.written.items()
         }
 
-    def __repr__(self) -> str:
+    @property
+    def accounts(self) -> dict[str, dict[str, object]]:
+        """Account of each topic of the log."""
+        return {
+            name: {
+                "declared": account.declared,
+                "found": account.found,
+                "written": self.kept[name],
+                "skipped": dict(account.skipped),
+                "dropped": dict(account.dropped),
+                "dropped_unknown": account.dropped_unknown,
+            }
+            for name, account in self.ledger.accounts.items()
+        }
+
+    @property
+    def places(self) -> tuple[Detail, ...]:
+        """Places where rows were dropped or skipped, with ``salvage``."""
+        return tuple(self.ledger.details) if self.salvage else ()
+
+    def lines(self) -> Iterator[str]:
+        """Yield a table of topics, and the size of the file."""
         rows = [
             (
                 name,
@@ -117,31 +121,60 @@ class Converted:
             for name, account in self.ledger.accounts.items()
         ]
         count, size = self.written.total(), self.size_bytes / 1e6
-        return (
-            f"{listing(HEAD, rows, 2)}\n"
-            f"{visible(str(self.path))}: {count} messages, {size:.1f} MB, read back"
-        )
+        yield listing(HEAD, rows, 2)
+        yield f"{visible(str(self.path))}: {count} messages, {size:.1f} MB, read back"
+
+    def messages(self) -> Iterator[str]:
+        """Yield notices and damaged places."""
+        places = [_place_text(detail) for detail in self.ledger.details]
+        shown = places if self.salvage else places[:SHOWN]
+        for line in (*self.notices[:SHOWN], *shown):
+            yield wrapped(line, terminal_width())
+        if len(shown) < len(places):
+            yield f"and {len(places) - len(shown)} more places"
+        if not self.ledger.is_whole and not self.salvage:
+            yield (
+                "the log is damaged; its readable part was written; crosscue convert --salvage "
+                "lists every damaged place"
+            )
+
+
+def _place_text(detail: Detail) -> str:
+    verb = "dropped" if detail.is_dropped else "skipped"
+    count = "?" if detail.count is None else detail.count
+    text = f"{detail.topic}: {count} {verb}: {detail.reason}; {detail.detail}"
+    return visible(text.rstrip("; "))
 
 
 def convert(
-    log: Log | Path | str,
-    output: Path | str,
+    log: LogGiven,
+    output: Annotated[Path | str, Option(metavar="OUT.mcap")],
     *,
     compression: Compression = "zstd",
+    salvage: bool = False,
     overwrite: bool = False,
-    on_rows: Callable[[int, int], None] = lambda done, of: None,
 ) -> Converted:
-    """Write a log as one MCAP file with standard ROS 2 types, message for message.
+    """Convert a log or data set to MCAP with ROS 2 types, message for message.
 
-    ROS 2 messages are copied byte for byte, ROS 1 messages are transcribed, and everything else is
-    written as the standard type for its contents. The file is read back and its messages counted.
+    ROS 2 messages are copied byte for byte, and ROS 1 messages are transcribed. CAN frames become
+    can_msgs/msg/Frame (CAN FD: crosscue_msgs/msg/CanFdFrame on TOPIC/fd). Pictures become
+    sensor_msgs/msg/CompressedImage, Image or foxglove_msgs/msg/CompressedVideo. Tables become the
+    standard type that has all their columns, or else crosscue_msgs/msg/TOPIC with one field per
+    column. The written file is read back and its messages are counted before success is reported.
+    For a damaged log, the readable part is written, and the exit status is 3.
+
+    Examples:
+        crosscue convert drive.bag -o drive.mcap
+        crosscue convert can0.log -o can0.mcap --from 10 --to 70
+        crosscue convert segment/ -o segment.mcap --topics wheels compass --compression lz4
+        crosscue convert damaged.mcap -o rescued.mcap --salvage
 
     Args:
-        log: One log, or its path; ``log.part(...)`` for a part of it.
-        output: File to write; its name ends in ``.mcap``.
-        compression: Compression of the chunks: ``zstd``, ``lz4`` or ``none``.
+        log: One log, or its path.
+        output: MCAP file to write.
+        compression: Compression of the chunks.
+        salvage: List every damaged place, with its byte range if the format has byte ranges.
         overwrite: Replace an existing file.
-        on_rows: Called with the number of rows done, and the number that the log declares.
 
     Raises:
         UsageError: There are several logs, or the output has another suffix or is the log itself.
@@ -156,16 +189,16 @@ def convert(
         _check_output(path, drive.paths[0])
         ledger = Ledger(drive.paths[0])
         with LogWriter(path, ledger, compression=compression, overwrite=overwrite) as writer:
-            _copy(drive, ledger, writer, on_rows)
+            _copy(drive, ledger, writer)
             # Rows found = rows written + rows skipped, for every topic.
             ledger.check({name: writer.kept[name] for name in ledger.accounts})
             is_read = any(account.handed_on for account in ledger.accounts.values())
             if not writer.written and (_is_whole(ledger) or not (is_read or _refused(ledger))):
                 raise empty_result("no row to write", drive.logs, drive.selection)
-        paths = drive.paths
+        name = drive.paths[0]
     _read_back(path, writer)
     size = path.stat().st_size
-    return Converted(paths[0], path, size, writer.written, writer.types, writer.kept, ledger)
+    return Converted(name, path, size, writer.written, writer.types, writer.kept, ledger, salvage)
 
 
 def _check_output(output: Path, log: str) -> None:
@@ -179,9 +212,7 @@ def _check_output(output: Path, log: str) -> None:
         )
 
 
-def _copy(
-    drive: Log, ledger: Ledger, writer: LogWriter, on_rows: Callable[[int, int], None]
-) -> None:
+def _copy(drive: Log, ledger: Ledger, writer: LogWriter) -> None:
     (log,) = drive.logs
     known: set[Topic] = set()
     declared = sum(topic.declared or 0 for topic in log.topics)
@@ -194,7 +225,7 @@ def _copy(
                 known.add(topic)
                 writer.add_topic(topic)
         writer.write(block)
-        on_rows(done, declared)
+        emit(Progress("converting", done, declared, "rows"))
 
 
 def _read_back(path: Path, writer: LogWriter) -> None:

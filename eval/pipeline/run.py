@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from crosscue.eval.interface.show import listing
 from crosscue.eval.runs.folder import Manifest, RunFolder, json_schema
 from crosscue.eval.runs.folder import open_run as open_folder
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, RunError, UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.results import listing
 
 if TYPE_CHECKING:
     import pyarrow as pa

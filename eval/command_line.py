@@ -1,0 +1,365 @@
+"""The command line of a verb, generated from its function's signature and docstring.
+
+A parameter without a default is a positional, or ``-o/--output``; every other parameter is an
+option. ``Args:`` is the help of the options, the rest of the docstring that of the command. Types
+say how words are read: ``Literal`` as choices, ``bool`` as a flag, sequences as several words. A
+frozen dataclass stands for its fields. ``crosscue.verb.Option`` states what remains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, field, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.results import Result
+from crosscue.verb import Option
+
+METAVARS: Final = {
+    "vehicle": "V.toml",
+    "truth": "T.json",
+    "landmarks": "DB",
+    "database": "DB",
+    "threshold": "P",
+    "precision": "P",
+    "overlap": "IOU",
+    "ray": "ADDRESS",
+    "figure": "PNG",
+    "junit": "XML",
+    "log": "LOG",
+    "logs": "LOG",
+    "run": "RUN",
+    "runs": "RUN",
+    "output": "DIR",
+    "matcher": "NAME",
+    "classes": "NAME",
+    "labels": "LABELS",
+    "topics": "TOPIC",
+}
+"""Metavar by name of a parameter, the same in every command."""
+UNITS: Final = {"m": "M", "s": "S", "px": "PX", "deg": "DEG", "gib": "GIB"}
+"""Metavar by the unit that ends a parameter's name."""
+TYPES: Final[dict[Any, str]] = {int: "N", float: "X", Path: "FILE", str: "NAME"}
+Groups = dict[str, argparse._MutuallyExclusiveGroup]
+_SECTION: Final = re.compile(r"^(Args|Attributes|Returns|Yields|Raises|Examples?):$", re.MULTILINE)
+_LEAD: Final = re.compile(
+    r"(?P<names>\w+(?:, \w+)*): (?:(?P<value>[^\s,]+|[^,]*(?=, expected )), )?"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """A docstring in parts.
+
+    Attributes:
+        text: Summary and body.
+        examples: Lines of examples.
+        parameters: Text on each parameter or attribute.
+    """
+
+    text: str
+    examples: str
+    parameters: Mapping[str, str]
+
+
+@dataclass(slots=True)
+class Call:
+    """A call of a function with arguments of a parsed command line.
+
+    Attributes:
+        function: The function to call.
+        positional: Name of its parameters ``*names``, if it has such.
+        values: For each parameter, its name among the parsed arguments or the call that makes it.
+        options: Option of each parameter, also of those of inner calls.
+    """
+
+    function: Callable[..., object]
+    positional: str | None = None
+    values: dict[str, str | Call] = field(default_factory=dict)
+    options: dict[str, str] = field(default_factory=dict)
+
+    def __call__(self, args: argparse.Namespace, stack: ExitStack) -> object:
+        """Call the function; context managers that make arguments are entered in ``stack``."""
+        made = {
+            name: _entered(value(args, stack), stack)
+            if isinstance(value, Call)
+            else getattr(args, value)
+            for name, value in self.values.items()
+        }
+        words = () if self.positional is None else made.pop(self.positional)
+        assert isinstance(words, Sequence)
+        return self.function(*words, **made)
+
+    def run(self, args: argparse.Namespace) -> object:
+        """Call the verb, and name options instead of parameters in what is wrong.
+
+        Raises:
+            CrosscueError: As the function, with the names of options.
+        """
+        try:
+            with ExitStack() as stack:
+                return self(args, stack)
+        except CrosscueError as error:
+            error.args = (self.with_options(str(error)), *error.args[1:])
+            raise
+
+    def with_options(self, text: str) -> str:
+        """Return an error about parameters with the names of their options.
+
+        ``bin_m: -1, expected more than 0`` becomes ``--bin-m -1: expected more than 0``.
+        """
+        lead = _LEAD.match(text)
+        if lead is None or not self.options.keys() >= set(lead["names"].split(", ")):
+            return text
+        named = ", ".join(self.options[name] for name in lead["names"].split(", "))
+        value = "" if lead["value"] is None else f" {lead['value']}"
+        return f"{named}{value}: {text[lead.end() :]}"
+
+
+def described(documented: object) -> Described:
+    """Return the docstring of a function or record in parts."""
+    parts = _SECTION.split(inspect.getdoc(documented) or "")
+    sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+    examples = sections.get("Examples", sections.get("Example", ""))
+    described_names = sections.get("Args", sections.get("Attributes", ""))
+    items = re.findall(r"^    (\w+): (.+(?:\n {5,}.*)*)", described_names, re.MULTILINE)
+    return Described(
+        parts[0].strip().replace("``", ""),
+        inspect.cleandoc(examples),
+        {name: " ".join(text.split()) for name, text in items},
+    )
+
+
+def fill(parser: argparse.ArgumentParser, verb: Callable[..., Any]) -> Call:
+    """Add a verb's parameters and its description to a parser.
+
+    Returns:
+        The call to make with the parsed arguments.
+    """
+    says = described(verb)
+    body = says.text
+    if says.examples:
+        lines = "\n".join(f"  {line}" for line in says.examples.splitlines())
+        body += f"\n\nexamples:\n{lines}"
+    parser.description = body
+    groups: Groups = {}
+    call = add_parameters(parser, verb, groups)
+    returned = _returned(verb)
+    if returned is dict or returned is type(None):
+        parser.set_defaults(json=False)
+    else:
+        shown = groups.get("json") or parser.add_mutually_exclusive_group()
+        formats = returned.formats if issubclass(returned, Result) else {}
+        for name, what in formats.items():
+            shown.add_argument(f"--{name}", action="store_true", help=what)
+        shown.add_argument("--json", action="store_true", help="print the result as JSON")
+    return call
+
+
+def add_parameters(
+    parser: argparse.ArgumentParser,
+    function: Callable[..., Any],
+    groups: Groups | None = None,
+    prefix: str = "",
+) -> Call:
+    """Add the parameters of a function to a parser.
+
+    Args:
+        parser: The parser.
+        function: The function, or a record.
+        groups: Groups of options that exclude each other, by name.
+        prefix: Prefix of the names among the parsed arguments.
+    """
+    groups = {} if groups is None else groups
+    function = getattr(function, "takes_record", function)
+    says = described(function)
+    call = Call(function)
+    hints = _hints(function)
+    for name, parameter in inspect.signature(function).parameters.items():
+        annotation = hints[name]
+        option, kind = _option_of(annotation)
+        if option.is_hidden:
+            continue
+        maker = option.made_by or (kind if is_dataclass(kind) else None)
+        if maker is not None:
+            assert callable(maker)
+            inner = add_parameters(parser, maker, groups, f"{prefix}{name}.")
+            call.values[name] = inner
+            call.options |= inner.options
+            continue
+        made = _Argument(name, parameter, kind, option)
+        if parameter.kind is parameter.VAR_POSITIONAL:
+            call.positional = name
+        container: Any = parser
+        if option.group is not None:
+            container = groups.setdefault(option.group, parser.add_mutually_exclusive_group())
+        if (text := says.parameters.get(name)) is None:
+            raise TypeError(f"{function.__name__}: no description of {name}")
+        action = container.add_argument(
+            *made.flags, **made.reading(), **made.naming(f"{prefix}{name}"), help=made.help(text)
+        )
+        call.values[name] = action.dest
+        call.options[name] = action.option_strings[-1] if action.option_strings else name
+    return call
+
+
+@dataclass(frozen=True, slots=True)
+class _Argument:
+    """One parameter as an argument of the command line."""
+
+    name: str
+    parameter: inspect.Parameter
+    kind: Any
+    option: Option
+
+    @property
+    def default(self) -> Any:
+        """Its default; ``Parameter.empty`` if it has none."""
+        return self.parameter.default
+
+    @property
+    def is_required(self) -> bool:
+        """True if it has no default."""
+        return self.default is inspect.Parameter.empty
+
+    @property
+    def is_positional(self) -> bool:
+        """True if the command line has no name for it."""
+        if self.parameter.kind is inspect.Parameter.VAR_POSITIONAL or self.option.is_positional:
+            return True
+        is_named = self.parameter.kind is inspect.Parameter.KEYWORD_ONLY or self.name == "output"
+        return self.is_required and not is_named and self.option.name is None
+
+    @property
+    def flags(self) -> list[str]:
+        """Option strings; none for a positional."""
+        if self.is_positional:
+            return []
+        plain = self.name.removeprefix("has_").replace("_", "-")
+        name = self.option.name or ("--without-" if self.default is True else "--") + plain
+        return ["-o", name] if name == "--output" else [name]
+
+    def naming(self, dest: str) -> dict[str, Any]:
+        """Return where the value is kept, and whether it is required."""
+        if self.is_positional:
+            return {"dest": dest}
+        return {"dest": dest, "required": self.is_required}
+
+    def reading(self) -> dict[str, Any]:
+        """Return how words become the value: action, type, choices, number and default."""
+        if self.kind is bool:
+            return {"action": "store_false" if self.default is True else "store_true"}
+        item, count = _items(self.kind)
+        if self.parameter.kind is inspect.Parameter.VAR_POSITIONAL:
+            count = "+"
+        if self.is_positional and not self.is_required:
+            count = "*" if count == "+" else "?"
+        if self.option.may_be_empty:
+            count = "*"
+        found: dict[str, Any] = {} if count is None else {"nargs": count}
+        if not self.is_required:
+            found["default"] = self.default
+        if typing.get_origin(item) is Literal:
+            found["choices"] = typing.get_args(item)
+        elif self.option.convert is not None:
+            found["type"] = _converter(self.option.convert)
+        elif item is not str:
+            found["type"] = item
+        if self.option.metavar is not None or "choices" not in found:
+            found["metavar"] = self.option.metavar or self._metavar(item)
+        return found
+
+    def _metavar(self, item: Any) -> str:
+        unit = self.name.rpartition("_")[2]
+        return METAVARS.get(self.name) or UNITS.get(unit) or TYPES[item]
+
+    def help(self, text: str) -> str:
+        """Return its one line of help, with the default."""
+        found = text.replace("``", "'").removesuffix(".")
+        if found[:1].isupper() and not any(c.isupper() for c in found.split()[0][1:]):
+            found = found[:1].lower() + found[1:]
+        value = () if self.is_required else self.default
+        if value not in (None, True, False, "", ()) and "(default" not in found:
+            found += f" (default: {_shown(value)})"
+        return found.replace("%", "%%")
+
+
+def _option_of(annotation: Any) -> tuple[Option, Any]:
+    """Return the option and the type of an annotation, without ``Annotated`` and None."""
+    option = Option()
+    while True:
+        if typing.get_origin(annotation) is Annotated:
+            inner, *rest = typing.get_args(annotation)
+            option = next((one for one in rest if isinstance(one, Option)), option)
+            annotation = inner
+        elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
+            members = [one for one in typing.get_args(annotation) if one is not type(None)]
+            marked = [one for one in members if typing.get_origin(one) is Annotated]
+            words = [one for one in members if one in (Path, float, int, str)]
+            annotation = (marked or words or members)[0]
+        else:
+            return option, annotation
+
+
+def _items(kind: Any) -> tuple[Any, str | int | None]:
+    """Return the type of one word, and the number of words."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple and Ellipsis not in inner:
+        return inner[0], len(inner)
+    if origin in (tuple, list) or (isinstance(origin, type) and issubclass(origin, Sequence)):
+        return _option_of(inner[0])[1], "+"
+    return kind, None
+
+
+@cache
+def _converter(convert: Callable[[str], object]) -> Callable[[str], object]:
+    """Return a converter whose ``UsageError`` is wrong usage for argparse."""
+
+    def converted(text: str) -> object:
+        try:
+            return convert(text)
+        except UsageError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    converted.__name__ = convert.__name__
+    return converted
+
+
+def _entered(value: object, stack: ExitStack) -> object:
+    return stack.enter_context(value) if isinstance(value, AbstractContextManager) else value
+
+
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations of a function's or record's parameters."""
+    plain = inspect.unwrap(function)
+    source: Any = plain.__init__ if isinstance(plain, type) else plain  # type: ignore[misc]
+    notes = {name: kind for name, kind in source.__annotations__.items() if name != "return"}
+    of = typing.get_type_hints
+    module = inspect.getmodule(plain)
+    names = {**vars(typing), **(vars(module) if module else {})}
+    return of(types.SimpleNamespace(__annotations__=notes), names, include_extras=True)
+
+
+def _returned(verb: Callable[..., Any]) -> type:
+    """Return the class of a verb's result."""
+    plain = inspect.unwrap(verb)
+    notes = {"return": plain.__annotations__["return"]}
+    module = inspect.getmodule(plain)
+    found = typing.get_type_hints(types.SimpleNamespace(__annotations__=notes), vars(module))
+    _, kind = _option_of(found["return"])
+    return typing.get_origin(kind) or kind  # type: ignore[no-any-return]
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return " ".join(map(_shown, value)) if isinstance(value, list | tuple) else str(value)

@@ -1,1 +1,0 @@
-"""Commands that inspect, convert, decode and seal logs."""

@@ -1,0 +1,210 @@
+"""What commands print: results, messages, and a progress line.
+
+The line shows the amount done, the rate and the time left. rich draws it on stderr and removes it
+at the end. Without a terminal on stderr, or with ``--quiet``, rich is not imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+
+from crosscue.eval.command_line import Call, fill
+from crosscue.replay.errors import one_line
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.progress import Progress as Progressed
+from crosscue.replay.progress import watching
+from crosscue.replay.safe_text import visible
+from crosscue.results import Result
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+EVERY_S: Final = 0.1
+"""Shortest time between two updates of the line."""
+
+
+class Done(NamedTuple):
+    """Progress of a command.
+
+    Attributes:
+        amount: Amount done.
+        total: Amount to do; None or 0 where unknown.
+        unit: Unit of both, as a plural noun.
+    """
+
+    amount: float
+    total: float | None
+    unit: str
+
+
+class ProgressLine:
+    """Progress line of one command; a context manager, or closed by ``end``."""
+
+    def __init__(self, what: str, *, is_shown: bool) -> None:
+        """Create a line that draws nothing before the first ``at``, or unless ``is_shown``.
+
+        Args:
+            what: The text before the bar.
+            is_shown: True to draw on stderr, which must then be a terminal.
+        """
+        self.is_shown = is_shown
+        self._what = what
+        self._began = time.monotonic()
+        self._shown = -EVERY_S
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        self._unit = ""
+
+    def at(self, done: Done, what: str = "") -> None:
+        """Show the progress; ``what`` replaces the text before the bar, for another stage."""
+        now = time.monotonic()
+        if not self.is_shown or now - self._shown < EVERY_S:
+            return
+        self._shown = now
+        bar, task = self._task_for(done.unit)
+        total = done.total if done.total and done.total >= done.amount else None
+        bar.update(
+            task,
+            description=visible(what or self._what),
+            completed=done.amount,
+            total=total,
+            amount=self._amount(done._replace(total=total)),
+            left="left" if total else "",
+        )
+        # Nothing is drawn before the first progress.
+        bar.start()
+
+    def counting(self, unit: str, per: float = 1.0) -> Callable[[float, float | None], None]:
+        """Return a callback for the amount done and the total, in 1/``per`` of the shown unit."""
+
+        def count(done: float, of: float | None) -> None:
+            self.at(Done(done / per, None if of is None else of / per, unit))
+
+        return count
+
+    def end(self) -> None:
+        """Remove the line."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._bar = self._task = None
+        self._began = time.monotonic()
+
+    def _amount(self, done: Done) -> str:
+        rate = done.amount / max(time.monotonic() - self._began, 1e-9)
+        of = "" if done.total is None else f" of {done.total:,.0f}"
+        return f"{done.amount:,.0f}{of} {done.unit}, {rate:,.{0 if rate >= 10 else 1}f} a second"
+
+    def _task_for(self, unit: str) -> tuple[Progress, TaskID]:
+        if self._bar is None:
+            self._bar = _new_bar()
+        if self._task is None or unit != self._unit:
+            if self._task is not None:
+                self._bar.remove_task(self._task)
+                self._began = time.monotonic()
+            self._unit = unit
+            self._task = self._bar.add_task("", total=None, amount="", left="")
+        return self._bar, self._task
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self.end()
+
+
+class VerbCommand:
+    """A command generated from a function."""
+
+    def __init__(self, verb: Callable[..., object]) -> None:
+        """Store the function."""
+        self._verb = verb
+        self._call: Call | None = None
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the function's parameters and its description to the parser."""
+        self._call = fill(parser, self._verb)
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Call the function and print its result; return the exit status."""
+        assert self._call is not None
+        with ProgressLine("", is_shown=is_shown(args)) as line:
+
+            def show(event: object) -> None:
+                if isinstance(event, Progressed):
+                    line.at(Done(event.done, event.total, event.unit), event.doing)
+                    return
+                line.end()
+                _print_part(event, args)
+
+            with watching(show):
+                found = self._call.run(args)
+        return print_found(found, args)
+
+
+def _print_part(event: object, args: argparse.Namespace) -> None:
+    """Print a part of a result; one that is an error or has losses goes to stderr."""
+    if isinstance(event, Exception):
+        warn(one_line(event))
+    elif args.json:
+        pass
+    elif isinstance(event, Result) and event.exit_status:
+        print(event, file=sys.stderr)
+    elif not args.quiet:
+        print(event)
+
+
+def print_found(found: Any, args: argparse.Namespace) -> int:
+    """Print what a verb returned, as text or as JSON; return its exit status."""
+    if not isinstance(found, Result):
+        if found is not None:
+            print_json(found)
+        return 0
+    shown = found.reported
+    chosen = next((name for name in shown.formats if getattr(args, name)), None)
+    if args.json:
+        print_json(shown.as_dict())
+    elif not args.quiet and not shown.is_printed_in_parts:
+        text = repr(shown) if chosen is None else getattr(shown, chosen)()
+        if text:
+            print(text)
+    if not args.quiet and not args.json:
+        for message in shown.messages():
+            print(message, file=sys.stderr)
+    return shown.exit_status
+
+
+def is_shown(args: argparse.Namespace) -> bool:
+    """Return True unless ``--quiet`` is set or stderr is not a terminal."""
+    return not args.quiet and sys.stderr.isatty()
+
+
+def print_json(value: object) -> None:
+    """Print strict JSON on stdout: sorted keys, NaN and infinities as null."""
+    print(strict_json(value))
+
+
+def warn(sentence: str) -> None:
+    """Print one line on stderr, with control characters escaped."""
+    print(f"crosscue: {visible(sentence)}", file=sys.stderr)
+
+
+def _new_bar() -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[amount]}", markup=False),
+        TimeRemainingColumn(compact=True),
+        TextColumn("{task.fields[left]}"),
+        console=Console(stderr=True),
+        transient=True,
+        # Results are printed on stdout during the work; rich would redirect them to stderr.
+        redirect_stdout=False,
+        redirect_stderr=False,
+    )

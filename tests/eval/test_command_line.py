@@ -1,0 +1,222 @@
+"""Parsers, help and calls are generated from a function's signature and docstring."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import pytest
+
+from crosscue.eval import cli
+from crosscue.eval.command_line import Call, fill
+from crosscue.eval.terminal import print_found
+from crosscue.replay.errors import UsageError
+from crosscue.results import Result, json_key
+from crosscue.verb import HIDDEN, Option, compared, keywords
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Filled(Result):
+    """What the verb was called with."""
+
+    boxes: tuple[Path, ...] = field(metadata=json_key("box_files"))
+    width_m: float
+    colour: str
+    label: str
+    is_open: bool
+    seen: tuple[str, ...]
+
+    formats: ClassVar = {"csv": "print the result as CSV"}
+
+    def csv(self) -> str:
+        """Return the result as CSV."""
+        return f"{self.colour},{self.width_m}"
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Shape of a box.
+
+    Attributes:
+        width_m: Width of a box, in percent of nothing; 100 % of it.
+        colour: Colour of a box.
+        workers: Number of workers.
+    """
+
+    width_m: float = 2.5
+    colour: Literal["red", "blue"] = "red"
+    workers: int = field(default=1, compare=False)
+
+
+ENTERED: list[str] = []
+
+
+@contextmanager
+def labelled(label: Annotated[str, Option("--from", metavar="L")] = "x") -> Iterator[str]:
+    """Make a label.
+
+    Args:
+        label: Label of all boxes.
+    """
+    ENTERED.append(f"enter {label}")
+    yield f"<{label}>"
+    ENTERED.append(f"leave {label}")
+
+
+@keywords(Shape)
+def pack(boxes: Sequence[Path], shape: Shape) -> Filled:
+    """Pack boxes into a bag.
+
+    Args:
+        boxes: Files of boxes.
+        shape: Shape of a box.
+    """
+    return Filled(tuple(boxes), shape.width_m, shape.colour, "", False, ())
+
+
+def pack_all(
+    boxes: Sequence[Path],
+    shape: Shape,
+    label: Annotated[str, Option(made_by=labelled)] = "",
+    *,
+    has_lid: bool = True,
+    is_open: bool = False,
+    seen: Sequence[str] = (),
+    inner: Annotated[int, HIDDEN] = 3,
+) -> Filled:
+    """Pack boxes into a bag.
+
+    The bag is ``closed``.
+
+    Examples:
+        crosscue pack a.box
+
+    Args:
+        boxes: Files of boxes.
+        shape: Shape of a box.
+        label: The label.
+        has_lid: Do not close the bag.
+        is_open: Leave the bag open.
+        seen: Names of boxes.
+        inner: Not on the command line.
+    """
+    if shape.width_m <= 0.0:
+        raise UsageError(f"width_m: {shape.width_m}, expected more than 0")
+    if is_open and not has_lid:
+        raise UsageError("is_open, has_lid: expected one of them")
+    return Filled(tuple(boxes), shape.width_m, shape.colour, label, is_open, tuple(seen))
+
+
+def parsed(words: str) -> tuple[Call, argparse.ArgumentParser, argparse.Namespace]:
+    """Parse a command line of ``pack_all``."""
+    parser = argparse.ArgumentParser(formatter_class=argparse.RawDescriptionHelpFormatter)
+    call = fill(parser, pack_all)
+    return call, parser, parser.parse_args(words.split())
+
+
+def test_options_become_arguments_with_defaults() -> None:
+    call, _, args = parsed("a.box b.box --width-m 4 --colour blue --seen x y")
+
+    assert call.run(args) == Filled(
+        (Path("a.box"), Path("b.box")), 4.0, "blue", "<x>", False, ("x", "y")
+    )
+    assert call.run(parsed("a.box")[2]) == Filled((Path("a.box"),), 2.5, "red", "<x>", False, ())
+
+
+def test_value_made_by_another_function_is_open_during_the_call() -> None:
+    ENTERED.clear()
+    call, _, args = parsed("a.box --from z")
+
+    found = call.run(args)
+
+    assert isinstance(found, Filled)
+    assert found.label == "<z>"
+    assert ENTERED == ["enter z", "leave z"]
+
+
+def test_help_comes_from_the_docstrings() -> None:
+    _, parser, _ = parsed("a.box")
+    text = parser.format_help()
+
+    assert (
+        "Pack boxes into a bag.\n\nThe bag is closed.\n\nexamples:\n  crosscue pack a.box" in text
+    )
+    assert "width of a box, in percent of nothing; 100 % of it" in text
+    assert "(default: 2.5)" in text
+    assert "--width-m M" in text
+    assert "--colour {red,blue}" in text
+    assert "--from L" in text
+    assert "--without-lid" in text
+    assert "inner" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("a --width-m -1", "--width-m -1.0: expected more than 0"),
+        ("a --is-open --without-lid", "--is-open, --without-lid: expected one of them"),
+    ],
+)
+def test_errors_about_arguments_name_options(words: str, message: str) -> None:
+    call, _, args = parsed(words)
+
+    with pytest.raises(UsageError) as error:
+        call.run(args)
+
+    assert str(error.value) == message
+
+
+def test_function_takes_fields_of_its_record_as_keywords() -> None:
+    found = pack([Path("a")], colour="blue")
+
+    assert (found.colour, found.width_m) == ("blue", 2.5)
+    assert "    colour: Colour of a box." in (pack.__doc__ or "")
+    assert "    shape:" not in (pack.__doc__ or "")
+    with pytest.raises(TypeError, match="size"):
+        pack([], size=3)  # type: ignore[call-arg]
+
+
+def test_only_settings_that_determine_a_result_are_compared() -> None:
+    assert compared(Shape(workers=3)) == {"width_m": 2.5, "colour": "red"}
+
+
+@pytest.mark.parametrize(
+    ("words", "printed"),
+    [
+        ("a --csv", "red,2.5\n"),
+        ("a --csv -q", ""),
+        ("a", "box files  a\nwidth m    2.5\n"),
+    ],
+)
+def test_result_is_printed_in_the_chosen_format(
+    words: str, printed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call, parser, _ = parsed("a")
+    parser.add_argument("-q", dest="quiet", action="store_true")
+    args = parser.parse_args(words.split())
+
+    assert print_found(call.run(args), args) == 0
+
+    assert capsys.readouterr().out.startswith(printed)
+
+
+def test_undescribed_parameter_is_refused() -> None:
+    def verb(*, size: int = 1) -> Filled:
+        """Do it."""
+        raise AssertionError
+
+    with pytest.raises(TypeError, match="no description of size"):
+        fill(argparse.ArgumentParser(), verb)
+
+
+@pytest.mark.parametrize("name", [n for n, where in cli.COMMANDS.items() if isinstance(where, str)])
+def test_summary_of_verb_is_that_of_its_function(name: str) -> None:
+    """The list of commands reads it from the source, without importing the module."""
+    _, parser = cli.parser_of(name)
+
+    first = str(parser.description).partition("\n")[0].removesuffix(".")
+    assert cli.summary_of(name) == first[0].lower() + first[1:]
