@@ -62,7 +62,14 @@ from .errors import (
 )
 from .files.bounded import PIECE_BYTES, read_at_most
 from .files.closing import Closing
-from .files.tree_text import MAX_DEPTH, json_tree, strict_json, toml_tree, yaml_tree
+from .files.tree_text import (
+    MAX_DEPTH,
+    json_tree,
+    strict_json,
+    toml_document,
+    toml_tree,
+    yaml_tree,
+)
 from .files.whole_file import (
     cannot_write,
     file_sha256,
@@ -157,6 +164,7 @@ __all__ = [
     "report_missing",
     "sha256_of",
     "strict_json",
+    "toml_document",
     "toml_tree",
     "versions",
     "versions_and_commit",

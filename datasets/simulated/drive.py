@@ -17,6 +17,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from crosscue.replay.base import toml_document
+
 Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]
 
@@ -200,11 +202,11 @@ def with_simulated_noise(text: str, settings: DriveSettings, motion: TrueMotion)
     The file is that of a newly calibrated car. It contains the gyro's bias, and the start of the
     drive with an error of the specified standard deviation.
     """
-    import tomlkit
+    import tomlkit  # it is slow to import
 
     east_m, north_m, off = np.random.default_rng([settings.seed, 11]).normal(0.0, 1.0, 3)
     way_m = float(np.hypot(np.diff(motion.x_m), np.diff(motion.y_m)).sum())
-    document = tomlkit.parse(text)
+    document = toml_document(text)
     document["odometry"].update(
         slip_per_sqrt_m=round(slip_per_sqrt_m(way_m, float(motion.speed_mps.max())), 4),
         scale_sd=round(TYRE_SD / 2**0.5, 4),

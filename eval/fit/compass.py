@@ -10,7 +10,7 @@ import tomlkit
 from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
 from crosscue.localization.fit.compass import CompassFit, fit_compass
-from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError
+from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError, toml_document
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -61,7 +61,7 @@ def section_of(fitted: CompassFit) -> dict[str, object]:
 
 def with_section(text: str, fitted: CompassFit) -> str:
     """Return a vehicle file's text with its [compass] values replaced and comments kept."""
-    document = tomlkit.parse(text)
+    document = toml_document(text)
     section = document.setdefault("compass", tomlkit.table())
     for key, value in section_of(fitted).items():
         section[key] = value

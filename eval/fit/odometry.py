@@ -18,7 +18,15 @@ from crosscue.localization.fit.compass import persistence
 from crosscue.localization.fit.known_drive import KnownDrive, whitened
 from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit, fit_odometry
 from crosscue.localization.odometry import OdometrySettings
-from crosscue.replay.base import EmptyResultError, Floats, Log, Selection, VehicleError, name_of
+from crosscue.replay.base import (
+    EmptyResultError,
+    Floats,
+    Log,
+    Selection,
+    VehicleError,
+    name_of,
+    toml_document,
+)
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -312,7 +320,7 @@ def camera_yaw_of(found: DriveFit) -> float | None:
 
 def with_section(text: str, found: DriveFit) -> str:
     """Return a vehicle file's text with its [odometry] values replaced and comments kept."""
-    document = tomlkit.parse(text)
+    document = toml_document(text)
     section = document.setdefault("odometry", tomlkit.table())
     for key, value in section_of(found).items():
         section[key] = value

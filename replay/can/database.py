@@ -10,6 +10,7 @@ import difflib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -26,13 +27,15 @@ from .dbc_text import read_dbc
 from .extract import Extractor
 from .layout import CanMessage, CanSignal, layout_problem, overlaps
 from .layout_cache import LayoutEntry, cache_folder
-from .sources import DatabaseText, doubts, read_text, refuse_bombs
+from .sources import MAX_CANTOOLS, DatabaseText, doubts, read_text, refuse_bombs
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
     from cantools.database.can.internal_database import InternalDatabase
 
 FORMATS: Final = ("dbc", "kcd", "arxml", "sym")
+_MAX_PAIRS: Final = 100
+"""Max reported pairs of overlapping signals in a message."""
 _EXTENDED_FLAG: Final = 0x8000_0000
 
 
@@ -249,6 +252,11 @@ def _defined(source: DatabaseText, form: str) -> list[CanMessage]:
 def _parse(source: DatabaseText, form: str) -> InternalDatabase:
     from cantools.database.can.formats import arxml, dbc, kcd, sym
 
+    if form in ("dbc", "sym") and len(source.text) > MAX_CANTOOLS:
+        raise LogTooLargeError(
+            f"{source.path}: {len(source.text)} characters with statements of unusual form, for "
+            f"which the limit is {MAX_CANTOOLS}; save it with a DBC editor, or split it"
+        )
     load: Callable[[str, bool], InternalDatabase]
     load = {"dbc": dbc, "kcd": kcd, "arxml": arxml, "sym": sym}[form].load_string
     try:
@@ -322,7 +330,10 @@ def _doubts_of(message: CanMessage) -> list[str]:
         return []
     if message.problem:
         return [f"{where} cannot be decoded: {message.problem}"]
-    notices = [f"{where}: signals {a} and {b} share bits" for a, b in overlaps(message)]
+    pairs = list(islice(overlaps(message), _MAX_PAIRS + 1))
+    notices = [f"{where}: signals {a} and {b} share bits" for a, b in pairs[:_MAX_PAIRS]]
+    if len(pairs) > _MAX_PAIRS:
+        notices.append(f"{where}: more signals share bits")
     for signal in message.signals:
         if signal.is_multiplexer and (signal.scale != 1 or signal.offset != 0):
             notices.append(

@@ -18,7 +18,7 @@ from .layout import CanMessage, CanSignal
 _NAME: Final = r"[A-Za-z_]\w*"
 _NUM: Final = r"[-+]?\d+\.?\d*(?:[eE][+-]?\d+)?"
 _TEXT: Final = r'"[^"\\]*"'
-_LONG_TEXT: Final = r'"(?>(?:\\"|[^"\\])*)"'
+_LONG_TEXT: Final = r'"[^"\\]*+(?:\\[^\\][^"\\]*+)*+"'
 _VALUE: Final = rf"(?:{_NUM}|{_LONG_TEXT})"
 _KEYWORDS: Final = frozenset(
     {
@@ -36,25 +36,25 @@ _STATEMENT: Final = re.compile(
     | SG_\s+(?P<sg>{_NAME})(?:\s+(?P<mux>M|m\d+M?))?\s*:\s*(?P<start>\d+)\s*\|\s*(?P<size>\d+)
       \s*@\s*(?P<order>\d+)\s*(?P<sign>[-+])\s*\(\s*(?P<scale>{_NUM})\s*,\s*(?P<offset>{_NUM})\s*\)
       \s*\[\s*(?P<min>{_NUM})\s*\|\s*(?P<max>{_NUM})\s*\]\s*(?P<unit>{_TEXT})
-      \s*{_FREE_NAME}(?:\s*,\s*{_NAME})*(?!\s*,)
+      \s*{_FREE_NAME}(?:\s*,\s*{_NAME})*+(?!\s*,)
     | BO_\s+(?P<bo>\d+)\s+(?P<bo_name>{_NAME})\s*:\s*(?P<bytes>0|[1-9]\d*)\s+{_FREE_NAME}
     | BA_\s+(?P<ba>{_TEXT})
       \s*(?:BO_\s+(?P<ba_bo>\d+)\s+|SG_\s+\d+\s+{_NAME}\s+|(?:BU_|EV_)\s+{_NAME}\s+)?
       (?P<ba_value>{_VALUE})\s*;
-    | VAL_\s+(?:(?P<val_bo>\d+)\s+)?(?P<val>{_NAME})(?P<pairs>(?:\s*[-+]?\d+\s*{_TEXT})*)\s*;
-    | VAL_TABLE_\s+{_NAME}(?:\s*[-+]?\d+\s*{_LONG_TEXT})*\s*;
+    | VAL_\s+(?:(?P<val_bo>\d+)\s+)?(?P<val>{_NAME})(?P<pairs>(?:\s*[-+]?\d+\s*{_TEXT})*+)\s*;
+    | VAL_TABLE_\s+{_NAME}(?:\s*[-+]?\d+\s*{_LONG_TEXT})*+\s*;
     | CM_\s*(?:(?:SG_\s+\d+\s+{_NAME}|BO_\s+\d+|(?:EV_|BU_)\s+{_NAME})\s*)?{_LONG_TEXT}\s*;
     | SIG_VALTYPE_\s+(?P<type_bo>\d+)\s+(?P<type>{_NAME})\s*:\s*(?P<kind>\d+)\s*;
     | SG_MUL_VAL_\s+(?P<mul_bo>\d+)\s+(?P<mul>{_NAME})\s+(?P<switch>{_NAME})
-      (?P<ranges>\s+\d+\s*-\d+(?:\s*,\s*\d+\s*-\d+)*)\s*;
+      (?P<ranges>\s+\d+\s*-\d+(?:\s*,\s*\d+\s*-\d+)*+)\s*;
     | BA_DEF_DEF_\s+(?P<default>{_TEXT})\s*(?P<default_value>{_VALUE})\s*;
     | BA_DEF_\s+(?:(?:SG_|BO_|EV_|BU_)\s+)?(?P<attribute>{_TEXT})\s*(?P<attribute_type>[A-Z]+)
-      \s*(?P<attribute_values>{_TEXT}(?:\s*,\s*{_TEXT})*|(?:\s*{_NUM})*)\s*;
-    | BO_TX_BU_\s+\d+\s*:\s*{_NAME}(?:\s*,\s*{_NAME})*\s*;
-    | SIG_GROUP_\s+\d+\s+{_NAME}\s+\d+\s*:(?:\s*{_NAME})*\s*;
-    | (?:BA_REL_|BA_DEF_REL_|BA_DEF_DEF_REL_)\s+{_TEXT}(?:[^";]|{_LONG_TEXT})*;
-    | (?P<bu>BU_)\s*:(?:\s*(?<![A-Za-z0-9_]){_FREE_NAME})*
-    | NS_\s*:(?:\s+{_NAME}\b(?!\s*:))*
+      \s*(?P<attribute_values>{_TEXT}(?:\s*,\s*{_TEXT})*+|(?:\s*{_NUM})*+)\s*;
+    | BO_TX_BU_\s+\d+\s*:\s*{_NAME}(?:\s*,\s*{_NAME})*+\s*;
+    | SIG_GROUP_\s+\d+\s+{_NAME}\s+\d+\s*:(?:\s*{_NAME})*+\s*;
+    | (?:BA_REL_|BA_DEF_REL_|BA_DEF_DEF_REL_)\s+{_TEXT}(?:[^";]++|{_LONG_TEXT})*+;
+    | (?P<bu>BU_)\s*:(?:\s*(?<![A-Za-z0-9_]){_FREE_NAME})*+
+    | NS_\s*:(?:\s+{_NAME}\b(?!\s*:))*+
     | BS_\s*:
     | VERSION\s*{_TEXT}
     """,

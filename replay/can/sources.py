@@ -7,16 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import CanDatabaseError, Limits, LogTooLargeError, read_at_most
+from crosscue.replay.base import MIB, CanDatabaseError, Limits, LogTooLargeError, read_at_most
 
 _MAX_BITS: Final = 8 * 2048
 """Upper bound on the bits of a message; the longest multi-packet message has 1785 bytes."""
 _MAX_BRANCHES: Final = 1_000_000
+MAX_CANTOOLS: Final = 2 * MIB
+"""Max characters of a DBC or SYM text for cantools, which takes up to 340 bytes for each."""
 
 _MESSAGE_HEADS: Final = {
     "dbc": r"^[ \t]*BO_\s+(\d+)",
     "sym": r'^\["?([^\]"\n]+)"?\]',
-    "kcd": r"<Message\b[^>]*?\bname=\"([^\"]*)\"",
+    "kcd": r"<Message\b[^<>]*?\bname=\"([^\"]*)\"",
     "arxml": r"<SHORT-NAME>([^<]*)</SHORT-NAME>",
 }
 
@@ -143,12 +145,14 @@ def refuse_bombs(source: DatabaseText, form: str) -> None:
         sizes = r"<(?:FRAME-LENGTH|LENGTH|START-POSITION)>\s*(\d{5,})"
         _refuse_over(source, sizes, "length or position")
     elif form == "sym":
-        _refuse_over(source, r"\b(?:Var|Sig|Mux|Len|DLC)\b[^\n]*?\b(\d{5,})\b", "bit number")
+        # A line without such a number is read once, however many of these words it has.
+        numbers = r"\b(?:Var|Sig|Mux|Len|DLC)\b(?>[^\n]*?\b(\d{5,})\b|[^\n]*)"
+        _refuse_over(source, numbers, "bit number")
 
 
 def _refuse_over(source: DatabaseText, pattern: str, what: str, bits_each: int = 1) -> None:
     for match in re.finditer(pattern, source.text, re.MULTILINE):
-        digits = match[1]
+        digits = match[1] or "0"
         if len(digits) > 9 or int(digits) * bits_each > _MAX_BITS:
             raise LogTooLargeError(
                 f"{source.path}:{source.line_at(match.start(1))}: {what} {digits[:20]} is larger "

@@ -11,14 +11,30 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from tomlkit import TOMLDocument
+
 MAX_DEPTH: Final = 64
 """Max levels of nested objects and arrays; a manifest has about ten."""
+_MAX_YAML: Final = 1 << 20
+"""Max characters of a YAML text, whose parser takes about 20 us for each."""
 _STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
 """A string, also one cut off by the end of the text, so that matching takes linear time."""
+_TOML_QUOTED: Final = re.compile(
+    r"""\"{3}[^"\\]*+(?:(?:\\.|"{1,2}(?!"))[^"\\]*+)*+(?:"{3,5}|\\?\Z)
+    | '{3}[^']*+(?:'{1,2}(?!')[^']*+)*+(?:'{3,5}|\Z)
+    | "[^"\\\n]*+(?:\\.[^"\\\n]*+)*+"? | '[^'\n]*+'? | \#[^\n]*+""",
+    re.DOTALL | re.VERBOSE,
+)
+"""A string or a comment, also one cut off; each character is tried once."""
+_TOML_KEY: Final = re.compile(
+    rf"(?<![\w-])[\w-]++(?:[ \t]*+\.[ \t]*+[\w-]++){{{MAX_DEPTH}}}", re.ASCII
+)
+"""A dotted key of more levels than allowed, in a text whose strings are replaced by letters."""
 _OPEN: Final = b"[{"
 _NO_BRACKET: Final = bytes(set(range(256)) - set(b"[]{}"))
 _TOO_DEEP: Final = f"nested over {MAX_DEPTH} levels deep"
@@ -48,6 +64,7 @@ def toml_tree(text: str) -> dict[str, Any]:
     Raises:
         ValueError: The text is not TOML, or nested too deeply; the message is one line.
     """
+    _check_toml(text)
     try:
         tree = tomllib.loads(text)
     except RecursionError:
@@ -60,20 +77,41 @@ def toml_tree(text: str) -> dict[str, Any]:
     return tree
 
 
+def toml_document(text: str) -> TOMLDocument:
+    """Parse a TOML text so that it can be changed and written again with its comments.
+
+    Raises:
+        ValueError: The text is not TOML, or nested too deeply; the message is one line.
+    """
+    import tomlkit
+
+    _check_toml(text)
+    return tomlkit.parse(text)
+
+
+def _check_toml(text: str) -> None:
+    """Refuse deep nesting in linear time, because parsing it takes quadratic time and memory."""
+    bare = _TOML_QUOTED.sub("s", text)
+    if _TOML_KEY.search(bare) or _depth(bare) > MAX_DEPTH:
+        raise ValueError(_TOO_DEEP)
+
+
 def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
     """Parse a YAML text.
 
     Args:
-        text: The text. An alias is refused, because a few of them can stand for gigabytes.
+        text: The text. Anchors and aliases are refused: a few of them can stand for gigabytes.
         scalars: "base" returns every scalar as a string, "safe" also numbers and booleans.
 
     Raises:
-        ValueError: The text is not YAML, nested too deeply, or uses an alias.
+        ValueError: The text is not YAML, too long, nested too deeply, or has an anchor or alias.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
     from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
+    if len(text) > _MAX_YAML:
+        raise ValueError(f"{len(text)} characters, the limit is {_MAX_YAML}")
     depth = 0
     try:
         for event in YAML(typ=scalars, pure=True).parse(text):
@@ -81,8 +119,9 @@ def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
             depth -= isinstance(event, CollectionEndEvent)
             if depth > MAX_DEPTH:
                 raise ValueError(_TOO_DEEP)
-            if isinstance(event, AliasEvent):
-                raise ValueError("an alias, which is not supported")
+            if getattr(event, "anchor", None) is not None:
+                what = "alias" if isinstance(event, AliasEvent) else "anchor"
+                raise ValueError(f"an {what}, which is not supported")
         return YAML(typ=scalars, pure=True).load(text)
     except (YAMLError, RecursionError) as error:
         raise ValueError(str(error)) from None

@@ -3,21 +3,34 @@
 import ast
 import json
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import pytest
+import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
-from crosscue.replay.base import MAX_DEPTH, json_tree, toml_tree, yaml_tree
+from crosscue.replay.base import MAX_DEPTH, json_tree, toml_document, toml_tree, yaml_tree
+from support.every_format import EVERY_FORMAT
+from support.measured import measured
 from support.pictures import picture_folder
 from support.scoring import run_folder, truth_folder
 
 ROOT: Final = Path(__file__).parents[2]
 PACKAGES: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval", "docs")
+PARSERS: Final = (
+    "json.loads",
+    "json.load",
+    "tomllib.loads",
+    "tomllib.load",
+    "tomlkit.parse",
+    "tomlkit.loads",
+    "tomlkit.load",
+)
 DEEP_JSON: Final = (
     "[" * 100_000,
     '{"a":' * 100_000,
@@ -28,6 +41,10 @@ DEEP_TOML: Final = (
     "a = " + "[" * 100_000,
     "a = " + "{a=" * 5_000,
     "a." * 10_000 + "a = 1",
+    "a." * 20_000 + "b=1",
+    "[" + "a . " * 20_000 + "b]",
+    '\'a\'."\\"#".' * 20_000 + "b = 1",
+    "a = {" + "a." * 20_000 + "b = 1}",
     "a = " + "[" * 900 + "]" * 900,
 )
 
@@ -83,12 +100,109 @@ def test_toml_at_depth_limit_is_read() -> None:
         toml_tree("a = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH)
 
 
+_TEXTS: Final = st.text("[]{}.=#\"'\\\na ", max_size=90)
+
+
+@settings(deadline=None)
+@given(st.dictionaries(_TEXTS, _TEXTS | st.lists(_TEXTS, max_size=3), max_size=4), _TEXTS)
+def test_toml_with_brackets_and_dots_in_texts_equals_tomllib(
+    value: dict[str, object], comment: str
+) -> None:
+    text = tomlkit.dumps(value) + "# " + comment.replace("\n", " ")
+    assert toml_tree(text) == tomllib.loads(text) == value
+
+
+@pytest.mark.parametrize("quote", ['"', "'"])
+@pytest.mark.parametrize("content", ["a." * 90, "[" * 90, "#" + "{" * 90])
+@pytest.mark.parametrize("end", ["", "{q}", "{q}{q}"])
+def test_toml_text_of_several_lines_may_contain_anything(
+    quote: str, content: str, end: str
+) -> None:
+    content += f"\n{quote}{quote}{content}" + end.format(q=quote)
+    text = f"a = {quote * 3}{content}{quote * 3} # {content[:90]}\nb.c = 1.5"
+
+    assert toml_tree(text) == tomllib.loads(text) == {"a": content, "b": {"c": 1.5}}
+    assert toml_document(text).unwrap() == toml_tree(text)
+
+
+def test_toml_numbers_in_a_long_list_are_no_key() -> None:
+    text = "a = [" + "1.5, 2024-01-01T00:00:00.5Z, " * 200 + "]"
+    assert toml_tree(text) == tomllib.loads(text)
+
+
+def test_dotted_toml_key_at_depth_limit_is_read() -> None:
+    assert toml_tree("a." * (MAX_DEPTH - 1) + "b = 1")["a"]
+    for parse in (toml_tree, toml_document):
+        with pytest.raises(ValueError, match="nested"):
+            parse("a." * MAX_DEPTH + "b = 1")
+
+
+_DBC: Final = 'VERSION ""\nBU_: A\nBO_ 100 M: 8 A\n SG_ S : 0|8@1+ (1,0) [0|255] "" A\n'
+BOMBS: Final[dict[str, tuple[str, Callable[[], str], bool]]] = {
+    "toml dotted key": ("toml", lambda: "a." * 20_000 + "b=1", False),
+    "toml table name": ("toml", lambda: "[" + "a." * 20_000 + "b]", False),
+    "toml brackets": ("toml", lambda: "a = " + "[" * 250_000, False),
+    "yaml anchors": ("yaml", lambda: "".join(f"a{i}: &x 1\n" for i in range(20_000)), False),
+    "yaml brackets": ("yaml", lambda: "[" * 500_000, False),
+    "yaml blocks": ("yaml", lambda: "- " * 250_000, False),
+    "dbc comment": ("dbc", lambda: _DBC + 'CM_ "' + "x" * 10_000_000 + '";\n', True),
+    "dbc comment with quotes": ("dbc", lambda: _DBC + 'CM_ "' + '\\"' * 5_000_000 + '";\n', True),
+    "dbc comment with paths": ("dbc", lambda: _DBC + 'CM_ "' + "C:\\a" * 2_500_000 + '";\n', True),
+    "dbc nodes": ("dbc", lambda: _DBC + "BU_ :" + " a" * 5_000_000 + "\n", True),
+    "dbc unclosed text": ("dbc", lambda: _DBC + 'CM_ "' + "x" * 10_000_000, False),
+    "dbc signals on one bit": (
+        "dbc",
+        lambda: (
+            _DBC
+            + "".join(f' SG_ S{i} : 0|8@1+ (1,0) [0|255] "" A\n' for i in range(20_000))
+            + 'CM_ "";\n'
+        ),
+        True,
+    ),
+    "kcd names": ("kcd", lambda: "<Message " * 1_000_000, False),
+    "sym words": ("sym", lambda: "Var " * 2_500_000, False),
+}
+"""Texts whose parsing must take time and memory in proportion to their size, and if they are read.
+
+DBC files with long comments are read; the others are refused.
+"""
+REFUSED: Final = {"toml": 2, "yaml": 3, "dbc": 4, "kcd": 4, "sym": 4}
+CPU_S: Final = 20
+MAX_MB: Final = 400
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", BOMBS)
+def test_text_takes_memory_and_time_in_proportion(case: str, tmp_path: Path) -> None:
+    suffix, text, is_read = BOMBS[case]
+    (tmp_path / "can.log").write_text("(1.000000) can0 064#0000000000000000\n")
+    (tmp_path / f"bomb.{suffix}").write_text(text())
+    vehicle = tmp_path / "bomb.toml"
+    if suffix == "yaml":
+        log = EVERY_FORMAT["rosbag2"](tmp_path)
+        (tmp_path / "bomb.yaml").rename(log / "metadata.yaml")
+        argv = ["info", str(log)]
+    else:
+        if suffix != "toml":
+            vehicle.write_text(f'version = 1\n[can]\ndbc = ["bomb.{suffix}"]\n')
+        log = tmp_path / "can.log"
+        argv = ["decode", str(log), "-o", str(tmp_path / "out"), "--vehicle", str(vehicle)]
+
+    status, output, peak_mb = measured(argv, cpu_s=CPU_S)
+
+    assert peak_mb < MAX_MB
+    assert status == (0 if is_read else REFUSED[suffix]), output
+    assert len(output) < 3_000 or is_read, output[:3_000]
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
         ("[" * 9_000, "nested"),
         ("\n".join(" " * i + "a:" for i in range(70)), "nested"),
-        ("a: &a [x, x]\nb: [*a, *a]", "alias"),
+        ("b: [*a, *a]", "alias"),
+        ("a: &a [x, x]\nb: 1", "anchor"),
+        ("a: " + "x" * (1 << 20), "the limit is 1048576"),
         ("a: [", "found"),
     ],
 )
@@ -225,6 +339,5 @@ def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
             assert not (isinstance(node, ast.Name) and node.id == "YAML"), path
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
                 name = f"{node.value.id}.{node.attr}"
-                assert name not in ("json.loads", "json.load", "tomllib.loads", "tomllib.load"), (
-                    path
-                )
+                assert name not in PARSERS, path
+                assert node.attr != "load_string" or path.name == "database.py", path

@@ -17,10 +17,17 @@ print(status, int(peak.split()[1]) // 1024)
 """The child reads its peak itself, because ``getrusage`` of a child includes its parent's peak."""
 
 
-def measured(argv: list[str]) -> tuple[int, str, float]:
-    """Return the exit status, the output on one line, and the peak memory in MB."""
+def measured(argv: list[str], cpu_s: int | None = None) -> tuple[int, str, float]:
+    """Return the exit status, the output on one line, and the peak memory in MB.
+
+    Raises:
+        CalledProcessError: The command failed, or took more than ``cpu_s`` seconds of a processor.
+    """
+    limit = ""
+    if cpu_s is not None:
+        limit = f"import resource\nresource.setrlimit(resource.RLIMIT_CPU, ({cpu_s}, {cpu_s}))"
     child = subprocess.run(
-        [sys.executable, "-c", _CHILD, *argv],
+        [sys.executable, "-c", limit + _CHILD, *argv],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

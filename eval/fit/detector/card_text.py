@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from crosscue.detectors.catalog.card import ModelCard
 from crosscue.detectors.catalog.class_names import CUE_LABELS
 from crosscue.detectors.catalog.class_scores import ClassScores
-from crosscue.replay.base import UsageError, VehicleError, one_line
+from crosscue.replay.base import UsageError, VehicleError, one_line, toml_document
 from crosscue.replay.vehicle.section import tuples
 
 from .class_fit import ClassFit
@@ -33,7 +33,7 @@ def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, 
     Raises:
         VehicleError: The result would not be a valid card.
     """
-    document = tomlkit.parse(text)
+    document = toml_document(text)
     scores = document.setdefault("scores", tomlkit.table(is_super_table=True))
     evidence = [
         row

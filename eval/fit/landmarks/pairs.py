@@ -19,7 +19,7 @@ from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
 from crosscue.localization.landmarks.features import Features, Matcher
 from crosscue.localization.landmarks.fit import ScoredPairs
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at_most
+from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at_most, toml_document
 
 MAX_PAIRS: Final = 1_000_000
 MAX_PAIR_BYTES: Final = 256 * MIB
@@ -144,7 +144,7 @@ def _columns(rows: list[tuple[float, bool, int]]) -> ScoredPairs:
 
 def with_min_score(text: str, min_score: float) -> str:
     """Return a vehicle file's text with ``landmarks.min_score`` replaced and comments kept."""
-    document = tomlkit.parse(text)
+    document = toml_document(text)
     section = document.setdefault("landmarks", tomlkit.table())
     section["min_score"] = min_score
     return tomlkit.dumps(document)
