@@ -100,7 +100,7 @@ def _need_gtsam() -> None:
         import_module("gtsam")
     except ImportError:
         raise UsageError(
-            "the smoother needs the package gtsam; install it with: pip install 'crosscue[gtsam]'"
+            "the smoother needs the package gtsam; install it with: pip install gtsam"
         ) from None
 
 

@@ -83,7 +83,6 @@ def read_interface(path: Path) -> Interface:
 
 
 def _of_onnx(content: bytes, path: Path) -> Interface:
-    _need("onnx", path)
     import onnx
 
     model: Any = onnx.load_model_from_string(content)
@@ -104,7 +103,8 @@ def _tensor(value: Any) -> Tensor:
 
 
 def _of_openvino(content: bytes, path: Path) -> Interface:
-    _need("openvino", path)
+    if find_spec("openvino") is None:
+        raise UsageError(f"{path}: needs the package openvino: pip install openvino")
     ov = import_openvino()
     second = path.with_suffix(".bin")
     weights = read_at_most(second, MAX_BYTES) if second.exists() else b""
@@ -159,11 +159,6 @@ def _is_flat(value: object) -> bool:
 
 
 _READERS: Final = {".onnx": _of_onnx, ".xml": _of_openvino}
-
-
-def _need(package: str, path: Path) -> None:
-    if find_spec(package) is None:
-        raise UsageError(f"{path}: needs the package {package}: pip install 'crosscue[{package}]'")
 
 
 def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:

@@ -3,25 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from typing import Any
-
-from crosscue.replay.errors import VehicleError
 
 Size = tuple[int, int]
 
 
 def free_size(content: bytes) -> bytes:
-    """Return an ONNX file whose input accepts pictures of any size.
-
-    Raises:
-        VehicleError: The package onnx is not installed.
-    """
-    if find_spec("onnx") is None:
-        raise VehicleError(
-            "input.is_resizable: other sizes than the file declares need the package onnx: "
-            "pip install 'crosscue[onnx]'"
-        )
+    """Return an ONNX file whose input accepts pictures of any size."""
     import onnx
 
     model: Any = onnx.load_model_from_string(content)

@@ -40,7 +40,7 @@ def joined(address: str, workers: int | None = None) -> Iterator[Any]:
     try:
         import ray
     except ImportError:
-        raise UsageError("--ray: Ray is not installed; pip install 'crosscue[ray]'") from None
+        raise UsageError("--ray: Ray is not installed; pip install ray") from None
     is_ours = not ray.is_initialized()
     if is_ours:
         _connect(ray, address, workers)

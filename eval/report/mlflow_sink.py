@@ -100,9 +100,7 @@ def open_experiment(uri: str, experiment: str) -> Experiment:
     try:
         from mlflow.tracking import MlflowClient
     except ImportError:
-        raise UsageError(
-            "--mlflow: MLflow is not installed; pip install 'crosscue[mlflow]'"
-        ) from None
+        raise UsageError("--mlflow: MLflow is not installed; pip install mlflow-skinny") from None
     with _reported(uri):
         client = MlflowClient(tracking_uri=uri)
         found = client.get_experiment_by_name(experiment)

@@ -7,12 +7,11 @@ in display order, whatever the order of coding.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Images, Ledger, LogError, Messages, one_line
+from crosscue.replay.base import Block, Images, Ledger, Messages, one_line
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -48,13 +47,8 @@ class PacketDecoder:
         self._taken = self._shown = 0
 
     def __call__(self, block: Block) -> Iterator[Block]:
-        """Yield the pictures completed by these packets; some may only follow later packets.
-
-        Raises:
-            LogError: PyAV is not installed.
-        """
+        """Yield the pictures completed by these packets; some may only follow later packets."""
         assert isinstance(block.rows, Images)
-        import_av(self._topic)
         import av
 
         for i, t_ns in enumerate(block.log_ns.tolist()):
@@ -109,16 +103,6 @@ class PacketDecoder:
             ("bgr8",) * len(frames),
         )
         return Block(self._topic, np.array([frame.pts for frame in frames], np.int64), images)
-
-
-def import_av(where: str) -> None:
-    """Check that PyAV is installed.
-
-    Raises:
-        LogError: It is not installed; the message states the remedy.
-    """
-    if find_spec("av") is None:
-        raise LogError(f"{where}: decoding video needs PyAV; install it with: pip install av")
 
 
 def _context(coding: str) -> Any:

@@ -40,7 +40,7 @@ class OpenVinoParts:
         except ImportError as error:
             raise VehicleError(
                 f"detector mask-rcnn: backend openvino: not installed or incomplete ({error}); "
-                "pip install 'crosscue[openvino]', or set backend = \"torch\""
+                'pip install openvino, or set backend = "torch"'
             ) from None
         self._core: Final = self._openvino.Core()
         self._asked: Final = {

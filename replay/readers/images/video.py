@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
@@ -33,7 +32,6 @@ from crosscue.replay.base import (
     Int64s,
     Ledger,
     Limits,
-    LogError,
     LogFormatError,
     Messages,
     Selection,
@@ -340,10 +338,7 @@ def open_video(path: Path, limits: Limits) -> Video:
 
     Raises:
         LogFormatError: It is truncated or damaged, has no video, or has no times.
-        LogError: It cannot be opened, or the extra ``video`` is not installed.
     """
-    if find_spec("av") is None:
-        raise LogError(f"{path}: reading video needs PyAV; install it with: pip install av")
     time_file = time_file_of_video(path)
     times = None if time_file is None else read_time_file(time_file, limits)
     if times is None and path.suffix.lower() in WITHOUT_TIMES:
