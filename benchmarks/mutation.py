@@ -303,10 +303,10 @@ def results(part: Part, folder: Path) -> list[Mutant]:
 
 
 def _functions(source: str) -> dict[str, str]:
-    """Text of every function and method by name."""
+    """Text of every function and method by name, with another name that is always the same."""
     lines = source.splitlines()
     return {
-        node.name: "\n".join(lines[node.lineno : node.end_lineno])
+        node.name: "\n".join(lines[node.lineno - 1 : node.end_lineno]).replace(node.name, "_", 1)
         for node in ast.walk(ast.parse(source))
         if isinstance(node, ast.FunctionDef) and "__mutmut_" in node.name
     }
