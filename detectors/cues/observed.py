@@ -105,7 +105,7 @@ def nose_of(heights_px: NDArray[np.float64]) -> int:
     if len(columns) < 4:
         return 0
     heights = heights_px[columns[0] : columns[-1] + 1]
-    quarter = max(len(heights) // 4, 1)
+    quarter = len(heights) // 4
     difference = heights[-quarter:].sum() - heights[:quarter].sum()
     return int(difference < 0) - int(difference > 0)
 

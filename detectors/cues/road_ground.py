@@ -128,12 +128,12 @@ def _fraction(
 
 
 def _inside(polygon: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Mark the pixels whose centres are in a convex polygon, shape (h, w)."""
+    """Mark the pixels whose centres are in a convex polygon, clockwise as shown; shape (h, w)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
     signs: list[NDArray[np.float64]] = []
     for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         signs.append((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0))
-    inside: NDArray[np.bool_] = (np.min(signs, axis=0) >= 0.0) | (np.max(signs, axis=0) <= 0.0)
+    inside: NDArray[np.bool_] = np.min(signs, axis=0) >= 0.0
     return inside
 
 

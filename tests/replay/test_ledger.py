@@ -388,7 +388,7 @@ def _opened_by_user(ledger: Ledger) -> None:
     opened()
 
 
-def test_each_loss_is_one_warning_at_the_users_line() -> None:
+def test_each_loss_is_one_warning() -> None:
     ledger = Ledger("a.log")
     ledger.skip("/t", "not a loss")
     ledger.drop("/t", "cut", 1, "at byte 9")
@@ -403,4 +403,13 @@ def test_each_loss_is_one_warning_at_the_users_line() -> None:
         "a.log: unknown topics: torn",
     ]
     assert {one.category for one in caught} == {LossWarning}
+
+
+def test_warning_is_at_the_line_of_the_user_who_opened_the_log() -> None:
+    ledger = Ledger("a.log")
+    ledger.drop("/t", "cut", 1)
+
+    with pytest.warns(LossWarning) as caught:
+        _opened_by_user(ledger)
+
     assert {one.lineno for one in caught} == {_opened_by_user.__code__.co_firstlineno + 4}

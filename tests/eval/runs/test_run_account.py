@@ -13,16 +13,32 @@ from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval import cli
 from crosscue.eval.runs.account import (
     Account,
+    LogAccount,
+    ScoredAccount,
+    SummedAccount,
+    TopicLine,
     account,
     account_lines,
     account_of,
     check,
+    details_of,
+    detecting_of,
+    joined_accounts,
     line,
+    reading_of,
     summed,
 )
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.base import DETAILS_KEPT, AccountError, Ledger
+from crosscue.replay.base import (
+    CHANGED,
+    DETAILS_KEPT,
+    DIFFERS,
+    NOT_ASKED_TIME,
+    NOT_ASKED_TOPIC,
+    AccountError,
+    Ledger,
+)
 from support.manifests import log_account
 from support.pictures import picture_folder
 
@@ -230,3 +246,291 @@ def test_account_includes_headings_of_the_first_pose(
     assert any("start heading" in sentence for sentence in printed["notices"])
     headings = _checked_account(run, printed).estimating["headings"]
     assert headings.entered == headings.used + sum(headings.skipped.values())
+
+
+def _scored(of: Account, **scoring: Any) -> ScoredAccount:
+    return ScoredAccount(
+        reading=of.reading,
+        detecting=of.detecting,
+        estimating=of.estimating,
+        is_whole=of.is_whole,
+        scoring=scoring,
+    )
+
+
+def _ledger() -> Ledger:
+    """11 rows of /b: 5 used, 2 skipped, 4 dropped; and an unknown number of unknown topics."""
+    ledger = Ledger("b.log", integrity="checked")
+    ledger.declare("/b", 11)
+    ledger.find("/b", 7)
+    ledger.topic("/b").handed_on = 5
+    ledger.skip("/b", "dull", 1)
+    ledger.skip("/b", "bad", 1, "at byte 5")
+    ledger.drop("/b", "torn", 1, "at byte 7")
+    ledger.drop("/b", "cut", 3)
+    ledger.drop("", "who knows", None, "to the end")
+    ledger.drop("", "who knows", None, "and again")
+    ledger.drop("", "lost", None)
+    ledger.notice("no index")
+    return ledger
+
+
+def test_lines_of_an_account_are_in_the_order_of_stages_and_names() -> None:
+    """Each stage has its own streams, sorted; sums have the same lines."""
+    first = log_account("a", "/t", used=7)
+    both = LogAccount(
+        log="a",
+        integrity="x",
+        is_whole=True,
+        notices=(),
+        topics={"/z": first.topics["/t"], "/a": first.topics["/t"]},
+    )
+    made = _scored(
+        account([both], {"/cam": line(1, 1, {})}, {"x": line(2, 2, {})}), y=line(3, 3, {})
+    )
+    expected = [
+        ("reading", "/a", 7),
+        ("reading", "/z", 7),
+        ("detecting", "/cam", 1),
+        ("estimating", "x", 2),
+        ("scoring", "y", 3),
+    ]
+
+    assert [(stage, name, one.used) for stage, name, one in made.lines()] == expected
+    total = summed([made, made])
+    assert [(stage, name, one.used) for stage, name, one in total.lines()] == [
+        (stage, name, 2 * used) for stage, name, used in expected
+    ]
+
+
+def test_line_leaves_out_zero_counts_and_sorts_reasons() -> None:
+    made = line(9, 2, {"z": 1, "a": 2, "none": 0}, {"y": 3, "b": 1, "none": 0}, ["cut"])
+
+    assert list(made.skipped.items()) == [("a", 2), ("z", 1)]
+    assert list(made.dropped.items()) == [("b", 1), ("y", 3)]
+    assert made.unknown == ("cut",)
+    assert (made.entered, made.used) == (9, 2)
+    assert line(2, 2, {}).dropped == {}
+
+
+def test_account_of_a_log_has_every_count_of_its_ledger() -> None:
+    (made,) = reading_of([_ledger()])
+
+    assert (made.log, made.integrity, made.is_whole) == ("b.log", "checked", False)
+    assert made.notices == ("no index",)
+    assert list(made.topics) == ["", "/b"]
+    known = made.topics["/b"]
+    assert (known.declared, known.found, known.entered, known.used) == (11, 7, 11, 5)
+    assert list(known.skipped.items()) == [("bad", 1), ("dull", 1)]
+    assert list(known.dropped.items()) == [("cut", 3), ("torn", 1)]
+    assert made.topics[""].dropped_unknown == ("lost", "who knows")
+    assert made.topics[""].declared is None
+
+
+def test_account_of_an_unbalanced_ledger_raises() -> None:
+    ledger = _ledger()
+    ledger.topic("/b").found += 1
+
+    with pytest.raises(AccountError, match="8 rows found"):
+        reading_of([ledger])
+
+
+def test_frames_are_compared_with_the_detectors_count() -> None:
+    """11 frames: 5 used, 2 skipped, 4 dropped; the detectors counted 5."""
+    ledger = _ledger()
+    ledger.drop("/b", "cut", None)
+    ledger.drop("/b", "cut", None)
+
+    assert detecting_of("/b", ledger, 5) == {
+        "/b": line(11, 5, {"dull": 1, "bad": 1}, {"torn": 1, "cut": 3}, ["cut"])
+    }
+    with pytest.raises(AccountError, match="detecting /b: 11 in, 6 used, 2 skipped, 4 dropped"):
+        account([], detecting_of("/b", ledger, 6))
+
+
+def test_account_with_an_unknown_loss_is_not_whole() -> None:
+    complete = log_account("a", "/t", used=7)
+
+    assert not account([complete], {"/cam": line(5, 5, {}, {}, ["cut"])}).is_whole
+    assert not account([complete], None, {"x": line(5, 4, {}, {"cut": 1})}).is_whole
+    lost = complete.model_copy(update={"is_whole": False})
+    assert not account([lost]).is_whole
+
+
+def test_error_names_stage_and_counts() -> None:
+    """3 in, but 1 used + 1 skipped + 2 dropped = 4; then -1 used, although the sum is right."""
+    made = _scored(account([]), **{"": line(3, 1, {"dull": 1}, {"cut": 2})})
+
+    with pytest.raises(AccountError) as error:
+        check(made)
+
+    assert str(error.value) == (
+        "scoring rows of unknown topics: 3 in, 1 used, 1 skipped, 2 dropped: this does not add up; "
+        "it is a bug in crosscue, please report it"
+    )
+    with pytest.raises(AccountError, match="scoring x: 0 in, -1 used"):
+        check(_scored(account([]), x=line(0, -1, {"dull": 1})))
+    check(_scored(account([]), x=line(0, 0, {})))
+
+
+def _topic(used: int) -> TopicLine:
+    return log_account("", "/t", used=used).topics["/t"]
+
+
+def _log(log: str, *, whole: bool, notices: tuple[str, ...], **topics: TopicLine) -> LogAccount:
+    return LogAccount(log=log, integrity=log, is_whole=whole, notices=notices, topics=topics)
+
+
+def test_topic_of_an_earlier_stage_is_taken_from_it() -> None:
+    """Stage 2 read "fix" (2 rows) after stage 1 read "cam" (9 rows) and 4 rows of no topic."""
+    ours = _log("a", whole=True, notices=("two", "both"), fix=_topic(2), cam=_topic(1))
+    before = _log("a", whole=True, notices=("one", "both"), fix=_topic(5), cam=_topic(9))
+    before.topics[""] = _topic(4)
+
+    (made,) = joined_accounts([ours], [_log("b", whole=False, notices=()), before], "cam")
+
+    assert (made.log, made.integrity, made.is_whole) == ("a", "a", True)
+    assert made.notices == ("one", "both", "two")
+    assert made.topics == {"fix": _topic(2), "cam": _topic(9), "": _topic(4)}
+    ours.topics[""] = _topic(3)
+    (made,) = joined_accounts([ours], [before], "cam")
+    assert made.topics[""] == _topic(3)
+    del before.topics[""], ours.topics[""]
+    assert "" not in joined_accounts([ours], [before], "cam")[0].topics
+
+
+@pytest.mark.parametrize(("ours", "before"), [(True, False), (False, True)])
+def test_joined_log_is_whole_only_if_both_are(ours: bool, before: bool) -> None:
+    (made,) = joined_accounts(
+        [_log("a", whole=ours, notices=())],
+        [_log("a", whole=before, notices=(), cam=_topic(1))],
+        "cam",
+    )
+
+    assert not made.is_whole
+
+
+@pytest.mark.parametrize(
+    "earlier",
+    [
+        [],
+        [_log("b", whole=False, notices=("one",), cam=_topic(1))],
+        [_log("a", whole=False, notices=("one",), fix=_topic(1))],
+    ],
+)
+def test_log_without_the_topic_before_is_unchanged(earlier: list[LogAccount]) -> None:
+    ours = _log("a", whole=True, notices=("two",), fix=_topic(2))
+
+    assert joined_accounts([ours], earlier, "cam") == [ours]
+
+
+def test_sum_counts_runs_and_those_with_unknown_losses() -> None:
+    """Two of three runs lost an unknown number: 3 runs, 2 of them unknown, 12 frames."""
+    unknown = account([], {"/cam": line(5, 4, {}, {"cut": 1}, ["cut", "torn"])})
+    whole = account([], {"/cam": line(2, 2, {})})
+
+    total = summed([unknown, whole, unknown]).detecting["/cam"]
+
+    assert (total.entered, total.used, total.dropped) == (12, 10, {"cut": 2})
+    assert (total.runs, total.runs_with_unknown_drops) == (3, 2)
+    assert total.unknown == ()
+    assert summed([whole, whole]).is_whole
+    assert not summed([unknown, whole]).is_whole
+    assert not summed([whole, unknown]).is_whole
+
+
+def test_sum_that_does_not_balance_raises() -> None:
+    with pytest.raises(AccountError, match="scoring x: 2 in, 1 used"):
+        summed([_scored(account([]), x=line(2, 1, {}))])
+    assert isinstance(summed([]), SummedAccount)
+    assert summed([]).is_whole
+
+
+def test_printed_account_lists_losses_first_and_rows_that_were_not_selected_never() -> None:
+    """Rows: 1,000 used + 4 skipped + 2,001 dropped = 3,005, and more of unknown topics."""
+    log = log_account(
+        "a",
+        "/z",
+        used=1000,
+        skipped={"dull": 2, NOT_ASKED_TIME: 1, NOT_ASKED_TOPIC: 1},
+        dropped={"cut": 2001},
+    )
+    log.topics[""] = account_of(_ledger()).topics[""]
+    made = account([log], {"/cam": line(2, 1, {}, {"bent": 1})}, {"a": line(3, 2, {"gate": 1})})
+
+    assert account_lines(_scored(made, cue=line(4, 3, {"no truth": 1}))) == [
+        "account  reading    3,005 rows: 1,000 used, 4 skipped, at least 2,001 dropped",
+        "         detecting  2 frames: 1 used, 0 skipped, 1 dropped",
+        "         estimating 3 readings: 2 used, 1 skipped, 0 dropped",
+        "         scoring    4 judgements: 3 used, 1 skipped, 0 dropped",
+        "  dropped an unknown number of reading unknown topics: lost",
+        "  dropped an unknown number of reading unknown topics: who knows",
+        "  dropped 2,001 of reading /z: cut",
+        "  dropped 1 of detecting /cam: bent",
+        "  skipped 2 of reading /z: dull",
+        "  skipped 1 of estimating a: gate",
+        "  to write what can be read: crosscue convert LOG -o OUT.mcap --salvage",
+    ]
+
+
+def test_unknown_losses_are_printed_with_the_topic_or_as_unknown_topics() -> None:
+    made = account([], {"": line(2, 1, {"dull": 1}), "/cam": line(0, 0, {}, {}, ["cut"])})
+
+    assert account_lines(made)[1:] == [
+        "  dropped an unknown number of detecting /cam: cut",
+        "  skipped 1 of detecting unknown topics: dull",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("reasons", "more"), [(20, []), (21, ["  and 1 more reasons: manifest.json"])]
+)
+def test_printed_account_has_at_most_twenty_reasons(reasons: int, more: list[str]) -> None:
+    skipped = {f"reason {n:02}": 1 for n in range(reasons)}
+
+    shown = account_lines(account([], {"/cam": line(reasons, 0, skipped)}))
+
+    assert shown[1:] == [
+        *(f"  skipped 1 of detecting /cam: reason {n:02}" for n in range(20)),
+        *more,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rows", "frames", "is_damaged"),
+    [
+        ({"cut": 1, DIFFERS: 1}, {}, True),
+        ({DIFFERS: 1, CHANGED: 1}, {}, False),
+        ({"not decoded": 1}, {"not decoded": 1}, False),
+        ({}, {"not decoded": 1}, False),
+    ],
+)
+def test_salvage_is_suggested_only_for_damaged_logs(
+    rows: dict[str, int], frames: dict[str, int], is_damaged: bool
+) -> None:
+    """Rows that differ from a seal, or whose picture does not decode, cannot be salvaged.
+
+    The other log and the other camera, without losses, are read afterwards.
+    """
+    logs = [log_account("a", "/a", used=1, dropped=rows), log_account("b", "/b", used=1)]
+    cameras = {"/a": line(1 + len(frames), 1, {}, frames), "/b": line(1, 1, {})}
+
+    assert any("--salvage" in text for text in account_lines(account(logs, cameras))) == is_damaged
+
+
+def test_unknown_loss_of_a_log_suggests_salvage() -> None:
+    assert any("--salvage" in text for text in account_lines(account([account_of(_ledger())])))
+
+
+def test_first_five_losses_are_shown_with_their_place() -> None:
+    ledger = Ledger("log")
+    for n in range(5):
+        ledger.drop("/t", "cut", 1, f"at byte {n}")
+
+    assert details_of([_ledger(), ledger]) == [
+        "dropped  /b: torn: at byte 7",
+        "dropped  rows: who knows: to the end",
+        "dropped  rows: who knows: and again",
+        "dropped  /t: cut: at byte 0",
+        "dropped  /t: cut: at byte 1",
+    ]

@@ -1,0 +1,181 @@
+"""Mobileye cues past the intersection: every condition at its limit, with numbers by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.cues.far_side import (
+    MobileyeState,
+    end_of,
+    lanes_past,
+    past_counts,
+    state_at,
+    vehicles_past,
+)
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.vehicle.mobileye_cues import Past
+
+MS = 1_000_000
+NAN = float("nan")
+PAST = Past(
+    intersection_length_m=16.0, lane_reach_m=5.0, lane_within_y_m=8.0, lane_quality=2.0,
+    lane_types=(0, 4), vehicle_beyond_m=3.0, vehicle_within_y_m=6.0, vehicle_types=(0, 2),
+    vehicle_age_frames=2.0, max_age_s=0.5, settles_s=0.03,
+)  # fmt: skip
+END_M = 20.0
+
+
+def obstacle(**changes: float) -> list[float]:
+    """A vehicle that counts: 23 m ahead = 20 m + 3 m, 6 m aside, of type 2, found in 2 images."""
+    row = {"burst": 1.0, "x_m": 23.0, "y_m": 6.0, "vx_mps": 0.0, "type": 2.0, "status": 0.0}
+    return list((row | {"valid": 1.0, "age_frames": 2.0} | changes).values())
+
+
+def lane(**changes: float) -> list[float]:
+    """A line that counts: it reaches 25 m = 20 m + 5 m, and its quality is 2.
+
+    At 25 m it is 0.5 + 0.1 * 25 + 0.004 * 625 + 0.00016 * 15,625 = 0.5 + 3 * 2.5 = 8 m aside.
+    """
+    row = {"side": 1.0, "lane_type": 4.0, "quality": 2.0, "c0_m": 0.5, "c1": 0.1}
+    rest = {"c2_per_m": 0.004, "c3_per_m2": 0.00016, "x_end_m": 25.0}
+    return list((row | rest | changes).values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "counts"),
+    [
+        ({}, True),
+        ({"x_m": 22.99}, False),
+        ({"y_m": -6.0}, True),
+        ({"y_m": 6.01}, False),
+        ({"y_m": -6.01}, False),
+        ({"type": 0.0}, True),
+        ({"type": 1.0}, False),
+        ({"valid": 0.0}, False),
+        ({"valid": 2.0}, True),
+        ({"age_frames": 1.0}, False),
+    ],
+)
+def test_vehicle_past_is_counted_at_each_limit(changes: dict[str, float], counts: bool) -> None:
+    """At least 3 m past 20 m, at most 6 m aside, valid, of a type of vehicles, and in 2 images."""
+    assert vehicles_past(np.array([obstacle(**changes)]), END_M, PAST).tolist() == [counts]
+    state = MobileyeState(np.array([obstacle(**changes), obstacle()]), None)
+    assert past_counts(state, END_M, PAST) == {"vehicles_past": 1 + counts}
+
+
+@pytest.mark.parametrize(
+    ("changes", "counts"),
+    [
+        ({"c0_m": 0.49}, True),
+        ({"c0_m": 0.51}, False),  # 8.01 m aside
+        ({"c0_m": -15.49}, True),  # -7.99 m aside
+        ({"c0_m": -15.51}, False),
+        ({"c0_m": 0.49, "x_end_m": 24.99}, False),
+        ({"c0_m": 0.49, "quality": 1.0}, False),
+        ({"c0_m": 0.49, "quality": 3.0}, True),
+        ({"c0_m": 0.49, "lane_type": 1.0}, False),
+        ({"c0_m": 0.49, "lane_type": 0.0}, True),
+        ({"c0_m": NAN, "x_end_m": NAN}, False),
+    ],
+)
+def test_lane_line_past_is_counted_at_each_limit(changes: dict[str, float], counts: bool) -> None:
+    """It reaches 5 m past 20 m, is at most 8 m aside there, and is usable."""
+    assert lanes_past(np.array([lane(**changes)]), END_M, PAST).tolist() == [counts]
+    state = MobileyeState(None, np.array([lane(**changes), lane(quality=0.0)]))
+    assert past_counts(state, END_M, PAST) == {"lanes_past": int(counts)}
+
+
+def test_one_of_two_lane_lines_past_is_one_count() -> None:
+    lanes = np.array([lane(c0_m=0.0), lane(c0_m=0.1), lane(quality=0.0)])
+
+    assert past_counts(MobileyeState(None, lanes), END_M, PAST) == {"lanes_past": 1}
+
+
+@pytest.mark.parametrize(
+    ("end_m", "known"), [(None, False), (-1.0, False), (0.0, False), (0.5, True), (1.0, True)]
+)
+def test_counts_are_known_ahead_of_the_intersections_end(end_m: float | None, known: bool) -> None:
+    assert bool(past_counts(MobileyeState(np.array([obstacle()]), None), end_m, PAST)) == known
+
+
+def test_end_is_the_start_plus_sixteen_metres() -> None:
+    assert end_of(30.0, is_end=False, past=PAST) == 46.0
+    assert end_of(30.0, is_end=True, past=PAST) == 30.0
+
+
+def samples(signal: Signal, *rows: tuple[int, Sequence[float]]) -> Samples:
+    times = np.array([ms * MS for ms, _ in rows], np.int64)
+    return Samples(signal, times, np.array([row for _, row in rows], np.float64))
+
+
+@pytest.mark.parametrize(
+    ("ms", "is_known"), [(1029, False), (1030, True), (1500, True), (1501, False)]
+)
+def test_state_is_of_bursts_that_are_complete_and_recent(ms: int, is_known: bool) -> None:
+    """A burst at 1,000 ms is complete after 30 ms and too old after 500 ms."""
+    obstacles = samples(Signal.MOBILEYE_OBSTACLES, (1000, obstacle()))
+    lanes = samples(Signal.MOBILEYE_LANES, (1000, lane()))
+
+    state = state_at(obstacles, lanes, ms * MS, PAST)
+
+    assert (state.obstacles is not None) == (state.lanes is not None) == is_known
+    nothing = state_at(None, None, ms * MS, PAST)
+    assert nothing.obstacles is None
+    assert nothing.lanes is None
+
+
+def test_state_has_the_rows_of_the_last_burst_with_a_position() -> None:
+    """Burst 2 has rows at 40, 50 and 60 m, and a row without a position that starts it."""
+    rows = samples(
+        Signal.MOBILEYE_OBSTACLES,
+        (1000, obstacle(burst=1.0, x_m=10.0)),
+        (1040, [2.0, *[NAN] * 7]),
+        (1040, obstacle(burst=2.0, x_m=40.0)),
+        (1100, obstacle(burst=2.0, x_m=50.0)),
+        (1100, obstacle(burst=2.0, x_m=60.0)),
+        (1200, obstacle(burst=3.0, x_m=70.0)),
+    )
+
+    found = state_at(rows, None, 1140 * MS, PAST).obstacles
+
+    assert found is not None
+    assert found[:, 1].tolist() == [40.0, 50.0, 60.0]
+
+
+def test_rows_without_a_burst_belong_together_within_the_settling_time() -> None:
+    """The last row is at 1,100 ms, so those after 1,070 ms are of its image. 0 is a number."""
+    rows = samples(
+        Signal.MOBILEYE_OBSTACLES,
+        (1000, obstacle(burst=-1.0, x_m=10.0)),
+        (1070, obstacle(burst=-1.0, x_m=20.0)),
+        (1071, obstacle(burst=-1.0, x_m=30.0)),
+        (1100, obstacle(burst=-1.0, x_m=40.0)),
+    )
+    numbered = samples(
+        Signal.MOBILEYE_OBSTACLES,
+        (1000, obstacle(burst=0.0, x_m=10.0)),
+        (1100, obstacle(burst=0.0, x_m=40.0)),
+    )
+
+    for one, expected in ((rows, [30.0, 40.0]), (numbered, [10.0, 40.0])):
+        found = state_at(one, None, 1200 * MS, PAST).obstacles
+        assert found is not None
+        assert found[:, 1].tolist() == expected
+
+
+def test_state_has_the_last_lane_line_of_each_side() -> None:
+    rows = samples(
+        Signal.MOBILEYE_LANES,
+        (1000, lane(side=1.0, c0_m=1.0)),
+        (1010, lane(side=0.0, c0_m=2.0)),
+        (1020, lane(side=1.0, c0_m=3.0)),
+        (1200, lane(side=0.0, c0_m=4.0)),
+    )
+
+    found = state_at(None, rows, 1100 * MS, PAST).lanes
+
+    assert found is not None
+    assert found[:, [0, 3]].tolist() == [[0.0, 2.0], [1.0, 3.0]]

@@ -1,0 +1,283 @@
+"""Cars in two frames (eq. 15, 16) and the nose of a car, with numbers worked out by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.cars import (
+    CarShapes,
+    Pairs,
+    car_shapes,
+    count_crossing,
+    count_oncoming,
+    count_outgoing,
+    count_parked,
+    cross_traffic,
+    no_pairs,
+    pair_cars,
+    parked_cars,
+)
+from crosscue.detectors.cues.observed import Judged, Sides, Ways, nose_of, of_side
+from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Cars, Vehicle
+
+SIZE = (400, 200)
+S = 1_000_000_000
+RULES = Cars(
+    labels=("car", "van"), score=0.9, length_per_height=2.0, area_change=0.03, position_change=0.05,
+    still_change=0.0025, slope=0.25, max_gap_s=0.5,
+)  # fmt: skip
+VEHICLE = Vehicle(version=1, cars=RULES)
+Car = tuple[float, float, float]
+
+
+def shapes(
+    *cars: Car, t_ns: int = 0, noses: Sequence[int] | None = None, size: tuple[int, int] = SIZE
+) -> CarShapes:
+    """Build cars from x and y of the centre, and the area."""
+    rows = np.array(cars, np.float64).reshape(-1, 3)
+    nose = np.array([0] * len(cars) if noses is None else noses, np.int64)
+    return CarShapes(t_ns, size, rows[:, :2], rows[:, 2], nose)
+
+
+def steps(before: CarShapes, now: CarShapes) -> list[list[float]]:
+    return sorted(pair_cars(before, now, RULES).step_px.tolist())
+
+
+def pairs(*steps_px: tuple[float, float], noses: Sequence[int] = ()) -> Pairs:
+    step = np.array(steps_px, np.float64).reshape(-1, 2)
+    nose = np.array(noses or [0] * len(step), np.int64)
+    return Pairs(step, np.zeros_like(step), nose, 400)
+
+
+@pytest.mark.parametrize(
+    ("heights", "nose"),
+    [
+        ([1, 1, 9, 9, 2, 2, 2, 2], -1),  # quarters 2 < 4; halves would be 20 > 8
+        ([2, 2, 2, 2, 9, 9, 1, 1], 1),  # quarters 4 > 2
+        ([0, 0, 1, 1, 9, 9, 2, 2, 2, 2, 0], -1),  # the same within a wider picture
+        ([1, 5, 5, 5, 5, 5, 2], -1),  # 7 // 4 = 1 column: 1 < 2
+        ([5, 5, 1, 1, 1, 1, 4, 3], 1),  # 10 > 7
+        ([3, 4, 1, 1, 1, 1, 5, 5], -1),  # 7 < 10
+        ([1, 2, 2, 2], -1),  # 4 columns suffice
+        ([1, 2, 3], 0),  # 3 columns do not
+        ([1, 0, 0, 0, 0, 2, 0, 3], 0),  # nor do 3 filled ones among 8
+        ([4, 1, 9, 9, 9, 9, 2, 3], 0),  # equal: 5 and 5
+        ([0, 0, 0, 0], 0),
+    ],
+)
+def test_nose_is_at_the_end_whose_outer_quarter_is_lower(heights: list[int], nose: int) -> None:
+    """An end is a quarter, rounded down, of the columns from the first to the last filled one."""
+    assert nose_of(np.array(heights, np.float64)) == nose
+
+
+def test_shapes_of_cars_are_centre_area_and_nose() -> None:
+    """Box (10, 20) to (110, 60): centre (60, 40), area 100 * 40 = 4,000 without a mask.
+
+    Its mask: 25 columns of 10 pixels, then 75 of 20: area 250 + 1,500 = 1,750, nose left.
+    """
+    box = np.array([[10.0, 20.0, 110.0, 60.0]] * 2)
+    drawn = np.zeros((40, 100), np.bool_)
+    drawn[30:, :25] = True
+    drawn[20:, 25:] = True
+    masks = (rle.encode(drawn, (10, 20), SIZE), b"")
+    two = Detections(7, SIZE, box, np.array([0.95, 0.95]), ("car", "van"), masks)
+
+    found = car_shapes([two], RULES)
+
+    assert (found.t_ns, found.size_px) == (7, SIZE)
+    assert found.center_px.tolist() == [[60.0, 40.0], [60.0, 40.0]]
+    assert found.area_px.tolist() == [1750.0, 4000.0]
+    assert found.nose.tolist() == [-1, 0]
+    assert found.nose.dtype == np.int64
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize(
+    ("width", "score", "label", "counts"),
+    [
+        (81.0, 0.91, "car", True),
+        (80.0, 0.91, "car", False),  # 80 = 2 * 40: not longer
+        (81.0, 0.9, "car", False),  # not above 0.9
+        (81.0, 0.91, "bus", False),
+    ],
+)
+def test_car_is_longer_than_twice_its_height_and_sure(
+    width: float, score: float, label: str, counts: bool
+) -> None:
+    """A box of 40 px height needs more than 80 px width; the cars of all detectors count."""
+    one = Detections(
+        3, SIZE, np.array([[15.0, 5.0, 15.0 + width, 45.0]]), np.array([score]), (label,), (b"",)
+    )
+
+    found = car_shapes([one, one], RULES)
+
+    assert len(found) == 2 * counts
+    assert found.center_px.shape == (2 * counts, 2)
+
+
+def test_cars_need_a_detector() -> None:
+    with pytest.raises(ValueError, match=r"^found: expected at least one detector's result$"):
+        car_shapes([], RULES)
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "is_pair"),
+    [
+        (100.0, 102.0, True),
+        (100.0, 103.0, False),  # 3 / 100 = 0.03, not below; 3 / 103 = 0.0291 would be
+        (103.0, 100.0, True),  # 3 / 103 = 0.0291
+        (100.0, 97.0, False),
+        (100.0, 98.0, True),
+    ],
+)
+def test_area_changes_by_less_than_three_percent_of_the_earlier_area(
+    before: float, now: float, is_pair: bool
+) -> None:
+    """|A2 - A1| / A1 < 0.03 (eq. 15)."""
+    found = pair_cars(shapes((50, 50, before)), shapes((50, 50, now), t_ns=S // 10), RULES)
+
+    assert len(found.nose) == is_pair
+
+
+@pytest.mark.parametrize(
+    ("dx", "dy", "is_pair"),
+    [(19.9, 0.0, True), (20.0, 0.0, False), (-12.0, 15.9, True), (12.0, -16.0, False)],
+)
+def test_position_changes_by_less_than_five_percent_of_the_width(
+    dx: float, dy: float, is_pair: bool
+) -> None:
+    """0.05 * 400 px = 20 px; sqrt(12**2 + 16**2) = 20 (eq. 15)."""
+    found = pair_cars(shapes((50, 50, 100)), shapes((50 + dx, 50 + dy, 100), t_ns=S // 10), RULES)
+
+    assert len(found.nose) == is_pair
+
+
+@pytest.mark.parametrize(
+    ("t_ns", "is_pair"), [(1, True), (S // 2, True), (S // 2 + 1, False), (0, False), (-1, False)]
+)
+def test_pair_is_at_most_half_a_second_apart(t_ns: int, is_pair: bool) -> None:
+    """0 < 5 s + t - 5 s <= 0.5 s."""
+    found = pair_cars(
+        shapes((50, 50, 100), t_ns=5 * S), shapes((50, 50, 100), t_ns=5 * S + t_ns), RULES
+    )
+
+    assert len(found.nose) == is_pair
+
+
+def test_pair_has_step_centre_and_nose_of_the_later_frame() -> None:
+    """(53, 48) - (50, 50) = (3, -2)."""
+    found = pair_cars(
+        shapes((50, 50, 100), noses=[-1]), shapes((53, 48, 101), t_ns=S // 10, noses=[1]), RULES
+    )
+
+    assert found.step_px.tolist() == [[3.0, -2.0]]
+    assert found.center_px.tolist() == [[53.0, 48.0]]
+    assert found.nose.tolist() == [1]
+    assert found.width_px == 400
+    assert found.judged is None
+
+
+def test_nearest_cars_are_paired_first() -> None:
+    """Cars at 0 and 10, then at 8 and 9: 10 -> 9 is 1 px, which leaves 0 -> 8.
+
+    Farthest first would be 0 -> 9 and 10 -> 8.
+    """
+    before = shapes((0, 50, 100), (10, 50, 100))
+
+    assert steps(before, shapes((8, 50, 100), (9, 50, 100), t_ns=1)) == [[-1.0, 0.0], [8.0, 0.0]]
+    assert steps(before, shapes((9, 50, 100), t_ns=1)) == [[-1.0, 0.0]]
+    assert steps(shapes((9, 50, 100)), shapes((10, 50, 100), (0, 50, 100), t_ns=1)) == [[1.0, 0.0]]
+    three = shapes((0, 50, 100), (1, 50, 100), (100, 50, 100))
+    later = shapes((1, 50, 100), (104, 50, 100), (200, 50, 100), t_ns=1)
+    assert steps(three, later) == [[0.0, 0.0], [4.0, 0.0]]
+
+
+def test_only_a_fitting_car_is_paired() -> None:
+    """The nearer car is 3 % larger, so the one 5 px away is the same car."""
+    found = steps(shapes((0, 50, 100)), shapes((1, 50, 103), (5, 50, 100), t_ns=1))
+
+    assert found == [[5.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        (shapes(), shapes((50, 50, 100), t_ns=1)),
+        (shapes((50, 50, 100)), shapes(t_ns=1)),
+        (shapes((50, 50, 100), size=(400, 100)), shapes((50, 50, 100), t_ns=1)),
+        (shapes((50, 50, 100)), shapes((350, 50, 100), t_ns=1)),
+    ],
+    ids=["none before", "none now", "other size", "too far"],
+)
+def test_frames_without_a_common_car_have_empty_pairs(before: CarShapes, now: CarShapes) -> None:
+    found = pair_cars(before, now, RULES)
+
+    assert found.step_px.shape == found.center_px.shape == (0, 2)
+    assert found.nose.shape == (0,)
+    assert found.nose.dtype == np.int64
+    assert found.width_px == 400
+    assert no_pairs(7).width_px == 7
+
+
+def test_crossing_car_moves_horizontally_and_by_enough() -> None:
+    """More than 0.0025 * 400 = 1 px, with a slope of at most 0.25 (eq. 15)."""
+    moved = [
+        (-1.0, 0.0),  # not more than 1 px
+        (-4.0, 1.0),  # left: 1 = 0.25 * 4
+        (-4.0, -1.1),  # too steep
+        (1.1, 0.2),  # right: 0.2 <= 0.275
+        (4.0, -1.0),  # right
+        (8.0, 1.9),  # right
+        (1.0, 0.0),
+        (0.0, 5.0),
+    ]
+
+    assert cross_traffic(pairs(*moved), RULES) == Sides(1, 3)
+    assert cross_traffic(pairs(), RULES) == Sides(0, 0)
+
+
+def test_parked_car_stands_on_both_axes_and_shows_its_nose() -> None:
+    """At most 0.0025 * 400 = 1 px on either axis (eq. 16)."""
+    moved = [(1.0, -1.0), (-1.0, 1.0), (0.0, 0.0), (1.1, 0.0), (0.0, -1.1), (0.0, 0.0), (0.5, 0.5)]
+    noses = [-1, 1, 0, -1, 1, 1, 1]
+
+    assert parked_cars(pairs(*moved, noses=noses), RULES) == Sides(1, 3)
+    assert parked_cars(pairs(), RULES) == Sides(0, 0)
+
+
+def test_cues_of_a_pair_count_their_side() -> None:
+    """Two cars cross to the left and one to the right; one is parked left and two right."""
+    found = pairs((-4, 0), (-4, 0), (4, 0), (0, 0), (0, 0), (0, 0), noses=[0, 0, 0, -1, 1, 1])
+
+    assert count_crossing(found, VEHICLE, CUES["cross_traffic_left"]) == 2
+    assert count_crossing(found, VEHICLE, CUES["cross_traffic_right"]) == 1
+    assert count_parked(found, VEHICLE, CUES["parked_left"]) == 1
+    assert count_parked(found, VEHICLE, CUES["parked_right"]) == 2
+    assert count_oncoming(found, VEHICLE, CUES["oncoming_cars"]) is None
+    assert count_outgoing(found, VEHICLE, CUES["outgoing_cars"]) is None
+
+
+def test_cues_of_tracked_cars_are_those_judged_over_frames() -> None:
+    judged = Judged(Sides(1, 2), Sides(3, 4), Sides(5, 6), Sides(7, 8), 9, 9, Ways(10, 11))
+    found = Pairs(np.array([[-4.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 400, judged)
+
+    assert count_crossing(found, VEHICLE, CUES["cross_traffic_left"]) == 1
+    assert count_crossing(found, VEHICLE, CUES["cross_traffic_right"]) == 2
+    assert count_parked(found, VEHICLE, CUES["parked_left"]) == 3
+    assert count_parked(found, VEHICLE, CUES["parked_right"]) == 4
+    assert count_oncoming(found, VEHICLE, CUES["oncoming_cars"]) == 10
+    assert count_outgoing(found, VEHICLE, CUES["outgoing_cars"]) == 11
+    unknown = Pairs(found.step_px, found.center_px, found.nose, 400, judged._replace(past=None))
+    assert count_oncoming(unknown, VEHICLE, CUES["oncoming_cars"]) is None
+    assert count_outgoing(unknown, VEHICLE, CUES["outgoing_cars"]) is None
+
+
+def test_side_is_that_which_the_cue_supports() -> None:
+    assert of_side(Sides(1, 2), CUES["road_left"]) == 1
+    assert of_side(Sides(1, 2), CUES["road_right"]) == 2
