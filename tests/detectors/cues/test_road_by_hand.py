@@ -265,7 +265,7 @@ def test_ground_fraction_is_road_over_pixels_of_the_projected_region(
     """The even-odd rule is the independent implementation; 40 % of the pixels are road (seed 3)."""
     width, height = size
     road = np.random.default_rng(3).random((height, width)) < 0.4
-    camera = changed(roll_rad=roll_rad, center_px=(200.3, 100.2))
+    camera = changed(roll_rad=roll_rad, center_px=(200.37, 100.23))
     found = fractions(camera, road=road, min_rows=1.0)
 
     seen = 0
