@@ -1,0 +1,590 @@
+"""Cues of whole frames and their account of candidates, with numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cues.candidates import (
+    BELOW_SCORE,
+    CUT_OR_FAR,
+    ELSEWHERE,
+    NOT_COUNTED,
+    NOT_FOUND_BEFORE,
+    NOT_FROM_THE_SIDE,
+    NOT_PAST,
+    OTHER_MOTION,
+    REGION_NOT_SEEN,
+    SAME_OBJECT,
+    TOO_FEW_FRAMES,
+    TOO_LITTLE_ROAD,
+    Candidates,
+    scores_of,
+    thresholds_met,
+    unsure_of,
+)
+from crosscue.detectors.cues.cars import CarShapes, Pairs, no_pairs
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.labelled import count, count_labels
+from crosscue.detectors.cues.observed import (
+    Judged,
+    Place,
+    RoadFractions,
+    Role,
+    Seen,
+    Sides,
+    role_of,
+    seen,
+)
+from crosscue.detectors.cues.rules import counts_of, rule_of
+from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
+from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Regions, Vehicle
+
+SIZE = (640, 480)
+MS = 1_000_000
+VEHICLE = Vehicle(
+    version=1,
+    cues=Cues(
+        traffic_light_score=0.6,
+        road_fraction=0.2,
+        own={
+            "crossing": OwnCue(labels=("zebra", "stripes"), score=0.3),
+            "dogs": OwnCue(labels=("dog",), score=0.5),
+        },
+    ),
+    cars=Cars(kind="pairs", labels=("car", "van"), score=0.5),
+    regions=Regions(kind="picture"),
+)
+CAMERA = Camera(focal_px=500.0, center_px=(320.0, 240.0), x_m=1.0, z_m=1.5, pitch_sd_rad=0.0)
+TRACKED = VEHICLE.model_copy(
+    update={"cars": Cars(kind="tracks", score=0.5, max_gap_s=0.5), "camera": CAMERA}
+)
+EGO = Motion(0.5, 0.0, 0.0, 0.1)
+Thing = tuple[str, float]
+
+
+def found(
+    *things: Thing,
+    boxes: Sequence[tuple[float, float, float, float]] = (),
+    min_scores: Sequence[float] | None = None,
+    t_ns: int = 0,
+) -> Detections:
+    """Build detections of 100 x 40 px, from labels and scores."""
+    where = list(boxes) or [
+        (5.0 + 150.0 * i, 5.0, 105.0 + 150.0 * i, 45.0) for i in range(len(things))
+    ]
+    return Detections(
+        t_ns,
+        SIZE,
+        np.array(where, np.float64).reshape(-1, 4),
+        np.array([score for _, score in things], np.float64),
+        tuple(label for label, _ in things),
+        (b"",) * len(things),
+        min_scores=None if min_scores is None else np.array(min_scores),
+    )
+
+
+FEW = found(("car", 0.6), ("van", 0.5), ("dog", 0.9), ("car", 0.2))
+MORE = found(("car", 0.7), ("dog", 0.4), min_scores=[0.8, 0.3])
+
+
+def test_scores_and_thresholds_are_those_of_the_labels() -> None:
+    """Cars: 0.6, 0.5 and 0.2 by a detector without thresholds, and 0.7 with a threshold of 0.8.
+
+    Not above 0.5: 0.5 and 0.2. Without a setting, 0.7 is not above 0.8 either.
+    """
+    both, labels = (FEW, MORE), ("car", "van")
+
+    assert scores_of(both, labels) == [0.6, 0.5, 0.2, 0.7]
+    assert unsure_of(both, labels, 0.5) == 2
+    assert unsure_of(both, labels, None) == 3
+    assert count_labels(both, labels, 0.5) == 2
+    assert count_labels(both, labels, None) == 1
+    assert thresholds_met(both, labels, 0.4) == [0.4]
+    assert thresholds_met(both, labels, 0.0) == [0.0]
+    assert thresholds_met(both, labels, None) == [0.5, 0.5, 0.5, 0.8]
+    assert thresholds_met(both, ("dog",), None) == [0.5, 0.3]
+
+
+def test_lights_need_a_score_and_signs_only_their_label() -> None:
+    """Lights of 0.6 and 0.7 with a threshold of 0.6: one. Signs of 0.01 and 0.9: both."""
+    boxes = [
+        found(("traffic light", 0.6), ("traffic light", 0.7)),
+        found(("one way left", 0.01), ("one way left", 0.9), ("one way right", 0.9)),
+    ]
+
+    assert count(boxes, VEHICLE, CUES["traffic_light"]) == 1
+    assert count(boxes, VEHICLE, CUES["one_way_left"]) == 2
+    assert count(boxes, VEHICLE, CUES["one_way_right"]) == 1
+
+
+def test_candidates_are_seen_used_and_skipped() -> None:
+    """3 seen, of which 2 skipped: 1 used. Then 2 seen and none skipped: in all 5 and 3."""
+    one = Candidates("detections")
+    one.take([], {"low": 0})
+    assert (one.seen, one.used, one.skipped, one.max_score) == (0, 0, {}, None)
+
+    one.take([0.2, 0.4, 0.3], {"low": 1, "far": 1, "none": 0})
+    assert (one.seen, one.used, one.max_score) == (3, 1, 0.4)
+    one.take([0.1, 0.3], {"low": 0})
+    one.take([0.9], {"low": 1})
+
+    assert (one.seen, one.used, one.max_score) == (6, 3, 0.9)
+    assert one.skipped == {"low": 2, "far": 1}
+
+
+def test_threshold_of_candidates_is_the_lowest() -> None:
+    one = Candidates("detections")
+    one.meet([])
+    assert one.threshold is None
+    one.meet([0.5, 0.4])
+    assert one.threshold == 0.4
+    one.meet([0.6])
+    assert one.threshold == 0.4
+    one.meet([0.3])
+    assert one.threshold == 0.3
+
+
+def test_rules_are_found_by_module_and_function() -> None:
+    assert rule_of("crosscue.detectors.cues.labelled:count") is count
+    light = found(("traffic light", 0.7))
+    assert counts_of("objects", [light], VEHICLE) == {"stop_sign": 0, "traffic_light": 1}
+    assert list(counts_of("signs", [light], VEHICLE)) == [
+        "one_way_left",
+        "one_way_right",
+        "do_not_enter",
+    ]
+    pairs = no_pairs(640)
+    assert counts_of("car pairs", pairs, VEHICLE) == {
+        "cross_traffic_left": 0,
+        "cross_traffic_right": 0,
+        "parked_left": 0,
+        "parked_right": 0,
+    }  # the cars past the intersection are unknown
+
+
+def road(fraction: float = 1.0) -> RoadMask:
+    """Road in the left part of the picture."""
+    size = (160, 120)
+    is_road = np.zeros((120, 160), np.bool_)
+    is_road[:, : round(160 * fraction)] = True
+    return RoadMask(0, SIZE, rle.encode(is_road, (0, 0), size), size)
+
+
+def test_results_are_sorted_by_role() -> None:
+    cars, signs, other = found(("car", 0.9)), found(("stop sign", 0.9)), found()
+    first, second = road(), road(0.5)
+
+    one = seen(7, [cars, signs, first, other, second], [False, True, False, False, True], None)
+
+    assert one == Seen(7, (cars, other), (signs,), first, None)
+    assert one.boxes == (cars, other, signs)
+    assert seen(8, [], [], frozenset({"car"})) == Seen(8, labels=frozenset({"car"}))
+    assert role_of(first, True) == Role.ROAD
+    assert role_of(cars, True) == Role.SIGNS
+    assert role_of(cars, False) == Role.OBJECTS
+
+
+def test_meaning_of_a_label_is_the_first_label_of_its_cue() -> None:
+    meaning = meanings(VEHICLE)
+
+    assert meaning["van"] == meaning["car"] == "car"
+    assert meaning["stripes"] == "zebra"
+    assert meaning["no entry"] == "do not enter"
+    assert "cat" not in meaning
+
+
+@pytest.mark.parametrize(("left", "is_same"), [(5.0 + 33.0, True), (5.0 + 34.0, False)])
+def test_same_object_overlaps_by_more_than_half(left: float, is_same: bool) -> None:
+    """Boxes of 100 px: shifted by 33, 67 / 133 = 0.504; by 34, 66 / 134 = 0.493."""
+    one = found(("car", 0.9))
+    two = found(("van", 0.8), boxes=[(left, 5.0, left + 100.0, 45.0)])
+
+    assert [a.tolist() for a in same_objects((one, two), meanings(VEHICLE), (False, False))] == [
+        [KEPT],
+        [0 if is_same else KEPT],
+    ]
+
+
+def test_overlap_of_exactly_half_is_another_object() -> None:
+    """Boxes of 90 px shifted by 30: 60 / 120 = 0.5."""
+    one = found(("car", 0.9), boxes=[(0.0, 0.0, 90.0, 40.0)])
+    two = found(("car", 0.8), boxes=[(30.0, 0.0, 120.0, 40.0)])
+
+    assert [a.tolist() for a in same_objects((one, two), {}, (False, False))] == [[KEPT], [KEPT]]
+
+
+def test_detection_is_the_same_as_the_one_that_overlaps_most() -> None:
+    """Two kept cars 40 px apart; the other detector's is 10 px from the second one.
+
+    90 / 110 = 0.82 with the second, 70 / 130 = 0.54 with the first. The next one, 30 px from the
+    second, has 0.54 with it, which already stands for a car of its detector.
+    """
+    kept = [
+        found(("car", 0.9), boxes=[(0.0, 0.0, 100.0, 40.0)]),
+        found(("car", 0.8), boxes=[(40.0, 0.0, 140.0, 40.0)]),
+    ]
+    third = found(
+        ("car", 0.7),
+        ("car", 0.6),
+        ("dog", 0.5),
+        boxes=[(30.0, 0.0, 130.0, 40.0), (70.0, 0.0, 170.0, 40.0), (30.0, 0.0, 130.0, 40.0)],
+    )
+
+    again = same_objects((*kept, third), {}, (False,) * 3)
+
+    assert [one.tolist() for one in again] == [[KEPT], [KEPT], [1, KEPT, KEPT]]
+    assert {one.dtype for one in again} == {np.dtype(np.int64)}
+
+
+def test_object_of_three_detectors_is_kept_once() -> None:
+    """The best of three is kept; a calibrated score is the best; equal scores keep the first."""
+    three = found(("car", 0.6)), found(("car", 0.9)), found(("car", 0.7))
+
+    assert _again(three, (False, False, False)) == [[1], [KEPT], [1]]
+    assert _again(three, (True, False, False)) == [[KEPT], [0], [0]]
+    equal = found(("car", 0.6)), found(("car", 0.6))
+    assert _again(equal, (False, False)) == [[KEPT], [0]]
+    assert _again((found(("car", 0.6)), found()), (False, False)) == [[KEPT], []]
+
+
+def _again(results: Sequence[Detections], calibrated: Sequence[bool]) -> list[list[int]]:
+    return [one.tolist() for one in same_objects(results, {}, calibrated)]
+
+
+def _cues(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
+    tally = CueTally(vehicle)
+    return CuePass(vehicle, tally=tally), tally
+
+
+def test_frame_counts_each_kind_of_cue() -> None:
+    """1 sure light, 2 signs, 1 zebra and 1 dog; road fills the left and the straight region."""
+    cues, _ = _cues()
+    objects = found(("traffic light", 0.7), ("traffic light", 0.6), ("zebra", 0.4), ("dog", 0.5))
+    signs = found(("one way left", 0.1), ("no entry", 0.2), ("dog", 0.6))
+
+    made = cues(Seen(0, (objects,), (signs,), road(0.65)))
+
+    assert made.counts == {
+        "stop_sign": 0,
+        "traffic_light": 1,
+        "one_way_left": 1,
+        "one_way_right": 0,
+        "do_not_enter": 1,
+        "crossing": 1,
+        "dogs": 1,
+        "road_left": 1,
+        "road_straight": 1,
+        "road_right": 0,
+    }
+    assert made.road == RoadFractions(1.0, 1.0, 0.0)
+    assert cues(Seen(1)).counts == {}
+    assert cues(Seen(1)).road is None
+
+
+def test_only_cues_whose_labels_can_be_reported_are_counted() -> None:
+    """Road has no label, so it always counts."""
+    cues, _ = _cues()
+    shown = Seen(
+        0, (found(("dog", 0.9)),), labels=frozenset({"dog", "van"}), road=RoadFractions(1, 0, 0)
+    )
+
+    assert dict(cues(shown).counts) == {
+        "dogs": 1,
+        "road_left": 1,
+        "road_straight": 0,
+        "road_right": 0,
+    }
+
+
+def test_road_on_the_ground_needs_a_place() -> None:
+    """Everything is road, but only with a place are there regions to search."""
+    ground = VEHICLE.model_copy(
+        update={"regions": Regions(kind="ground", min_rows=1.0), "camera": CAMERA}
+    )
+    cues, tally = _cues(ground)
+
+    unknown = cues(Seen(0, road=road()))
+    known = cues(Seen(1, road=road()), None, Place(10.0, 26.0, 0.0))
+
+    assert unknown.road is not None
+    assert math.isnan(unknown.road.left)
+    assert unknown.counts == {}
+    assert known.counts["road_straight"] == 1
+    assert tally.by_cue["road_straight"].skipped == {REGION_NOT_SEEN: 1}
+    assert (tally.by_cue["road_straight"].seen, tally.by_cue["road_straight"].used) == (2, 1)
+
+
+def test_cars_are_paired_with_the_previous_frame_until_restarted() -> None:
+    """A car moves 4 px to the right, more than 0.002 * 640 = 1.28 px: it crosses to the right."""
+    cues, _ = _cues()
+    here = found(("car", 0.9), t_ns=0)
+
+    def moved(t_ms: int) -> Seen:
+        x = 5.0 + t_ms / 25.0
+        return Seen(
+            t_ms * MS, (found(("car", 0.9), boxes=[(x, 5.0, x + 100.0, 45.0)], t_ns=t_ms * MS),)
+        )
+
+    assert "cross_traffic_right" not in cues(Seen(0, (here,))).counts
+    assert cues(moved(100)).counts["cross_traffic_right"] == 1
+    assert cues(moved(100)).counts["cross_traffic_right"] == 0  # not later
+    assert cues(moved(200)).counts["cross_traffic_right"] == 1
+    cues.restart()
+    assert "cross_traffic_right" not in cues(moved(300)).counts
+
+
+def test_own_tracker_pairs_the_cars() -> None:
+    given: list[tuple[int, int, Cars]] = []
+
+    def tracker(before: CarShapes, now: CarShapes, settings: Cars, /) -> Pairs:
+        given.append((len(before), len(now), settings))
+        return Pairs(np.array([[-9.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 640)
+
+    cues = CuePass(VEHICLE, tracker)
+    cues(Seen(0, (found(("car", 0.9)),)))
+
+    assert cues(Seen(0, (found(("car", 0.9), ("van", 0.9)),))).counts["cross_traffic_left"] == 1
+    assert given == [(1, 2, VEHICLE.cars)]
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "ego", "why"),
+    [
+        (TRACKED, None, "no odometry, so the camera's own motion is unknown"),
+        (
+            TRACKED,
+            Motion(None, 0.0, 0.0, 0.1),
+            "no odometry, so the camera's own motion is unknown",
+        ),
+        (TRACKED, Motion(0.5, 0.0, 0.0, 0.51), "frames further than 0.5 s apart"),
+        (
+            TRACKED.model_copy(update={"camera": Camera()}),
+            EGO,
+            "camera.focal_px is not set",
+        ),
+    ],
+)
+def test_frames_without_tracked_cars_are_counted_by_reason(
+    vehicle: Vehicle, ego: Motion | None, why: str
+) -> None:
+    cues, tally = _cues(vehicle)
+    frame = Seen(0, (found(("car", 0.9)),))
+    cues(frame, EGO)
+    for _ in range(2):
+        assert "parked_left" not in cues(frame, ego).counts
+
+    assert cues.followed() == []
+    frames = 3 if "focal" in why else 2
+    assert cues.not_followed == {why: frames}
+    assert cues.notes() == {f"crossing and parked cars: {why}": frames}
+    assert tally.by_cue.get("cross_traffic_left", Candidates("detections")).seen == 3 - frames
+
+
+def test_tracked_cars_are_those_of_the_newest_frame() -> None:
+    """Half a second between frames is not too long; a gap forgets the cars."""
+    cues, tally = _cues(TRACKED)
+    assert cues.followed() == []
+    frame = Seen(0, (found(("car", 0.9)),))
+    for _ in range(2):
+        counts = cues(frame, EGO._replace(way_m=0.0, seconds=0.5)).counts
+
+    (car,) = cues.followed()
+    assert (car.frames, car.center_px, car.step_px) == (2, (55.0, 25.0), (0.0, 0.0))
+    assert {name for name in counts if "cars" in name} == set()
+    past = cues(frame, EGO._replace(way_m=0.0), Place(10.0, 20.0, 1.0)).counts
+    assert (past["oncoming_cars"], past["outgoing_cars"]) == (0, 0)
+    assert tally.by_cue["oncoming_cars"].skipped == {NOT_PAST: 1}
+    cues.restart()
+    assert cues.followed() == []
+
+
+def skipped(tally: CueTally, name: str) -> tuple[int, int, dict[str, int]]:
+    one = tally.by_cue[name]
+    assert one.seen == one.used + sum(one.skipped.values())
+    return one.seen, one.used, one.skipped
+
+
+def test_labelled_candidates_are_below_the_score_or_not_counted() -> None:
+    """Lights 0.5, 0.6, 0.7 and 0.8 with 0.6: 2 are low; the rule counts 1 of the other 2."""
+    tally = CueTally(VEHICLE)
+    lights = found(*[("traffic light", score) for score in (0.5, 0.6, 0.7, 0.8)])
+
+    tally.labelled("objects", [lights], {"traffic_light": 1, "stop_sign": 0, "one_way_left": 1})
+
+    assert set(tally.by_cue) == {"traffic_light", "stop_sign"}
+    assert skipped(tally, "traffic_light") == (4, 1, {BELOW_SCORE: 2, NOT_COUNTED: 1})
+    made = tally.by_cue["traffic_light"]
+    assert (made.unit, made.setting) == ("detections", "[cues] traffic_light_score")
+    assert (made.threshold, made.max_score) == (0.6, 0.8)
+    assert tally.by_cue["stop_sign"].threshold is None
+    tally.labelled("objects", [lights], {"traffic_light": 9})
+    assert skipped(tally, "traffic_light") == (8, 3, {BELOW_SCORE: 4, NOT_COUNTED: 1})
+
+
+def test_signs_have_no_threshold() -> None:
+    tally = CueTally(VEHICLE)
+
+    tally.labelled("signs", [found(("one way left", 0.1))], {"one_way_left": 1})
+
+    assert skipped(tally, "one_way_left") == (1, 1, {})
+    assert (tally.by_cue["one_way_left"].setting, tally.by_cue["one_way_left"].threshold) == (
+        None,
+        None,
+    )
+
+
+def test_own_cues_have_their_own_score() -> None:
+    """Zebras of 0.3 and 0.4 with 0.3: one is low. The cue without a count is left out."""
+    tally = CueTally(VEHICLE)
+
+    tally.own([found(("stripes", 0.3), ("zebra", 0.4), ("dog", 0.9))], {"crossing": 1})
+    assert set(tally.by_cue) == {"crossing"}
+    assert skipped(tally, "crossing") == (2, 1, {BELOW_SCORE: 1})
+    made = tally.by_cue["crossing"]
+    assert (made.setting, made.threshold) == ("[cues.own.crossing] score", 0.3)
+
+    tally.own([found(("dog", 0.9))], {"dogs": 1})
+    assert skipped(tally, "dogs") == (1, 1, {})
+    assert tally.by_cue["dogs"].threshold == 0.5
+
+
+CARS = found(*[("car", 0.9)] * 9, ("car", 0.5), ("van", 0.4), ("dog", 0.9))
+"""11 cars, of which 2 are not above 0.5."""
+
+
+def test_pairs_are_skipped_by_the_first_rule_that_fails() -> None:
+    """11 cars: 2 low; 7 of 9 from the side; 4 of 7 found before; 1 and 0 cross."""
+    tally = CueTally(VEHICLE)
+
+    tally.cars([CARS], 7, 4, {"cross_traffic_left": 1, "parked_left": 6})
+
+    assert set(tally.by_cue) == {
+        "cross_traffic_left",
+        "cross_traffic_right",
+        "parked_left",
+        "parked_right",
+    }
+    before = {BELOW_SCORE: 2, NOT_FROM_THE_SIDE: 2, NOT_FOUND_BEFORE: 3}
+    assert skipped(tally, "cross_traffic_left") == (11, 1, before | {OTHER_MOTION: 3})
+    assert skipped(tally, "cross_traffic_right") == (11, 0, before | {OTHER_MOTION: 4})
+    assert skipped(tally, "parked_left") == (11, 4, before)
+    made = tally.by_cue["cross_traffic_left"]
+    assert (made.unit, made.setting, made.threshold) == ("detections", "[cars] score", 0.5)
+    assert made.max_score == 0.9
+
+
+def test_threshold_of_cars_is_the_detectors_where_none_is_set() -> None:
+    unset = VEHICLE.model_copy(update={"cars": Cars(kind="pairs")})
+    tally = CueTally(unset)
+
+    tally.cars([found(("car", 0.9), min_scores=[0.7])], 1, 1, {})
+
+    assert tally.by_cue["parked_left"].threshold == 0.7
+
+
+def test_followed_cars_are_skipped_by_the_first_rule_that_fails() -> None:
+    """11 cars: 2 low; 8 of 9 complete; 6 of 8 followed.
+
+    Crossing left: 1 here and 2 elsewhere of 6, so 3 move otherwise. Right: 2 and 1. Parked left: 0
+    and 3; right: 4 and 0. Past: 2 of 9 outgoing; oncoming has no count.
+    """
+    tally = CueTally(VEHICLE)
+    judged = Judged(Sides(1, 2), Sides(0, 4), Sides(2, 1), Sides(3, 0), 8, 6)
+
+    tally.followed([CARS], judged, {"outgoing_cars": 2})
+
+    before = {BELOW_SCORE: 2, CUT_OR_FAR: 1, TOO_FEW_FRAMES: 2, OTHER_MOTION: 3}
+    assert skipped(tally, "cross_traffic_left") == (11, 1, before | {ELSEWHERE: 2})
+    assert skipped(tally, "cross_traffic_right") == (11, 2, before | {ELSEWHERE: 1})
+    assert skipped(tally, "parked_left") == (11, 0, before | {ELSEWHERE: 3})
+    assert skipped(tally, "parked_right") == (11, 4, before | {OTHER_MOTION: 2})
+    assert skipped(tally, "outgoing_cars") == (11, 2, {BELOW_SCORE: 2, NOT_PAST: 7})
+    assert "oncoming_cars" not in tally.by_cue
+
+
+def test_doubles_are_skipped_for_cues_that_were_counted() -> None:
+    """Of a dog and two cars, the dog's cue has no count and that of crossing cars has a tally."""
+    tally = CueTally(VEHICLE)
+    tally.cars([found()], 0, 0, {})
+
+    tally.doubles([found(("dog", 0.9), ("car", 0.4), ("van", 0.95))], {"parked_left": 0, "dogs": 1})
+
+    assert skipped(tally, "parked_left") == (2, 0, {SAME_OBJECT: 2})
+    assert tally.by_cue["parked_left"].max_score == 0.95
+    assert skipped(tally, "parked_right") == (0, 0, {})
+    assert "dogs" not in tally.by_cue
+
+
+def test_road_is_a_candidate_of_its_side() -> None:
+    """Fractions 0.2, not above 0.2; 0.21; and 0, where no road was found. Then none is seen."""
+    tally = CueTally(VEHICLE)
+
+    tally.road(RoadFractions(0.2, 0.21, 0.0))
+
+    assert set(tally.by_cue) == {"road_left", "road_straight", "road_right"}
+    assert skipped(tally, "road_left") == (1, 0, {TOO_LITTLE_ROAD: 1})
+    assert skipped(tally, "road_straight") == (1, 1, {})
+    assert skipped(tally, "road_right") == (0, 0, {})
+    made = tally.by_cue["road_left"]
+    assert (made.unit, made.setting, made.threshold) == ("frames", "[cues] road_fraction", 0.2)
+    assert made.max_score == 0.2
+
+    tally.road(RoadFractions(math.nan, math.nan, 0.5))
+    assert skipped(tally, "road_left") == (2, 0, {TOO_LITTLE_ROAD: 1, REGION_NOT_SEEN: 1})
+    assert skipped(tally, "road_right") == (1, 1, {})
+    unseen = CueTally(VEHICLE)
+    unseen.road(RoadFractions(math.nan, 0.1, 1.0))
+    made = unseen.by_cue["road_left"]
+    assert (made.unit, made.setting, made.threshold) == ("frames", "[cues] road_fraction", 0.2)
+    assert made.max_score == 0.0
+    assert skipped(unseen, "road_straight") == (1, 0, {TOO_LITTLE_ROAD: 1})
+
+
+def test_frames_are_explained_by_the_detectors_that_ran() -> None:
+    """A car of unknown nose, in two frames: first not found before, then moving otherwise.
+
+    Its double is skipped where the cue has a count. Each frame has a dog, one below 0.5, and one
+    more as a double.
+    """
+    cues, tally = _cues()
+    car = found(("car", 0.9), ("dog", 0.9))
+    signs = found(("one way left", 0.9), ("dog", 0.1))
+    for t_ms in (0, 100):
+        cues(Seen(t_ms * MS, (replace(car, t_ns=t_ms * MS),), (signs,), doubles=(car,)))
+
+    assert skipped(tally, "parked_left") == (
+        3,
+        0,
+        {NOT_FOUND_BEFORE: 1, OTHER_MOTION: 1, SAME_OBJECT: 1},
+    )
+    assert skipped(tally, "dogs") == (6, 2, {BELOW_SCORE: 2, SAME_OBJECT: 2})
+    assert skipped(tally, "one_way_left") == (2, 2, {})
+    assert skipped(tally, "traffic_light") == (0, 0, {})
+
+
+@pytest.mark.parametrize("vehicle", [VEHICLE, TRACKED])
+@pytest.mark.parametrize(
+    ("labels", "is_explained"), [({"car"}, True), ({"dog"}, False), (None, True)]
+)
+def test_cars_are_explained_if_a_detector_can_report_them(
+    vehicle: Vehicle, labels: set[str] | None, is_explained: bool
+) -> None:
+    cues, tally = _cues(vehicle)
+    reported = None if labels is None else frozenset(labels)
+
+    cues(Seen(0, (found(("car", 0.9)),), labels=reported), EGO)
+
+    assert ("parked_left" in tally.by_cue) == is_explained
+    cues(Seen(0, (), (found(("car", 0.9)),), labels=reported), EGO)
+    if is_explained:
+        assert tally.by_cue["parked_left"].seen == 1
