@@ -155,7 +155,7 @@ class Fate(NamedTuple):
     topic: str
     becomes: Literal["used", "skipped", "dropped", "spoiled", "hidden", "gone"]
     reason: str
-    count: int
+    rows: int
 
 
 FATES = st.builds(
@@ -169,13 +169,13 @@ FATES = st.builds(
 
 def _read(ledger: Ledger, fate: Fate) -> None:
     if fate.becomes in ("used", "skipped", "spoiled"):
-        ledger.find(fate.topic, fate.count)
+        ledger.find(fate.topic, fate.rows)
     if fate.becomes == "skipped":
-        ledger.skip(fate.topic, fate.reason, fate.count)
+        ledger.skip(fate.topic, fate.reason, fate.rows)
     elif fate.becomes == "spoiled":
-        ledger.spoil(fate.topic, fate.reason, fate.count)
+        ledger.spoil(fate.topic, fate.reason, fate.rows)
     elif fate.becomes in ("dropped", "hidden"):
-        ledger.drop("" if fate.becomes == "hidden" else fate.topic, fate.reason, fate.count)
+        ledger.drop("" if fate.becomes == "hidden" else fate.topic, fate.reason, fate.rows)
 
 
 def _total(fates: Sequence[Fate], *becomes: str) -> Counter[str]:
@@ -183,7 +183,7 @@ def _total(fates: Sequence[Fate], *becomes: str) -> Counter[str]:
     found: Counter[str] = Counter()
     for fate in fates:
         if fate.becomes in becomes:
-            found[fate.reason] += fate.count
+            found[fate.reason] += fate.rows
     return found
 
 
@@ -193,23 +193,23 @@ def test_declared_rows_are_used_skipped_or_dropped_and_each_loss_is_counted_once
 ) -> None:
     ledger = Ledger("log")
     by_topic = {topic: [one for one in fates if one.topic == topic] for topic in declaring}
-    for topic, rows in by_topic.items():
-        ledger.declare(topic, sum(one.count for one in rows))
+    for topic, its in by_topic.items():
+        ledger.declare(topic, sum(one.rows for one in its))
     for fate in fates:
         _read(ledger, fate)
     for topic in sorted(declaring):
         ledger.settle(topic)
 
-    for topic, rows in by_topic.items():
+    for topic, its in by_topic.items():
         account = ledger.topic(topic)
-        dropped = account.dropped.total()
-        assert account.declared == account.used + account.skipped.total() + dropped
-        assert account.used == _total(rows, "used").total()
-        assert account.skipped == _total(rows, "skipped")
+        lost = account.dropped.total()
+        assert account.declared == account.used + account.skipped.total() + lost
+        assert account.used == _total(its, "used").total()
+        assert account.skipped == _total(its, "skipped")
     # Rows of unknown topics are attributed as long as a topic lacks rows. What was dropped is then
     # what was taken away: each reason as often as it occurred, and the rest was not found.
     hidden = _total(fates, "hidden")
-    lacking = [one for rows in by_topic.values() for one in rows]
+    lacking = [one for its in by_topic.values() for one in its]
     missing = _total(lacking, "hidden", "gone").total()
     nameless = ledger.topic("").dropped
     assert nameless.total() == max(0, hidden.total() - missing)

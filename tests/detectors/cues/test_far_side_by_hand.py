@@ -21,10 +21,18 @@ from crosscue.replay.vehicle.mobileye_cues import Past
 MS = 1_000_000
 NAN = float("nan")
 PAST = Past(
-    intersection_length_m=16.0, lane_reach_m=5.0, lane_within_y_m=8.0, lane_quality=2.0,
-    lane_types=(0, 4), vehicle_beyond_m=3.0, vehicle_within_y_m=6.0, vehicle_types=(0, 2),
-    vehicle_age_frames=2.0, max_age_s=0.5, settles_s=0.03,
-)  # fmt: skip
+    intersection_length_m=16.0,
+    lane_reach_m=5.0,
+    lane_within_y_m=8.0,
+    lane_quality=2.0,
+    lane_types=(0, 4),
+    vehicle_beyond_m=3.0,
+    vehicle_within_y_m=6.0,
+    vehicle_types=(0, 2),
+    vehicle_age_frames=2.0,
+    max_age_s=0.5,
+    settles_s=0.03,
+)
 END_M = 20.0
 
 

@@ -29,9 +29,15 @@ from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 SIZE = (400, 200)
 S = 1_000_000_000
 RULES = Cars(
-    labels=("car", "van"), score=0.9, length_per_height=2.0, area_change=0.03, position_change=0.05,
-    still_change=0.0025, slope=0.25, max_gap_s=0.5,
-)  # fmt: skip
+    labels=("car", "van"),
+    score=0.9,
+    length_per_height=2.0,
+    area_change=0.03,
+    position_change=0.05,
+    still_change=0.0025,
+    slope=0.25,
+    max_gap_s=0.5,
+)
 VEHICLE = Vehicle(version=1, cars=RULES)
 Car = tuple[float, float, float]
 

@@ -302,7 +302,7 @@ def test_region_of_one_pixel_is_seen_and_of_none_is_not(far_m: float, pixels: in
     There x = 10 - 5 l / 20, from 12 m at 7.0 to 15 m at 6.25, or to 12.5 m at 6.875: 6.5 is in
     the first.
     """
-    regions = {"aside_m": (12.0, far_m), "min_rows": 0.1}
+    regions: dict[str, Any] = {"aside_m": (12.0, far_m), "min_rows": 0.1}
     outline = outlines(CAMERA, REGIONS.model_copy(update=regions), PLACE, SIZE)[0]
     assert np.count_nonzero(pixels_of(outline, 10, 20)) == pixels
 
