@@ -495,35 +495,12 @@ def test_reversing_and_returning_car_stays_on_same_approach() -> None:
     assert nearest.approach == 1
 
 
-def test_turn_at_ranged_intersection_closes_approach_and_opens_no_other() -> None:
-    loop = approaches()
-    run_steps(drive(40.0, 0.0, {"stop_sign": (40.0, 1)}), loop)
-
-    turning = [
-        replace(frame(100 + i, 1.0, road_right=1), turned_rad=math.pi / 2 / 12) for i in range(10)
-    ]
-    taken = run_steps(turning, loop)
-
-    assert taken[-1].approach is None
-    assert loop.counts["approaches closed: turned"] == loop.counts["approaches opened"] == 1
-
-
 def test_continuous_road_cue_is_split_into_approaches_of_max_length() -> None:
     loop = approaches()
 
     run_steps([frame(i, 1.0, road_left=1) for i in range(1000)], loop)
 
     assert loop.counts["approaches closed: too long"] == 9
-
-
-def test_nearby_sign_joins_open_approach_and_keeps_belief() -> None:
-    loop = approaches()
-    run_steps([frame(i, 1.0, road_left=1) for i in range(10)], loop)
-
-    step = loop(replace(frame(10, 1.0, stop_sign=1), signs=(sign(40.0),)))
-
-    assert step.approach == 1
-    assert step.probabilities["left"] > 0.9
 
 
 def test_isolated_false_detections_never_establish_presence() -> None:

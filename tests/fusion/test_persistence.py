@@ -217,9 +217,9 @@ def test_continuous_cue_beyond_validated_range_reports_reason() -> None:
 
 
 def test_cue_is_silent_in_approach_until_seen_in_three_pictures() -> None:
-    """A repeated picture is none; the count of a cue past the intersection is held likewise.
+    """A repeated picture does not count, and cues past the intersection wait likewise.
 
-    A frame without an approach tells why, and a restart forgets.
+    A frame without an approach has the reason, too, and a restart forgets.
     """
     fusion = Fusion.model_validate(
         {"kind": "persistent", "cues": {"stop_sign": {"seen_frames": 1}}}

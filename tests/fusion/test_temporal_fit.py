@@ -275,24 +275,10 @@ def test_fit_recovers_chain_rates(learned: Temporal) -> None:
     assert chain(learned, "road", ("intersection",)).appears[0] < 0.1
 
 
-def test_outgoing_roads_and_presence_are_counted_once_per_place(learned: Temporal) -> None:
-    # 24 places: 8 with a left road, 8 without, 8 that are not an intersection.
-    assert learned.ahead == pytest.approx(17.0 / 26.0, abs=1e-4)
-    assert learned.ways == pytest.approx({"left": 0.5, "none": 0.5})
-
-
-def test_cue_without_observations_has_no_chain(learned: Temporal) -> None:
-    assert {one.cue for one in learned.chains} == {"sign", "road", "again"}
-
-
 def test_redundant_cue_lowers_exponent(learned: Temporal, drives: list[AnnotatedDrive]) -> None:
     once = fit_temporal(drives, GRAPH.without("again")).temporal
 
     assert learned.exponent < once.exponent
-
-
-def test_consistent_ranges_yield_low_stray_probability(learned: Temporal) -> None:
-    assert learned.stray < 0.03
 
 
 def test_filter_recovers_features_of_held_out_drives(
