@@ -142,10 +142,9 @@ class CalibratedMessageModel:
         is_fresh = is_positive and _is_fresh(history, count, situation.objects.get(messages.cue))
         before = False if is_fresh and history.was_positive else history.was_positive
         rho = math.exp(history.observed_at - at)
-        fraction = 1.0
+        last_at = -math.inf if is_fresh else history.changed_at.get(is_positive, -math.inf)
+        fraction = effective_sample_fraction(at - last_at)
         if before is not is_positive:
-            last_at = history.changed_at.get(is_positive, -math.inf)
-            fraction = 1.0 if is_fresh else effective_sample_fraction(at - last_at)
             history.changed_at[is_positive] = at
         for edge in messages.near if situation.is_near else messages.far:
             out[edge.feature] += edge.message(is_positive, before, rho, fraction)
