@@ -117,7 +117,45 @@ PARTS: Final = {
         ("detectors/cues/tracked/*.py",),
         ("tests/detectors/cues/test_car_tracks.py", "tests/detectors/cues/test_tracks_by_hand.py"),
     ),
-    "fusion": Part(("fusion/*.py",), ("tests/fusion",)),
+    "fusion": Part(
+        ("fusion/*.py",),
+        tuple(
+            f"tests/fusion/test_{name}.py"
+            for name in (
+                "approaches",
+                "calibrated",
+                "factor_graph",
+                "intersection_range",
+                "persistence",
+                "range_track",
+                "temporal",
+            )
+        ),
+        tuple(
+            f"tests/fusion/test_{name}"
+            for name in (
+                "approaches.py::test_range_errors_over_drives_match_reported_variance",
+                "calibrated.py::test_fit_recovers_true_rates",
+                "calibrated.py::test_fit_recovers_true_fade_length",
+                "calibrated.py::test_calibrated_model_beats_source_on_held_out_simulated_approaches",
+                "intersection_range.py::"
+                "test_filter_errors_match_variance_with_distance_correlated_noise",
+                "range_track.py::test_followed_range_errors_match_reported_variance",
+            )
+        ),
+    ),
+    "fits": Part(
+        ("fusion/fit/*.py",),
+        ("tests/fusion/test_message_fit.py", "tests/fusion/test_temporal_fit.py"),
+        tuple(
+            f"tests/fusion/test_temporal_fit.py::test_{name}"
+            for name in (
+                "fit_recovers_chain_rates",
+                "redundant_cue_lowers_exponent",
+                "filter_recovers_features_of_held_out_drives",
+            )
+        ),
+    ),
     "ekf": Part(("localization/ekf.py",), ("tests/localization/test_ekf.py",)),
 }
 
