@@ -140,17 +140,13 @@ def no_pairs(width_px: int) -> Pairs:
 def _nearest(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns of the smallest finite entries, each row and column at most once."""
     rows, columns = np.nonzero(np.isfinite(cost))
-    order = np.argsort(cost[rows, columns], kind="stable")
-    kept: list[int] = []
-    used_rows: set[int] = set()
-    used_columns: set[int] = set()
-    for i in order.tolist():
-        row, column = int(rows[i]), int(columns[i])
-        if row not in used_rows and column not in used_columns:
-            used_rows.add(row)
-            used_columns.add(column)
-            kept.append(i)
-    return rows[kept], columns[kept]
+    pairs = zip(cost[rows, columns].tolist(), rows.tolist(), columns.tolist(), strict=True)
+    kept: list[tuple[int, int]] = []
+    for _, row, column in sorted(pairs):
+        if all(row != r and column != c for r, c in kept):
+            kept.append((row, column))
+    first, second = np.array(kept, np.intp).T
+    return first, second
 
 
 def cross_traffic(pairs: Pairs, settings: Cars) -> Sides:

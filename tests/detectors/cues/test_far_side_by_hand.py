@@ -79,6 +79,7 @@ def test_vehicle_past_is_counted_at_each_limit(changes: dict[str, float], counts
     [
         ({"c0_m": 0.49}, True),
         ({"c0_m": 0.51}, False),  # 8.01 m aside
+        ({"c0_m": 8.0, "c1": 0.0, "c2_per_m": 0.0, "c3_per_m2": 0.0}, True),
         ({"c0_m": -15.49}, True),  # -7.99 m aside
         ({"c0_m": -15.51}, False),
         ({"c0_m": 0.49, "x_end_m": 24.99}, False),
@@ -133,6 +134,34 @@ def test_state_is_of_bursts_that_are_complete_and_recent(ms: int, is_known: bool
     nothing = state_at(None, None, ms * MS, PAST)
     assert nothing.obstacles is None
     assert nothing.lanes is None
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "x_m"),
+    [
+        (100_000 * MS - 1, [23.0]),
+        (100_000 * MS, [40.0]),
+        (200_000 * MS, [40.0]),
+        (200_000 * MS + 1, None),
+    ],
+)
+def test_limits_of_a_bursts_age_are_exact_to_the_nanosecond(
+    late_ns: int, x_m: list[float] | None
+) -> None:
+    """Bursts at 1 and 101 s are complete after 100 s and recent for 200 s.
+
+    The row 100 s before the last is not of its image.
+    """
+    slow = PAST.model_copy(update={"settles_s": 100.0, "max_age_s": 200.0})
+    obstacles = samples(
+        Signal.MOBILEYE_OBSTACLES,
+        (1000, obstacle(burst=-1.0)),
+        (101_000, obstacle(burst=-1.0, x_m=40.0)),
+    )
+
+    found = state_at(obstacles, None, 101_000 * MS + late_ns, slow).obstacles
+
+    assert (None if found is None else found[:, 1].tolist()) == x_m
 
 
 def test_state_has_the_rows_of_the_last_burst_with_a_position() -> None:

@@ -199,6 +199,8 @@ def test_nearest_cars_are_paired_first() -> None:
     assert steps(before, shapes((8, 50, 100), (9, 50, 100), t_ns=1)) == [[-1.0, 0.0], [8.0, 0.0]]
     assert steps(before, shapes((9, 50, 100), t_ns=1)) == [[-1.0, 0.0]]
     assert steps(shapes((9, 50, 100)), shapes((10, 50, 100), (0, 50, 100), t_ns=1)) == [[1.0, 0.0]]
+    # Of two that are equally near, the first car of the earlier frame is paired.
+    assert steps(shapes((0, 50, 100), (10, 50, 100)), shapes((5, 50, 100), t_ns=1)) == [[5.0, 0.0]]
     three = shapes((0, 50, 100), (1, 50, 100), (100, 50, 100))
     later = shapes((1, 50, 100), (104, 50, 100), (200, 50, 100), t_ns=1)
     assert steps(three, later) == [[0.0, 0.0], [4.0, 0.0]]

@@ -85,6 +85,7 @@ def test_fractions_are_road_pixels_over_pixels_of_each_region() -> None:
     [
         (0.2, 0.21, 0.0, (0, 1, 0)),  # 0.2 is not more than 0.2
         (0.21, 0.2, NAN, (1, 0, None)),
+        (0.0, 1.0, 0.2, (0, 1, 0)),
         (NAN, NAN, 1.0, (None, None, 1)),
     ],
 )
