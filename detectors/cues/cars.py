@@ -119,8 +119,7 @@ def pair_cars(before: CarShapes, now: CarShapes, settings: Cars) -> Pairs:
     """
     gap_s = (now.t_ns - before.t_ns) * 1e-9
     width = now.size_px[0]
-    is_apart = not 0.0 < gap_s <= settings.max_gap_s or before.size_px != now.size_px
-    if is_apart or not len(before) or not len(now):
+    if not 0.0 < gap_s <= settings.max_gap_s or before.size_px != now.size_px:
         return no_pairs(width)
     steps = now.center_px[None, :, :] - before.center_px[:, None, :]
     distance = np.hypot(steps[:, :, 0], steps[:, :, 1])

@@ -174,7 +174,7 @@ class CueTally:
 
     def _of_cars(self, cue: CueSpec, boxes: Sequence[Detections]) -> Candidates:
         cars = self.vehicle.cars
-        counted = self._of(cue.name, "detections", "[cars] score", cars.score)
+        counted = self._of(cue.name, "detections", "[cars] score", None)
         counted.meet(thresholds_met(boxes, cars.labels, cars.score))
         return counted
 

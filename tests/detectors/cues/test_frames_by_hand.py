@@ -11,6 +11,7 @@ import pytest
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.cues import frame
 from crosscue.detectors.cues.candidates import (
     BELOW_SCORE,
     CUT_OR_FAR,
@@ -39,12 +40,14 @@ from crosscue.detectors.cues.observed import (
     Role,
     Seen,
     Sides,
+    Ways,
     role_of,
     seen,
 )
 from crosscue.detectors.cues.rules import counts_of, rule_of
 from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
 from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.cues.tracked.judge import judge
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Regions, Vehicle
@@ -408,6 +411,50 @@ def test_tracked_cars_are_those_of_the_newest_frame() -> None:
     assert cues.followed() == []
 
 
+def test_rules_get_the_tracked_cars_and_what_was_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two cars, one stands and one moves by (6, 2) px; their noses are unknown.
+
+    Centres are (55, 25) and (205 + 6, 25 + 2). They are judged with camera, settings and place.
+    """
+    given: list[Pairs] = []
+    judged_with: list[tuple[object, ...]] = []
+
+    def rules(observed_by: str, observed: object, settings: object) -> dict[str, int]:
+        given.extend([observed] if isinstance(observed, Pairs) else [])
+        return {}
+
+    def judged_as(*arguments: object) -> Judged:
+        judged_with.append(arguments)
+        return judge(*arguments)  # type: ignore[arg-type]
+
+    def past_as(*arguments: object) -> Ways:
+        judged_with.append(arguments)
+        return Ways(3, 4)
+
+    monkeypatch.setattr(frame, "counts_of", rules)
+    monkeypatch.setattr(frame, "judge", judged_as)
+    monkeypatch.setattr(frame, "cars_past", past_as)
+    cues, place = CuePass(TRACKED), Place(10.0, 26.0, 1.0)
+    still = EGO._replace(way_m=0.0)
+    boxes = [(5.0, 5.0, 105.0, 45.0), (161.0, 7.0, 261.0, 47.0)]
+    cues(Seen(0, (found(("car", 0.9), ("car", 0.9)),)), still, place)
+    cues(Seen(1, (found(("car", 0.9), ("car", 0.9), boxes=boxes),)), still, place)
+
+    none, both = given
+    assert none.step_px.shape == none.center_px.shape == (0, 2)
+    assert none.nose.shape == (0,)
+    assert sorted(both.step_px.tolist()) == [[0.0, 0.0], [6.0, 2.0]]
+    assert sorted(both.center_px.tolist()) == [[55.0, 25.0], [211.0, 27.0]]
+    assert both.nose.tolist() == [0, 0]
+    assert both.nose.dtype == np.int64
+    assert both.width_px == 640
+    assert both.judged is not None
+    assert (both.judged.seen, both.judged.past) == (2, Ways(3, 4))
+    for arguments in judged_with:
+        assert arguments[-3:] in ((CAMERA, TRACKED.cars, place),)
+    assert len(judged_with) == 4
+
+
 def skipped(tally: CueTally, name: str) -> tuple[int, int, dict[str, int]]:
     one = tally.by_cue[name]
     assert one.seen == one.used + sum(one.skipped.values())
@@ -489,6 +536,27 @@ def test_threshold_of_cars_is_the_detectors_where_none_is_set() -> None:
 
     tally.cars([found(("car", 0.9), min_scores=[0.7])], 1, 1, {})
 
+    assert tally.by_cue["parked_left"].threshold == 0.7
+
+
+def test_score_of_cars_that_is_set_replaces_the_detectors() -> None:
+    """0.7 and 0.9 with 0.8: one is low, although the detector's threshold is 0.6."""
+    tally = CueTally(VEHICLE.model_copy(update={"cars": Cars(kind="pairs", score=0.8)}))
+    cars = found(("car", 0.7), ("car", 0.9), min_scores=[0.6, 0.6])
+
+    tally.cars([cars], 1, 1, {"parked_left": 1})
+
+    assert skipped(tally, "parked_left") == (2, 1, {BELOW_SCORE: 1})
+    assert tally.by_cue["parked_left"].threshold == 0.8
+
+
+def test_threshold_of_followed_cars_is_the_detectors_where_none_is_set() -> None:
+    tally = CueTally(VEHICLE.model_copy(update={"cars": Cars(kind="tracks")}))
+    nothing = Judged(Sides(0, 0), Sides(0, 0), Sides(0, 0), Sides(0, 0), 1, 1)
+
+    tally.followed([found(("car", 0.9), min_scores=[0.7])], nothing, {"outgoing_cars": 0})
+
+    assert tally.by_cue["outgoing_cars"].threshold == 0.7
     assert tally.by_cue["parked_left"].threshold == 0.7
 
 

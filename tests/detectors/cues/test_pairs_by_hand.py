@@ -248,6 +248,11 @@ def test_crossing_car_moves_horizontally_and_by_enough() -> None:
 
     assert cross_traffic(pairs(*moved), RULES) == Sides(1, 3)
     assert cross_traffic(pairs(), RULES) == Sides(0, 0)
+    # With 0.0005 * 400 = 0.2 px, half a pixel is enough.
+    finer = RULES.model_copy(update={"still_change": 0.0005})
+    assert cross_traffic(pairs((0.5, 0.0), (0.2, 0.0), (-0.5, 0.0), (-0.6, 0.0)), finer) == Sides(
+        2, 1
+    )
 
 
 def test_parked_car_stands_on_both_axes_and_shows_its_nose() -> None:

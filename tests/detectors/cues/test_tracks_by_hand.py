@@ -174,7 +174,7 @@ def test_cars_are_counted_by_side_here_and_elsewhere() -> None:
     and one is further than 100 m, so 6.
     """
     left, right = car(**FAST | {"right_mps": -7.0}), car(**FAST)
-    far = {"distance_m": 80.0}
+    far: dict[str, Any] = {"distance_m": 80.0}
     moving = [left, left, right, left._replace(**far), right._replace(**far), right._replace(**far)]
     others = [car(frames=2), car(distance_m=100.1)]
     standing = [car(nose=-1.0), car(**far), car(**far)]
