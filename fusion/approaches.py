@@ -309,7 +309,7 @@ class Approaches:
         ranges = self._measured(current, signs, evidence.posteriors, moved.way_m)
         best, reference = _best(current, Reference(self._fusion.reference))
         more = past(best, reference)
-        counts = {**evidence.counts, **more} if more else evidence.counts
+        counts = {**evidence.counts, **more}
         if more:
             also = self._confirmed(more, evidence.is_new_picture)
             confirmed = Confirmed(
