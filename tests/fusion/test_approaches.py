@@ -61,16 +61,6 @@ def test_drive_past_one_intersection_is_one_approach() -> None:
     }
 
 
-def test_sign_seen_once_opens_approach_without_range() -> None:
-    loop = approaches(range_filter=RangeFilter())
-    once = replace(frame(1, stop_sign=1), signs=(sign(60.0),))
-    taken = run_steps([frame(0), once, *(frame(i) for i in range(2, 40))], loop)
-
-    assert taken[1].approach == 1
-    assert not any(step.ranges for step in taken)
-    assert loop.counts["ranges waiting for a second observation"] == 1
-
-
 def test_approaches_are_numbered_and_start_from_fresh_belief() -> None:
     loop, taken = approaches(), list[Step]()
     for i, side in enumerate(("road_left", "road_right", "road_left")):
@@ -487,21 +477,6 @@ def test_crawling_car_keeps_one_approach_until_passed() -> None:
     assert max(p for one in slow for p in one.probabilities.values()) < 1.0
 
 
-def test_reversing_and_returning_car_stays_on_same_approach() -> None:
-    loop = approaches()
-    there = list(drive(40.0, 10.0, {"stop_sign": (40.0, 1)}))
-    back = [frame(100 + i, -1.0) for i in range(10)]
-    again = [frame(200 + i, 1.0) for i in range(10)]
-
-    run_steps(there, loop)
-    furthest = run_steps(back, loop)[-1]
-    nearest = run_steps(again, loop)[-1]
-
-    assert furthest.ranges[0].range_m == pytest.approx(20.0)
-    assert nearest.ranges[0].range_m == pytest.approx(10.0)
-    assert nearest.approach == 1
-
-
 def test_continuous_road_cue_is_split_into_approaches_of_max_length() -> None:
     loop = approaches()
 
@@ -603,14 +578,6 @@ def test_start_and_end_references_are_filtered_independently() -> None:
         for row in one.ranges
     }
     assert {row.reference: (row.range_m, row.var_m2) for row in last.ranges} == alone
-
-
-def test_signs_alone_update_range_without_odometry() -> None:
-    seen = [replace(one, travelled_m=None) for one in drive(60.0, 10.0, {"stop_sign": (60.0, 1)})]
-
-    last = run_steps(seen)[-1]
-
-    assert last.ranges[0].range_m == pytest.approx(10.0, abs=1.0)
 
 
 def test_approach_open_at_end_of_drive_is_counted() -> None:

@@ -188,20 +188,6 @@ def test_message_memory_is_reset_for_each_approach() -> None:
     assert loop.counts["approaches opened"] == 2
 
 
-def test_probabilities_stay_in_open_interval_with_extreme_rates() -> None:
-    sure = Calibrated(
-        rates=(
-            Rates(cue="road_left", feature="left", near=False, if_there=1 - 1e-12, if_not=1e-12),
-        )
-    )
-    fusion = Fusion(kind="calibrated", calibrated=sure)
-    loop = Approaches(GRAPH, fusion, RangeFilter())
-
-    steps = [loop(one) for one in drive(90.0, -10.0, {"road_left": (80.0, 1)})]
-
-    assert all(0.0 < p < 1.0 for step in steps for p in step.probabilities.values())
-
-
 def test_fit_recovers_true_rates() -> None:
     fit = fit_messages(annotated(1, 150), GRAPH)
 

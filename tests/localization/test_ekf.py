@@ -249,20 +249,6 @@ def test_bicycle_jacobians_match_central_differences(
     np.testing.assert_allclose(motion.by_input, by_input, atol=1e-7)
 
 
-@given(heading=HEADINGS, speed=SPEEDS, yaw_rate=st.floats(-1.0, 1.0))
-@settings(max_examples=60, deadline=None)
-def test_yaw_rate_jacobians_match_central_differences(
-    heading: float, speed: float, yaw_rate: float
-) -> None:
-    mean, inputs = np.array([2.0, -1.0, heading, speed]), np.array([0.7, yaw_rate])
-    motion = turning(mean, 0.7, yaw_rate, 0.1)
-    by_state = central_differences(lambda m: turning(m, 0.7, yaw_rate, 0.1).mean, mean)
-    by_input = central_differences(lambda u: turning(mean, u[0], u[1], 0.1).mean, inputs)
-
-    np.testing.assert_allclose(motion.by_state, by_state, atol=1e-7)
-    np.testing.assert_allclose(motion.by_input, by_input, atol=1e-7)
-
-
 @given(heading=HEADINGS, speed=SPEEDS, steering=STEERINGS)
 @settings(max_examples=40, deadline=None)
 def test_steering_and_equivalent_yaw_rate_predict_the_same_pose(
