@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Protocol, Self, TypeAlias
 
@@ -249,6 +249,45 @@ def reportable(detector: Detector) -> tuple[str, ...] | None:
     return None if labels is None else tuple(sorted({*labels}))
 
 
+def fault_of(found: Found, frame: Frame, labels: Sequence[str] | None) -> str | None:
+    """Explain how a result breaks the contract of ``Detector``; None if it keeps it.
+
+    Masks are not decoded.
+
+    Args:
+        found: The result for ``frame``.
+        frame: The frame.
+        labels: All labels that the detector declares; None for any.
+    """
+    if not isinstance(found, Detections | RoadMask):
+        return f"returned a {type(found).__name__}; expected Detections or RoadMask"
+    if found.t_ns != frame.t_ns or found.size_px != frame.size_px:
+        have, want = (found.t_ns, found.size_px), (frame.t_ns, frame.size_px)
+        return f"time and size of the result are {have}; expected the frame's, {want}"
+    return None if isinstance(found, RoadMask) else _fault_of_boxes(found, labels)
+
+
+def _fault_of_boxes(found: Detections, labels: Sequence[str] | None) -> str | None:
+    boxes, ends = found.boxes_px, (*found.size_px, *found.size_px)
+    is_ordered = np.all(boxes[:, :2] <= boxes[:, 2:], axis=1)
+    is_inside = np.all((boxes >= 0.0) & (boxes <= ends), axis=1)
+    is_fraction = (found.scores >= 0.0) & (found.scores <= 1.0)
+    is_known = np.array([bool(x) and (labels is None or x in labels) for x in found.labels], bool)
+    wrong = np.flatnonzero(~(is_ordered & is_inside & is_fraction & is_known))
+    if not len(wrong):
+        return None
+    i = int(wrong[0])
+    corners = ", ".join(f"{value:g}" for value in boxes[i].tolist())
+    where = f"box {i} of {len(boxes)}, {found.labels[i]!r} at ({corners})"
+    if not is_ordered[i]:
+        return f"{where}: x1 < x0 or y1 < y0; expected x0, y0, x1, y1 and not a width and a height"
+    if not is_inside[i]:
+        return f"{where}: not inside the picture of {found.size_px} px; clip it"
+    if not is_fraction[i]:
+        return f"{where}: score {found.scores[i]:g}; expected 0 to 1"
+    return f"{where}: label not declared; expected one of {', '.join(labels or ('any text',))}"
+
+
 @dataclass(frozen=True, slots=True)
 class Choice:
     """A requested detector, not yet built.
@@ -257,8 +296,21 @@ class Choice:
         name: Name in tables.
         kind: Name, ``module:factory`` or model card, as in ``crosscue.detectors.registry``.
         settings: Keyword arguments of its factory.
+        factory: The factory itself, of a detector that was passed as an object.
+        identity: Identity of such a detector, which no name tells; otherwise None.
     """
 
     name: str
     kind: str
     settings: Mapping[str, Any] = field(default_factory=dict)
+    factory: Callable[..., Any] | None = None
+    identity: str | None = None
+
+    def as_row(self) -> dict[str, object]:
+        """Return what decides the detector's results, as JSON."""
+        row: dict[str, object] = {
+            "name": self.name,
+            "kind": self.kind,
+            "settings": dict(self.settings),
+        }
+        return row if self.identity is None else {**row, "identity": self.identity}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
@@ -11,15 +12,34 @@ import numpy as np
 from .base import Detections, Frame, View
 from .settings import Settings, identity_of, settings_of
 
+# Label, score from 0 to 1, and x0, y0, x1, y1 in pixels of the decoded frame.
 ScoredBox: TypeAlias = tuple[str, float, Sequence[float]]
-"""Label, score from 0 to 1, and x0, y0, x1, y1 in pixels of the decoded frame."""
 
 
 class BoxDetector(Settings):
     """Base class of a detector of boxes. Its fields are its settings, typed and with defaults.
 
-    A subclass sets ``name`` and ``labels`` and implements ``boxes_in``. Its ``build`` is the
-    factory for ``--detectors module:Class.build``, a table of detectors or an entry point.
+    A subclass sets ``name`` and ``labels`` and implements ``boxes_in``. This is a whole detector::
+
+        import cv2
+        import crosscue
+
+        class Red(crosscue.BoxDetector):
+            name, labels = "red", ("stop sign",)  # with a space, as cues spell it
+            min_area_px: float = 100.0  # a setting of the vehicle file
+
+            def boxes_in(self, frame):
+                blue, green, red = cv2.split(frame.pixels)  # BGR, as OpenCV has it
+                is_red = (red > 150) & (green < 80) & (blue < 80)
+                found = cv2.connectedComponentsWithStats(is_red.astype("uint8"))[2][1:]
+                for x, y, width, height, area in found.tolist():
+                    if area > self.min_area_px:
+                        score = area / (width * height)  # 0 to 1; above 0.5 it counts for a cue
+                        yield "stop sign", score, (x, y, x + width, y + height)
+
+    ``crosscue.replay_drive(log, run, detectors=[Red])`` runs it, or ``--detectors module:Red`` of a
+    module that can be imported. Each result is checked: order of corners, inside the picture,
+    score, label.
 
     Attributes:
         name: Name in error messages.
@@ -36,7 +56,15 @@ class BoxDetector(Settings):
 
     @abstractmethod
     def boxes_in(self, frame: Frame) -> Iterable[ScoredBox]:
-        """Find the boxes in one frame."""
+        """Yield label, score and corners of each box in one frame.
+
+        Args:
+            frame: Its ``pixels`` are BGR, shape (H, W, 3), or grey (H, W) by ``view``.
+
+        Returns:
+            For each box: one of ``labels``; a score from 0 to 1; x0, y0, x1, y1 in pixels of
+            ``frame.pixels``, with x0 <= x1 and y0 <= y1, inside the picture.
+        """
 
     @classmethod
     def build(cls, **given: Any) -> Self:
@@ -57,13 +85,51 @@ class BoxDetector(Settings):
         return [self._detections(frame) for frame in frames]
 
     def _detections(self, frame: Frame) -> Detections:
-        found = list(self.boxes_in(frame))
-        boxes = np.array([box for _, _, box in found], np.float64).reshape(-1, 4)
-        return Detections(
-            frame.t_ns,
-            frame.size_px,
-            boxes * np.tile(frame.scale, 2),
-            np.array([score for _, score, _ in found], np.float64),
-            tuple(label for label, _, _ in found),
-            (b"",) * len(found),
-        )
+        return as_detections(frame, self.boxes_in(frame))
+
+
+def as_detections(frame: Frame, found: Iterable[ScoredBox]) -> Detections:
+    """Return boxes in pixels of the decoded frame as detections in the camera's pixels.
+
+    Raises:
+        TypeError: An item is not a label, a score and four numbers.
+    """
+    labels, scores, boxes = [], [], []
+    for item in found:
+        try:
+            label, score, corners = item
+            boxes.append([float(value) for value in corners])
+            scores.append(float(score))
+        except (TypeError, ValueError):
+            boxes.append([])
+        if len(boxes[-1]) != 4 or not isinstance(label, str):
+            raise TypeError(f"yielded {item!r}; expected (label, score, (x0, y0, x1, y1))")
+        labels.append(label)
+    return Detections(
+        frame.t_ns,
+        frame.size_px,
+        np.array(boxes, np.float64).reshape(-1, 4) * np.tile(frame.scale, 2),
+        np.array(scores, np.float64),
+        tuple(labels),
+        (b"",) * len(labels),
+    )
+
+
+class FunctionDetector:
+    """Detector of one function from a frame to its boxes, as ``BoxDetector.boxes_in`` yields them.
+
+    Attributes:
+        view: Full size, in colour.
+        identity: Name and hash of the function's source.
+    """
+
+    view: ClassVar[View] = View()
+
+    def __init__(self, function: Callable[[Frame], Iterable[ScoredBox]]) -> None:
+        """Wrap a function."""
+        self._function = function
+        self.identity = identity_of(function.__qualname__, inspect.getsource(function))
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Detections]:
+        """Return the detections of each frame."""
+        return [as_detections(frame, self._function(frame)) for frame in frames]

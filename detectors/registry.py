@@ -3,16 +3,19 @@
 A name is one of ``BUILTIN``, a model of the catalog (``crosscue model list``), an entry point of
 the group ``crosscue.detectors`` of an installed package, a ``module:factory``, or the file name of
 a model card (``.toml``). A factory accepts the settings of the vehicle file as keyword arguments
-and returns a ``Detector``.
+and returns a ``Detector``; a class is its own factory. From Python, a class, a function from a
+frame to its boxes, or a detector itself can take the place of a name.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from importlib.metadata import entry_points
-from inspect import getattr_static
+from inspect import getattr_static, isfunction
 from operator import attrgetter
 from typing import Final, cast
 
@@ -20,6 +23,7 @@ from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.plugins import GROUPS
 
 from .base import Choice, Detector
+from .box_detector import FunctionDetector
 from .catalog import places as catalog
 
 GROUP: Final = GROUPS["detector"]
@@ -45,32 +49,60 @@ _PARTS: Final = ("view", "identity", "__call__")
 """Attributes that every ``Detector`` has."""
 
 
-def chosen(names: str, sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
+def chosen(names: str | Sequence[object], sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
     """Return the detectors of a list such as ``cars,signs,my.toml,pack.mod:make``.
 
     Args:
-        names: Comma-separated names.
+        names: Comma-separated names, or names and detectors as classes, functions or objects.
         sections: Detectors of the vehicle file, by name; they have precedence.
 
     Raises:
-        UsageError: The list is empty or names a detector twice.
+        UsageError: The list is empty, names a detector twice, or holds something else.
     """
-    asked = [name.strip() for name in names.split(",") if name.strip()]
+    listed = names.split(",") if isinstance(names, str) else names
+    asked = [name.strip() if isinstance(name, str) else name for name in listed]
+    asked = [name for name in asked if name != ""]
     if not asked:
         raise UsageError(f"--detectors: none named; expected some of {', '.join(known(sections))}")
     found = tuple(_choice(name, sections) for name in asked)
     if len({choice.name for choice in found}) != len(found):
-        raise UsageError(f"--detectors {names}: one is named twice; name each once")
+        twice = ", ".join(choice.name for choice in found)
+        raise UsageError(f"--detectors {twice}: one is named twice; name each once")
     return found
 
 
-def _choice(name: str, sections: Mapping[str, Choice]) -> Choice:
+def _choice(name: object, sections: Mapping[str, Choice]) -> Choice:
+    if not isinstance(name, str):
+        return _choice_of_object(name)
     if name in sections:
         return sections[name]
     if name.endswith(".toml"):
         stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".toml")
         return Choice(stem, "model", {"card": name})
     return Choice(name, name)
+
+
+def _choice_of_object(given: object) -> Choice:
+    """Return the choice of a detector that is a class, a function or an object."""
+    kind = given if isinstance(given, type) or isfunction(given) else type(given)
+    name = getattr(given, "name", kind.__name__)
+    if not callable(given):
+        raise UsageError(
+            f"detectors: {given!r}: expected a name, a class, a function from a frame to its "
+            "boxes, or a detector"
+        )
+    if isfunction(given):
+        factory: Callable[..., object] = partial(FunctionDetector, given)
+    elif isinstance(given, type):
+        factory = given
+    else:
+        factory = partial(_itself, given)
+    choice = Choice(str(name), f"{kind.__module__}:{kind.__qualname__}", factory=factory)
+    return replace(choice, identity=make(choice).identity)
+
+
+def _itself(given: object) -> object:
+    return given
 
 
 def knows_simulated_only(choice: Choice) -> bool:
@@ -99,6 +131,8 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
         UsageError: The detector does not exist or cannot be imported.
         VehicleError: Its settings are invalid, or the factory returns no detector.
     """
+    if choice.factory is not None:
+        return _built(choice, choice.factory, choice.kind)
     if choice.kind in catalog.names() and choice.kind not in table:
         card = str(catalog.card_path(choice.kind))
         choice = Choice(choice.name, "model", {**choice.settings, "card": card})
@@ -116,11 +150,23 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
         hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
         raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or use module:factory")
     try:
-        build = cast("Callable[..., Detector]", attrgetter(factory)(import_module(module)))
+        found = cast("Callable[..., object]", attrgetter(factory)(import_module(module)))
     except (ImportError, AttributeError) as error:
         raise UsageError(f"detector {place}: {error}; check the module and the name") from None
+    return _built(choice, found, place)
+
+
+def _built(choice: Choice, factory: Callable[..., object], place: str) -> Detector:
+    """Build a detector with its settings, and check that it is one.
+
+    Raises:
+        VehicleError: The settings are invalid, or the factory returns no detector.
+    """
+    if isinstance(factory, type):
+        # ``BoxDetector.build`` explains invalid settings.
+        factory = getattr(factory, "build", factory)
     try:
-        built = build(**choice.settings)
+        built = factory(**choice.settings)
     except TypeError as error:
         raise VehicleError(f"detector {choice.name}: settings do not fit: {error}") from None
     # Static, because a property may hash a network's weights.
@@ -130,7 +176,7 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
             f"detector {choice.name}: {place} returned a {type(built).__name__} without "
             f"{', '.join(lacking)}; derive from crosscue.BoxDetector, or see crosscue.Detector"
         )
-    return built
+    return cast("Detector", built)
 
 
 def _offered(name: str) -> str | None:

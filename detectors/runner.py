@@ -9,7 +9,7 @@ from typing import Final
 
 from crosscue.replay.base import Block, Bytes, CrosscueError, Images, LogError, UsageError, one_line
 
-from .base import Detections, Detector, Found, Frame, View
+from .base import Detections, Detector, Found, Frame, View, fault_of, reportable
 from .images import Encoded, decode, encoded, reduction, size_of
 from .ranging.lens import VERSION, with_lenses
 from .result_cache import ResultCache, picture_key
@@ -96,7 +96,8 @@ class Runner:
         """Yield the results of a block's pictures in order, without those that do not decode.
 
         Raises:
-            UsageError: A detector returned more or fewer results than frames.
+            UsageError: A detector returned more or fewer results than frames, or one that breaks
+                its contract (``fault_of``).
             CrosscueError: A detector failed.
         """
         if not isinstance(block.rows, Images):
@@ -176,6 +177,11 @@ class Runner:
                 f"detector {named.name}: returned {len(found)} results for {len(frames)} frames; "
                 "expected one for each"
             )
+        labels = reportable(named.detector)
+        for one, frame in zip(found, frames, strict=True):
+            fault = fault_of(one, frame, labels)
+            if fault is not None:
+                raise UsageError(f"detector {named.name}: frame at {frame.t_ns} ns: {fault}")
         return [
             with_lenses(one, frame, self.light_labels) if isinstance(one, Detections) else one
             for one, frame in zip(found, frames, strict=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -177,7 +176,7 @@ def input_of(
     settings = {
         "vehicle": vehicle.model_dump(mode="json"),
         "selection": part_of(selection).as_json(),
-        "detectors": [asdict(choice) for choice in choices],
+        "detectors": [choice.as_row() for choice in choices],
         "draw": draw,
         "landmarks": None if landmarks is None else str(landmarks.resolve()),
         "versions": versions(),

@@ -65,12 +65,12 @@ class _RepeatsFirstFrame(BrightBlob):
 @pytest.mark.parametrize(
     ("kind", "match"),
     [
-        (_WrongTime, "time is"),
-        (_BoxOutsidePicture, "outside the picture"),
-        (_ScoreAboveOne, "outside 0 to 1"),
+        (_WrongTime, "time and size of the result"),
+        (_BoxOutsidePicture, "not inside the picture"),
+        (_ScoreAboveOne, "expected 0 to 1"),
         (_ChangesPixels, "changed a frame's pixels"),
-        (_UndeclaredLabel, "are not among its labels"),
-        (_RepeatsFirstFrame, "frame 17: the result's time"),
+        (_UndeclaredLabel, "label not declared; expected one of zebra"),
+        (_RepeatsFirstFrame, "frame 17: time and size"),
     ],
 )
 def test_contract_check_reports_invalid_detector(kind: type[BrightBlob], match: str) -> None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import crosscue
 from crosscue.detectors.base import Choice, Detections, Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
-from crosscue.detectors.registry import make
-from crosscue.replay.errors import VehicleError
+from crosscue.detectors.registry import chosen, make
+from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
 from crosscue.testing import check_detector
+from support.pictures import picture_folder
 
 
 class Corner(BoxDetector):
@@ -56,6 +59,86 @@ def test_detector_is_selected_by_class_and_factory() -> None:
 
     assert isinstance(found, Corner)
     assert found.side_px == 3
+
+
+def bright(frame: Frame) -> Iterator[ScoredBox]:
+    """Return one box around the whole of a frame that is not black."""
+    height, width = frame.pixels.shape[:2]
+    if frame.pixels.any():
+        yield "bright", 0.75, (0, 0, width, height)
+
+
+@pytest.mark.parametrize(
+    "given", [Corner, Corner(side_px=4), bright, f"{__name__}:Corner", f"{__name__}:Corner.build"]
+)
+def test_class_object_function_and_name_are_detectors(given: object) -> None:
+    (choice,) = chosen([given], {})
+
+    check_detector(lambda: make(choice))
+    assert ":" in choice.kind
+
+
+def test_same_function_has_the_same_identity_and_another_source_another() -> None:
+    def other(frame: Frame) -> Iterator[ScoredBox]:
+        return bright(frame)
+
+    first, again, second = (make(chosen([one], {})[0]) for one in (bright, bright, other))
+
+    assert first.identity == again.identity != second.identity
+
+
+def test_other_objects_are_no_detectors() -> None:
+    with pytest.raises(UsageError, match="detectors: 5: expected a name, a class, a function"):
+        chosen([5], {})
+    with pytest.raises(UsageError, match="corner, corner: one is named twice"):
+        chosen([Corner, Corner], {})
+
+
+class Yields(BoxDetector):
+    """Detector that yields what a test gives it."""
+
+    name, labels = "yields", ("stop sign",)
+    item: tuple[object, ...] = ()
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Return the item as it is."""
+        yield self.item  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("item", "fault"),
+    [
+        (("stop sign", 0.9, (10, 20, 5, 5)), "'stop sign' at (10, 20, 5, 5): x1 < x0"),
+        (("stop sign", 90, (10, 8, 15, 12)), "score 90; expected 0 to 1"),
+        (("stop sign", 0.9, (10, 8, 15, 99)), "not inside the picture of (24, 16) px"),
+        (("stop_sign", 0.9, (10, 8, 15, 12)), "label not declared; expected one of stop sign"),
+        (("stop sign", (10, 8, 15, 12)), "expected (label, score, (x0, y0, x1, y1))"),
+        (("stop sign", 0.9, (10, 8, 15)), "expected (label, score, (x0, y0, x1, y1))"),
+    ],
+)
+def test_wrong_box_of_a_run_is_refused_with_frame_and_reason(
+    item: tuple[object, ...], fault: str, tmp_path: Path
+) -> None:
+    log = picture_folder(tmp_path / "log", 2, "rate_hz: 10")
+
+    with pytest.raises(CrosscueError) as refused:
+        crosscue.detect_drive(log, tmp_path / "run", detectors=[Yields.build(item=item)])
+
+    assert str(refused.value).startswith("detector yields: ")
+    assert " ns: " in str(refused.value)
+    assert fault in str(refused.value)
+
+
+def test_near_label_is_named(tmp_path: Path) -> None:
+    class Near(Yields):
+        labels = ("stop_sign",)
+
+    log = picture_folder(tmp_path / "log", 2, "rate_hz: 10")
+    item = ("stop_sign", 0.9, (10, 8, 15, 12))
+    run = crosscue.detect_drive(log, tmp_path / "run", detectors=[Near.build(item=item)])
+
+    (notice,) = [one for one in run.manifest.notices if "no cue counts" in one]
+    assert "did you mean 'stop sign'?" in notice
 
 
 class NoDetector:

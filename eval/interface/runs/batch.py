@@ -22,7 +22,14 @@ from crosscue.eval.logs.log import open as open_drive
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import FAILURE, create
 from crosscue.eval.runs.logs import files_named_in
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, versions, visible
+from crosscue.replay.base import (
+    DEFAULT_LIMITS,
+    CrosscueError,
+    Limits,
+    UsageError,
+    versions,
+    visible,
+)
 from crosscue.replay.logs.log_part import LogPart
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.vehicle.pose import GnssUse
@@ -218,7 +225,7 @@ def replay_drives(
         drives: Result of ``find_drives``; or logs, each of them a drive, and folders of drives.
         output: Output folder, with one run folder per drive, and ``merged``.
         vehicle: The vehicle file of all drives; None for the ``vehicle.toml`` next to each.
-        detectors: As in ``replay_drive``.
+        detectors: Names, as in ``replay_drive``; other processes cannot import an object.
         start: Start, in seconds after a drive's first row, or absolute as text, ``17...ns``.
         end: End (exclusive), in the same form.
         topics: Names of topics; None for all.
@@ -239,8 +246,11 @@ def replay_drives(
             ``done`` and ``failed``.
 
     Raises:
-        UsageError: No drive is found, or ``workers`` is below 1.
+        UsageError: No drive is found, ``workers`` is below 1, or a detector is not a name.
     """
+    nameless = [one for one in detectors or () if not isinstance(one, str)]
+    if nameless:
+        raise UsageError(f"detectors: {nameless[0]!r}: many drives need names, as module:Class")
     found = drives if isinstance(drives, DriveList) else find_drives(*_several(drives), each=True)
     engine = engine_of(workers, ray, cores, memory_gib)
     folder = Path(output)

@@ -23,7 +23,7 @@ def replay_drive(
     log: Log | Path | str,
     output: Path | str,
     vehicle: Vehicle | Path | str | None = None,
-    detectors: Sequence[str] | None = None,
+    detectors: str | Sequence[object] | None = None,
     *,
     gnss: GnssUse | None = None,
     start: Path | str | None = None,
@@ -41,8 +41,9 @@ def replay_drive(
         log: The drive, or its path; ``log.part(...)`` for a part of it.
         output: Folder for the run.
         vehicle: The vehicle file; None for the ``vehicle.toml`` next to the log, if it exists.
-        detectors: Names, model cards or ``module:factory``; None for those of the vehicle file. An
-            empty list estimates only the pose.
+        detectors: Names, model cards, ``module:factory``, classes, functions from a frame to its
+            boxes, or detectors; None for those of the vehicle file. An empty list estimates only
+            the pose.
         gnss: Use of GNSS: ``start``, ``truth``, ``fuse`` or ``off``; None for the vehicle file's
             ``gnss.use``.
         start: The first pose: ``X,Y,HEADING`` in metres and degrees, or a truth file with a track.
@@ -101,7 +102,7 @@ def detect_drive(
     log: Log | Path | str,
     output: Path | str,
     vehicle: Vehicle | Path | str | None = None,
-    detectors: Sequence[str] | None = None,
+    detectors: str | Sequence[object] | None = None,
     *,
     cache: Path | str | None = None,
     draw: int = 0,
@@ -187,14 +188,14 @@ def _settings_again(
         return with_start(logs, vehicle, manifest.selection.selection, gnss, start)
 
 
-def choices_for(vehicle: Vehicle, detectors: Sequence[str] | None) -> tuple[Choice, ...]:
+def choices_for(vehicle: Vehicle, detectors: str | Sequence[object] | None) -> tuple[Choice, ...]:
     """Return the requested detectors, or else those of the vehicle file, which may be none."""
     from crosscue.detectors.registry import chosen
     from crosscue.eval.pipeline.detect import choices_of
 
     sections = choices_of(vehicle)
-    names = [*sections] if detectors is None else [*detectors]
-    return chosen(",".join(names), sections) if names else ()
+    names = [*sections] if detectors is None else detectors
+    return chosen(names, sections) if len(names) else ()
 
 
 def _copied(folder: RunFolder, output: Path) -> RunFolder:
