@@ -20,6 +20,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .errors import AccountError, LossWarning
 
 DETAILS_KEPT: Final = 1000
@@ -39,9 +42,17 @@ class RowsOfTopic(Protocol):
         """Topic name."""
         ...
 
+    @property
+    def log_ns(self) -> NDArray[np.int64]:
+        """Log times in stored order."""
+        ...
+
     def __len__(self) -> int: ...
 
 
+REVERSED_ROWS: Final = 3
+"""Min rows of a topic whose log times all decrease to report it."""
+_LATEST_NS: Final = (1 << 63) - 1
 B = TypeVar("B", bound=RowsOfTopic)
 
 
@@ -180,14 +191,16 @@ class Ledger:
 
     def handing_on(self, blocks: Iterable[B]) -> Iterator[B]:
         """Pass a reader's blocks through and count their rows, for ``check``."""
-        rest = iter(blocks)
+        rest, order = iter(blocks), ReversedTimes()
         while True:
             self._is_reading = True
             block = next(rest, None)
             self._is_reading = False
             if block is None:
+                order.report(self)
                 return
             self.topic(block.topic).handed_on += len(block)
+            order.follow(block)
             yield block
 
     def check(self, used: Mapping[str, int] | None = None) -> None:
@@ -292,3 +305,27 @@ def warn_of(ledger: Ledger) -> None:
         detail = f" ({drop.detail})" if drop.detail else ""
         text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"
         warnings.warn(text, LossWarning, stacklevel=3)
+
+
+class ReversedTimes:
+    """Search for topics whose log times all decrease; a topic is left at its first other step."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, tuple[int, int] | None] = {}
+
+    def follow(self, block: RowsOfTopic) -> None:
+        """Add the next rows, in stored order."""
+        times, topic = block.log_ns, block.topic
+        seen = self._seen.get(topic, (0, _LATEST_NS))
+        if seen is not None and len(times):
+            is_reversed = times[0] < seen[1] and bool((times[1:] < times[:-1]).all())
+            self._seen[topic] = (seen[0] + len(times), int(times[-1])) if is_reversed else None
+
+    def report(self, ledger: Ledger) -> None:
+        """Add a notice for each topic found."""
+        for topic, seen in self._seen.items():
+            if seen is not None and seen[0] >= REVERSED_ROWS:
+                ledger.notice(
+                    f"{topic}: every one of its {seen[0]} rows is earlier in log time than the row "
+                    "before; the log may have been written in reverse order"
+                )

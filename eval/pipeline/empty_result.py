@@ -45,6 +45,7 @@ def empty_result(what: str, logs: Sequence[Log], selection: Selection) -> Crossc
     first_ns: int | None = None
     last_ns: int | None = None
     damage: list[str] = []
+    skipped: Counter[str] = Counter()
     for log in logs:
         ledger = Ledger(name_of(log))
         for block in log.read(ledger):
@@ -53,10 +54,13 @@ def empty_result(what: str, logs: Sequence[Log], selection: Selection) -> Crossc
                 low, high = int(block.log_ns.min()), int(block.log_ns.max())
                 first_ns = low if first_ns is None else min(first_ns, low)
                 last_ns = high if last_ns is None else max(last_ns, high)
+        for account in ledger.accounts.values():
+            skipped += account.skipped
         damage += [f"{loss.reason} ({loss.detail})" for loss in ledger.drops()]
     named = [f"{name} ({count:,} rows)" for name, count in rows.most_common(TOPICS_SHOWN)]
     more = f" and {len(rows) - TOPICS_SHOWN} more" if len(rows) > TOPICS_SHOWN else ""
-    holds = "no row at all"
+    unusable = "; ".join(f"{count:,} of them: {why}" for why, count in skipped.most_common(3))
+    holds = f"{skipped.total():,} rows, none usable ({unusable})" if skipped else "no row at all"
     if first_ns is not None and last_ns is not None:
         seconds = (last_ns - first_ns) * 1e-9
         holds = f"{first_ns}ns to {last_ns}ns ({seconds:.1f} s), topics {', '.join(named)}{more}"

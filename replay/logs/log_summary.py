@@ -408,6 +408,6 @@ def rows_of_clocks(topics: Iterable[TopicSummary]) -> Iterator[tuple[str, ...]]:
 def span_sentence(start_ns: int | None, end_ns: int | None) -> str:
     """Describe a time range by its start, its end and its duration."""
     if start_ns is None or end_ns is None:
-        return "no rows"
+        return "no rows with a time from 1970 to 2115"
     span = f"{(end_ns - start_ns) * 1e-9:.2f} s"
     return f"{instant_text(start_ns)} to {instant_text(end_ns)} ({span})"

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import EVERYTHING, Block, Int64s, Ledger, Log, Selection
+from crosscue.replay.ledger import ReversedTimes
 
 STRAY_STAMP: Final = "stray time stamp"
 BEGINNING: Final = int(np.iinfo(np.int64).min)
@@ -181,6 +182,7 @@ class TimedLog:
         """
         seen: Counter[str] = Counter()
         epochs: Counter[str] = Counter()
+        order = ReversedTimes()
         for block in self.log.read(ledger, selection):
             marks = self.clock.topics.get(block.topic)
             first = seen[block.topic]
@@ -188,9 +190,11 @@ class TimedLog:
             if marks is None or not len(block):
                 yield block
                 continue
+            order.follow(block)
             epoch = _epochs(block.log_ns, first, epochs[block.topic], marks)
             epochs[block.topic] = int(epoch[-1])
             yield self._placed(block, epoch, _is_stray(first, len(block), marks), ledger)
+        order.report(ledger)
 
     def _placed(
         self, block: Block, epoch: Int64s, is_stray: NDArray[np.bool_], ledger: Ledger

@@ -6,9 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from crosscue.replay.base import (
     DETAILS_KEPT,
@@ -82,6 +84,12 @@ def test_rows_are_counted_beyond_kept_details() -> None:
 class _Rows:
     topic: str
     rows: int
+    first_ns: int = 0
+    step_ns: int = 1
+
+    @property
+    def log_ns(self) -> NDArray[np.int64]:
+        return self.first_ns + self.step_ns * np.arange(self.rows, dtype=np.int64)
 
     def __len__(self) -> int:
         return self.rows
@@ -328,6 +336,30 @@ def test_skips_and_losses_are_stored_with_place_time_and_count() -> None:
     assert account.dropped_unknown == ["cut"]
     assert (account.found, account.used, account.in_file) == (17, 7, 20)
     assert not account.is_whole
+
+
+@pytest.mark.parametrize(
+    ("blocks", "is_reversed"),
+    [
+        ([_Rows("/t", 4, 100, -1), _Rows("/t", 0), _Rows("/t", 2, 96, -1)], True),
+        ([_Rows("/t", 1, 100), _Rows("/t", 1, 99), _Rows("/t", 1, 98)], True),
+        ([_Rows("/t", 2, 100, -1)], False),
+        ([_Rows("/t", 4, 100, -1), _Rows("/t", 2, 97, -1)], False),
+        ([_Rows("/t", 4, 100, -1), _Rows("/t", 2, 96, 1), _Rows("/t", 4, 90, -1)], False),
+        ([_Rows("/t", 4, 100, 0)], False),
+    ],
+)
+def test_topic_is_reported_if_all_its_times_decrease(
+    blocks: list[_Rows], is_reversed: bool
+) -> None:
+    ledger = Ledger("log")
+
+    assert list(ledger.handing_on(blocks)) == blocks
+
+    rows = sum(map(len, blocks))
+    expected = f"/t: every one of its {rows} rows is earlier in log time than the row before"
+    assert [one.startswith(expected) for one in ledger.notices] == [True] * is_reversed
+    assert ledger.is_whole
 
 
 def test_rows_of_several_blocks_add_up() -> None:

@@ -238,7 +238,7 @@ class _Pass:
     def _add_notices(self, ledger: Ledger) -> None:
         start_ns, stop_ns = self._header.start_ns, self._header.stop_ns
         if start_ns is None:
-            ledger.notice("the log states no start time; times count from 1970-01-01")
+            ledger.notice("the log states no start time before 2116; times count from 1970-01-01")
         else:
             ledger.notice("the log states no time zone; its start time is read as UTC")
             if stop_ns is not None and start_ns + self.tally.last_tick_ns > stop_ns + 10_000_000:

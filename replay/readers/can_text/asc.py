@@ -41,6 +41,7 @@ from .dialect import (
 )
 from .digits import (
     NANOS,
+    OUT_OF_RANGE,
     SECONDS_MAX,
     TIME_MAX_NS,
     Bools,
@@ -160,7 +161,7 @@ class Asc(Dialect):
         if found := _TIMED.fullmatch(text):
             seconds = int(found[1])
             if seconds > SECONDS_MAX:
-                return Damage("time out of range")
+                return Damage(OUT_OF_RANGE)
             return self._timed(seconds * NANOS + int(found[2].ljust(9, "0")), found[3])
         text = text.strip().removeprefix("\xef\xbb\xbf")
         if not text or text.startswith("//"):
@@ -198,7 +199,9 @@ class Asc(Dialect):
         if self._has_date:
             ledger.notice("the log states no time zone; its start date is read as UTC")
         else:
-            ledger.notice("the log states no readable start date; times count from 1970-01-01")
+            ledger.notice(
+                "the log states no readable start date before 2116; times count from 1970-01-01"
+            )
         if not self._has_header:
             ledger.notice("the log has no 'base' line; read as hexadecimal, absolute times")
         if self._other_dates:
@@ -247,7 +250,7 @@ class Asc(Dialect):
         if _SECOND.search(rest):
             return Damage("two lines in one")
         if self._is_relative and t_ns > _STEP_MAX_NS:
-            return Damage("time out of range")
+            return Damage(OUT_OF_RANGE)
         if _EVENT.fullmatch(rest):
             return Other("event that is not a CAN frame", t_ns)
         if not rest.isascii():

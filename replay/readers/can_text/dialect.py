@@ -273,7 +273,7 @@ class TextCanLog(Closing):
             if isinstance(piece, Lines) or found or scribe.is_recognised:
                 break
         if not self._names and not scribe.is_recognised:
-            why = next((d.detail for d in ledger.drops()), "it is empty")
+            why = next((f"{d.reason}: {d.detail}" for d in ledger.drops()), "it is empty")
             raise LogFormatError(
                 f"{self._path}: no frame of a {dialect.says} at its start ({why}); "
                 "check that it is a complete log of this format"

@@ -29,6 +29,7 @@ NANOS: Final = 1_000_000_000
 TIME_MAX_NS: Final = 1 << 62
 """Maximum time, in the year 2116. The sum of a start and an offset below it does not overflow."""
 SECONDS_MAX: Final = TIME_MAX_NS // NANOS - 1
+OUT_OF_RANGE: Final = "time of the year 2116 or later, which is out of range"
 
 
 def within_range(start_ns: int) -> int | None:

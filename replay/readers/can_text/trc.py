@@ -33,7 +33,7 @@ from .dialect import (
     comment,
     head_of,
 )
-from .digits import NANOS, SECONDS_MAX, Bools, decimal, seconds_ns, within_range
+from .digits import NANOS, OUT_OF_RANGE, SECONDS_MAX, Bools, decimal, seconds_ns, within_range
 from .lines import Field, Lines, clean_lines, next_fields, skip_gap
 from .message_numbers import MessageNumbers
 from .spaced import NOTHING_FAST, Spaced, is_bus_name, is_direction, payload_stop, spaced_frames
@@ -158,7 +158,7 @@ class Trc(Dialect):
         if not found or not number or by.get("R", "-") != "-":
             return Damage(NOT_UNDERSTOOD)
         if int(found[1]) > SECONDS_MAX:
-            return Damage("time out of range")
+            return Damage(OUT_OF_RANGE)
         t_ns = (int(found[1]) * NANOS + int((found[2] or "").ljust(9, "0"))) // 1000
         outcome = self._outcome(t_ns, by, values[before:])
         if isinstance(outcome, Frame | Other) and "N" in by:

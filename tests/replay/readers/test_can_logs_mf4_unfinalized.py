@@ -209,6 +209,26 @@ def test_truncation_drops_only_frames_after_it(tmp_path: Path, virtual: bool, or
         assert known <= len(frames) - len(inside) + 1
 
 
+CUT_UNSEEN = "states no record counts: a cut between two records cannot be detected"
+
+
+@pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes"])
+def test_cut_between_records_of_unfinalized_log_is_disclosed_as_undetectable(
+    tmp_path: Path, variant: str
+) -> None:
+    options = VARIANTS[variant]
+    whole = unsorted(_frames(100, virtual=options["virtual"]), **options)
+    path = tmp_path / "x.mf4"
+    for end in (len(whole.content), whole.starts[60]):
+        path.write_bytes(whole.content[:end])
+        _, ledger = read_back(path)
+        assert ledger.is_whole
+        assert CUT_UNSEEN in ledger.integrity
+
+    path.write_bytes(unsorted(_frames(100, virtual=True), virtual=True, is_finalized=True).content)
+    assert CUT_UNSEEN not in read_back(path)[1].integrity
+
+
 def test_end_inside_payload_drops_one_frame(tmp_path: Path) -> None:
     frames = _frames(50, virtual=False)
     whole = unsorted(frames, virtual=False)

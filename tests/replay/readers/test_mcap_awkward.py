@@ -143,7 +143,9 @@ def test_log_time_beyond_int64_is_skipped_with_reason(tmp_path: Path) -> None:
     reading = read_back(stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)])))
 
     assert [log for log, *_ in reading.messages["/a"]] == [7, (1 << 63) - 1]
-    assert dict(reading.ledger.accounts["/a"].skipped) == {"log time of 2^63 ns or later": 1}
+    assert dict(reading.ledger.accounts["/a"].skipped) == {
+        "log time after the year 2262 (2^63 ns or later)": 1
+    }
     assert reading.ledger.is_whole
 
 

@@ -27,7 +27,7 @@ from crosscue.replay.readers.mcap.records import MESSAGE_HEAD, BrokenRecordError
 
 UNDECLARED: Final = "message of a channel that the file does not declare"
 TOO_LARGE: Final = "message over the size limit"
-TIME_TOO_LATE: Final = "log time of 2^63 ns or later"
+TIME_TOO_LATE: Final = "log time after the year 2262 (2^63 ns or later)"
 NO_PUBLISH_TIME: Final = (
     "publish times of 2^63 ns or later count as not available; the log time is used instead"
 )
