@@ -19,7 +19,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from crosscue.replay.base import OutputError, json_tree
+from crosscue.replay.base import OutputError, door, json_tree
 
 from .base import Detections, Found, RoadMask
 from .images import Encoded
@@ -56,6 +56,7 @@ class ResultCache:
         try:
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
+                os.close(door.opened(path, os.O_CREAT | os.O_RDWR))
             self._file = sqlite3.connect(":memory:" if path is None else path, timeout=30.0)
             self._file.execute(_SCHEMA)
         except (sqlite3.Error, OSError) as error:

@@ -60,6 +60,7 @@ from .errors import (
     WorkerError,
     one_line,
 )
+from .files import door
 from .files.bounded import PIECE_BYTES, read_at_most
 from .files.closing import Closing
 from .files.tree_text import (
@@ -152,6 +153,7 @@ __all__ = [
     "WorkerError",
     "WrappedLog",
     "cannot_write",
+    "door",
     "file_sha256",
     "installed",
     "is_remote",

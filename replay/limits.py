@@ -14,7 +14,7 @@ MIB: Final = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Maximum sizes that a reader accepts, both declared and after decompression.
+    """Maximum sizes that a reader accepts, declared and after decompression, and use of links.
 
     Attributes:
         chunk_bytes: Size of a decompressed chunk, container or page.
@@ -22,6 +22,7 @@ class Limits:
         records_per_chunk: Number of records in a chunk; a few kilobytes can hold millions.
         schema_bytes: Size of a message definition.
         record_bytes: Size of a JSON file in which crosscue records how a result was made.
+        follow_links: Read files of a log through links, which may lead out of the log's folder.
     """
 
     chunk_bytes: int = 256 * MIB
@@ -29,6 +30,7 @@ class Limits:
     records_per_chunk: int = 4_000_000
     schema_bytes: int = 1 * MIB
     record_bytes: int = 64 * MIB
+    follow_links: bool = False
 
 
 DEFAULT_LIMITS: Final = Limits()
@@ -54,13 +56,15 @@ def limits_of(
     max_chunk_bytes: Annotated[
         int, Option("--max-chunk", metavar="MIB", convert=mebibytes)
     ] = DEFAULT_LIMITS.chunk_bytes,
+    follow_links: bool = False,
 ) -> Limits:
     """Return limits for reading a log.
 
     Args:
         max_chunk_bytes: Largest chunk, container or page to decompress, in MiB (default: 256).
+        follow_links: Read files of a log through links, which may lead out of its folder.
     """
-    return replace(DEFAULT_LIMITS, chunk_bytes=max_chunk_bytes)
+    return replace(DEFAULT_LIMITS, chunk_bytes=max_chunk_bytes, follow_links=follow_links)
 
 
 LimitsGiven: TypeAlias = Annotated[Limits, Option(made_by=limits_of)]

@@ -6,7 +6,6 @@ The log is written in parts of a second, so that memory holds the pictures of on
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.simulated.drive import (
+    FILES_OF_DRIVE,
     START_NS,
     DriveSettings,
     TrueMotion,
@@ -30,7 +30,6 @@ from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.base import (
-    DEFAULT_LIMITS,
     Block,
     ImageCoding,
     Images,
@@ -38,10 +37,11 @@ from crosscue.replay.base import (
     Ledger,
     Messages,
     Topic,
+    door,
     json_tree,
-    read_at_most,
     sha256_of,
     strict_json,
+    write_bytes,
     write_text,
 )
 from crosscue.replay.encode.outgoing import standard_type
@@ -188,12 +188,12 @@ def write_scene(
     layout, conditions, world = world_of(settings, is_painted=imager.is_painted)
     log = folder / "drive.mcap"
     record = _Record(layout, conditions, world, settings, imager)
-    with LogWriter(log, Ledger(str(log)), overwrite=overwrite) as writer:
+    with LogWriter(log, Ledger(str(log)), overwrite=overwrite, beside=FILES_OF_DRIVE) as writer:
         for topic in TOPICS:
             writer.add_topic(topic)
         for block in record.blocks():
             writer.write(block)
-    shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
+    write_bytes(folder / "simulated_car.dbc", dbc_path().read_bytes())
     write_text(folder / "vehicle.toml", record.vehicle_text(is_calibrated=is_calibrated))
     write_text(folder / MADE_OF, strict_json(made_of([], _settings_of(settings, imager))) + "\n")
     return SceneFiles(
@@ -218,7 +218,7 @@ def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = P
     if not (folder / "drive.mcap").exists():
         return
     try:
-        there = json_tree(read_at_most(folder / MADE_OF, DEFAULT_LIMITS.record_bytes) or b"")
+        there = json_tree(door.read(folder / MADE_OF))
     except (OSError, ValueError):
         there = None
     refuse_another(folder, "--overwrite", there, made_of([], _settings_of(settings, imager)))

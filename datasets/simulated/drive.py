@@ -28,6 +28,8 @@ TRACK_WIDTH_M: Final = 1.55
 STEERING_RATIO: Final = 15.0
 FIELD_T: Final = np.array([20e-6, -43e-6])
 """Horizontal (towards magnetic north) and vertical (up) part of the Earth's field."""
+FILES_OF_DRIVE: Final = ("vehicle.toml", "truth.json", "pose.tum", "objects.json", "ranges.csv")
+"""Files next to the log of a drive; some drives have fewer."""
 START_NS: Final = 1_700_000_000_000_000_000
 RATE_HZ: Final = 100
 TYRE_SD: Final = 0.003

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,10 +10,11 @@ import numpy as np
 
 from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
-from crosscue.replay.base import Ledger, write_text
+from crosscue.replay.base import Ledger, write_bytes, write_text
 from crosscue.replay.write.convert import LogWriter
 
 from .drive import (
+    FILES_OF_DRIVE,
     DriveSettings,
     TrueMotion,
     dbc_path,
@@ -57,12 +57,12 @@ def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = Fals
     sensed = sense(motion, settings)
     log = folder / "drive.mcap"
     ledger = Ledger(str(log))
-    with LogWriter(log, ledger, overwrite=overwrite) as writer:
+    with LogWriter(log, ledger, overwrite=overwrite, beside=FILES_OF_DRIVE) as writer:
         for topic in (BUS, GYRO, MAGNETOMETER):
             writer.add_topic(topic)
         for block in sensor_blocks(sensed, settings.seed):
             writer.write(block)
-    shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
+    write_bytes(folder / "simulated_car.dbc", dbc_path().read_bytes())
     car = vehicle_text(settings, "simulated_car.dbc")
     write_text(folder / "vehicle.toml", with_simulated_noise(car, settings, motion))
     return DriveFiles(

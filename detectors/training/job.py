@@ -22,7 +22,7 @@ from crosscue.detectors.networks.mask_rcnn.checkpoint import (
 from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
 from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
-from crosscue.replay.base import OutputError, json_tree, strict_json, write_text
+from crosscue.replay.base import OutputError, door, json_tree, strict_json, write_text
 
 from .annotations import LabelledSet
 from .loop import Schedule, Training
@@ -276,4 +276,4 @@ def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float 
 
 def read_curve(path: Path) -> list[Point]:
     """Read the points of a curve file."""
-    return [Point(**row) for row in json_tree(path.read_text(encoding="utf-8"))]
+    return [Point(**row) for row in json_tree(door.read(path))]

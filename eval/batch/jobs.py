@@ -20,14 +20,23 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final, Generic, Protocol, TypeAlias, TypeVar
 
-from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder, is_alive, signature
+from crosscue.eval.runs.folder import (
+    FAILURE,
+    LOCK,
+    MANIFEST,
+    MAX_MANIFEST_BYTES,
+    RunFolder,
+    is_alive,
+    refuse_files_of_user,
+    signature,
+)
 from crosscue.replay.base import (
     CrosscueError,
     RunError,
     UsageError,
+    door,
     losses_heard,
     one_line,
-    read_at_most,
     strict_json,
     versions,
     warn_again,
@@ -295,7 +304,7 @@ def _check_free(job: Job) -> None:
             f"{job.run}: process {process} is writing it; wait, or if it is gone start again in "
             f"{STALE_S - silent:.0f} s"
         )
-    if read_at_most(lock, MAX_LOCK_BYTES) == worker.encode():
+    if door.read(lock, MAX_LOCK_BYTES) == worker.encode():
         lock.unlink()
 
 
@@ -379,6 +388,7 @@ def _check_unique(jobs: Sequence[Job]) -> None:
 def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
     """Return the outcome of an earlier start, or None if the job must be processed."""
     try:
+        door.inside(job.run.parent, job.run.name)
         state = state_of(job)
         if state is State.DONE:
             entry = read_entry(job.run)
@@ -388,6 +398,8 @@ def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
                 f"{job.run}: holds a run of other logs, settings or versions; "
                 "give another folder or --overwrite"
             )
+        if state is not State.MISSING:
+            refuse_files_of_user(job.run)
     except (CrosscueError, OSError) as error:
         status, line = reported_error(error)
         return Done(job, status, line, attempts=0)
@@ -402,7 +414,7 @@ def _inputs(job: Job) -> dict[str, object]:
 
 def _manifest_hash(job: Job) -> str:
     RunFolder(job.run).manifest()
-    return hashlib.sha256(job.run.joinpath(MANIFEST).read_bytes()).hexdigest()
+    return hashlib.sha256(door.read(job.run / MANIFEST, MAX_MANIFEST_BYTES)).hexdigest()
 
 
 def _holds_anything(folder: Path) -> bool:

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import json_tree, strict_json, write_text
+from crosscue.replay.base import door, json_tree, strict_json, write_text
 
 JOURNAL: Final = ".drives"
 PLANS: Final = "plans"
@@ -27,7 +27,7 @@ STALE_S: Final = 12.0 * BEAT_S
 
 def entry_path(run: Path) -> Path:
     """Return the path of the entry of the drive with this run folder."""
-    return run.parent / JOURNAL / f"{run.name}.json"
+    return door.inside(run.parent, f"{JOURNAL}/{run.name}.json")
 
 
 def write_entry(run: Path, entry: dict[str, object]) -> None:
@@ -38,7 +38,7 @@ def write_entry(run: Path, entry: dict[str, object]) -> None:
 def read_entry(run: Path) -> dict[str, Any] | None:
     """Return a drive's entry; None if it does not exist or is damaged."""
     try:
-        entry = json_tree(entry_path(run).read_text(encoding="utf-8"))
+        entry = json_tree(door.read(entry_path(run)))
     except (OSError, ValueError):
         return None
     is_ours = isinstance(entry, dict) and entry.get("format_version") == FORMAT_VERSION
@@ -66,11 +66,12 @@ def names_in(folder: Path) -> set[str]:
 
 def _planned(path: Path) -> list[str]:
     try:
-        tree = json_tree(path.read_text(encoding="utf-8"))
+        tree = json_tree(door.read(path))
     except (OSError, ValueError):
         return []
     names = tree.get("drives") if isinstance(tree, dict) else None
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    listed = names if isinstance(names, list) else []
+    return [name for name in listed if isinstance(name, str) and Path(name).name == name]
 
 
 def write_plan(folder: Path, names: Sequence[str], part: str) -> None:
@@ -81,7 +82,7 @@ def write_plan(folder: Path, names: Sequence[str], part: str) -> None:
         names: Names of the drives.
         part: ``all``, or the name of the shard.
     """
-    path = folder / JOURNAL / PLANS / f"{part.replace('/', '-of-')}.json"
+    path = door.inside(folder, f"{JOURNAL}/{PLANS}/{part.replace('/', '-of-')}.json")
     write_text(path, strict_json({"format_version": FORMAT_VERSION, "drives": [*names]}) + "\n")
 
 

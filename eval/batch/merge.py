@@ -9,6 +9,7 @@ same bytes however the drives were distributed over batches.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ from crosscue.eval.runs.folder import (
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
-from crosscue.replay.base import RunError, UnreadableRunError, UsageError, one_line
+from crosscue.replay.base import RunError, UnreadableRunError, UsageError, door, one_line
 
 from .status import MERGED, NO_RUN, unfinished
 
@@ -94,7 +95,7 @@ def merge_runs(
     """
     drives = [_Drive(name, run, run.drive_manifest()) for name, run in sorted(runs.items())]
     kinds = sorted({path.stem for one in drives for path in one.run.path.glob("*.parquet")})
-    with locked(out), staged(out) as new:
+    with locked(out), staged(out, always=True) as new:
         clear(new)
         for kind in kinds:
             _merge_table(kind, drives, new)
@@ -189,7 +190,7 @@ def _tables_hash(run: RunFolder) -> str:
     """Return a hash of a run's tables."""
     digest = hashlib.sha256()
     for path in sorted(run.path.glob("*.parquet")):
-        with path.open("rb") as file:
+        with os.fdopen(door.opened(path), "rb") as file:
             digest.update(path.stem.encode() + b"\0")
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()

@@ -30,8 +30,8 @@ from crosscue.replay.base import (
     MIB,
     UnreadableRunError,
     UsageError,
+    door,
     json_tree,
-    read_at_most,
     visible,
 )
 
@@ -313,12 +313,7 @@ def _metrics_of(run: RunFolder) -> dict[str, MetricValue] | None:
 
 def _tree_of(path: Path) -> dict[str, Any]:
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise UnreadableRunError(
-                f"{path}: over {MAX_BYTES // MIB} MiB; run crosscue score again"
-            )
-        tree = json_tree(content)
+        tree = json_tree(door.read(path, MAX_BYTES))
     except (OSError, ValueError) as error:
         raise UnreadableRunError(
             f"{path}: unreadable ({error}); run crosscue score again"

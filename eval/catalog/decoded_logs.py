@@ -202,7 +202,7 @@ def decode_tables(
     tables: dict[str, _Table] = {}
     declared = sum(map(rows_declared, logs))
     timeline = whole_timeline(logs, vehicle, selection)
-    with locked(run), staged(run) as new, nothing_left(new):
+    with locked(run), staged(run, always=True) as new, nothing_left(new):
         clear(new)
         with ExitStack() as stack:
             for number, (log, ledger) in enumerate(zip(logs, ledgers, strict=True)):

@@ -9,7 +9,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from crosscue.replay.base import AnnotationError, json_tree, strict_json, write_text, write_whole
+from crosscue.replay.base import (
+    AnnotationError,
+    door,
+    json_tree,
+    strict_json,
+    write_text,
+    write_whole,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -18,6 +25,8 @@ Kind = Literal["missed", "late", "false", "range", "flipped"]
 Level = Literal["approach", "frames"]
 KINDS: Final[tuple[Kind, ...]] = ("missed", "late", "false", "range", "flipped")
 FORMAT: Final = 1
+MAX_BYTES: Final = 256 << 20
+"""Max size of a table in JSON."""
 DISTANCES_M: Final = (0, 10, 20, 40, 80)
 """Bin edges of the distances by which failures are filtered."""
 
@@ -187,14 +196,15 @@ def _parquet_rows(path: Path) -> list[Any]:
     import pyarrow.parquet as pq
 
     try:
-        return list(pq.read_table(path, page_checksum_verification=True).to_pylist())
+        with door.arrow_file(path.resolve()) as file:
+            return list(pq.read_table(file, page_checksum_verification=True).to_pylist())
     except (OSError, pa.ArrowException) as error:
         raise _unreadable(path, str(error).partition("\n")[0]) from None
 
 
 def _json_rows(path: Path) -> list[Any]:
     try:
-        tree = json_tree(path.read_bytes())
+        tree = json_tree(door.read(path.resolve(), MAX_BYTES))
     except (OSError, ValueError) as error:
         raise _unreadable(path, str(error)) from None
     rows = tree.get("failures") if isinstance(tree, dict) else None

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
 from crosscue.eval.report.html import page_template, template_text
+from crosscue.eval.runs import owned
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.replay.base import Limits, strict_json, write_bytes, write_text
+from crosscue.replay.base import Limits, write_bytes, write_text
 
 from .chart import RunRows, belief_around
 from .pictures import draw_pictures
@@ -144,7 +145,6 @@ def write_lists(site: Path, entries: Sequence[Entry], pictures: frozenset[str]) 
         OutputError: A file cannot be written.
     """
     write_text(site / "style.css", template_text("failures.css"))
-    write_text(site / MARKER, strict_json({"format": 1, "failures": len(entries)}) + "\n")
     render = page_template("failures.html.j2", {"number": _number})
     facets = _facets(entries)
     script = template_text("failures.js")
@@ -163,6 +163,7 @@ def write_lists(site: Path, entries: Sequence[Entry], pictures: frozenset[str]) 
             for _, name, some, names in _pages(mine, slug, slug):
                 page = {"title": title, "entries": some, "name": name, "names": names, "up": "../"}
                 write_text(site / "by" / f"{name}.html", render(common | without | page))
+    owned.write_marker(site / MARKER, {"format": 1, "failures": len(entries)})
 
 
 def _pages(

@@ -12,7 +12,7 @@ from crosscue.eval.interface.runs.recording import save_recording
 from crosscue.eval.interface.runs.score import ScoredRun, score_run
 from crosscue.eval.interface.simulate import simulate_approach
 from crosscue.eval.pipeline.run import Run
-from crosscue.replay.base import CrosscueError, UsageError, write_text
+from crosscue.replay.base import CrosscueError, UsageError, door, write_text
 
 REAL: Final = "pandaset_002"
 MODEL: Final = "yolox-nano"
@@ -179,7 +179,7 @@ def _simulated(
     files = simulate_approach(
         folder / "drive", layout, run, seed, width_px=width_px, overwrite=overwrite
     )
-    write_text(files.vehicle, files.vehicle.read_text("utf-8") + FOLLOWED)
+    write_text(files.vehicle, door.read(files.vehicle).decode() + FOLLOWED)
     return KnownDrive(files.log, files.vehicle, files.truth, "", tuple(EMBEDDED.split(",")))
 
 

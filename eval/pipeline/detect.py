@@ -161,7 +161,7 @@ def detect_into(
             reading.topic.name,
             vehicle,
             named,
-            Drawer(run.path / "pictures", draw),
+            Drawer(run.file("pictures"), draw),
             CuePass(vehicle),
             [choice.kind == "signs" for choice in choices],
             reading.timeline,

@@ -24,7 +24,7 @@ from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.base import strict_json
+from crosscue.replay.base import door, strict_json
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .html import write_page
@@ -264,7 +264,7 @@ def _report_text(one: RunScored, intersection: str) -> str:
 
 def _pose_figures(folder: Path) -> list[_Picture]:
     return [
-        _Picture(base64.b64encode((folder / name).read_bytes()).decode(), caption)
+        _Picture(base64.b64encode(door.read(folder / name)).decode(), caption)
         for name, caption in POSE_FIGURES.items()
         if (folder / name).exists()
     ]

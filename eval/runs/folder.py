@@ -7,6 +7,7 @@ The records of the manifest, the account and the candidates can be imported from
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 from collections.abc import Iterator, Mapping
@@ -22,12 +23,14 @@ from crosscue.replay.base import (
     RunError,
     UnreadableRunError,
     cannot_write,
-    read_at_most,
+    door,
+    json_tree,
     strict_json,
     write_text,
 )
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
 
+from . import owned
 from .account import (
     UNATTRIBUTED,
     Account,
@@ -127,8 +130,10 @@ __all__ = [
     "locked",
     "not_looked_lines",
     "open_run",
+    "own_files",
     "part_of",
     "reading_of",
+    "refuse_files_of_user",
     "signature",
     "staged",
     "summed",
@@ -137,19 +142,29 @@ __all__ = [
     "write_timings",
 ]
 
+
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
 INPUT: Final = "input.json"
 """Inputs of a run, written first, because an interrupted run has no manifest."""
 FAILURE: Final = "failure.log"
 """Error of the last attempt at a run; removed when the run finishes."""
-MAX_MANIFEST_BYTES: Final = 256 << 20
 TAGS: Final = "tags.json"
 """The user's tags of a run, see ``tags``; they are kept when the run is made again."""
 TIMINGS: Final = "timings.json"
 """What took how long; a run without this file is complete."""
 STAGED: Final = ".new"
 """Folder inside a run with the files that will replace it when they are complete."""
+MAX_MANIFEST_BYTES: Final = 256 << 20
+_RECORDS: Final = frozenset({MANIFEST, INPUT, FAILURE, LOCK, TAGS, TIMINGS})
+_RUN: Final = re.compile(
+    r"drive\.rrd|(?:frames|detections|road|skipped|pose|measurements|mobileye_(?:obstacles|lanes)"
+    r"|cues|range|belief|ranged_objects)\.parquet"
+    r"|score/(?:(?:metrics|smoother|detector_[\w.-]+)\.json|junit\.xml|(?:truth|estimate)\.tum"
+    r"|(?:report|detector_[\w.-]+)\.html|(?:curves|cue_frames|approaches|by_drive)\.parquet"
+    r"|pose_(?:plan|error|heading|nees|major_axis)\.png)"
+)
+_PICTURE: Final = re.compile(r"pictures/(-?\d{1,19})\.jpg")
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +191,7 @@ class RunFolder(TableFolder):
         """
         path = self.file(MANIFEST)
         try:
-            content = read_at_most(path, MAX_MANIFEST_BYTES)
-            if content is None:
-                raise ValueError(f"over {MAX_MANIFEST_BYTES >> 20} MiB")
-            return parse_manifest(content)
+            return parse_manifest(door.read(path, MAX_MANIFEST_BYTES))
         except FileNotFoundError:
             raise UnreadableRunError(
                 f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
@@ -187,7 +199,9 @@ class RunFolder(TableFolder):
             ) from None
         except OtherVersionError as error:
             raise UnreadableRunError(f"{path}: {error}: replay again") from None
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise UnreadableRunError(f"{path}: {error.strerror}; then replay again") from None
+        except ValueError as error:
             raise UnreadableRunError(
                 f"{path}: unreadable ({error}); run crosscue replay again"
             ) from None
@@ -195,8 +209,7 @@ class RunFolder(TableFolder):
     def timings(self) -> Timings | None:
         """Read how long the run took; None if that is missing, damaged or of another version."""
         try:
-            content = read_at_most(self.file(TIMINGS), MAX_MANIFEST_BYTES)
-            return None if content is None else Timings.model_validate_json(content)
+            return Timings.model_validate_json(door.read(self.file(TIMINGS)))
         except (OSError, ValueError):
             return None
 
@@ -229,42 +242,103 @@ class RunFolder(TableFolder):
             )
 
 
-def create(path: Path, *, overwrite: bool) -> RunFolder:
-    """Create an empty run folder.
+def own_files(run: RunFolder) -> owned.IsOurs:
+    """Return which files of a folder are those of its run; without a run, a lock and a failure.
+
+    The manifest of a finished run, or the ``input.json`` of an unfinished one, says by which stage
+    the folder was made, and each stage writes files of known names. Every other file is the user's.
+    """
+    tables, is_finished = frozenset[str](), True
+    try:
+        manifest = run.manifest()
+    except RunError:
+        is_finished, is_drive = False, _is_begun(run)
+    else:
+        is_drive = manifest.stage in ("detect", "estimate")
+        if manifest.stage == "decode":
+            named = {*manifest.tables.values(), "skipped.parquet"}
+            tables = frozenset(name for name in named if name.endswith(".parquet"))
+        elif manifest.stage == "merged":
+            tables = frozenset(f"{name}.parquet" for name in manifest.tables)
+    is_run = is_finished or is_drive
+    drawn = _drawn(run) if is_drive else frozenset[int]()
+
+    def is_ours(name: str) -> bool:
+        if name.startswith(f"{STAGED}/") or is_partial(name.rpartition("/")[2]):
+            return True
+        picture = _PICTURE.fullmatch(name)
+        if picture is not None:
+            return int(picture[1]) in drawn
+        is_table = name in tables or (is_drive and _RUN.fullmatch(name) is not None)
+        return is_table or name in (_RECORDS if is_run else {LOCK, FAILURE})
+
+    return is_ours
+
+
+def refuse_files_of_user(path: Path) -> None:
+    """Refuse to replace a run in whose folder there are other files, too.
 
     Raises:
-        RunError: The path is a file, or a folder that is not empty; the files of an earlier run
-            are accepted with ``overwrite``.
+        UsageError: There are; the message names them.
+        OSError: A folder cannot be listed.
+    """
+    owned.refuse_others(path, own_files(RunFolder(path)))
+
+
+def _is_begun(run: RunFolder) -> bool:
+    """Return whether ``input.json`` is that of a run."""
+    try:
+        tree = json_tree(door.read(run.file(INPUT)))
+        return bool(tree["format_version"] and tree["identity"] and tree["settings"])
+    except (RunError, OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _drawn(run: RunFolder) -> frozenset[int]:
+    """Return the times of the frames, by which pictures are named."""
+    with suppress(RunError):
+        table = run.table("frames", ["t_ns", "log_t_ns"])
+        return frozenset(t for name in table.column_names for t in table[name].to_pylist())
+    return frozenset()
+
+
+def create(path: Path, *, overwrite: bool, resume: bool = False) -> RunFolder:
+    """Create an empty run folder.
+
+    Args:
+        path: The folder.
+        overwrite: Accept the files of an earlier run, which will be deleted.
+        resume: Accept an earlier run, which will be continued.
+
+    Raises:
+        RunError: The path is a file, or a folder that is not empty.
+        UsageError: ``overwrite`` would delete files that are not of the earlier run.
         OutputError: The folder cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        leftovers = [entry for entry in path.iterdir() if entry.name not in (LOCK, FAILURE)]
+        is_empty = all(entry.name in (LOCK, FAILURE) for entry in path.iterdir())
+        if not is_empty and overwrite:
+            refuse_files_of_user(path)
     except FileExistsError:
         raise RunError(f"{path}: is a file; give a folder for the run") from None
     except OSError as error:
         raise cannot_write(path, error) from None
-    if leftovers and not overwrite:
+    if not (is_empty or overwrite or resume):
         raise RunError(f"{path}: holds files already; give another folder or --overwrite")
-    if leftovers and not _looks_like_run(leftovers):
-        names = ", ".join(sorted(entry.name for entry in leftovers)[:3])
-        raise RunError(
-            f"{path}: holds files that do not belong to a run ({names}); give another folder"
-        )
     return RunFolder(path)
 
 
 @contextmanager
-def created(path: Path, *, overwrite: bool) -> Iterator[RunFolder]:
+def created(path: Path, *, overwrite: bool, resume: bool = False) -> Iterator[RunFolder]:
     """Create a run folder as ``create`` does, and empty it again if no result gets into it.
 
     Raises:
-        RunError: As for ``create``.
-        OutputError: As for ``create``.
+        CrosscueError: As for ``create``.
     """
     is_new = not path.exists()
     was_empty = is_new or (path.is_dir() and not any(path.iterdir()))
-    run = create(path, overwrite=overwrite)
+    run = create(path, overwrite=overwrite, resume=resume)
     try:
         yield run
     except BaseException:
@@ -290,17 +364,13 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
     Raises:
         OutputError: A file cannot be deleted.
     """
+    is_ours = own_files(run)
+    kept = {LOCK, TAGS} if content is None else {LOCK, TAGS, INPUT}
     try:
         run.file(MANIFEST).unlink(missing_ok=True)
         if content is not None:
             write_input(run, content)
-        for entry in run.path.iterdir():
-            if entry.name in (LOCK, TAGS) or (entry.name == INPUT and content is not None):
-                continue
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink()
+        owned.remove(run.path, lambda name: name not in kept and is_ours(name))
     except OSError as error:
         place = Path(error.filename) if error.filename else run.path
         raise cannot_write(place, error) from None
@@ -308,22 +378,24 @@ def clear(run: RunFolder, content: Mapping[str, object] | None = None) -> None:
 
 @contextmanager
 def staged(
-    run: RunFolder, *, keep: bool = False, until: Manifest | None = None
+    run: RunFolder, *, keep: bool = False, until: Manifest | None = None, always: bool = False
 ) -> Iterator[RunFolder]:
     """Yield a folder for files that replace a finished run once they are complete.
 
-    Without a finished run there is nothing to protect, and the folder is the run itself. Call it
-    while holding the lock.
+    Without a finished run there is nothing to protect, and the folder is the run itself, unless
+    ``always`` is set. Call it while holding the lock.
 
     Args:
         run: The run.
         keep: Start with the run's files, and keep those that are not replaced.
         until: Manifest while files are being replaced; None for no manifest during that time.
+        always: Also use another folder for the first files, whose names nothing records until they
+            are complete.
 
     Raises:
         OutputError: The folder cannot be written.
     """
-    if not run.file(MANIFEST).exists():
+    if not (always or run.file(MANIFEST).exists()):
         yield run
         return
     new = replace(run, path=run.path / STAGED, home=run.home or run.path)
@@ -331,7 +403,7 @@ def staged(
         shutil.rmtree(new.path, ignore_errors=True)
         new.path.mkdir()
         if keep:
-            _link_files(run, new)
+            copy_files(run, new, is_linked=True)
     except OSError as error:
         raise cannot_write(new.path, error) from None
     try:
@@ -344,31 +416,46 @@ def staged(
         shutil.rmtree(new.path, ignore_errors=True)
 
 
-def _link_files(run: RunFolder, new: RunFolder) -> None:
-    """Hard-link the run's files, which is safe because files are replaced and never modified."""
-    for entry in run.path.iterdir():
-        if entry.name == LOCK or not entry.is_file():
+def copy_files(run: RunFolder, new: RunFolder, *, is_linked: bool) -> None:
+    """Copy the run's own files except its scores, or hard-link its tables and records.
+
+    Links are safe because files are replaced and never modified.
+
+    Raises:
+        OSError: A file cannot be copied.
+    """
+    is_ours = own_files(run)
+    for name in sorted(owned.files_in(run.path)):
+        source, folder = run.path / name, name.rpartition("/")[0]
+        is_wanted = folder in ({""} if is_linked else {"", "pictures"}) and name != LOCK
+        if not (is_wanted and is_ours(name)) or source.is_symlink() or not source.is_file():
             continue
+        target = new.file(name)
+        target.parent.mkdir(exist_ok=True)
         try:
-            new.file(entry.name).hardlink_to(entry)
+            if is_linked:
+                target.hardlink_to(source)
+                continue
         except OSError:
-            shutil.copy2(entry, new.file(entry.name))
+            target.unlink(missing_ok=True)
+        shutil.copy2(source, target)
 
 
 def _swap(run: RunFolder, new: RunFolder, keep: bool, until: Manifest | None) -> None:
     """Replace the old files by the new ones; remove the manifest first and write it last."""
+    is_ours = own_files(run)
     if until is None:
-        run.file(MANIFEST).unlink()
+        run.file(MANIFEST).unlink(missing_ok=True)
     else:
         write_manifest(run, until)
     names = {entry.name for entry in new.path.iterdir()}
-    for entry in run.path.iterdir():
-        if entry.name in (LOCK, STAGED, TAGS) or (keep and entry.name not in names):
-            continue
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        elif entry.name not in names | {MANIFEST}:
-            entry.unlink()
+
+    def is_gone(name: str) -> bool:
+        top = name.partition("/")[0]
+        is_kept = top in (LOCK, STAGED, TAGS) or name in names | {MANIFEST}
+        return not (is_kept or (keep and top not in names)) and is_ours(name)
+
+    owned.remove(run.path, is_gone)
     for name in sorted(names, key=lambda name: name == MANIFEST):
         new.file(name).replace(run.file(name))
 
@@ -396,14 +483,6 @@ def open_run(
     run = RunFolder(path, logs, without_images, limits)
     run.manifest()
     return run
-
-
-def _looks_like_run(entries: list[Path]) -> bool:
-    ours = {MANIFEST, FAILURE, STAGED, "score", "view", "pictures"}
-    return all(
-        e.name in ours or e.suffix in (".parquet", ".rrd", ".json") or is_partial(e.name)
-        for e in entries
-    )
 
 
 @contextmanager
@@ -435,7 +514,7 @@ def locked(run: RunFolder) -> Iterator[None]:
 def _lock_file(path: Path) -> int:
     """Return the folder's lock file, opened, locked and signed by this process."""
     while True:
-        handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        handle = door.opened(path, os.O_CREAT | os.O_RDWR)
         try:
             is_ours = lock(handle)
             _refuse_if_held(path, os.read(handle, 4096), is_ours=is_ours)

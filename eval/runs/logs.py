@@ -19,16 +19,15 @@ from typing import Any, Final
 from crosscue.detectors.base import Choice
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, LogRow, RunFolder, part_of
 from crosscue.replay.base import (
-    DEFAULT_LIMITS,
     CrosscueError,
     Log,
     Selection,
     UnreadableRunError,
     UsageError,
+    door,
     is_remote,
     json_tree,
     origin,
-    read_at_most,
     sha256_of,
     strict_json,
     versions,
@@ -238,8 +237,7 @@ def files_named_in(settings: object) -> dict[str, str]:
 def _read(run: RunFolder) -> Mapping[str, Any] | None:
     """Return the content of ``input.json``; None if it is missing or damaged."""
     try:
-        content = read_at_most(run.file(INPUT), DEFAULT_LIMITS.record_bytes)
-        found = json_tree(content or b"")
+        found = json_tree(door.read(run.file(INPUT)))
         of_row(found["identity"])
         return found if isinstance(found["settings"], dict) else None
     except (OSError, ValueError, KeyError, TypeError):

@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import StringConstraints, ValidationError
 
-from crosscue.replay.base import UnreadableRunError, UsageError, strict_json, write_text
+from crosscue.replay.base import UnreadableRunError, UsageError, door, strict_json, write_text
 
 from .folder import TAGS
 from .record import Record
@@ -51,7 +51,7 @@ def read_tags(run: Path) -> dict[str, str]:
     """
     path = run / TAGS
     try:
-        return parse_tags(path.read_bytes())
+        return parse_tags(door.read(path))
     except FileNotFoundError:
         return {}
     except OSError as error:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import write_text
+from crosscue.replay.base import door, write_text
 
 HEAD: Final = """\
 <meta charset="utf-8">
@@ -69,7 +69,7 @@ def write_page(
     parts = [f"<h1>{html.escape(title)}</h1>"]
     parts += [f'<p class="note">{html.escape(note)}</p>' for note in notes]
     for picture in pictures:
-        coded = base64.b64encode(picture.read_bytes()).decode()
+        coded = base64.b64encode(door.read(picture)).decode()
         parts.append(f'<img alt="{html.escape(picture.stem)}" src="data:image/png;base64,{coded}">')
     parts += [_table(table) for table in tables]
     body = "\n".join(parts)

@@ -28,7 +28,7 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING, versions, write_text
+from crosscue.replay.base import EVERYTHING, door, versions, write_text
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
@@ -78,7 +78,7 @@ class Work:
         """Return the drive's folder; simulate it unless it is complete and up to date."""
         folder, key = self.drives / name, self.made_by[name]
         made_by = folder / MADE_BY
-        if not made_by.exists() or made_by.read_text(encoding="utf-8") != key:
+        if not made_by.exists() or door.read(made_by) != key.encode():
             scene = self.scenes[name]
             refuse_other_drive(folder, scene, self.imager)
             made_by.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, overload
 
-from crosscue.replay.base import MIB, json_tree, read_at_most
+from crosscue.replay.base import MIB, door, json_tree
 
 from .layout import CanMessage, CanSignal
 from .sources import DatabaseText
@@ -69,10 +69,10 @@ class LayoutEntry:
         if self._path is None:
             return None
         try:
-            stored = read_at_most(self._path, _ENTRY_BYTES)
+            stored = door.read(self._path, _ENTRY_BYTES)
         except OSError:
             return None
-        head, _, body = (stored or b"").partition(b"\n")
+        head, _, body = stored.partition(b"\n")
         if head != _HEAD + _checksum(body):
             return None
         try:

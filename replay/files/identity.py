@@ -164,6 +164,22 @@ def _files(place: Path) -> Iterator[tuple[bytes, Path]]:
     yield from sorted((os.fsencode(name), path) for name, path in found.items())
 
 
+def link_of_log(place: Path) -> Path | None:
+    """Return a link among the files of a log and those that belong to it; None without any.
+
+    The log itself may be given as a link.
+
+    Raises:
+        OSError: A folder cannot be listed.
+    """
+    for folder, folders, names in os.walk(place, onerror=_raise) if place.is_dir() else ():
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted([*folders, *filter(lambda name: _is_of_log((name,)), names)]):
+            if os.path.islink(f"{folder}/{name}"):  # noqa: PTH114 (there may be 100,000)
+                return Path(folder, name)
+    return next((path for path in _beside(place) if path.is_symlink()), None)
+
+
 def _below(folder: Path) -> dict[str, Path]:
     found = {}
     for place, folders, names in os.walk(folder, onerror=_raise):

@@ -6,6 +6,7 @@ in the same folder.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from http.client import HTTPResponse
@@ -19,6 +20,7 @@ from crosscue.replay.base import (
     CrosscueError,
     UsageError,
     cannot_write,
+    door,
     file_sha256,
     one_line,
     write_whole,
@@ -152,7 +154,8 @@ def _resume(url: str, partial: Path, file: KnownFile, on_bytes: Callable[[int], 
     with answer:
         if answer.status != _PARTIAL:
             have = 0
-        with partial.open("ab" if have else "wb") as out:
+        how = os.O_WRONLY | os.O_CREAT | (os.O_APPEND if have else os.O_TRUNC)
+        with os.fdopen(door.opened(partial, how), "wb") as out:
             while have < file.size_bytes and (
                 piece := answer.read(min(MIB // 4, file.size_bytes - have))
             ):

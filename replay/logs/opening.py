@@ -17,6 +17,7 @@ from crosscue.replay.base import (
     MissingTopicError,
     name_of,
 )
+from crosscue.replay.files.identity import link_of_log
 from crosscue.replay.formats import FORMATS, format_of, known_formats
 
 
@@ -42,11 +43,17 @@ def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
 
 
 def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:
-    """Open a file or folder as ``open_log`` does, but ignore its seal."""
+    """Open a file or folder as ``open_log`` does, but ignore its seal.
+
+    A link among the files of the log is refused, because it may lead anywhere on this machine.
+    """
     name = format_of(path)
     module, _, function = (FORMATS.get(name) or known_formats()[name]).opener.partition(":")
     opener = cast("Callable[[Path, Limits], Log]", getattr(import_module(module), function))
     try:
+        link = None if limits.follow_links else link_of_log(path)
+        if link is not None:
+            raise LogError(f"{link}: a link, which is not followed; see --follow-links")
         return opener(path, limits)
     except PermissionError:
         raise LogError(

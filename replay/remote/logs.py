@@ -38,6 +38,7 @@ from crosscue.replay.base import (
     UsageError,
     WrappedLog,
     cannot_write,
+    door,
     is_remote,
     one_line,
 )
@@ -556,7 +557,7 @@ def _locked(entry: Path) -> int:
     while True:
         entry.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):
-            hold = os.open(entry / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+            hold = door.opened(entry / LOCK, os.O_CREAT | os.O_RDWR)
             fcntl.flock(hold, fcntl.LOCK_EX)
             if is_still(hold, entry / LOCK):
                 return hold
@@ -569,7 +570,7 @@ def _make_room(store: Store, entry: Path, size: int) -> None:
     Raises:
         OutputError: The entries in use leave too little space.
     """
-    gate = os.open(store.folder / LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+    gate = door.opened(store.folder / LOCK, os.O_CREAT | os.O_RDWR)
     try:
         fcntl.flock(gate, fcntl.LOCK_EX)
         others = [one for one in store.folder.iterdir() if one.is_dir() and one != entry]
@@ -591,7 +592,7 @@ def _make_room(store: Store, entry: Path, size: int) -> None:
 
 def _reserved(entry: Path) -> int:
     try:
-        return int(entry.joinpath(SIZE).read_text())
+        return int(door.read(entry / SIZE, 64))
     except (OSError, ValueError):
         return 0
 
@@ -606,7 +607,7 @@ def _last_used(entry: Path) -> int:
 def _removed(entry: Path) -> bool:
     """Remove an entry unless it is in use; return whether it was removed."""
     try:
-        hold = os.open(entry / LOCK, os.O_RDWR)
+        hold = door.opened(entry / LOCK, os.O_RDWR)
     except FileNotFoundError:
         shutil.rmtree(entry, ignore_errors=True)
         return not entry.exists()

@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import xxhash
 
-from crosscue.replay.base import MIB, LogError, OutputError, json_tree, one_line, read_at_most
+from crosscue.replay.base import MIB, LogError, OutputError, door, json_tree, one_line
 
 SUFFIX: Final = ".seal"
 KIND: Final = "crosscue seal"
@@ -269,11 +269,9 @@ def read_seal(path: Path) -> Seal:
         LogError: It cannot be read, is damaged, or is of another version.
     """
     try:
-        raw = read_at_most(path, MAX_SEAL_BYTES)
+        raw = door.read(path, MAX_SEAL_BYTES)
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path") from None
-    if raw is None:
-        raise _unsound(path, f"larger than {MAX_SEAL_BYTES} bytes")
     try:
         tree = json_tree(raw)
     except (ValueError, RecursionError) as error:

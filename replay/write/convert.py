@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -56,6 +56,7 @@ class LogWriter:
         *,
         compression: Compression = "zstd",
         overwrite: bool = False,
+        beside: Sequence[str] = (),
     ) -> None:
         """Create a file, which has its final name once the writer is closed.
 
@@ -64,9 +65,10 @@ class LogWriter:
             ledger: Ledger of the log that is read; rows that cannot be written are skipped in it.
             compression: Compression of chunks.
             overwrite: Replace an existing file.
+            beside: As in ``McapWriter``.
 
         Raises:
-            OutputError: ``path`` exists, or cannot be written.
+            OutputError: ``path`` or a file beside it exists, or it cannot be written.
         """
         self.written: Counter[str] = Counter()
         """Number of messages by topic name in the file."""
@@ -79,7 +81,7 @@ class LogWriter:
         self._known: dict[str, Encoder | str] = {}
         self._details: dict[str, str] = {}
         self._from: dict[str, str] = {}
-        self._mcap = McapWriter(path, compression=compression, overwrite=overwrite)
+        self._mcap = McapWriter(path, compression=compression, overwrite=overwrite, beside=beside)
 
     def add_topic(self, topic: Topic) -> bool:
         """Prepare a topic; False if ROS 2 cannot represent it, so that its rows will be skipped.

@@ -70,6 +70,7 @@ class McapWriter:
         *,
         compression: Compression = "zstd",
         overwrite: bool = False,
+        beside: Sequence[str] = (),
         chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         """Open a temporary file next to ``path`` and write its header.
@@ -78,15 +79,19 @@ class McapWriter:
             path: Final path of the file.
             compression: Compression of chunks.
             overwrite: Replace an existing file.
+            beside: Names of files that will be written next to it. With ``overwrite``, they may
+                exist only if ``path`` does, because otherwise they are another's.
             chunk_bytes: Target size of a chunk in uncompressed bytes.
 
         Raises:
-            OutputError: ``path`` exists, or cannot be written.
+            OutputError: ``path`` or a file beside it exists, or it cannot be written.
         """
         if path.is_dir():
             raise OutputError(f"{path}: is a folder; expected the name of a file")
-        if path.exists() and not overwrite:
-            raise OutputError(f"{path}: exists; give another name or --overwrite")
+        there = [one for one in (path, *map(path.with_name, beside)) if one.exists()]
+        if there and not (overwrite and path.exists()):
+            instead = "" if overwrite else " or --overwrite"
+            raise OutputError(f"{there[0]}: exists; give another name{instead}")
         self.path = path
         self._ids: dict[tuple[str, str], int] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.files.parquet import opened
+from crosscue.replay.base import door
 
 READS = """
 import sys
@@ -50,4 +50,4 @@ def test_table_at_path_that_is_not_utf_8_is_read(tmp_path: Path) -> None:
 
 def test_missing_table_is_named_in_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="absent"):
-        opened(tmp_path / "absent.parquet")
+        door.arrow_file(tmp_path / "absent.parquet")

@@ -52,8 +52,8 @@ def letters(job: Job) -> Letters:
     word = log.read_text()
     run = create(job.run, overwrite=True)
     with locked(run):
-        clear(run)
-        with TableSink(run, "letters", SCHEMA) as sink:
+        clear(run, {"identity": [word], "settings": {"word": word}})
+        with TableSink(run, "pose", SCHEMA) as sink:
             sink.write({"t_ns": range(len(word)), "letter": list(word)})
             _obey(word, log)
         write_manifest(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from crosscue.replay.base import OutputError, UnreadableRunError, is_remote
+from crosscue.replay.base import OutputError, UnreadableRunError, door, is_remote
 
 from .columns import INDEXED, arrow_schema
 from .local import CUT_SHORT, Found
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 NAME: Final = ".catalog"
 """Name of the folder of the index."""
 MAX_BYTES: Final = 256 << 20
-"""Max size of a manifest."""
+"""Max size of a manifest, and of the index."""
 ENTRIES: Final = "entries"
 HALF: Final = "no manifest.json: cut short, or still being made; replay again"
 KEPT: Final = ("runs", "approaches", "dropped")
@@ -154,7 +154,7 @@ def _read_index(path: Path | None) -> _Earlier:
     if path is None:
         return _Earlier({}, {}, {})
     try:
-        stored = Stored(path.read_bytes(), _MARK)
+        stored = Stored(door.read(path, MAX_BYTES), _MARK)
         entries = stored.table(ENTRIES).to_table()
         columns = [entries[name].to_pylist() for name in ("run", *_STAMP, "reason")]
         tables = {name: stored.table(name) for name in KEPT}

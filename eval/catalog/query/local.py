@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, TAGS, TIMINGS
-from crosscue.replay.base import UnreadableRunError
+from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, MAX_MANIFEST_BYTES, TAGS, TIMINGS
+from crosscue.replay.base import UnreadableRunError, door
 
 if TYPE_CHECKING:
     import pyarrow.fs
@@ -73,14 +73,17 @@ class LocalRuns:
         """Return the names of a run's tables, then of those of its score, and what is beside them.
 
         Raises:
-            OSError: The folder cannot be listed.
+            OSError: The folder cannot be listed, or a file is not a regular one.
         """
         folder = self.folder / run
         names = sorted(os.listdir(folder))  # noqa: PTH208 (there may be 100,000)
         tables = [name for name in names if name.endswith(".parquet") or name in BESIDE]
         if SCORE in names and (folder / SCORE).is_dir():
-            scored = sorted(os.listdir(folder / SCORE))  # noqa: PTH208
+            scored = sorted(os.listdir(door.inside(folder, SCORE)))  # noqa: PTH208
             tables += [f"{SCORE}/{name}" for name in scored if name.endswith(".parquet")]
+        # Arrow opens tables by their names, so they are examined here.
+        for name in tables:
+            os.close(door.opened(folder / name))
         return tables
 
     def read(self, run: str, file: str) -> bytes:
@@ -89,7 +92,8 @@ class LocalRuns:
         Raises:
             OSError: The file cannot be read.
         """
-        return (self.folder / run / file).read_bytes()
+        place = door.inside(self.folder / run, file)
+        return door.read(place, door.SMALL_BYTES if file in BESIDE else MAX_MANIFEST_BYTES)
 
     def place(self, run: str, file: str) -> str:
         """Return the path of a file in ``filesystem``."""

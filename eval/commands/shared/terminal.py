@@ -123,13 +123,13 @@ def add_file_output(parser: argparse.ArgumentParser, metavar: str, what: str) ->
 
 
 def add_limit_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--max-chunk``."""
+    """Add ``--max-chunk`` and ``--follow-links``."""
     add_parameters(parser, limits.limits_of)
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
     """Return the limits for reading a log."""
-    return limits.limits_of(max_chunk_bytes=args.max_chunk_bytes)
+    return limits.limits_of(max_chunk_bytes=args.max_chunk_bytes, follow_links=args.follow_links)
 
 
 @contextmanager

@@ -17,10 +17,10 @@ from crosscue.replay.base import (
     Floats,
     Int64s,
     SchemaError,
+    door,
     json_tree,
     read_at_most,
 )
-from crosscue.replay.files.parquet import opened
 
 MAX_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
@@ -181,6 +181,6 @@ def _parquet(path: Path) -> tuple[Floats, ...]:
     import pyarrow.parquet as pq
 
     names = list(RangePairs._fields)
-    with opened(path) as file:
+    with door.arrow_file(path.resolve()) as file:
         table = pq.read_table(file, columns=names, page_checksum_verification=True)
     return tuple(np.asarray(table[name].to_numpy(), np.float64) for name in names)

@@ -13,6 +13,7 @@ from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
 from crosscue.eval.interface.runs.recording import save_recording
 from crosscue.eval.pipeline.run import open_run
+from crosscue.eval.runs import owned
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EmptyResultError,
@@ -115,7 +116,8 @@ def browse(
     Raises:
         UsageError: A value is out of range, or a table is combined with other runs.
         EmptyResultError: There is no failure.
-        OutputError: The folder has other contents, or cannot be written.
+        UsageError: ``overwrite`` would delete files that an earlier call did not write.
+        OutputError: The folder is not empty, or cannot be written.
     """
     folder = Path(output)
     _check_place(folder, overwrite)
@@ -141,8 +143,7 @@ def browse(
                 run = open_run(one.failure.run, moved, limits=limits)
                 save_recording(run, path, at=f"{one.failure.t_ns}ns")
         write_lists(made, entries, pictures)
-        shutil.rmtree(folder, ignore_errors=True)
-        made.rename(folder)
+        owned.replace_folder(made, folder, owned.of_list(folder / MARKER))
     except OSError as error:
         raise cannot_write(Path(error.filename or folder), error) from None
     finally:
@@ -158,10 +159,12 @@ def _check_place(folder: Path, overwrite: bool) -> None:
         there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     except OSError as error:
         raise cannot_write(folder, error) from None
-    if there and not (folder / MARKER).is_file():
-        raise OutputError(f"{folder}: contains something other than a site; use another folder")
+    if there and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; give another folder")
     if there and not overwrite:
-        raise OutputError(f"{folder}: contains a site; use another folder or --overwrite")
+        raise OutputError(f"{folder}: holds files already; give another folder or --overwrite")
+    if there:
+        owned.refuse_others(folder, owned.of_list(folder / MARKER))
 
 
 def _given(

@@ -14,10 +14,11 @@ from typing import Any, Final
 
 from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
 from crosscue.datasets.truth.annotations import Annotations, Picture, meanings
-from crosscue.datasets.truth.coco import write_coco
+from crosscue.datasets.truth.coco import WRITTEN, write_coco
 from crosscue.eval.failures.export import ExportedRun, export_run
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.fit.truth_check import FILE, ImportedTruth, import_part
+from crosscue.eval.runs import owned
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     AnnotationError,
@@ -28,10 +29,9 @@ from crosscue.replay.base import (
     SchemaError,
     UsageError,
     cannot_write,
+    door,
     json_tree,
-    strict_json,
     visible,
-    write_text,
 )
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
@@ -111,7 +111,8 @@ def export(
         UsageError: The format is not supported.
         EmptyResultError: There is no picture to export; nothing is written.
         CrosscueError: No run could be read.
-        OutputError: The folder has other contents, or cannot be written.
+        UsageError: ``overwrite`` would delete files that an earlier call did not write.
+        OutputError: The folder is not empty, or cannot be written.
     """
     if to not in LABEL_FORMATS:
         raise UsageError(f"--to {to}: expected one of {', '.join(LABEL_FORMATS)}")
@@ -148,9 +149,8 @@ def export(
             raise EmptyResultError(f"{where}: no picture to export: {why}")
         file = kind.write(made, found)
         index = [one.as_index(folder) for one in runs if one.pictures]
-        write_text(made / INDEX, strict_json({"format": 1, "to": to, "drives": index}) + "\n")
-        shutil.rmtree(folder, ignore_errors=True)
-        made.rename(folder)
+        owned.write_marker(made / INDEX, {"format": 1, "to": to, "drives": index})
+        owned.replace_folder(made, folder, owned.of_list(folder / INDEX))
     except OSError as error:
         raise cannot_write(Path(error.filename or folder), error) from None
     finally:
@@ -167,10 +167,12 @@ def export(
 
 def _check_place(folder: Path, overwrite: bool) -> None:
     there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    if there and not (folder / INDEX).is_file():
-        raise OutputError(f"{folder}: contains something other than an export; use another folder")
+    if there and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; give another folder")
     if there and not overwrite:
-        raise OutputError(f"{folder}: contains an export; use another folder or --overwrite")
+        raise OutputError(f"{folder}: holds files already; give another folder or --overwrite")
+    if there:
+        owned.refuse_others(folder, owned.of_list(folder / INDEX))
 
 
 def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:
@@ -276,7 +278,7 @@ def import_labels(
     cues = meanings(read, meant | dict(labels), tuple(settings.cues.own), any_thing=True)
     wanted = {name for one in drives for name in one["pictures"]}
     there = {one["drive"]: target / one["drive"] / FILE for one in drives}
-    for path in there.values():
+    for path in (target / "coco.json", target / WRITTEN, *there.values()):
         if path.exists() and not (add or overwrite):
             raise OutputError(f"{path}: exists; use --add, --overwrite, or another name")
     done: dict[str, ImportedTruth] = {}
@@ -328,9 +330,9 @@ def _placed(
 def _read_index(folder: Path) -> list[dict[str, Any]]:
     path = folder / INDEX
     try:
-        drives = json_tree(path.read_bytes())["drives"]
+        drives = json_tree(door.read(path))["drives"]
         for one in drives:
-            assert one["drive"]
+            assert Path(one["drive"]).name == one["drive"] != ""
             assert isinstance(one["log"], str)
             assert isinstance(one["labels"], dict)
             for row in one["pictures"].values():
@@ -343,7 +345,7 @@ def _read_index(folder: Path) -> list[dict[str, Any]]:
 
 
 def _format(folder: Path) -> str:
-    return str(json_tree((folder / INDEX).read_bytes())["to"])
+    return str(json_tree(door.read(folder / INDEX))["to"])
 
 
 def _log_of(log: str, folder: Path) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crosscue.eval.logs.log import Log, opened, vehicle_of
 from crosscue.eval.pipeline.run import Run, run_given
-from crosscue.eval.runs.folder import RunFolder, created
+from crosscue.eval.runs.folder import RunFolder, copy_files, created
 from crosscue.replay.base import OutputError, UsageError
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
@@ -84,7 +83,7 @@ def replay_drive(
         if landmarks is not None:
             matcher = matcher_for(settings)
             database = stack.enter_context(open_for(Path(landmarks), matcher))
-        folder = stack.enter_context(created(Path(output), overwrite=overwrite or resume))
+        folder = stack.enter_context(created(Path(output), overwrite=overwrite, resume=resume))
         outcome = replay_into(
             drive.logs,
             settings,
@@ -205,5 +204,7 @@ def _copied(folder: RunFolder, output: Path) -> RunFolder:
         raise UsageError(f"{output}: expected a folder next to the run, {folder.path}")
     if output.exists():
         raise OutputError(f"{output}: exists; give another folder")
-    shutil.copytree(folder.path, output, ignore=shutil.ignore_patterns("score", ".*"))
-    return RunFolder(output, folder.logs, folder.without_images, folder.limits)
+    new = RunFolder(output, folder.logs, folder.without_images, folder.limits)
+    output.mkdir()
+    copy_files(folder, new, is_linked=False)
+    return new

@@ -14,7 +14,7 @@ from crosscue.eval.studies.intersections.settings import IntersectionStudy
 from crosscue.eval.studies.intersections.study import score_study
 from crosscue.eval.studies.intersections.tables import StudyScores
 from crosscue.eval.studies.simulated_drives import run_drives
-from crosscue.replay.base import RunError, json_tree, visible
+from crosscue.replay.base import RunError, door, json_tree, visible
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -38,7 +38,7 @@ class IntersectionResult:
 
     def as_dict(self) -> object:
         """Return the JSON output of ``crosscue study intersections``: the tables in its folder."""
-        return json_tree(self.files.tables.read_text(encoding="utf-8"))
+        return json_tree(door.read(self.files.tables))
 
     def __repr__(self) -> str:
         text = summary(self.drives, self.scored, self.files)

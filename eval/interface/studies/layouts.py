@@ -20,7 +20,7 @@ from crosscue.eval.studies.layouts.report import (
 from crosscue.eval.studies.layouts.settings import LayoutStudy, Perception
 from crosscue.eval.studies.layouts.study import OnStep, score_study
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
-from crosscue.replay.base import RunError, json_tree
+from crosscue.replay.base import RunError, door, json_tree
 
 SEEN_BY: Final = {
     "pixels": SPARSE_AND_EMBEDDED,
@@ -50,7 +50,7 @@ class LayoutResult:
 
     def as_dict(self) -> object:
         """Return the JSON output of ``crosscue study layouts``: the tables in its folder."""
-        return json_tree(self.files.tables.read_text(encoding="utf-8"))
+        return json_tree(door.read(self.files.tables))
 
     def __repr__(self) -> str:
         parts = [

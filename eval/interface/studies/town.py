@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.studies.town.settings import LandmarkStudy, RangeStudy
-from crosscue.replay.base import UsageError, json_tree
+from crosscue.replay.base import UsageError, door, json_tree
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -63,7 +63,7 @@ class StudyResult:
         """Return the JSON output of ``crosscue study range``: the summary in its folder."""
         from crosscue.eval.studies.town.run import SUMMARY
 
-        return json_tree((self.folder / SUMMARY).read_text(encoding="utf-8"))
+        return json_tree(door.read(self.folder / SUMMARY))
 
     def __repr__(self) -> str:
         tables = "\n\n".join(table.as_text() for table in self.made.tables)

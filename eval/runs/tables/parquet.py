@@ -9,8 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from crosscue.replay.base import UnreadableRunError, cannot_write
-from crosscue.replay.files.parquet import opened
+from crosscue.replay.base import UnreadableRunError, cannot_write, door
 from crosscue.replay.files.partial_file import PartialFile
 
 if TYPE_CHECKING:
@@ -31,8 +30,15 @@ class TableFolder:
     path: Path
 
     def file(self, name: str) -> Path:
-        """Return the path of one of its files."""
-        return self.path / name
+        """Return the path of one of its files or folders.
+
+        Raises:
+            RunError: It is a link, which could lead anywhere.
+        """
+        try:
+            return door.inside(self.path, name)
+        except OSError as error:
+            raise UnreadableRunError(f"{error.filename}: {error.strerror}") from None
 
     def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
         """Read ``NAME.parquet`` and verify its page checksums.
@@ -45,7 +51,7 @@ class TableFolder:
 
         path = self.file(f"{name}.parquet")
         try:
-            with opened(path) as file:
+            with door.arrow_file(path) as file:
                 return pq.read_table(file, columns=columns, page_checksum_verification=True)
         except FileNotFoundError:
             raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
@@ -65,7 +71,7 @@ class TableFolder:
 
         path = self.file(f"{name}.parquet")
         try:
-            with opened(path) as file:
+            with door.arrow_file(path) as file:
                 return pq.read_schema(file).remove_metadata()
         except FileNotFoundError:
             raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
@@ -88,7 +94,7 @@ class TableFolder:
         path = self.file(f"{name}.parquet")
         try:
             with (
-                opened(path) as handle,
+                door.arrow_file(path) as handle,
                 pq.ParquetFile(handle, page_checksum_verification=True) as file,
             ):
                 yield from file.iter_batches(rows, columns=columns, use_threads=False)

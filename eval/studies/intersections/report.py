@@ -18,7 +18,7 @@ from crosscue.eval.scoring.files import write_scores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored, metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
-from crosscue.replay.base import strict_json, versions, write_text
+from crosscue.replay.base import door, strict_json, versions, write_text
 
 from .conditions import condition_costs
 from .contact_sheet import write_sheet
@@ -134,7 +134,7 @@ def _figures(out: Path, scored: StudyScores, approaches: ApproachScore) -> dict[
     learned = None if scored.calibrated is None else scored.calibrated.belief
     draw_reliability(scored.scores.belief, learned, paths["reliability"])
     return {
-        name: f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
+        name: f"data:image/png;base64,{base64.b64encode(door.read(path)).decode()}"
         for name, path in paths.items()
     }
 

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.simulated.drive import FIELD_T, START_NS
+from crosscue.datasets.simulated.drive import FIELD_T, FILES_OF_DRIVE, START_NS
 from crosscue.datasets.truth.truth import Mounting, Truth
 from crosscue.datasets.truth.truth import save as save_truth
 from crosscue.datasets.truth.tum import planar, write_tum
@@ -149,9 +149,8 @@ def write_drive_files(
     log = folder / "drive.mcap"
     t_ns = _times(settings, len(traced.steps))
     passed = traced.of_kind(LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED)
-    write_text(folder / "study_car.dbc", DBC)
-    write_text(folder / "vehicle.toml", vehicle_text(settings, traced))
-    with LogWriter(log, Ledger(str(log)), overwrite=overwrite) as writer:
+    with LogWriter(log, Ledger(str(log)), overwrite=overwrite, beside=FILES_OF_DRIVE) as writer:
+        write_text(folder / "study_car.dbc", DBC)
         topics = [BUS]
         topics += [COMPASS] if settings.sensors.compass_2sigma_deg is not None else []
         topics += [CAMERA] if len(passed) else []
@@ -159,6 +158,7 @@ def write_drive_files(
             writer.add_topic(topic)
         for block in _in_order(settings, traced, t_ns, passed, seed, folder):
             writer.write(block)
+    write_text(folder / "vehicle.toml", vehicle_text(settings, traced))
     landmarks = None
     if len(passed):
         landmarks = folder / "landmarks.db"

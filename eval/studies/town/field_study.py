@@ -25,7 +25,7 @@ from crosscue.eval.studies.words import percent
 from crosscue.localization.town.drive import Traced
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import RunError, json_tree, strict_json, write_text
+from crosscue.replay.base import RunError, door, json_tree, strict_json, write_text
 from crosscue.replay.processes import in_processes
 
 from .range_study import implied_m
@@ -168,7 +168,7 @@ def _claim(study: FieldStudy, folder: Path, *, overwrite: bool) -> None:
     wanted = study.model_dump(mode="json")
     if path.exists() and not overwrite:
         try:
-            before = json_tree(path.read_text(encoding="utf-8"))
+            before = json_tree(door.read(path))
         except (OSError, ValueError):
             before = None
         if before != wanted:
@@ -187,7 +187,7 @@ def _run(through_log: ThroughLog, job: _Job) -> FieldRun:
     kept = folder / "field_run.json"
     if kept.exists():
         try:
-            return FieldRun(**json_tree(kept.read_text(encoding="utf-8")))
+            return FieldRun(**json_tree(door.read(kept)))
         except (ValueError, TypeError):
             kept.unlink()
     settings = job.study.settings(has_landmarks=job.has_landmarks)

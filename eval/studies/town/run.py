@@ -12,7 +12,7 @@ from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.page import Table, write_page
 from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import Result
-from crosscue.replay.base import RunError, json_tree, strict_json, write_text
+from crosscue.replay.base import RunError, door, json_tree, strict_json, write_text
 
 from . import landmark_figure, landmark_study, range_figure, range_study
 from .cases import split
@@ -225,7 +225,7 @@ def _refuse_another(study: RangeStudy | LandmarkStudy, folder: Path, *, overwrit
     if overwrite or not path.exists():
         return
     try:
-        before = json_tree(path.read_text(encoding="utf-8"))["study"]
+        before = json_tree(door.read(path))["study"]
     except (OSError, ValueError, KeyError, TypeError):
         before = None
     if before != study.model_dump(mode="json"):

@@ -36,7 +36,7 @@ def _run(path: Path, **columns: "pa.Array") -> RunFolder:
 def test_merged_rows_keep_their_order_and_name_their_drive(tmp_path: Path) -> None:
     run = _merged(tmp_path, ["abc", "damaged", "de"])
 
-    table = run.table("letters")
+    table = run.table("pose")
     assert table.column_names == ["drive", "t_ns", "letter"]
     assert table["drive"].to_pylist() == ["drive0"] * 3 + ["drive2"] * 2
     assert table["letter"].to_pylist() == list("abcde")
@@ -52,7 +52,7 @@ def test_merged_manifest_lists_failures_and_sums_accounts(tmp_path: Path) -> Non
     assert (letters.runs, letters.entered, letters.used) == (2, 5, 3)
     assert letters.skipped == {"dull": 2}
     assert letters.entered == letters.used + sum(letters.skipped.values())
-    assert [one.rows for one in manifest.drives] == [{"letters": 3}, {"letters": 2}]
+    assert [one.rows for one in manifest.drives] == [{"pose": 3}, {"pose": 2}]
 
 
 def test_merging_twice_writes_equal_bytes(tmp_path: Path) -> None:

@@ -140,9 +140,9 @@ def test_existing_output_is_not_replaced(worst: Path, exported: Path, tmp_path: 
         crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
     crosscue.import_labels(exported, exported.parent, tmp_path / "labelled", add=True)
 
-    with pytest.raises(OutputError, match="contains an export"):
+    with pytest.raises(OutputError, match="holds files already"):
         crosscue.export(worst, exported.parent)
-    with pytest.raises(OutputError, match="other than an export"):
+    with pytest.raises(UsageError, match="not of a result"):
         crosscue.export(worst, worst.parent, overwrite=True)
 
 

@@ -164,9 +164,9 @@ def test_folder_other_than_a_site_is_not_replaced(
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("keep")
 
-    with pytest.raises(OutputError, match="other than a site"):
+    with pytest.raises(UsageError, match=r"notes\.txt"):
         crosscue.browse(folder / "run", tmp_path / "mine", overwrite=True)
-    with pytest.raises(OutputError, match="contains a site"):
+    with pytest.raises(OutputError, match="holds files already"):
         crosscue.browse(folder / "run", folder / "site")
     assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
 

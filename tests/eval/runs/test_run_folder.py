@@ -13,7 +13,7 @@ import pytest
 from crosscue.eval.runs import folder
 from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.replay.base import OutputError, RunError, write_text, write_whole
+from crosscue.replay.base import OutputError, RunError, UsageError, write_text, write_whole
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 
@@ -99,7 +99,7 @@ def test_lock_of_dead_process_is_taken_over(tmp_path: Path) -> None:
 def test_folder_with_other_files_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
 
-    with pytest.raises(RunError, match=r"thesis\.tex"):
+    with pytest.raises(UsageError, match=r"thesis\.tex"):
         create(tmp_path, overwrite=True)
     with pytest.raises(RunError, match="--overwrite"):
         create(tmp_path, overwrite=False)

@@ -1,0 +1,107 @@
+"""The files that crosscue wrote into a folder, which alone ``--overwrite`` may delete.
+
+Those of a run are known from its stage (``folder.own_files``); an export and a site list theirs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from crosscue.replay.base import (
+    UsageError,
+    door,
+    json_tree,
+    strict_json,
+    visible,
+    write_text,
+)
+
+MAX_LIST_BYTES: Final = 256 << 20
+NAMED: Final = 10
+"""Max number of files named in an error."""
+
+IsOurs: TypeAlias = Callable[[str], bool]
+"""Whether crosscue wrote a file, given its path in the folder, with slashes."""
+
+
+def of_list(marker: Path) -> IsOurs:
+    """Return which files of a folder are those that its ``marker`` lists; see ``write_marker``."""
+    try:
+        names = frozenset(json_tree(door.read(marker, MAX_LIST_BYTES))["files"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return lambda name: False
+    return lambda name: name in names or name == marker.name
+
+
+def write_marker(marker: Path, content: dict[str, object]) -> None:
+    """Write the file that marks a folder as ours, with a list of all files that are there.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    tree = {**content, "files": sorted(files_in(marker.parent))}
+    write_text(marker, strict_json(tree) + "\n")
+
+
+def replace_folder(made: Path, folder: Path, is_ours: IsOurs) -> None:
+    """Delete the files of ours from a folder, and move the finished folder ``made`` there.
+
+    Raises:
+        OSError: Something else is there, or it cannot be written.
+    """
+    if folder.is_dir():
+        remove(folder, is_ours)
+        folder.rmdir()
+    made.rename(folder)
+
+
+def files_in(folder: Path) -> Iterator[str]:
+    """Yield the path of every file and link below a folder, relative to it, with slashes.
+
+    Raises:
+        OSError: A folder cannot be listed.
+    """
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    for place, folders, names in os.walk(folder, onerror=fail):
+        links = [name for name in folders if os.path.islink(os.path.join(place, name))]  # noqa: PTH114, PTH118
+        for name in [*names, *links]:
+            yield Path(place, name).relative_to(folder).as_posix()
+
+
+def refuse_others(folder: Path, is_ours: IsOurs) -> None:
+    """Refuse to overwrite a folder that holds files of the user.
+
+    Raises:
+        UsageError: It does; the message names them.
+        OSError: A folder cannot be listed.
+    """
+    others = sorted(name for name in files_in(folder) if not is_ours(name))
+    if others:
+        more = f" and {len(others) - NAMED:,} more" if len(others) > NAMED else ""
+        raise UsageError(
+            f"{folder}: holds files that are not of a result of this crosscue, so nothing was "
+            f"overwritten ({visible(', '.join(others[:NAMED]))}{more}); move them, or give another "
+            "folder"
+        )
+
+
+def remove(folder: Path, is_ours: IsOurs) -> None:
+    """Delete the files of ours, and folders that are empty then; links are not followed.
+
+    Raises:
+        OSError: A file cannot be deleted.
+    """
+    for name in list(files_in(folder)):
+        if is_ours(name):
+            (folder / name).unlink()
+    for place, _, _ in os.walk(folder, topdown=False):
+        if Path(place) != folder:
+            with suppress(OSError):
+                Path(place).rmdir()

@@ -1,0 +1,258 @@
+"""``--overwrite`` deletes files of crosscue only; a folder with another file stays as it is.
+
+The commands are those of the table ``COMMANDS`` that have the option and write a folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from crosscue.eval import cli
+from crosscue.eval.runs.folder import RunFolder, own_files
+from crosscue.eval.runs.owned import files_in
+from support.empty_inputs import empty_inputs
+from support.failures import table_of_failures
+
+REPLAY: Final = "replay {log} -o {out} --vehicle {car} --no-cache"
+DETECT: Final = "detect {log} -o {out} --vehicle {car} --detectors grey --no-cache --draw 3"
+SIMULATE: Final = "simulate A --width 320 --fps 10 -o {out}"
+WRITING: Final[dict[str, str]] = {
+    "replay": REPLAY,
+    "detect": DETECT,
+    "decode": "decode {log} -o {out} --vehicle {car}",
+    "merge": "merge {run} -o {out}",
+    "export": "export {failures} -o {out}",
+    "browse": "browse {failures} -o {out}",
+}
+"""Commands that replace a folder, with arguments."""
+BY_NAME: Final = {
+    "truth": "writes a truth file of a given name",
+    "model": "writes a model card of a given name",
+    "simulate": "replaces the drives of the same settings, file by file",
+    "demo": "writes a drive and a run, each as simulate and replay do",
+    "study": "keeps finished parts, and replaces its pages file by file",
+}
+"""Other commands whose help names a folder, and what they do."""
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A log, its vehicle file, its run, and failures of that run."""
+    folder = tmp_path_factory.mktemp("inputs")
+    found = empty_inputs(folder)
+    table = folder / "failures.parquet"
+    times = RunFolder(found["run"]).table("frames")["t_ns"].to_pylist()
+    table_of_failures(found["run"], table, *times[:2])
+    return {**found, "failures": table}
+
+
+def _run(line: str, names: dict[str, Path], out: Path, *more: str) -> int:
+    return cli.run([*shlex.split(line.format(**names, out=out)), *more])
+
+
+def _content(folder: Path) -> dict[str, str]:
+    """Return the hash of every file below a folder; of a link, its target."""
+    return {
+        name: str(path.readlink())
+        if (path := folder / name).is_symlink()
+        else hashlib.sha256(path.read_bytes()).hexdigest()
+        for name in files_in(folder)
+    }
+
+
+def _parsers() -> dict[str, argparse.ArgumentParser]:
+    """Return the parser of every command in the table of commands."""
+    return {name: cli.parser_of(name)[1] for name in cli.COMMANDS}
+
+
+def _writes_folder(parser: argparse.ArgumentParser) -> bool:
+    options = {option: one for one in parser._actions for option in one.option_strings}
+    output = options.get("--output") or options.get("-o")
+    is_folder = output is not None and "folder" in str(output.help)
+    return "--overwrite" in options and is_folder
+
+
+def test_every_command_that_replaces_folder_has_case() -> None:
+    writing = {name for name, parser in _parsers().items() if _writes_folder(parser)}
+
+    assert writing - WRITING.keys() == {n for n in writing if n.split()[0] in BY_NAME}
+    assert writing >= WRITING.keys()
+
+
+FOREIGN: Final[dict[str, dict[str, str]]] = {
+    "photographs and labels": {"pictures/photo": "a photo", "labels.json": "{}"},
+    "a training set": {"annotations.json": "{}", "train.parquet": "PAR1"},
+    "a package": {"package.json": "{}"},
+    "a thesis": {"thesis.tex": "years of work"},
+    "a folder called score": {"score/thesis.tex": "years of work"},
+    "a manifest of something else": {"manifest.json": '{"name": "app"}', "a.json": "1"},
+    "an input of something else": {"input.json": '{"format_version": 6}', "pose.parquet": "1"},
+}
+
+
+@pytest.mark.parametrize("command", WRITING)
+@pytest.mark.parametrize("case", FOREIGN)
+def test_folder_of_user_is_refused_with_list_of_its_files(
+    case: str,
+    command: str,
+    names: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    for name, text in FOREIGN[case].items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+    before = _content(out)
+
+    assert _run(WRITING[command], names, out, "--overwrite") == 2
+
+    assert _content(out) == before
+    error = capsys.readouterr().err
+    assert all(name in error for name in before)
+    assert error.count("\n") == 1
+
+
+HAND_MADE: Final[dict[str, Callable[[Path], object]]] = {
+    "truth.json": lambda path: path.write_text("{}"),
+    "notes.parquet": lambda path: path.write_text("PAR1"),
+    "drive2.rrd": lambda path: path.write_text("RRF2"),
+    "score/notes.txt": lambda path: path.write_text("good"),
+    "pictures/photo.jpg": lambda path: path.write_text("a photo"),
+    "pictures/20240101.jpg": lambda path: path.write_text("a photo"),
+    "link": lambda path: path.symlink_to("/etc/hostname"),
+    "folder": lambda path: path.symlink_to("/etc"),
+}
+
+
+@pytest.fixture(scope="module")
+def made(names: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Results of each command."""
+    folder = tmp_path_factory.mktemp("made")
+    for command, line in WRITING.items():
+        assert _run(line, names, folder / command) in (0, 3)
+    return {command: folder / command for command in WRITING}
+
+
+@pytest.mark.parametrize("command", WRITING)
+@pytest.mark.parametrize("foreign", HAND_MADE)
+def test_result_with_one_file_of_user_keeps_everything(
+    foreign: str,
+    command: str,
+    names: dict[str, Path],
+    made: dict[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(made[command], out)
+    (out / foreign).parent.mkdir(exist_ok=True)
+    HAND_MADE[foreign](out / foreign)
+    before = _content(out)
+
+    assert _run(WRITING[command], names, out, "--overwrite") == 2
+
+    assert _content(out) == before
+    assert foreign in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", WRITING)
+def test_result_alone_is_replaced(
+    command: str, names: dict[str, Path], made: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(made[command], out)
+
+    assert _run(WRITING[command], names, out, "--overwrite") in (0, 3)
+
+    assert _content(out).keys() == _content(made[command]).keys()
+
+
+def test_scored_tagged_and_viewed_run_has_no_file_of_another(
+    names: dict[str, Path], made: dict[str, Path], tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(names["run"].parent, tmp_path / "all")
+    run = tmp_path / "all" / "run"
+    truth = names["car"].parent / "truth.json"
+    for line in (
+        f"score {run} --truth {truth} --any-log",
+        f"tag {run} a=b",
+        f"view {run} -o {run}/drive.rrd",
+    ):
+        assert cli.run(shlex.split(line)) in (0, 3)
+    assert (run / "score" / "report.html").exists()
+
+    is_ours = own_files(RunFolder(run))
+    assert [name for name in files_in(run) if not is_ours(name)] == []
+    assert _run(REPLAY, names, run, "--overwrite") in (0, 3)
+    assert not (run / "score").exists()
+    assert json.loads((run / "tags.json").read_text())["tags"] == {"a": "b"}
+
+
+def test_interrupted_run_is_overwritten_but_not_with_file_of_user(
+    names: dict[str, Path], made: dict[str, Path], tmp_path: Path
+) -> None:
+    run = tmp_path / "out"
+    shutil.copytree(made["detect"], run)
+    (run / "manifest.json").unlink()
+    (run / "truth.json").write_text("{}")
+    before = _content(run)
+
+    assert _run(DETECT, names, run, "--overwrite") == 2
+    assert _content(run) == before
+
+    (run / "truth.json").unlink()
+    assert _run(DETECT, names, run, "--overwrite") in (0, 3)
+
+
+def test_batch_leaves_folders_of_user_alone(
+    names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "runs"
+    for name in ("a", "b"):
+        shutil.copytree(names["log"].parent, drives / name)
+    line = f"replay {drives} -o {out} --vehicle {names['car']} --no-cache --overwrite"
+    cli.run(shlex.split(line))
+    first, second = sorted(path for path in out.iterdir() if path.name[0] in "ab")
+    (first / "labels.json").write_text("{}")
+    elsewhere = tmp_path / "elsewhere"
+    second.rename(elsewhere)
+    second.symlink_to(elsewhere)
+    for run in (first, elsewhere):
+        (run / "manifest.json").unlink()
+    before = _content(first), _content(elsewhere)
+    capsys.readouterr()
+
+    assert cli.run(shlex.split(line)) != 0
+
+    assert (_content(first), _content(elsewhere)) == before
+    printed = "".join(capsys.readouterr())
+    assert "labels.json" in printed
+    assert "a link" in printed
+
+
+@pytest.mark.parametrize("name", ["truth.json", "vehicle.toml"])
+@pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
+@pytest.mark.parametrize("command", [SIMULATE, "study drive -o {out}"])
+def test_drive_is_not_written_over_user_files(
+    command: str, overwrite: list[str], name: str, names: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    place = out / "A-01" if command.startswith("simulate") else out
+    place.mkdir(parents=True)
+    (place / name).write_text("by hand")
+
+    assert _run(command, names, out, *overwrite) != 0
+
+    assert _content(place).keys() == {name}
+    assert (place / name).read_text() == "by hand"
