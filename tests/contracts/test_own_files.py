@@ -194,7 +194,7 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "eval/failures/record.py": NEW,
     "eval/fit/ranges/pairs.py": HANDLE,
     "eval/interface/fits/": NAMED,
-    "eval/interface/logs/log.py": LOGS,
+    "eval/logs/log.py": LOGS,
     "eval/report/html.py": PACKAGE,
     "eval/runs/folder.py": "copies files of ours that are no links, and reads this machine's",
     "eval/runs/tables/parquet.py": HANDLE,
