@@ -166,13 +166,13 @@ def test_car_is_past_the_end_if_that_is_probable(
 
 @pytest.mark.parametrize(
     ("start_m", "end_m", "counts"),
-    [(26.5, 30.0, True), (26.6, 30.0, False), (10.0, 16.5, True), (10.0, 16.4, False)],
+    [(28.5, 30.0, True), (28.6, 30.0, False), (10.0, 14.5, True), (10.0, 14.4, False)],
 )
 def test_car_is_at_the_intersection_within_the_doubt(
     start_m: float, end_m: float, counts: bool
 ) -> None:
-    """20 + 1.5 = 21.5 m; the doubt is 2 * 1 + 0.15 * 20 = 5 m: start <= 26.5 m, end >= 16.5 m."""
-    assert is_at(car(), CAMERA, Place(start_m, end_m, 1.0)) == counts
+    """20 + 1.5 = 21.5 m; the doubt is 2 * 2 + 0.15 * 20 = 7 m: start <= 28.5 m, end >= 14.5 m."""
+    assert is_at(car(), CAMERA, Place(start_m, end_m, 2.0)) == counts
 
 
 def test_cars_are_counted_by_side_here_and_elsewhere() -> None:
@@ -192,6 +192,9 @@ def test_cars_are_counted_by_side_here_and_elsewhere() -> None:
     assert found == Judged(Sides(2, 1), Sides(1, 0), Sides(1, 2), Sides(0, 2), 9, 6)
     anywhere = judge([*moving, *others], standing, 9, CAMERA, RULES, None)
     assert anywhere == Judged(Sides(3, 3), Sides(0, 0), Sides(0, 0), Sides(1, 2), 9, 6)
+    slow = RULES.model_copy(update={"crossing_mps": 0.5})
+    slowly = car(right_mps=0.9, right_sd_mps=0.1)
+    assert judge([slowly], [], 1, CAMERA, slow, None).crossing == Sides(0, 1)
     edge = judge([car(distance_m=100.0)], [], 1, CAMERA, RULES, None)
     assert edge.followed == 1
 
