@@ -117,7 +117,11 @@ PARTS: Final = {
     ),
     "tracked": Part(
         ("detectors/cues/tracked/*.py",),
-        ("tests/detectors/cues/test_car_tracks.py", "tests/detectors/cues/test_tracks_by_hand.py"),
+        (
+            "tests/detectors/cues/test_car_tracks.py",
+            "tests/detectors/cues/test_assigned_cars_by_hand.py",
+            "tests/detectors/cues/test_tracks_by_hand.py",
+        ),
         tuple(
             f"tests/detectors/cues/test_car_tracks.py::test_stationary_car_{law}"
             for law in (
