@@ -58,7 +58,7 @@ def is_same(first: Box, second: Box, **changes: Any) -> bool:
 
 
 def observation(k: int, box: Box, **changes: Any) -> Observation:
-    """What a box is in frame k of a camera that stands."""
+    """Observe a box in frame k, with a camera that stands."""
     x0, y0, x1, y1 = box
     height = y1 - y0
     edges = math.atan((x0 - 640.0) / 800.0), math.atan((x1 - 640.0) / 800.0)

@@ -411,7 +411,7 @@ def test_tracked_cars_are_those_of_the_newest_frame() -> None:
     assert cues.followed() == []
 
 
-def test_rules_get_the_tracked_cars_and_what_was_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two cars, one stands and one moves by (6, 2) px; their noses are unknown.
 
     Centres are (55, 25) and (205 + 6, 25 + 2). They are judged with camera, settings and place.
