@@ -19,10 +19,10 @@ from crosscue.replay.base import (
     Ledger,
     Limits,
     LogError,
-    VehicleError,
+    MissingTopicError,
     warn_of,
 )
-from crosscue.replay.logs.opening import open_log
+from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.readers.images.folder import picture_names
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
@@ -37,10 +37,10 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
         LogError: The log or its first picture cannot be read.
         VehicleError: The log has no camera, or several.
     """
-    with open_log(path, limits) as log:
+    with open_log(path, limits) as log, unless_damaged([log]):
         camera = camera_of([(0, topic) for topic in log.topics], vehicle)
         if camera is None:
-            raise VehicleError(f"{path}: no camera in the log; annotations need its pictures")
+            raise MissingTopicError(f"{path}: no camera in the log; annotations need its pictures")
         topic = camera[1]
         ledger = Ledger(str(path))
         times: list[Int64s] = []

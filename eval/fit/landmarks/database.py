@@ -28,9 +28,9 @@ from crosscue.replay.base import (
     Ledger,
     Log,
     LogError,
+    MissingTopicError,
     Selection,
     UsageError,
-    VehicleError,
     read_at_most,
 )
 from crosscue.replay.signals.extractor import pictures_of
@@ -140,7 +140,7 @@ def camera_frames(
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     camera = camera_of(topics, vehicle)
     if camera is None:
-        raise VehicleError("the logs have no camera; use a log with pictures")
+        raise MissingTopicError("the logs have no camera; use a log with pictures")
     log, topic = logs[camera[0]], camera[1]
     ledger = ledgers[camera[0]]
     for block, pictures in pictures_of(log, camera[0], topic, vehicle, ledger, selection):

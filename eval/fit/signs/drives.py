@@ -18,11 +18,11 @@ from crosscue.replay.base import (
     Ledger,
     Limits,
     Log,
-    LogError,
+    MissingTopicError,
     read_at_most,
     warn_of,
 )
-from crosscue.replay.logs.opening import open_log
+from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle, load
@@ -35,7 +35,8 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[La
 
     Raises:
         AnnotationError: The folder is not a drive, or has no annotated objects with times.
-        LogError: The log cannot be read, or has no camera.
+        LogError: The log cannot be read, or is damaged and has no camera.
+        VehicleError: The log has no camera, or several.
     """
     drives = drives_of([str(folder)])
     if len(drives.drives) != 1 or len(drives.drives[0].logs) != 1:
@@ -75,9 +76,10 @@ def _pictures(drive: DriveInput, boxes: dict[int, Boxes], limits: Limits) -> Ite
 
 
 def _camera(log: Log, vehicle: Vehicle) -> Iterator[tuple[int, Encoded]]:
-    camera = camera_of([(0, topic) for topic in log.topics], vehicle)
-    if camera is None:
-        raise LogError(f"{log.path}: no camera in the log; signs need its pictures")
+    with unless_damaged([log]):
+        camera = camera_of([(0, topic) for topic in log.topics], vehicle)
+        if camera is None:
+            raise MissingTopicError(f"{log.path}: no camera in the log; signs need its pictures")
     ledger = Ledger(str(log.path))
     for block, pictures in pictures_of(log, 0, camera[1], vehicle, ledger, EVERYTHING):
         for i, t_ns in enumerate(block.log_ns.tolist()):
