@@ -201,6 +201,9 @@ def test_only_sign_opens_approach_within_ten_metres_after_intersection() -> None
     ]
     ranged = replace(frame(4, 0.0), signs=(sign(50.0),))
     assert run_steps([*start, ranged])[-1].approach == 2
+    turned = [established(), replace(frame(1, 0.0), turned_rad=0.8)]
+    after = [frame(2, 9.5, **road), frame(3, 0.5, **road)]
+    assert [one.approach for one in run_steps([*turned, *after])] == [1, None, None, 2]
 
 
 def test_approach_opens_at_once_after_one_that_did_not_pass() -> None:
