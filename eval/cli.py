@@ -16,6 +16,7 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -23,8 +24,9 @@ from types import FrameType
 from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
 
 # Not from crosscue.replay.base, which needs numpy: the list of commands is printed without it.
-from crosscue.replay.errors import CrosscueError, one_line
+from crosscue.replay.errors import CrosscueError, one_line, without_secrets
 from crosscue.replay.losses import losses_heard
+from crosscue.replay.remote.address import is_remote
 from crosscue.replay.safe_text import visible
 from crosscue.replay.versions import installed
 
@@ -121,7 +123,13 @@ class _Parser(argparse.ArgumentParser):
             if name.startswith("--") and name not in known:
                 close = difflib.get_close_matches(name, known, n=1)
                 self.error(f"no option {name}" + (f"; did you mean {close[0]}?" if close else ""))
-        return super().parse_known_args(args, namespace)
+        known_args, rest = super().parse_known_args(args, namespace)
+        for action in self._actions:
+            value = getattr(known_args, action.dest, None)
+            for path in value if isinstance(value, list) else [value]:
+                if isinstance(path, Path) and is_remote(str(path).replace(":/", "://", 1)):
+                    self.error(f"{path}: expected a path on this machine, found a URL; copy it")
+        return known_args, rest
 
     def error(self, message: str) -> NoReturn:
         """Report wrong usage and exit."""
@@ -145,6 +153,7 @@ class Command(Protocol):
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit status."""
     _prepare_streams()
+    warnings.formatwarning = lambda message, *_, **__: f"crosscue: {visible(str(message))}\n"
     if "_ARGCOMPLETE" in os.environ:
         from crosscue.eval.commands.completion import complete
 
@@ -161,6 +170,14 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
         print(f"crosscue: standard output: {error.strerror}; write it elsewhere", file=sys.stderr)
         status = _without_reader()
     sys.exit(status)
+
+
+class _PublicText(io.TextIOWrapper):
+    """Standard error without secrets of URLs: libraries print there, too."""
+
+    def write(self, text: str, /) -> int:
+        """Write."""
+        return super().write(without_secrets(text))
 
 
 class _Messages(io.FileIO):
@@ -189,7 +206,7 @@ def _prepare_streams() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     if sys.stderr is None or isinstance(sys.stderr, io.TextIOWrapper):
-        sys.stderr = io.TextIOWrapper(
+        sys.stderr = _PublicText(
             io.BufferedWriter(_Messages(2, "w", closefd=False)),
             errors="backslashreplace",
             line_buffering=True,
@@ -304,7 +321,7 @@ def _complain(error: BaseException, status: int, args: argparse.Namespace) -> in
     if args.verbose:
         import traceback
 
-        traceback.print_exc()
+        print(without_secrets(traceback.format_exc()), end="", file=sys.stderr)
     print("crosscue: " + visible(one_line(error)), file=sys.stderr)
     return status
 

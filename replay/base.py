@@ -9,7 +9,6 @@ that define them import only each other.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,6 +91,7 @@ from .ledger import (
 )
 from .limits import DEFAULT_LIMITS, MIB, Limits
 from .losses import losses_heard, warn_again, with_losses
+from .remote.address import is_remote
 from .safe_text import visible
 from .versions import installed, versions, versions_and_commit
 
@@ -210,7 +210,6 @@ class Selection:
 
 
 EVERYTHING: Final = Selection()
-_URL: Final = re.compile(r"^[a-z][a-z0-9+.-]+://")
 
 
 class Readable(Protocol):
@@ -279,18 +278,13 @@ class HasUrl(Protocol):
 
     @property
     def url(self) -> str:
-        """The URL as the user wrote it."""
+        """The URL, without user, password and query; see ``remote.address``."""
         ...
 
 
 def origin(log: Log) -> Path | str:
     """Return the path or the URL that a log was opened from."""
     return log.url if isinstance(log, HasUrl) else log.path
-
-
-def is_remote(path: Path | str) -> bool:
-    """Return whether ``path`` is a URL; never for a ``Path``, which collapses the slashes."""
-    return isinstance(path, str) and _URL.match(path) is not None
 
 
 def name_of(log: Log) -> str:

@@ -23,15 +23,28 @@ An invalid argument of the caller's own code raises ``ValueError``. Dropped rows
 work; they issue a ``LossWarning``.
 """
 
+import re
+from typing import Final
+
+_CONTAINER: Final = ("abfs", "abfss", "az", "wasb", "wasbs")
+"""Schemes in which the part before the ``@`` names a container."""
+# Path("http://...") has only one slash.
+_URL: Final = re.compile(r"\b([a-z][a-z0-9+.-]{1,30}):(/+)(\S+)", re.IGNORECASE)
+_HOST: Final = re.compile(r"\[[0-9a-f:.%]*\](:\d*)?|arn:[^@]*|[^:@]*(:\d*)?", re.IGNORECASE)
+
 
 class CrosscueError(Exception):
     """Base class of all exceptions that crosscue raises on purpose.
 
     The message is one line: what happened, where (file, topic, time), what was expected, what
-    to do.
+    to do. URLs in it lose user, password and query.
     """
 
     exit_status: int = 1
+
+    def __init__(self, message: object = "") -> None:
+        """Keep the message without the secrets of URLs."""
+        super().__init__(without_secrets(str(message)))
 
 
 class UsageError(CrosscueError):
@@ -117,14 +130,46 @@ class AccountError(CrosscueError):
 
 
 def one_line(error: BaseException, max_length: int | None = None) -> str:
-    """Return an error's message on one line, with runs of white space collapsed.
+    """Return an error's message on one line, without secrets of URLs, white space collapsed.
 
     Args:
         error: The exception. Messages of other libraries may span lines and quote a complete file.
         max_length: Maximum number of characters to keep; None keeps all.
     """
-    return " ".join(str(error).split())[:max_length]
+    return " ".join(without_secrets(str(error)).split())[:max_length]
 
 
 class LossWarning(UserWarning):
     """Rows of a log were dropped; the message is one line."""
+
+
+def split_address(scheme: str, rest: str) -> tuple[str, str, str]:
+    """Split what follows ``SCHEME://`` into user with ``@``, host with path, and query with ``?``.
+
+    On the web, everything from a ``?`` or ``#`` on is the query. Elsewhere both may be part of a
+    name, and only ``?NAME=`` begins a query.
+    """
+    mark = re.search(r"[?#]" if scheme.lower() in ("http", "https") else r"\?(?=[^/?]*=)", rest)
+    place, query = (rest[: mark.start()], rest[mark.start() :]) if mark else (rest, "")
+    host, slash, path = place.partition("/")
+    user, at, bare = host.rpartition("@")
+    if scheme.lower() in _CONTAINER and ":" not in user:
+        return "", place, query
+    return user + at, bare + slash + path, query
+
+
+def is_host(text: str) -> bool:
+    """Return whether a text may be a host with its port, or a bucket."""
+    return _HOST.fullmatch(text) is not None
+
+
+def without_secrets(text: str) -> str:
+    """Return a text with every URL in it reduced to scheme, host and path."""
+    return _URL.sub(_public, text) if ":/" in text else text
+
+
+def _public(url: re.Match[str]) -> str:
+    _, place, query = split_address(url[1], url[3])
+    # "http://user:pass?word@host/" is not a valid URL; all of it may be the password.
+    hidden = "@" in place + query and not is_host(place.partition("/")[0].rpartition("@")[2])
+    return f"{url[1]}:{url[2]}{'...' if hidden else without_secrets(place)}"

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 from crosscue.replay.errors import LogError, UnknownFormatError
@@ -159,19 +159,26 @@ def format_of(path: Path) -> str:
             next(path.iterdir(), None)
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}; check the path") from None
-    suffix = path.suffix.lower()
-    formats = FORMATS
-    name = _fitting(path, is_folder, formats)
+    name = _fitting(path, is_folder, FORMATS) or _fitting(path, is_folder, known_formats())
     if name is None:
-        formats = known_formats()
-        name = _fitting(path, is_folder, formats)
-    if name is not None:
-        return name
+        raise unknown_format(path, "a folder without a known log in it" if is_folder else None)
+    return name
+
+
+def has_known_suffix(name: str) -> bool:
+    """Return whether the suffix of a file's name is that of a format."""
+    suffix = PurePosixPath(name).suffix.lower()
+    return any(suffix in known.suffixes for known in known_formats().values())
+
+
+def unknown_format(place: Path | str, what: str | None = None) -> UnknownFormatError:
+    """Return the error for a file or folder that no reader supports; it lists the formats."""
     wanted = ", ".join(
-        f"{f.says} ({' '.join(f.suffixes) if f.suffixes else 'folder'})" for f in formats.values()
+        f"{f.says} ({' '.join(f.suffixes) if f.suffixes else 'folder'})"
+        for f in known_formats().values()
     )
-    what = "a folder without a known log in it" if is_folder else f"suffix {suffix!r} unknown"
-    raise UnknownFormatError(f"{path}: {what}; there are: {wanted}")
+    what = what or f"suffix {PurePosixPath(place).suffix.lower()!r} unknown"
+    return UnknownFormatError(f"{place}: {what}; there are: {wanted}")
 
 
 def _fitting(path: Path, is_folder: bool, formats: Mapping[str, Format]) -> str | None:

@@ -37,6 +37,7 @@ from crosscue.replay.base import (
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
+from crosscue.replay.remote.address import LogAddress
 from crosscue.replay.remote.logs import matches
 
 from .shards import Shard, read_shard
@@ -154,6 +155,7 @@ def drives_of(
 
 
 def _all_of(arguments: Sequence[str], *, each: bool) -> DriveList:
+    arguments = [LogAddress(text) if is_remote(text) else text for text in arguments]
     is_many = each or any(_is_plural(text) for text in arguments)
     if not is_many and len(arguments) > 1:
         return DriveList(tuple(_named([_Found(tuple(arguments), None)])), False)
@@ -215,7 +217,7 @@ def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
             words = shlex.split(line, comments=True)
         except ValueError as error:
             raise UsageError(f"@{path}: line {number}: {error}; quote names with blanks") from None
-        logs = [word if is_remote(word) else str(path.parent / word) for word in words]
+        logs = [LogAddress(word) if is_remote(word) else str(path.parent / word) for word in words]
         if len(logs) == 1:
             yield from _expanded(logs[0], each=each)
         elif logs:

@@ -42,6 +42,7 @@ from crosscue.replay.base import (
     warn_again,
     write_text,
 )
+from crosscue.replay.errors import without_secrets
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
 
@@ -329,7 +330,7 @@ def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: s
     text = "".join(f"{name:10}{value}\n" for name, value in lines.items())
     # The disk may be full or unmounted; the original error matters more than this one.
     with suppress(CrosscueError, OSError):
-        write_text(job.run / FAILURE, f"{text}\n{details.rstrip()}\n")
+        write_text(job.run / FAILURE, without_secrets(f"{text}\n{details.rstrip()}\n"))
     with suppress(CrosscueError, OSError):
         entry = {"error": failed.error, "exit_status": failed.exit_status}
         write_entry(job.run, {"inputs": inputs, **entry})
@@ -344,7 +345,7 @@ def reported_error(error: Exception) -> tuple[int, str]:
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return 1, f"{where}{error.strerror or error}; check the path, its mode and the disk"
-    text = " ".join(f"{type(error).__name__}: {error}".split())
+    text = f"{type(error).__name__}: {one_line(error)}"
     return 1, f"{text}; a bug in crosscue: replay this drive alone with -v and report it"
 
 

@@ -36,7 +36,8 @@ from crosscue.replay.files.identity import identity_of, identity_of_all, identit
 from crosscue.replay.files.log_identity import as_row, of_row
 from crosscue.replay.files.made_of import SIMULATED, difference
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.remote.logs import RangedLog, version_of
+from crosscue.replay.remote.address import LogAddress
+from crosscue.replay.remote.logs import RangedLog
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -57,7 +58,7 @@ def log_names(logs: Sequence[Log]) -> list[str]:
 def place_name(place: Path | str) -> str:
     """Return the last part of a path or URL."""
     if isinstance(place, str) and is_remote(place):
-        return place.rstrip("/").rpartition("/")[2]
+        return LogAddress(place).name
     return Path(place).name or Path(place).resolve().name
 
 
@@ -103,12 +104,10 @@ def place_of(run: RunFolder, row: LogRow) -> Path | str:
         RunError: The log does not exist, or its content has changed.
     """
     where, wanted = row.path, row.identity
-    if is_remote(where):
-        places: list[Path | str] = [where]
-    elif run.logs is None:
-        places = [(run.home or run.path).resolve() / where]
+    if run.logs is not None:
+        places: list[Path | str] = [*_moved(run.logs, Path(where))]
     else:
-        places = list(_moved(run.logs, Path(where)))
+        places = [where if is_remote(where) else (run.home or run.path).resolve() / where]
     others = []
     for place in places:
         if isinstance(place, Path) and not place.exists():
@@ -116,7 +115,12 @@ def place_of(run: RunFolder, row: LogRow) -> Path | str:
         try:
             found = identity_of(place)
         except CrosscueError as error:
-            raise UnreadableRunError(f"{run.path}: its log cannot be examined: {error}") from None
+            raise UnreadableRunError(
+                f"{run.path}: its log cannot be examined: {error}; a run keeps no user, password "
+                "or query of a URL: name the folder of a copy with --logs DIR, or replay again"
+                if isinstance(place, str)
+                else f"{run.path}: its log cannot be examined: {error}"
+            ) from None
         if found.digest == wanted.digest:
             return place if isinstance(place, str) else Path(os.path.normpath(place))
         others.append((place, found))
@@ -225,8 +229,10 @@ def files_named_in(settings: object) -> dict[str, str]:
     """
     if isinstance(settings, str):
         # Longer texts are not file names, and some systems fail on them.
-        is_file = "/" in settings and len(settings) < 4096 and Path(settings).is_file()
-        return {settings: version_of(settings)} if is_file else {}
+        if "/" not in settings or len(settings) >= 4096 or not Path(settings).is_file():
+            return {}
+        found = Path(settings).stat()
+        return {settings: f"{found.st_size} {found.st_mtime_ns}"}
     if isinstance(settings, Mapping):
         settings = list(settings.values())
     if isinstance(settings, list | tuple):

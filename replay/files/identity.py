@@ -28,6 +28,7 @@ from typing import Final, Protocol
 
 from crosscue.replay.base import MIB, Log, LogError, is_remote
 from crosscue.replay.files.log_identity import Identity
+from crosscue.replay.remote.address import LogAddress
 from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch
 from crosscue.replay.remote.ranges import RangedFile
 
@@ -51,7 +52,7 @@ def identity_of(place: Path | str) -> Identity:
         LogError: It does not exist or cannot be read.
     """
     if isinstance(place, str) and is_remote(place):
-        return _identity_of_url(place)
+        return _identity_of_url(LogAddress(place))
     path = Path(place)
     if path.name in ("", ".."):
         path = path.resolve()
@@ -79,7 +80,7 @@ def identity_of_log(log: Log) -> Identity:
     return _identity_of_ranged(log.ranged) if isinstance(log, RangedLog) else identity_of(log.path)
 
 
-def _identity_of_url(url: str) -> Identity:
+def _identity_of_url(url: LogAddress) -> Identity:
     ranged = by_ranges(url)
     if ranged is not None:
         with closing(ranged):
@@ -91,11 +92,10 @@ def _identity_of_url(url: str) -> Identity:
     return found
 
 
-def _identity_of_parts(url: str) -> Identity | None:
+def _identity_of_parts(url: LogAddress) -> Identity | None:
     """Return the identity of a remote log of any format; None if all of it should be fetched."""
     remote = RemoteFiles(url)
-    name = url.rstrip("/").rpartition("/")[2]
-    names = sorted(_names_of(name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
+    names = sorted(_names_of(url.name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
     max_bytes = _hashed_bytes(len(names))
     sizes = [remote.sizes[at] for _, at in names]
     total = sum(sizes)
@@ -111,7 +111,7 @@ def _identity_of_parts(url: str) -> Identity | None:
             with closing(ranged):
                 content = _hash(_Remote(ranged), max_bytes)
         digest.update(_report_text(os.fsencode(reported), remote.sizes[at], content))
-    return Identity(name, total, digest.hexdigest())
+    return Identity(url.name, total, digest.hexdigest())
 
 
 def _names_of(name: str, sizes: Mapping[str, int]) -> dict[str, str]:
@@ -129,7 +129,7 @@ def _hashed_bytes(files: int) -> int:
 
 
 def _identity_of_ranged(ranged: RangedFile) -> Identity:
-    name = ranged.url.rstrip("/").rpartition("/")[2]
+    name = ranged.url.name
     file = _Remote(ranged)
     digest = hashlib.sha256()
     digest.update(_report_text(os.fsencode(name), file.size, _hash(file, SHARE_BYTES)))

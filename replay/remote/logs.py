@@ -5,7 +5,8 @@ part are fetched (``RangedLog``). Other logs are downloaded completely: a log th
 end is often read twice, and some readers need a local file (SQLite, videos). Downloads are stored
 under a name derived from the address and version, so that a changed object is downloaded again.
 When the store exceeds its limit, the least recently used logs are removed, but never an open log.
-Protocols and credentials are those of fsspec.
+Protocols and credentials are those of fsspec. An object's suffix is that of its URL's path, and an
+unknown one is refused before anything is fetched.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, Final, Protocol, TypeVar, cast
@@ -39,15 +40,16 @@ from crosscue.replay.base import (
     WrappedLog,
     cannot_write,
     door,
-    is_remote,
     one_line,
 )
 from crosscue.replay.files.partial_file import is_still
-from crosscue.replay.formats import known_formats
+from crosscue.replay.formats import has_known_suffix, unknown_format
 
+from .address import LogAddress
 from .ranges import RangedFile, Spool
+from .waiting import answered
 
-CHUNK_BYTES: Final = 8 << 20
+CHUNK_BYTES: Final = 4 << 20
 VERSION_KEYS: Final = (
     "ETag",
     "etag",
@@ -120,7 +122,7 @@ def default_store() -> Store:
 class _Object:
     """One object of a remote log: remote address, local name, size and version."""
 
-    address: str
+    address: str = field(repr=False)
     name: str
     size: int
     version: str
@@ -155,11 +157,11 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
         LogTooLargeError: Larger than the limit of the store.
         OutputError: The store cannot be written, or the disk is full.
     """
-    system, address = _opened(url)
+    url, system, address = opened_store(url)
     if _is_local(system):
         return Fetched(Path(address), None)
     store = store or default_store()
-    objects = _guarded(url, lambda: _objects(system, address))
+    objects = guarded(url, lambda: _objects(system, address, url))
     size = sum(one.size for one in objects)
     if size > store.max_bytes:
         raise LogTooLargeError(
@@ -167,10 +169,16 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
             f"set {LIMIT_VARIABLE}"
         )
     entry = store.folder / _key(url, objects)
-    path = entry / "log" / PurePosixPath(address.rstrip("/")).name
+    path = entry / "log" / url.name
     try:
         while True:
-            hold = _locked(entry)
+            # Shared, as by other users of the log: they keep it open for as long as they read.
+            hold = _locked(entry, fcntl.LOCK_SH)
+            if path.exists():
+                os.utime(entry)
+                return Fetched(path, hold)
+            os.close(hold)
+            hold = _locked(entry, fcntl.LOCK_EX)
             try:
                 if not path.exists():
                     _make_room(store, entry, size)
@@ -188,45 +196,19 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
         raise cannot_write(path, error) from None
 
 
-def version_of(path: str) -> str:
-    """Return the size and version of a file, folder or URL without reading its contents.
-
-    Raises:
-        LogError: It does not exist or cannot be examined.
-    """
-    if is_remote(path):
-        system, address = _opened(path)
-        if _is_local(system):
-            return version_of(address)
-        return _key(path, _guarded(path, lambda: _objects(system, address)))
-    place = Path(path)
-    try:
-        if place.is_file():
-            found = place.stat()
-            return f"{found.st_size} {found.st_mtime_ns}"
-        digest = hashlib.sha256()
-        for entry in sorted(one for one in place.rglob("*") if one.is_file()):
-            found = entry.stat()
-            name = entry.relative_to(place).as_posix().encode(errors="surrogateescape")
-            digest.update(name + f"\0{found.st_size} {found.st_mtime_ns}\0".encode())
-        place.stat()
-    except OSError as error:
-        raise LogError(f"{path}: {error.strerror or error}; check the path") from None
-    return digest.hexdigest()
-
-
 def matches(pattern: str) -> tuple[str, ...]:
     """Return the URLs that match a pattern such as ``s3://bucket/drives/*.mcap``, sorted.
 
     Raises:
         LogError: The store cannot be queried.
     """
-    system, address = _opened(pattern)
-    found = _guarded(pattern, lambda: sorted(map(str, system.glob(address))))
+    url, system, address = opened_store(pattern)
+    names = address.partition("?")[0] if url.has_query else address
+    found = guarded(url, lambda: sorted(map(str, system.glob(names))))
     if _is_local(system):
         return tuple(found)
-    scheme = pattern.partition("://")[0]
-    return tuple(one if "://" in one else f"{scheme}://{one.lstrip('/')}" for one in found)
+    scheme = url.partition("://")[0]
+    return tuple(url.at(one if "://" in one else f"{scheme}://{one.lstrip('/')}") for one in found)
 
 
 class RemoteLog(WrappedLog):
@@ -358,6 +340,7 @@ def open_remote(
     Raises:
         CrosscueError: As raised by ``fetch`` and ``opener``.
     """
+    url, system, address = opened_store(url)
 
     def whole(why: str) -> RemoteLog:
         fetched = fetch(url, store)
@@ -367,8 +350,7 @@ def open_remote(
             fetched.close()
             raise
 
-    system, address = _opened(url)
-    suffix = PurePosixPath(address).suffix.lower()
+    suffix = PurePosixPath(url.name).suffix.lower()
     if _is_local(system) or suffix not in RANGED:
         return whole("its format is read from a local file")
     ranged = _ranged(url, system, address, store or default_store())
@@ -380,7 +362,7 @@ def open_remote(
         getattr(import_module(module), function),
     )
     try:
-        log = open_ranged(Path(PurePosixPath(address).name), ranged, limits)
+        log = open_ranged(Path(url.name), ranged, limits)
     except BaseException:
         ranged.close()
         raise
@@ -396,8 +378,8 @@ def by_ranges(url: str) -> RangedFile | None:
     Raises:
         LogError: As raised by ``fetch``.
     """
-    system, address = _opened(url)
-    if _is_local(system) or PurePosixPath(address).suffix.lower() not in RANGED:
+    url, system, address = opened_store(url)
+    if _is_local(system) or PurePosixPath(url.name).suffix.lower() not in RANGED:
         return None
     return _ranged(url, system, address, default_store())
 
@@ -415,13 +397,12 @@ class RemoteFiles:
         Raises:
             LogError: As raised by ``fetch``.
         """
-        self._url: Final = url
         self._store: Final = default_store()
-        self._system, self._address = _opened(url)
+        self._url, self._system, self._address = opened_store(url)
         self._objects: Final = (
             []
             if _is_local(self._system)
-            else _guarded(url, lambda: _objects(self._system, self._address))
+            else guarded(self._url, lambda: _objects(self._system, self._address, self._url))
         )
         self.sizes: Final = {one.name: one.size for one in self._objects}
 
@@ -441,17 +422,16 @@ class RemoteFiles:
         return _ranged(self._url, self._system, address, self._store)
 
 
-def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile | None:
+def _ranged(url: LogAddress, system: _System, address: str, store: Store) -> RangedFile | None:
     """Open an object in byte ranges; None if it is not a single object of known size."""
-    info = _guarded(url, lambda: system.info(address))
+    info = guarded(url, lambda: system.info(address))
     if info.get("type") == "directory" or not info.get("size") or info.get("partial") is False:
         return None
-    name = PurePosixPath(address.rstrip("/")).name
-    reported = _object(name, info)
+    reported = _object(url.name, info)
 
     def changed() -> bool:
         system.invalidate_cache()
-        return _object(name, system.info(address)) != reported
+        return _object(url.name, system.info(address)) != reported
 
     def opened() -> BinaryIO:
         return system.open(address, "rb", cache_type="none")
@@ -459,106 +439,112 @@ def _ranged(url: str, system: _System, address: str, store: Store) -> RangedFile
     return RangedFile(url, reported.size, opened, changed, Spool(store.folder, store.max_bytes))
 
 
-def _opened(url: str) -> tuple[_System, str]:
+def opened_store(url: str) -> tuple[LogAddress, _System, str]:
+    """Return an address, its store, and the address in the store, which may hold secrets."""
+    url = LogAddress(url)
     try:
         url_to_fs = import_module("fsspec.core").url_to_fs
     except ImportError:
         raise LogError(
             f"{url}: reading from object stores needs fsspec; pip install fsspec"
         ) from None
-    try:
-        system, address = url_to_fs(url)
-    except (ImportError, ValueError) as error:
-        raise LogError(f"{url}: {one_line(error)}") from None
-    return cast("_System", system), str(address)
+    system, address = guarded(url, lambda: url_to_fs(url.with_secrets()))
+    return url, cast("_System", system), str(address)
 
 
 def _is_local(system: _System) -> bool:
     return "file" in ([system.protocol] if isinstance(system.protocol, str) else system.protocol)
 
 
-def _guarded(url: str, ask: Callable[[], T]) -> T:
+def guarded(url: LogAddress, ask: Callable[[], T]) -> T:
     """Return ``ask()`` and convert any error of a store's library to a ``LogError``."""
     try:
-        return ask()
+        return answered(url, ask)
     except CrosscueError:
         raise
-    except FileNotFoundError:
-        raise LogError(f"{url}: no such object; check the address") from None
-    except PermissionError as error:
-        raise LogError(f"{url}: no permission ({one_line(error)}); check credentials") from None
     except Exception as error:
-        kind = type(error).__name__
-        raise LogError(f"{url}: cannot be read ({kind}: {one_line(error)}); try again") from None
+        line = url.hide(f"{type(error).__name__}: {one_line(error)}")
+        # The web's store calls every failure a missing file; the cause has the server's status.
+        status = getattr(error.__cause__, "status", None)
+        if isinstance(error, PermissionError) or status in (401, 403):
+            why = f"no permission ({status or line}); check credentials"
+        elif isinstance(error, FileNotFoundError):
+            why = "no such object; check the address"
+        else:
+            why = f"cannot be read ({line}); try again"
+    # Raised here, so that it does not carry the library's error, whose text may hold secrets.
+    raise LogError(f"{url}: {why}")
 
 
-def _objects(system: _System, address: str) -> list[_Object]:
-    """List the objects of a log: all objects below a folder, or those that share a file's stem."""
+def _objects(system: _System, address: str, url: LogAddress) -> list[_Object]:
+    """List the objects of a log: all objects below a folder, or those that share a file's stem.
+
+    Raises:
+        UnknownFormatError: It is a file of an unknown suffix.
+    """
     address = address.rstrip("/")
-    name = PurePosixPath(address).name
-    if _is_folder(system, address):
+    if _is_folder(system, address, url):
         found = system.find(address, detail=True).values()
         start = len(address) + 1
-        named = [(f"{name}/{str(info['name'])[start:]}", info) for info in found]
+        named = [(f"{url.name}/{str(info['name'])[start:]}", info) for info in found]
     else:
-        alone = system.info(address)
-        try:
-            around = system.ls(address[: len(address) - len(name)] or address, detail=True)
-        except (OSError, ValueError):  # a plain web server may have no listing
-            around = [alone | {"name": address}]
-        around = [one for one in around if _belongs(PurePosixPath(str(one["name"])).name, name)]
-        # A web server's listing has no sizes.
-        around = [
-            one if one.get("size") is not None else system.info(str(one["name"])) for one in around
-        ] or [alone | {"name": address}]
-        named = [(PurePosixPath(str(info["name"])).name, info) for info in around]
-        named = [(other, info) for other, info in named if _belongs(other, name)]
-    return sorted((_object(other, info) for other, info in named), key=lambda one: one.name)
+        if not has_known_suffix(url.name):
+            raise unknown_format(url)
+        named = [(url.name, system.info(address) | {"name": address})]
+        around: list[dict[str, Any]] = []
+        with suppress(Exception):  # a web server may have no listing, or forbid it
+            around = [] if url.has_query else system.ls(address[: -len(url.name)], detail=True)
+        for one in around:
+            if _belongs(name := PurePosixPath(str(one["name"])).name, url.name):
+                # A web server's listing has no sizes.
+                known = one.get("size") is not None
+                named.append((name, one if known else system.info(str(one["name"]))))
+    return sorted((_object(name, info) for name, info in named), key=lambda one: one.name)
 
 
-def _is_folder(system: _System, address: str) -> bool:
-    """Return whether an address is a folder.
-
-    On a web server, every address is both a file and a folder, and ``isdir`` downloads the file.
-    Addresses with the suffix of a known format are therefore checked with ``info``.
-    """
-    suffix = PurePosixPath(address).suffix.lower()
-    if any(suffix in known.suffixes for known in known_formats().values()):
-        try:
-            return system.info(address).get("type") == "directory"
-        except FileNotFoundError:
-            return system.isdir(address)
-    return system.isdir(address)
+def _is_folder(system: _System, address: str, url: LogAddress) -> bool:
+    """Return whether an address is a folder. A web server has none: ``isdir`` fetches the file."""
+    if url.startswith(("http://", "https://")):
+        return False
+    try:
+        return system.info(address).get("type") == "directory"
+    except FileNotFoundError:
+        return system.isdir(address)
 
 
 def _belongs(other: str, name: str) -> bool:
-    """Return whether ``other`` is the log itself, its time file, index or write-ahead log."""
-    stem = PurePosixPath(name).stem
-    return other == name or other.startswith((f"{stem}.", f"{name}-"))
+    """Return whether ``other`` is the log's time file, index or write-ahead log."""
+    return other != name and other.startswith((f"{PurePosixPath(name).stem}.", f"{name}-"))
 
 
 def _object(name: str, info: dict[str, Any]) -> _Object:
     if any(part in ("", ".", "..") for part in name.split("/")) or "\0" in name:
-        raise LogError(f"{info['name']}: not a valid file name; rename the object")
+        raise LogError(f"{name}: not a valid file name; rename the object")
     version = next((str(info[key]) for key in VERSION_KEYS if info.get(key) is not None), "")
     return _Object(str(info["name"]), name, int(info["size"]), version)
 
 
-def _key(url: str, objects: Sequence[_Object]) -> str:
-    """Return a name derived from a log's address and version."""
+def _key(url: LogAddress, objects: Sequence[_Object]) -> str:
+    """Return a name derived from a log's address and version.
+
+    A new signature of the same object does not change it. Only where the store reports no version
+    may the query tell objects apart.
+    """
     digest = hashlib.sha256(url.encode())
+    if not all(one.version for one in objects):
+        digest.update(url.with_secrets().partition("?")[2].encode())
     for one in objects:
         digest.update(f"\0{one.name}\0{one.size}\0{one.version}".encode())
     return digest.hexdigest()[:32]
 
 
-def _locked(entry: Path) -> int:
-    """Wait for an exclusive lock on an entry, and return its open lock file."""
+def _locked(entry: Path, how: int) -> int:
+    """Wait for a lock on an entry, and return its open lock file."""
     while True:
         entry.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):
             hold = door.opened(entry / LOCK, os.O_CREAT | os.O_RDWR)
-            fcntl.flock(hold, fcntl.LOCK_EX)
+            fcntl.flock(hold, how)
             if is_still(hold, entry / LOCK):
                 return hold
             os.close(hold)
@@ -625,7 +611,7 @@ def _removed(entry: Path) -> bool:
 
 
 def _download(
-    url: str, system: _System, address: str, objects: Sequence[_Object], entry: Path
+    url: LogAddress, system: _System, address: str, objects: Sequence[_Object], entry: Path
 ) -> None:
     partial = entry / "partial"
     shutil.rmtree(partial, ignore_errors=True)
@@ -639,7 +625,7 @@ def _download(
                 file.flush()
                 os.fsync(file.fileno())
         system.invalidate_cache()
-        if _guarded(url, lambda: _objects(system, address)) != list(objects):
+        if guarded(url, lambda: _objects(system, address, url)) != list(objects):
             raise LogError(f"{url}: changed while it was fetched; run again when it is written")
         partial.replace(entry / "log")
     except BaseException:
@@ -647,12 +633,12 @@ def _download(
         raise
 
 
-def _chunks(url: str, system: _System, one: _Object) -> Iterator[bytes]:
+def _chunks(url: LogAddress, system: _System, one: _Object) -> Iterator[bytes]:
     """Yield an object's bytes and check that their number equals the listed size."""
-    source = _guarded(url, lambda: system.open(one.address, "rb"))
+    source = guarded(url, lambda: system.open(one.address, "rb", cache_type="none"))
     left = one.size
     with source:
-        while chunk := _guarded(url, lambda: bytes(source.read(CHUNK_BYTES))):
+        while chunk := guarded(url, lambda: bytes(source.read(CHUNK_BYTES))):
             left -= len(chunk)
             if left < 0:
                 break

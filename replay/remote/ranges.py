@@ -4,8 +4,8 @@ A reader announces the ranges that it is going to read (``expect``). Within thes
 4 MiB are fetched at once. Elsewhere a small read-ahead is added, which doubles for sequential
 reads. Nothing is fetched twice: a replay reads its window several times, so data that no longer
 fits into memory moves to a sparse temporary file, as long as the disk has space. A failed request
-is retried a few times. A short response, or an object whose size or version has changed, is an
-error.
+is retried a few times, but one that the store does not answer in time is not. A short response, or
+an object whose size or version has changed, is an error.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from threading import Lock
 from typing import BinaryIO, Final, TypeVar
 
 from crosscue.replay.errors import CrosscueError, LogError, one_line
+
+from .address import LogAddress
+from .waiting import answered
 
 PIECE: Final = 4 << 20
 AHEAD: Final = 8 << 10
@@ -102,14 +105,14 @@ class RangedFile:
     """Random access to a remote object; thread-safe.
 
     Attributes:
-        url: URL as the user wrote it.
+        url: URL of the object.
         size: Size in bytes, as reported by the store.
         transferred: Number of bytes fetched so far.
     """
 
     def __init__(
         self,
-        url: str,
+        url: LogAddress,
         size: int,
         opened: Callable[[], BinaryIO],
         changed: Callable[[], bool],
@@ -118,7 +121,7 @@ class RangedFile:
         """Wrap a remote object.
 
         Args:
-            url: URL as the user wrote it.
+            url: URL of the object.
             size: Size in bytes, as reported by the store.
             opened: Opens the object; the file's reads must fetch exactly the requested bytes.
             changed: Queries the store and returns whether the size or version has changed.
@@ -228,19 +231,22 @@ class RangedFile:
 
     def _tried(self, ask: Callable[[], T], what: str) -> T:
         """Return ``ask()``, with a few retries on any error of a store's library."""
-        for wait_s in (*WAITS_S, None):
+        why = ""
+        for wait_s in (0.0, *WAITS_S):
+            time.sleep(wait_s)
             try:
-                return ask()
+                return answered(self.url, ask)
             except CrosscueError:
                 raise
             except FileNotFoundError:
-                raise LogError(f"{self.url}: deleted while it was read; check the store") from None
+                why = "deleted while it was read; check the store"
+                break
             except Exception as error:
                 self._file = None
-                if wait_s is None:
-                    raise LogError(
-                        f"{self.url}: {what} could not be read in {len(WAITS_S) + 1} tries "
-                        f"({type(error).__name__}: {one_line(error)}); check the connection"
-                    ) from None
-                time.sleep(wait_s)
-        raise AssertionError("the last try returns or raises")
+                why = (
+                    f"{what} could not be read in {len(WAITS_S) + 1} tries "
+                    f"({self.url.hide(f'{type(error).__name__}: {one_line(error)}')}); check "
+                    "the connection"
+                )
+        # Raised here, so that it does not carry the library's error, whose text may hold secrets.
+        raise LogError(f"{self.url}: {why}")

@@ -19,7 +19,7 @@ from crosscue.replay.base import (
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
-from crosscue.replay.remote.logs import Store, fetch, matches, version_of
+from crosscue.replay.remote.logs import Store, fetch, matches
 from support.can_files import candump, random_frames
 from support.can_files import read_back as read_file
 
@@ -67,19 +67,16 @@ def test_log_is_fetched_once_until_it_changes(bucket: str, monkeypatch: pytest.M
 
     monkeypatch.setattr(remote, "_download", counted)
     url = _put(f"{bucket}/a.log", b"one")
-    before = version_of(url)
     for _ in range(2):
         with fetch(url) as fetched:
             assert fetched.path.read_bytes() == b"one"
     assert len(fetches) == 1
-    assert version_of(url) == before
 
     _put(url, b"two")
 
     with fetch(url) as fetched:
         assert fetched.path.read_bytes() == b"two"
     assert len(fetches) == 2
-    assert version_of(url) != before
 
 
 def test_folder_and_companion_files_are_fetched(bucket: str) -> None:
@@ -200,7 +197,6 @@ def test_file_url_is_read_in_place(tmp_path: Path) -> None:
 
     with open_log(path.as_uri()) as log:
         assert log.path == path
-    assert version_of(path.as_uri()) == version_of(str(path))
 
 
 def test_pattern_matches_urls(bucket: str) -> None:
@@ -208,18 +204,6 @@ def test_pattern_matches_urls(bucket: str) -> None:
         _put(f"{bucket}/{name}", b"")
 
     assert matches(f"{bucket}/*/x.mcap") == (f"{bucket}/a/x.mcap", f"{bucket}/b/x.mcap")
-
-
-def test_folder_version_changes_with_any_file(tmp_path: Path) -> None:
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "a").write_text("1")
-    before = version_of(str(tmp_path / "bag"))
-
-    (tmp_path / "bag" / "b").write_text("")
-
-    assert version_of(str(tmp_path / "bag")) != before
-    with pytest.raises(LogError, match="No such file"):
-        version_of(str(tmp_path / "gone"))
 
 
 def test_only_strings_with_a_scheme_are_remote() -> None:

@@ -1,13 +1,17 @@
-"""A local web server that supports range requests, counts bytes and can interrupt responses."""
+"""A local web server that supports range requests, counts bytes and can interrupt responses.
+
+Queries are ignored, as a server of presigned addresses does once it has checked them.
+"""
 
 from __future__ import annotations
 
 import re
+from base64 import b64decode
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
+from threading import Event, Thread
 
 
 @dataclass(slots=True)
@@ -20,6 +24,9 @@ class Served:
         sent: Number of bytes sent in bodies.
         gets: ``Range`` headers of the GET requests.
         failing: Number of further GET requests to interrupt midway.
+        requests: Method and path of every request.
+        password: Secret that a request must contain, in its query or as basic authorization.
+        stalling: ``headers`` to stop before the response, ``body`` to stop halfway through it.
     """
 
     base: str = ""
@@ -27,12 +34,16 @@ class Served:
     sent: int = 0
     gets: list[str] = field(default_factory=list)
     failing: int = 0
+    requests: list[str] = field(default_factory=list)
+    password: str = ""
+    stalling: str = ""
 
 
 @contextmanager
 def serving() -> Iterator[Served]:
     """Serve ``Served.files`` for the duration of the ``with`` block."""
     served = Served()
+    ended = Event()
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -47,9 +58,16 @@ def serving() -> Iterator[Served]:
             """Log nothing; tests examine ``Served``."""
 
         def _answer(self, *, with_body: bool) -> None:
-            content = served.files.get(self.path.lstrip("/"))
-            if content is None:
-                self.send_response(404)
+            path, _, query = self.path.partition("?")
+            served.requests.append(f"{self.command} {path}")
+            if served.stalling == "headers":
+                ended.wait(60.0)
+                return
+            login = b64decode(self.headers.get("Authorization", "").removeprefix("Basic "))
+            may_read = served.password in query or served.password in login.decode()
+            content = served.files.get(path.lstrip("/"))
+            if content is None or not may_read:
+                self.send_response(404 if may_read else 403)
                 self.send_header("Content-Length", "0")
                 self.end_headers()
                 return
@@ -70,6 +88,11 @@ def serving() -> Iterator[Served]:
             if not with_body:
                 return
             served.gets.append(self.headers.get("Range", "all"))
+            if served.stalling == "body":
+                self.wfile.write(body[: len(body) // 2])
+                self.wfile.flush()
+                ended.wait(60.0)
+                return
             if served.failing:
                 served.failing -= 1
                 self.wfile.write(body[: len(body) // 2])
@@ -86,6 +109,7 @@ def serving() -> Iterator[Served]:
     try:
         yield served
     finally:
+        ended.set()
         server.shutdown()
         server.server_close()
         thread.join()

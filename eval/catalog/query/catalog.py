@@ -200,7 +200,7 @@ def catalog(place: Path | str) -> Catalog:
         RunError: The place is not a folder, holds no run, or cannot be listed.
     """
     if is_remote(place) and not str(place).startswith("file://"):
-        places: Runs = RemoteRuns(str(place))
+        places: Runs = RemoteRuns(place)
     else:
         folder = Path(str(place).removeprefix("file://"))
         if not folder.is_dir():

@@ -7,12 +7,12 @@ import posixpath
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from crosscue.eval.runs.folder import FAILURE, MANIFEST
-from crosscue.replay.base import UnreadableRunError, UsageError, one_line
+from crosscue.replay.base import LogError, UnreadableRunError, UsageError
+from crosscue.replay.remote.logs import guarded, opened_store
 
 from .local import BESIDE, CUT_SHORT, DEPTH, SCORE, Found, Stamp, is_cut_short
 
@@ -40,14 +40,9 @@ class RemoteRuns:
         Raises:
             UnreadableRunError: The protocol is unknown.
         """
-        url_to_fs = import_module("fsspec.core").url_to_fs
-        self.name: Final = url
-        try:
-            system, root = url_to_fs(url)
-        except (ImportError, ValueError) as error:
-            raise UnreadableRunError(f"{url}: {one_line(error)}") from None
+        self.name, system, root = _as_run(lambda: opened_store(url))
         self._system: Final[Any] = system
-        self._root: Final = str(root).rstrip("/")
+        self._root: Final = root.rstrip("/")
         self._objects: dict[str, dict[str, Mapping[str, Any]]] = {}
 
     def find(self) -> Iterator[Found]:
@@ -58,7 +53,9 @@ class RemoteRuns:
         """
         # Some stores' libraries cache the listing of an earlier catalog.
         self._system.invalidate_cache()
-        listed = self._with_errors(lambda: self._system.find(self._root, detail=True))
+        listed = _as_run(
+            lambda: guarded(self.name, lambda: self._system.find(self._root, detail=True))
+        )
         self._objects = _by_folder(self._root, listed)
         found: list[str] = []
         for folder in sorted(self._objects, key=lambda name: [*name.split("/")]):
@@ -95,11 +92,9 @@ class RemoteRuns:
             OSError: The file cannot be read.
         """
         try:
-            return bytes(self._system.cat_file(self.place(run, file)))
-        except OSError:
-            raise
-        except Exception as error:  # each store's library has its own errors
-            raise OSError(one_line(error)) from None
+            return bytes(guarded(self.name, lambda: self._system.cat_file(self.place(run, file))))
+        except LogError as error:
+            raise OSError(str(error)) from None
 
     def place(self, run: str, file: str) -> str:
         """Return the path of a file in ``filesystem``."""
@@ -134,22 +129,13 @@ class RemoteRuns:
         size = int(own[head].get("size") or 0)
         return (_digest({head: own[head]}), size, _digest(others), _digest(scored))
 
-    def _with_errors(self, ask: Callable[[], T]) -> T:
-        """Return a store's answer; translate the errors of the store's library."""
-        try:
-            return ask()
-        except FileNotFoundError:
-            raise UnreadableRunError(f"{self.name}: nothing there; check the address") from None
-        except PermissionError as error:
-            line = one_line(error)
-            raise UnreadableRunError(
-                f"{self.name}: no permission ({line}); check credentials"
-            ) from None
-        except Exception as error:
-            kind = type(error).__name__
-            raise UnreadableRunError(
-                f"{self.name}: cannot be listed ({kind}: {one_line(error)}); try again"
-            ) from None
+
+def _as_run(ask: Callable[[], T]) -> T:
+    """Return a store's answer; its errors are those of a run."""
+    try:
+        return ask()
+    except LogError as error:
+        raise UnreadableRunError(error) from None
 
 
 def _by_folder(root: str, listed: Infos) -> dict[str, dict[str, Mapping[str, Any]]]:
