@@ -275,6 +275,25 @@ def test_standing_car_is_found_where_the_ego_motion_predicts() -> None:
     assert not is_same(CAR, nearer, ego=Motion(25.0, 0.0, 0.0, 0.1))  # it would be behind
 
 
+def test_standing_car_may_be_nearer_than_a_metre() -> None:
+    """After 19.2 m it is 0.8 m ahead, and a box of 700 px looks 1.771 m away.
+
+    ln(1.771 / 0.8) = 0.795 < 4 * 0.03 + ln(1 + 3 / 1.771) = 1.11.
+    """
+    assert is_same(CAR, (200.0, 10.0, 1000.0, 710.0), ego=Motion(19.2, 0.0, 0.0, 0.1))
+
+
+def test_place_of_a_standing_car_is_scaled_to_the_distance_of_the_box() -> None:
+    """A car at 20 m is from 9.0 to 12.1 m to the right, and one of 85 px, at 14.588 m, from 3.67 m.
+
+    Scaled by 14.588 / 20, it stood from 6.56 to 8.83 m, so it moved by 2.9 m, within 3 m.
+    """
+    before = (1000.0, 300.0, 1124.0, 362.0)
+
+    assert is_same(before, (841.0, 300.0, 965.0, 385.0))
+    assert not is_same(before, (831.0, 300.0, 955.0, 385.0))
+
+
 def test_each_box_continues_the_track_it_fits_best() -> None:
     """Two cars 30 px apart move by 5 px each, although one is then 25 px from the other."""
     second = moved(30.0)
@@ -301,13 +320,14 @@ def test_tracks_are_forgotten_at_a_restart() -> None:
     assert made.number == 2
 
 
-def test_motion_uses_the_newest_frames_and_fewer_if_it_is_unsteady() -> None:
-    """A car stands for 12 frames, then jumps by 60 px a frame. Of 14 frames none are steady.
+@pytest.mark.parametrize("moves", [2, 6])
+def test_motion_uses_the_newest_frames_and_fewer_if_it_is_unsteady(moves: int) -> None:
+    """A car stands, then moves by 60 px a frame: longer fits halve the frames, to at least 3.
 
-    Longer fits halve the frames, to at least 3, until the motion is steady.
+    With 2 moves, 13, 6, 8 and 4 frames are unsteady. With 6, the newest 6 and 4 are steady.
     """
     rules = RULES.model_copy(update={"max_frames": 3, "parked_frames": 8, "past_frames": 13})
-    boxes = [CAR] * 12 + [moved(60.0), moved(120.0)]
+    boxes = [CAR] * 12 + [moved(60.0 * (k + 1)) for k in range(moves)]
     seen = [observation(k + 1, box) for k, box in enumerate(boxes)]
     tracks = CarTracks(CAMERA, rules)
     for box in boxes:
@@ -322,6 +342,8 @@ def test_motion_uses_the_newest_frames_and_fewer_if_it_is_unsteady() -> None:
 
     assert [one.frames for one in cars] == [3]
     assert same_motion(cars[0], fitted([3], 10.0))
+    assert tracks.longer()[0].frames == (3 if moves == 2 else 6)
+    assert tracks.standing()[0].frames == (3 if moves == 2 else 4)
     assert same_motion(tracks.longer()[0], fitted([13, 6, 3], 0.3))
     assert same_motion(tracks.standing()[0], fitted([8, 4, 3], 10.0))
     assert not motion_of(seen[-13:], 0.3).is_steady

@@ -125,6 +125,7 @@ def test_car_is_longer_than_twice_its_height_and_sure(
 
     assert len(found) == 2 * counts
     assert found.center_px.shape == (2 * counts, 2)
+    assert found.nose.dtype == np.int64
 
 
 def test_cars_need_a_detector() -> None:

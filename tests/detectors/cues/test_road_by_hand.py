@@ -173,6 +173,7 @@ def test_regions_are_seen_by_a_camera_less_than_a_metre_high() -> None:
 
     assert all(one is not None for one in outlines(low, REGIONS, PLACE, SIZE))
     assert fractions(low, min_rows=1.0) == RoadFractions(1.0, 1.0, 1.0)
+    assert fractions(changed(center_px=None), min_rows=1.0) == RoadFractions(1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(("start_m", "is_seen"), [(-2.0, True), (-2.01, False)])
@@ -280,20 +281,22 @@ def test_ground_fraction_is_road_over_pixels_of_the_projected_region(
 
 
 def test_quarter_of_a_region_has_to_be_in_the_picture() -> None:
-    """The left region is 100 * 8 / 13 = 61.54 px wide below, 38.10 px above and 5.861 px high.
+    """Each side region is 100 * 8 / 13 = 61.54 px wide below, 38.10 px above and 5.861 px high.
 
     Its area is 0.5 * (61.54 + 38.10) * 5.861 = 292.0 px, and a quarter 73.0. The principal point
     is shifted, so that the picture's edge cuts it.
     """
     seen = []
-    for center_x in range(60, 110):
+    for center_x in (*range(60, 110, 2), *range(290, 340, 2)):
         camera = changed(center_px=(float(center_x), 100.0))
-        inside = np.count_nonzero(pixels_of(outlines(camera, REGIONS, PLACE, SIZE)[0], 200, 400))
+        outline = outlines(camera, REGIONS, PLACE, SIZE)[0 if center_x < 200 else 2]
+        found = fractions(camera)
 
-        seen.append(not math.isnan(fractions(camera).left))
+        seen.append(not math.isnan(found.left if center_x < 200 else found.right))
 
-        assert seen[-1] == (inside >= 73.0), center_x
-    assert 5 < sum(seen) < 45
+        assert seen[-1] == (np.count_nonzero(pixels_of(outline, 200, 400)) >= 73.0), center_x
+    assert 5 < sum(seen[:25]) < 20
+    assert 5 < sum(seen[25:]) < 20
 
 
 @pytest.mark.parametrize(("far_m", "pixels"), [(15.0, 1), (12.5, 0)])

@@ -206,6 +206,9 @@ def test_cars_past_are_oncoming_and_outgoing() -> None:
     others = [car(distance_m=80.0), car(ahead_mps=8.0)]
 
     assert cars_past([*cars, *others], CAMERA, RULES, PLACE) == Ways(2, 1)
+    slow = RULES.model_copy(update={"crossing_mps": 0.5})
+    slowly = away._replace(ahead_mps=0.9, ahead_sd_mps=0.1)
+    assert cars_past([slowly], CAMERA, slow, PLACE) == Ways(0, 1)
     assert cars_past(cars, CAMERA, RULES, None) is None
     assert cars_past(cars, CAMERA, RULES, Place(-10.0, 0.0, 1.0)) is None
     assert cars_past(cars, CAMERA, RULES, Place(-10.0, 0.5, 1.0)) == Ways(2, 1)
