@@ -145,7 +145,6 @@ def refuse_bombs(source: DatabaseText, form: str) -> None:
         sizes = r"<(?:FRAME-LENGTH|LENGTH|START-POSITION)>\s*(\d{5,})"
         _refuse_over(source, sizes, "length or position")
     elif form == "sym":
-        # A line without such a number is read once, however many of these words it has.
         numbers = r"\b(?:Var|Sig|Mux|Len|DLC)\b(?>[^\n]*?\b(\d{5,})\b|[^\n]*)"
         _refuse_over(source, numbers, "bit number")
 

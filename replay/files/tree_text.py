@@ -108,7 +108,7 @@ def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
-    from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
+    from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
     if len(text) > _MAX_YAML:
         raise ValueError(f"{len(text)} characters, the limit is {_MAX_YAML}")
@@ -120,8 +120,7 @@ def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
             if depth > MAX_DEPTH:
                 raise ValueError(_TOO_DEEP)
             if getattr(event, "anchor", None) is not None:
-                what = "alias" if isinstance(event, AliasEvent) else "anchor"
-                raise ValueError(f"an {what}, which is not supported")
+                raise ValueError("an anchor or alias, which is not supported")
         return YAML(typ=scalars, pure=True).load(text)
     except (YAMLError, RecursionError) as error:
         raise ValueError(str(error)) from None

@@ -200,7 +200,7 @@ class Asc(Dialect):
             ledger.notice("the log states no time zone; its start date is read as UTC")
         else:
             ledger.notice(
-                "the log states no readable start date before 2116; times count from 1970-01-01"
+                "the log states no readable start date before 2116; times count from 1970"
             )
         if not self._has_header:
             ledger.notice("the log has no 'base' line; read as hexadecimal, absolute times")

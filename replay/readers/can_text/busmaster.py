@@ -113,9 +113,7 @@ class Busmaster(Dialect):
         if self._is_dated:
             ledger.notice("the log states no time zone; its start date and times are read as UTC")
         else:
-            ledger.notice(
-                "the log states no readable start date before 2116; times count from 1970-01-01"
-            )
+            ledger.notice("the log states no start date before 2116; times count from 1970-01-01")
 
     def _session(self, t_ns: Int64s) -> Int64s:
         if not len(t_ns):

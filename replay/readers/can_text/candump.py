@@ -262,10 +262,8 @@ def _frame_of_log_line(found: re.Match[bytes]) -> Outcome:
     t_ns, bus = _time_ns(found), found[3]
     flags, fd_text, remote, text = found[5], found[6], found[7], found[8]
     payload = bytes.fromhex((fd_text or text or b"").decode("ascii"))
-    if t_ns is None:
-        return Damage(OUT_OF_RANGE)
-    if not IS_INTERFACE.fullmatch(bus):
-        return Damage(NOT_A_FRAME)
+    if t_ns is None or not IS_INTERFACE.fullmatch(bus):
+        return Damage(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
     kind = DATA if remote is None else REMOTE
     return _frame(bus, t_ns, found[4], kind, payload, flags is not None)
 
@@ -274,10 +272,8 @@ def _frame_of_screen_line(found: re.Match[bytes]) -> Outcome:
     t_ns, bus, length, text = _time_ns(found), found[3], found[5], found[6]
     kind = REMOTE if text == b"remote request" else DATA
     payload = b"" if kind == REMOTE else bytes.fromhex(text.decode("ascii"))
-    if t_ns is None:
-        return Damage(OUT_OF_RANGE)
-    if not IS_INTERFACE.fullmatch(bus):
-        return Damage(NOT_A_FRAME)
+    if t_ns is None or not IS_INTERFACE.fullmatch(bus):
+        return Damage(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
     if kind == DATA and int(length) != len(payload):
         return Damage("length differs from the number of bytes")
     return _frame(bus, t_ns, found[4], kind, payload, is_fd=len(length) == 2)

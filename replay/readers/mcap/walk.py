@@ -380,8 +380,9 @@ class Walk:
             BrokenRecordError: The run starts with such a message.
         """
         for found in rows.definitions:
-            is_hidden = self._resync.is_hidden(at + found.at, len(found.content))
-            if not is_hidden or is_definition(found):
+            if is_definition(found) or not self._resync.is_hidden(
+                at + found.at, len(found.content)
+            ):
                 self._resync.plausible.declare(found)
                 continue
             if not found.at:

@@ -207,9 +207,7 @@ class Blocks:
             raise LogFormatError(f"{path}: MDF header damaged: {broken}") from None
         start_ns, _, _, time_flags = struct.unpack_from("<QhhB", block.body)
         if start_ns >= 1 << 62:
-            raise LogFormatError(
-                f"{path}: MDF header damaged: start time {start_ns} ns, after the year 2115"
-            )
+            raise LogFormatError(f"{path}: MDF header damaged: starts at {start_ns} ns, after 2115")
         is_finalized = name == b"MDF     "
         unfinished, custom = (0, 0) if is_finalized else struct.unpack_from("<HH", head, 60)
         if custom:

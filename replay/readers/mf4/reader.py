@@ -210,10 +210,7 @@ class Mf4Log(Closing):
                     there = stored.stream.size // size if size else 0
                     _settle(source, _Account(met=min(there, source.declared or 0)), ledger)
         if not self._header.is_finalized:
-            ledger.notice(
-                "not finalized by the logger; only reading it can detect a cut, and only one "
-                "inside a record"
-            )
+            ledger.notice("not finalized by the logger; only reading it can detect a cut")
 
     def _sources(self) -> Iterator[_Source]:
         return (source for stored in self._stored for source in stored.sources)
@@ -236,10 +233,7 @@ class Mf4Log(Closing):
             "checksums of compressed blocks verified; MDF has none for the rest of the file"
         )
         if not self._header.is_finalized and any(one.declared is None for one in self._sources()):
-            ledger.integrity += (
-                "; the logger did not finalize it, so it states no record counts: a cut between "
-                "two records cannot be detected"
-            )
+            ledger.integrity += "; not finalized: a cut between two records cannot be detected"
         if unread := sum(account.unread for account in accounts):
             ledger.integrity += f"; {unread} of {met} records, of other times, were not read"
 

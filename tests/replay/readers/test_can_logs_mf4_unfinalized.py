@@ -209,7 +209,7 @@ def test_truncation_drops_only_frames_after_it(tmp_path: Path, virtual: bool, or
         assert known <= len(frames) - len(inside) + 1
 
 
-CUT_UNSEEN = "states no record counts: a cut between two records cannot be detected"
+CUT_UNSEEN = "not finalized: a cut between two records cannot be detected"
 
 
 @pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes"])
