@@ -140,6 +140,7 @@ from crosscue.eval.logs.log import Log as Log
 from crosscue.eval.logs.log import LogTopic as LogTopic
 from crosscue.eval.logs.log import Signals as Signals
 from crosscue.eval.logs.log import Topics as Topics
+from crosscue.eval.logs.log import UnopenedLog as UnopenedLog
 from crosscue.eval.logs.log import open as open  # noqa: A004
 from crosscue.eval.logs.seals import SealCheck as SealCheck
 from crosscue.eval.logs.seals import Sealed as Sealed

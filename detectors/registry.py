@@ -17,6 +17,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from inspect import getattr_static, isfunction
 from operator import attrgetter
+from pathlib import Path
 from typing import Final, cast
 
 from crosscue.replay.errors import UsageError, VehicleError
@@ -25,6 +26,8 @@ from crosscue.replay.plugins import GROUPS
 from .base import Choice, Detector
 from .box_detector import FunctionDetector
 from .catalog import places as catalog
+from .catalog.card import read_card, read_weights
+from .catalog.entries import weights_folder
 
 GROUP: Final = GROUPS["detector"]
 
@@ -133,27 +136,9 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
     """
     if choice.factory is not None:
         return _built(choice, choice.factory, choice.kind)
-    if choice.kind in catalog.names() and choice.kind not in table:
-        card = str(catalog.card_path(choice.kind))
-        choice = Choice(choice.name, "model", {**choice.settings, "card": card})
-    place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
-    module, colon, factory = place.partition(":")
-    if not colon and choice.kind.endswith(_WEIGHTS):
-        raise UsageError(
-            f"detector {choice.kind!r}: expected a model card (.toml); write one with crosscue "
-            "model init, or name a checkpoint of crosscue train under [detectors.NAME] of a "
-            "vehicle file"
-        )
-    if not colon:
-        names = known({})
-        close = difflib.get_close_matches(choice.kind, names, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
-        raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or use module:factory")
-    try:
-        found = cast("Callable[..., object]", attrgetter(factory)(import_module(module)))
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"detector {place}: {error}; check the module and the name") from None
-    return _built(choice, found, place)
+    choice = _with_card(choice, table)
+    place, factory = _factory_of(choice, table)
+    return _built(choice, factory, place)
 
 
 def _built(choice: Choice, factory: Callable[..., object], place: str) -> Detector:
@@ -177,6 +162,53 @@ def _built(choice: Choice, factory: Callable[..., object], place: str) -> Detect
             f"{', '.join(lacking)}; derive from crosscue.BoxDetector, or see crosscue.Detector"
         )
     return cast("Detector", built)
+
+
+def check(choice: Choice, table: Mapping[str, str] = BUILTIN) -> None:
+    """Refuse a detector that does not exist, without building it.
+
+    Raises:
+        UsageError: The detector does not exist or cannot be imported.
+        VehicleError: Its model card or weights cannot be read.
+    """
+    if choice.factory is not None:
+        return
+    choice = _with_card(choice, table)
+    _factory_of(choice, table)
+    if isinstance(card := choice.settings.get("card"), str):
+        path = Path(card)
+        found = read_card(path)
+        read_weights(found, weights_folder(found, path))
+
+
+def _with_card(choice: Choice, table: Mapping[str, str]) -> Choice:
+    """Return a model of the catalog as a detector with its card."""
+    if choice.kind not in catalog.names() or choice.kind in table:
+        return choice
+    card = str(catalog.card_path(choice.kind))
+    return Choice(choice.name, "model", {**choice.settings, "card": card})
+
+
+def _factory_of(choice: Choice, table: Mapping[str, str]) -> tuple[str, Callable[..., object]]:
+    """Return the ``module:factory`` of a detector, and the imported factory."""
+    place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
+    module, colon, factory = place.partition(":")
+    if not colon and choice.kind.endswith(_WEIGHTS):
+        raise UsageError(
+            f"detector {choice.kind!r}: expected a model card (.toml); write one with crosscue "
+            "model init, or name a checkpoint of crosscue train under [detectors.NAME] of a "
+            "vehicle file"
+        )
+    if not colon:
+        names = known({})
+        close = difflib.get_close_matches(choice.kind, names, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
+        raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or use module:factory")
+    try:
+        found = attrgetter(factory)(import_module(module))
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"detector {place}: {error}; check the module and the name") from None
+    return place, cast("Callable[..., object]", found)
 
 
 def _offered(name: str) -> str | None:

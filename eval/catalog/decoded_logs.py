@@ -172,10 +172,9 @@ def decode(
         EmptyResultError: There is no row for any table; the folder is unchanged.
         OutputError: The folder has other contents, or cannot be written.
     """
-    with opened(log) as drive:
-        settings = vehicle_of(drive, vehicle)
-        with created(Path(output), overwrite=overwrite) as folder:
-            return decode_tables(drive.logs, settings, folder, drive.selection)
+    settings = vehicle_of(log, vehicle)
+    with opened(log) as drive, created(Path(output), overwrite=overwrite) as folder:
+        return decode_tables(drive.logs, settings, folder, drive.selection)
 
 
 def decode_tables(

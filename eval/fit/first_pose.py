@@ -63,6 +63,12 @@ def with_start(
     return vehicle
 
 
+def check_start(vehicle: Vehicle, start: str | None) -> None:
+    """Refuse a first pose that is neither three numbers nor a truth file, before a log is read."""
+    if start is not None and _numbers(start) is None:
+        of_truth(Path(start), vehicle, spacing_ns=0)
+
+
 def _started(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, start: str | None
 ) -> Vehicle:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -32,7 +31,7 @@ from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_signals import plan_of, read_signals
-from .reference import Reference, of_gnss, of_truth
+from .reference import Reference, of_gnss
 from .turns import turn_samples, wheel_speeds
 
 SHARED: Final = (
@@ -130,7 +129,7 @@ class DriveFit:
 
 
 def fit(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, truth: Path | None = None
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, known: Reference | None = None
 ) -> DriveFit:
     """Fit to the first half of the drive and test on the second.
 
@@ -138,29 +137,28 @@ def fit(
         logs: Open logs.
         vehicle: Initial settings.
         selection: The part of the logs to use.
-        truth: Truth file with the positions; None for the log's GNSS.
+        known: True positions; None for the log's GNSS.
 
     Raises:
         EmptyResultError: The drive has no wheel speeds, or no positions.
         VehicleError: The drive is too short.
-        SchemaError: The truth file is invalid, or has no pose.
     """
     planned = plan_of(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
-    if truth is None and gnss is None:
+    if known is None and gnss is None:
         raise EmptyResultError(
             f"no positions to fit to: no GNSS in the log ({planned.missing[Signal.POSITION]}); "
             "name a truth file with --truth"
         )
     wanted = [Signal.WHEEL_SPEEDS, Signal.YAW_RATE, Signal.STEERING]
     found = read_signals(
-        logs, planned, vehicle, selection, wanted + ([Signal.POSITION] if truth is None else [])
+        logs, planned, vehicle, selection, wanted + ([Signal.POSITION] if known is None else [])
     )
     if (wheels := found.get(Signal.WHEEL_SPEEDS)) is None:
         none = "no wheel speeds: not one row in this part"
         raise EmptyResultError(planned.missing.get(Signal.WHEEL_SPEEDS, none))
-    reference = _reference(
-        truth, found.get(Signal.POSITION), gnss.topic.name if gnss else None, vehicle
+    reference = known or _gnss_track(
+        found.get(Signal.POSITION), gnss.topic.name if gnss else None, vehicle
     )
     given = odometry_settings(vehicle)
     first = turn_signal_of(planned, vehicle)
@@ -198,11 +196,7 @@ def fit(
     )
 
 
-def _reference(
-    truth: Path | None, samples: Samples | None, topic: str | None, vehicle: Vehicle
-) -> Reference:
-    if truth is not None:
-        return of_truth(truth, vehicle)
+def _gnss_track(samples: Samples | None, topic: str | None, vehicle: Vehicle) -> Reference:
     if samples is None or topic is None:
         raise EmptyResultError(f"{topic}: not one GNSS position in this part of the log")
     return of_gnss(topic, samples, vehicle)

@@ -20,7 +20,7 @@ from crosscue.eval.fit.landmarks.database import (
     near_of,
     read_poses,
 )
-from crosscue.eval.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
 from crosscue.localization.landmarks.images import grey_of, read_picture
@@ -161,7 +161,7 @@ class LandmarkMatches:
 
 def add_landmarks(
     database: Path | str,
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     poses: Path | str,
     vehicle: Vehicle | Path | str | None = None,
     *,
@@ -189,10 +189,9 @@ def add_landmarks(
     """
     settings = vehicle_given(vehicle)
     describing = matcher_for(settings, matcher)
+    known = read_poses(Path(poses), settings)
     with opened(log) as drive:
         name = source or drive.logs[0].path.resolve().stem
-
-        known = read_poses(Path(poses), settings)
 
         def add(writer: LandmarkWriter) -> tuple[AddCounts, bool]:
             with frames_of(drive, settings) as (frames, ledgers):

@@ -7,7 +7,7 @@ from typing import Any
 
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
-from crosscue.eval.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.replay.base import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
@@ -33,7 +33,9 @@ def write_truth(log: Path | str, output: Path | str, *, limits: Limits = DEFAULT
 
 
 def truth_from_gnss(
-    log: Log | Path | str, output: Path | str, vehicle: Vehicle | Path | str | None = None
+    log: Log | UnopenedLog | Path | str,
+    output: Path | str,
+    vehicle: Vehicle | Path | str | None = None,
 ) -> Path:
     """Write a drive's GNSS positions as truth: ``truth.json`` and the antenna's track.
 

@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from crosscue.eval.interface.show import listing
-from crosscue.eval.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.eval.vehicle.check import Checked, Shown, check
 from crosscue.eval.vehicle.check_page import check_output, write_check
 from crosscue.eval.vehicle.mounting import estimate_mounting
 from crosscue.replay.base import EmptyResultError, OutputError, UsageError, name_of, write_text
+from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.vehicle.drafting.camera import Measured, Mounting, camera_of
 from crosscue.replay.vehicle.drafting.text import Examined, draft, examine
 from crosscue.replay.vehicle.vehicle import Vehicle, parse, vehicle_given
@@ -44,7 +45,7 @@ class VehicleDraft:
 
 
 def draft_vehicle(
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     databases: Sequence[Path | str] = (),
     output: Path | str | None = None,
     *,
@@ -89,8 +90,11 @@ def draft_vehicle(
         _given(camera_pitch_deg, "camera_pitch_deg", -60.0, 60.0, math.pi / 180.0),
         _given(camera_yaw_deg, "camera_yaw_deg", -180.0, 180.0, math.pi / 180.0),
     )
+    files = [Path(name) for name in databases]
+    for file in files:
+        CanDatabase.load([file])
     with opened(log) as drive:
-        examined = examine(drive.logs, [Path(name) for name in databases])
+        examined = examine(drive.logs, files)
         text = draft(examined, folder, _mounting(examined, given))
     parse(text, "the draft")
     if path is not None:
@@ -161,7 +165,7 @@ def _known(row: dict[str, object]) -> dict[str, object]:
 
 
 def check_vehicle(
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     vehicle: Vehicle | Path | str,
     output: Path | str | None = None,
     *,

@@ -6,8 +6,8 @@ import difflib
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
@@ -85,10 +85,32 @@ def open(*paths: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:  # noqa: A
     return Log(logs, files, limits)
 
 
+@dataclass(frozen=True, slots=True)
+class UnopenedLog:
+    """A drive that is not open yet, and the part of it to use.
+
+    A function that accepts a drive opens it after all its other arguments have been checked.
+
+    Attributes:
+        paths: Files, folders of data sets, or URLs.
+        part: The part to read.
+        limits: Largest chunk, message and file to read.
+    """
+
+    paths: tuple[Path | str, ...]
+    part: LogPart = field(default_factory=LogPart)
+    limits: Limits = DEFAULT_LIMITS
+
+
 @contextmanager
-def opened(log: Log | Path | str) -> Iterator[Log]:
+def opened(log: Log | UnopenedLog | Path | str) -> Iterator[Log]:
     """Open a drive for a ``with`` block; a drive that is already open is not closed."""
     with ExitStack() as files:
+        if isinstance(log, UnopenedLog):
+            drive = files.enter_context(open(*log.paths, limits=log.limits))
+            files.enter_context(unless_damaged(drive.logs))
+            yield replace(drive, selection=log.part.selected(drive.logs))
+            return
         drive = log if isinstance(log, Log) else files.enter_context(open(log))
         with unless_damaged(drive.logs):
             yield drive
@@ -173,35 +195,31 @@ class Log(Closing):
         return f"{names}\n{self.topics!r}"
 
 
-@contextmanager
-def open_part(*logs: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS) -> Iterator[Log]:
-    """Open a part of a drive for a ``with`` block.
+def unopened(*logs: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS) -> UnopenedLog:
+    """Return a part of a drive, which a verb opens when its other arguments are checked.
 
     Args:
         logs: Recordings of one drive; paths or URLs.
         part: The part to read.
         limits: Limits for reading.
     """
-    with open(*logs, limits=limits) as drive, unless_damaged(drive.logs):
-        yield replace(drive, selection=part.selected(drive.logs))
+    return UnopenedLog(logs, part, limits)
 
 
-def open_one_part(
-    log: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS
-) -> AbstractContextManager[Log]:
-    """Open a part of one log for a ``with`` block.
+def unopened_one(log: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS) -> UnopenedLog:
+    """Return a part of one log, as ``unopened`` does.
 
     Args:
         log: A recording, a data-set folder or a URL.
         part: The part to read.
         limits: Limits for reading.
     """
-    return open_part(log, part=part, limits=limits)
+    return UnopenedLog((log,), part, limits)
 
 
-DriveGiven: TypeAlias = Annotated[Log | Path | str, Option(made_by=open_part)]
+DriveGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened)]
 """A drive, as a parameter of a verb: on the command line, ``LOG...`` and the part to read."""
-LogGiven: TypeAlias = Annotated[Log | Path | str, Option(made_by=open_one_part)]
+LogGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened_one)]
 """One log, as a parameter of a verb."""
 
 
@@ -538,14 +556,15 @@ def _warn(ledger: Ledger, topic: str) -> None:
             warnings.warn(text, LossWarning, stacklevel=4)
 
 
-def vehicle_of(log: Log, given: Vehicle | Path | str | None) -> Vehicle:
+def vehicle_of(log: Log | UnopenedLog | Path | str, given: Vehicle | Path | str | None) -> Vehicle:
     """Return the given settings, or those of the ``vehicle.toml`` next to the log, or defaults."""
     from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
 
     if given is not None:
         return vehicle_given(given)
-    for one in log.logs:
-        beside = (one.path if one.path.is_dir() else one.path.parent) / VEHICLE
+    paths = log.paths if isinstance(log, Log | UnopenedLog) else (log,)
+    for path in map(Path, paths):
+        beside = (path if path.is_dir() else path.parent) / VEHICLE
         if beside.is_file():
             return load(beside)
     return Vehicle(version=1)

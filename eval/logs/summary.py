@@ -97,8 +97,9 @@ def info(
         quick: Print what the log declares, and whether its end is missing, without reading its
             messages.
     """
+    settings = vehicle_given(vehicle)
     with opened(log) as drive:
-        return summary_of(drive.logs, drive.selection, vehicle_given(vehicle), quick=quick)
+        return summary_of(drive.logs, drive.selection, settings, quick=quick)
 
 
 def summary_of(

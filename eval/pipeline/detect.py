@@ -57,6 +57,7 @@ from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import (
     Block,
+    EmptyResultError,
     Int64s,
     Ledger,
     Log,
@@ -136,13 +137,12 @@ def detect_into(
         timeline: The drive's time segments, if already known.
 
     Raises:
-        VehicleError: The drive has no camera or several, or a card, weights or settings are
-            invalid.
-        EmptyResultError: The selected part contains no frame.
+        VehicleError: The drive has several cameras, or a card, weights or settings are invalid.
+        EmptyResultError: The drive has no camera, or the selected part contains no frame.
         OutputError: The disk is full.
     """
     began = time.monotonic()
-    camera = _only_camera(logs, vehicle)
+    camera = only_camera(logs, vehicle)
     named = [Named(choice.name, make(choice)) for choice in choices]
     uncounted = _uncounted(named, choices, vehicle)
     reading = _Reading(logs, camera, vehicle, selection, timeline)
@@ -193,15 +193,19 @@ def detect_into(
     )
 
 
-def _only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:
+def only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:
     """Return the index of the camera's log, and its topic.
 
     Raises:
-        VehicleError: The drive has no camera or several.
+        VehicleError: The drive has several cameras.
+        EmptyResultError: It has none.
     """
     camera = camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
     if camera is None:
-        raise VehicleError(f"{logs[0].path}: no camera in the logs; name its topic under [topics]")
+        raise EmptyResultError(
+            f"{logs[0].path}: no camera in the logs, which detectors and landmarks need; name its "
+            "topic under [topics], or leave them out"
+        )
     return camera
 
 

@@ -45,7 +45,7 @@ from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.base import Ledger, Log, Selection, Topic, sha256_of, versions_and_commit
+from crosscue.replay.base import Ledger, Log, Selection, sha256_of, versions_and_commit
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
@@ -192,7 +192,6 @@ def _notices(reading: _Reading, stage: PoseStage, silent: Mapping[Signal, str]) 
         *gaps_text(reading.timeline.segments),
         *_missing(reading.planned),
         *silent.values(),
-        *_no_camera(reading.landmarks, reading.camera),
         *_no_mobileye(reading.found, reading.planned),
         *_no_scene(reading.found, reading),
         *_of_detecting(reading.found),
@@ -428,12 +427,6 @@ def _missing(planned: Plan) -> list[str]:
         for signal, what in names.items()
         if signal in planned.missing and not (signal is Signal.MAGNETIC_FIELD and has_heading)
     ]
-
-
-def _no_camera(landmarks: LandmarkDatabase | None, camera: tuple[int, Topic] | None) -> list[str]:
-    if landmarks is None or camera is not None:
-        return []
-    return ["landmarks were given, but the logs have no camera: none is searched for"]
 
 
 def _no_mobileye(found: DetectManifest | None, planned: Plan) -> list[str]:

@@ -31,7 +31,7 @@ from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import detect_into
+from .detect import detect_into, only_camera
 from .drive_time import drive_timeline
 from .empty_result import nothing_left
 from .estimate import begin_again, estimate_into
@@ -51,6 +51,7 @@ class Detecting:
         draw: Number of pictures to write with detections drawn.
         resume: Keep detections of an earlier start that would be the same.
         on_frames: Called with the number of frames done, and the total if known.
+        is_required: The user named the detectors, so a drive without a camera is an error.
     """
 
     choices: tuple[Choice, ...]
@@ -58,6 +59,7 @@ class Detecting:
     draw: int = 0
     resume: bool = False
     on_frames: OnFrames = no_progress
+    is_required: bool = False
 
 
 NO_DETECTORS: Final = Detecting(())
@@ -89,7 +91,8 @@ def replay_drive(
     Raises:
         UsageError: The folder to be resumed holds a run of other logs or settings.
         VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: The result is empty; the folder is unchanged.
+        EmptyResultError: The result is empty, or there is no camera for the detectors or landmarks
+            that the user named; the folder is unchanged.
         OutputError: The disk is full.
     """
     mine = input_of(
@@ -126,9 +129,15 @@ def _camera(
     detecting: Detecting,
     landmarks: LandmarkDatabase | None,
 ) -> tuple[int, Topic] | None:
-    """Return the camera if detectors or landmarks need it."""
+    """Return the camera if detectors or landmarks need it.
+
+    Raises:
+        EmptyResultError: There is none, but the user named detectors or landmarks.
+    """
     if not detecting.choices and landmarks is None:
         return None
+    if detecting.is_required or landmarks is not None:
+        return only_camera(logs, vehicle)
     return camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
 
 

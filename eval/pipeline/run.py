@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.runs.folder import Manifest, RunFolder, json_schema
 from crosscue.eval.runs.folder import open_run as open_folder
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, RunError, UsageError, visible
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogError, RunError, UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from crosscue.results import listing
 
@@ -128,11 +128,21 @@ def open_run(
         RunError: The folder is not a run, is damaged or of another version, or contains merged
             drives.
     """
-    moved = None if logs is None else Path(logs)
-    folder = open_folder(Path(path), moved, without_images=without_images, limits=limits)
+    folder = open_folder(Path(path), moved_to(logs), without_images=without_images, limits=limits)
     # Refuses a folder of merged drives.
     folder.drive_manifest()
     return Run(folder)
+
+
+def moved_to(logs: Path | str | None) -> Path | None:
+    """Return the folder that the logs of runs have moved to.
+
+    Raises:
+        LogError: It is not a folder.
+    """
+    if logs is not None and not Path(logs).is_dir():
+        raise LogError(f"--logs {logs}: no such folder; name the one that the logs have moved to")
+    return None if logs is None else Path(logs)
 
 
 def run_schema() -> dict[str, Any]:

@@ -91,11 +91,13 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     "`replay`, `estimate`": [
         (1, f"replay {{log}} -o {{out}} --vehicle {{car}} {LATER}"),
         (1, "replay {can_log} -o {out}"),
+        (1, "replay {can_log} -o {out} --detectors signs"),
         (1, "estimate {run} --vehicle {other_car}"),
     ],
     "`detect`": [
         (1, f"detect {{log}} -o {{out}} --detectors support.gap_drive:build {LATER}"),
         (1, "detect {spoiled} -o {out} --detectors signs"),
+        (1, "detect {can_log} -o {out} --detectors signs"),
     ],
     "`decode`, `convert`": [
         (1, f"decode {{log}} -o {{out}} {LATER}"),

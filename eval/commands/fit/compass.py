@@ -16,7 +16,7 @@ import crosscue
 from crosscue.eval.commands.shared.terminal import (
     add_log_arguments,
     add_vehicle_output,
-    open_part,
+    part_of,
     print_result,
 )
 
@@ -31,15 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, report, and write the vehicle file if requested."""
-    if args.vehicle is not None:
-        # Errors in the settings are reported before a long log is opened.
-        crosscue.load_vehicle(args.vehicle)
-    with open_part(args, args.logs) as log:
-        found = crosscue.fit_compass(
-            log,
-            args.vehicle,
-            args.output,
-            overwrite=args.overwrite,
-        )
+    found = crosscue.fit_compass(
+        part_of(args, args.logs), args.vehicle, args.output, overwrite=args.overwrite
+    )
     print_result(found, args)
     return 0

@@ -13,7 +13,6 @@ example:
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
 from pathlib import Path
 
 import crosscue
@@ -21,7 +20,7 @@ from crosscue.eval.commands.shared.terminal import (
     add_part_arguments,
     add_vehicle_output,
     metres,
-    open_part,
+    part_of,
     print_result,
 )
 
@@ -79,21 +78,20 @@ def _fraction(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, report, and write the vehicle file if requested."""
-    with open_part(args, args.logs) if args.logs else nullcontext() as log:
-        found = crosscue.fit_landmarks(
-            args.pairs,
-            log,
-            args.database,
-            args.poses,
-            args.vehicle,
-            args.output,
-            false_match_rate=args.false_match_rate,
-            every_m=args.every,
-            same_within_m=args.same_within,
-            different_beyond_m=args.different_beyond,
-            max_landmarks=args.max_landmarks,
-            matcher=args.matcher,
-            overwrite=args.overwrite,
-        )
+    found = crosscue.fit_landmarks(
+        args.pairs,
+        part_of(args, args.logs) if args.logs else None,
+        args.database,
+        args.poses,
+        args.vehicle,
+        args.output,
+        false_match_rate=args.false_match_rate,
+        every_m=args.every,
+        same_within_m=args.same_within,
+        different_beyond_m=args.different_beyond,
+        max_landmarks=args.max_landmarks,
+        matcher=args.matcher,
+        overwrite=args.overwrite,
+    )
     print_result(found, args)
     return 0

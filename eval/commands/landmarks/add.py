@@ -18,7 +18,7 @@ import crosscue
 from crosscue.eval.commands.shared.terminal import (
     add_part_arguments,
     metres,
-    open_part,
+    part_of,
     print_result,
 )
 
@@ -69,17 +69,16 @@ def run(args: argparse.Namespace) -> int:
     """Add landmarks; return 3 when a log is damaged."""
     given = (bool(args.logs), bool(args.poses), bool(args.images), bool(args.coordinates))
     if given == (True, True, False, False):
-        with open_part(args, args.logs) as log:
-            found = crosscue.add_landmarks(
-                args.database,
-                log,
-                args.poses,
-                args.vehicle,
-                every_m=args.every,
-                sd_m=args.sd,
-                source=args.source,
-                matcher=args.matcher,
-            )
+        found = crosscue.add_landmarks(
+            args.database,
+            part_of(args, args.logs),
+            args.poses,
+            args.vehicle,
+            every_m=args.every,
+            sd_m=args.sd,
+            source=args.source,
+            matcher=args.matcher,
+        )
     elif given == (False, False, True, True):
         found = crosscue.add_landmark_images(
             args.database,

@@ -18,7 +18,7 @@ from crosscue.eval.commands.shared.terminal import (
     DriveLine,
     add_log_arguments,
     is_shown,
-    open_part,
+    part_of,
     print_result,
 )
 
@@ -39,12 +39,9 @@ def run(args: argparse.Namespace) -> int:
     """Detect; return 3 when something was dropped."""
     if args.draw < 0:
         raise crosscue.UsageError(f"--draw {args.draw}: expected 0 or more")
-    with (
-        open_part(args, args.logs) as log,
-        DriveLine("detecting", is_shown=is_shown(args)) as line,
-    ):
+    with DriveLine("detecting", is_shown=is_shown(args)) as line:
         run = crosscue.detect_drive(
-            log,
+            part_of(args, args.logs),
             args.output,
             args.vehicle or crosscue.Vehicle(version=1),
             detectors_of(args),

@@ -22,7 +22,12 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.detectors import add_detector_arguments, cache_of, detectors_of
+from crosscue.eval.commands.shared.detectors import (
+    add_detector_arguments,
+    cache_of,
+    check_named,
+    detectors_of,
+)
 from crosscue.eval.commands.shared.terminal import (
     DriveLine,
     DrivesLine,
@@ -30,7 +35,7 @@ from crosscue.eval.commands.shared.terminal import (
     add_part_arguments,
     is_shown,
     limits_of,
-    open_part,
+    part_of,
     print_result,
 )
 
@@ -109,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay; return 3 when something was dropped."""
     if args.draw < 0:
         raise crosscue.UsageError(f"--draw {args.draw}: expected 0 or more")
+    check_named(args)
     found = crosscue.find_drives(*args.logs, each=args.each, shard=args.shard)
     if found.is_many:
         return _run_many(args, found)
@@ -118,12 +124,9 @@ def run(args: argparse.Namespace) -> int:
             "treat each log as a drive"
         )
     (drive,) = found.drives
-    with (
-        DriveLine("replaying", is_shown=is_shown(args)) as line,
-        open_part(args, drive.logs) as log,
-    ):
+    with DriveLine("replaying", is_shown=is_shown(args)) as line:
         run = crosscue.replay_drive(
-            log,
+            part_of(args, drive.logs),
             args.output,
             args.vehicle or drive.vehicle or crosscue.Vehicle(version=1),
             detectors_of(args),

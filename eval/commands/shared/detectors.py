@@ -44,6 +44,13 @@ def detectors_of(args: argparse.Namespace) -> Sequence[str] | None:
     return [] if args.detectors == "none" else str(args.detectors).split(",")
 
 
+def check_named(args: argparse.Namespace) -> None:
+    """Refuse what the options of ``crosscue replay`` name, before the drives are found."""
+    from crosscue.eval.interface.runs.make import check_inputs
+
+    check_inputs(args.vehicle, detectors_of(args), args.first_pose, args.landmarks)
+
+
 def cache_of(args: argparse.Namespace) -> Path | None:
     """Return the path of the detection cache: as requested, or in the user's cache folder."""
     if args.no_cache:

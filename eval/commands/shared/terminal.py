@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -132,15 +131,13 @@ def limits_of(args: argparse.Namespace) -> Limits:
     return limits.limits_of(max_chunk_bytes=args.max_chunk_bytes, follow_links=args.follow_links)
 
 
-@contextmanager
-def open_part(args: argparse.Namespace, logs: Sequence[Path | str]) -> Iterator[crosscue.Log]:
-    """Open a drive's logs, restricted to the part that ``add_part_arguments`` selects."""
-    from crosscue.eval.logs import log
+def part_of(args: argparse.Namespace, logs: Sequence[Path | str]) -> crosscue.UnopenedLog:
+    """Return a drive's logs with the part that ``add_part_arguments`` selects, not open yet."""
     from crosscue.replay.logs.log_part import LogPart
 
-    part = LogPart(args.start, args.end, args.topics)
-    with log.open_part(*map(str, logs), part=part, limits=limits_of(args)) as drive:
-        yield drive
+    return crosscue.UnopenedLog(
+        tuple(logs), LogPart(args.start, args.end, args.topics), limits_of(args)
+    )
 
 
 def add_logs_argument(parser: argparse.ArgumentParser) -> None:

@@ -14,7 +14,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import add_log_arguments, open_part, print_json
+from crosscue.eval.commands.shared.terminal import add_log_arguments, part_of, print_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,10 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write truth.json."""
-    if args.vehicle is not None:
-        crosscue.load_vehicle(args.vehicle)
-    with open_part(args, args.logs) as log:
-        written = crosscue.truth_from_gnss(log, args.output, args.vehicle)
+    written = crosscue.truth_from_gnss(part_of(args, args.logs), args.output, args.vehicle)
     if args.json:
         print_json({"truth": str(written)})
     elif not args.quiet:

@@ -47,14 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check and print the table; return 1 when signals contradict each other."""
-    with crosscue.open(*args.logs, limits=limits_of(args)) as log:
-        found = crosscue.check_vehicle(
-            log,
-            args.vehicle,
-            args.output,
-            start_s=args.start_s,
-            seconds=args.seconds,
-            overwrite=args.overwrite,
-        )
+    found = crosscue.check_vehicle(
+        crosscue.UnopenedLog((*args.logs,), limits=limits_of(args)),
+        args.vehicle,
+        args.output,
+        start_s=args.start_s,
+        seconds=args.seconds,
+        overwrite=args.overwrite,
+    )
     print_result(found, args)
     return 1 if found.contradictions else 0

@@ -49,18 +49,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draft the file, check that it can be read back, and write or print it."""
-    with crosscue.open(*args.logs, limits=limits_of(args)) as log:
-        found = crosscue.draft_vehicle(
-            log,
-            args.dbc,
-            args.output,
-            overwrite=args.overwrite,
-            camera_x_m=args.camera_x_m,
-            camera_y_m=args.camera_y_m,
-            camera_height_m=args.camera_height_m,
-            camera_pitch_deg=args.camera_pitch_deg,
-            camera_yaw_deg=args.camera_yaw_deg,
-        )
+    found = crosscue.draft_vehicle(
+        crosscue.UnopenedLog((*args.logs,), limits=limits_of(args)),
+        args.dbc,
+        args.output,
+        overwrite=args.overwrite,
+        camera_x_m=args.camera_x_m,
+        camera_y_m=args.camera_y_m,
+        camera_height_m=args.camera_height_m,
+        camera_pitch_deg=args.camera_pitch_deg,
+        camera_yaw_deg=args.camera_yaw_deg,
+    )
     if args.json:
         print_json(found.as_dict())
     elif found.path is None:

@@ -12,7 +12,7 @@ from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
 from crosscue.eval.interface.runs.recording import save_recording
-from crosscue.eval.pipeline.run import open_run
+from crosscue.eval.pipeline.run import moved_to, open_run
 from crosscue.eval.runs import owned
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
@@ -121,6 +121,7 @@ def browse(
     """
     folder = Path(output)
     _check_place(folder, overwrite)
+    moved = moved_to(logs)
     chosen, found = _given(runs, truth, top, threshold, any_log, workers)
     if not chosen:
         raise EmptyResultError(f"{folder}: no failure to show; nothing was written")
@@ -130,7 +131,6 @@ def browse(
         shutil.rmtree(made, ignore_errors=True)
         for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
             (made / part).mkdir(parents=True)
-        moved = None if logs is None else Path(logs)
         work = RunWork(made, len(entries), moved, has_recordings, limits)
         groups, pictures, reasons = by_run(entries), frozenset[str](), []
         for done, (written, why) in enumerate(in_processes(work, groups, workers), 1):

@@ -18,6 +18,7 @@ from crosscue.datasets.truth.coco import WRITTEN, write_coco
 from crosscue.eval.failures.export import ExportedRun, export_run
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.fit.truth_check import FILE, ImportedTruth, import_part
+from crosscue.eval.pipeline.run import moved_to
 from crosscue.eval.runs import owned
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
@@ -121,6 +122,7 @@ def export(
     where = str(failures) if given else "failures"
     folder, kind = Path(output), LABEL_FORMATS[to]
     _check_place(folder, overwrite)
+    moved = moved_to(logs)
     made = folder.with_name(f".{folder.name}.partial")
     by_run: dict[str, set[int]] = {}
     for one in chosen:
@@ -131,7 +133,6 @@ def export(
         shutil.rmtree(made, ignore_errors=True)
         (made / kind.pictures).mkdir(parents=True)
         for done, (run, times) in enumerate(by_run.items(), 1):
-            moved = None if logs is None else Path(logs)
             try:
                 images = made / kind.pictures
                 wanted = sorted(times), images, classes or None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from crosscue.eval.fit.compass import fit, section_of, with_section
 from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
-from crosscue.eval.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def _residual(fitted: CompassFit) -> list[str]:
 
 
 def fit_compass(
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     vehicle: Vehicle | Path | str | None = None,
     output: Path | str | None = None,
     *,

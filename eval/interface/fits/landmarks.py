@@ -10,7 +10,7 @@ from crosscue.eval.fit.landmarks.database import read_poses
 from crosscue.eval.fit.landmarks.pairs import pairs_of_drive, pairs_of_table, with_min_score
 from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
 from crosscue.eval.interface.landmarks import frames_of
-from crosscue.eval.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.fit import fit_landmarks as fit_threshold
 from crosscue.replay.base import SchemaError, UsageError
@@ -72,7 +72,7 @@ def _rate(rate: Rate) -> str:
 
 def fit_landmarks(
     pairs: Path | str | None = None,
-    log: Log | Path | str | None = None,
+    log: Log | UnopenedLog | Path | str | None = None,
     database: Path | str | None = None,
     poses: Path | str | None = None,
     vehicle: Vehicle | Path | str | None = None,
@@ -123,7 +123,7 @@ def fit_landmarks(
     settings = vehicle_given(vehicle)
     comparing = matcher_for(settings, matcher)
 
-    def of_drive(log: Log | Path | str, database: Path, poses: Path) -> ScoredPairs:
+    def of_drive(log: Log | UnopenedLog | Path | str, database: Path, poses: Path) -> ScoredPairs:
         known = read_poses(poses, settings)
         with (
             open_for(database, comparing) as marks,

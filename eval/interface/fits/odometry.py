@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from crosscue.eval.fit.odometry import camera_yaw_of, fit, section_of, with_section
+from crosscue.eval.fit.reference import of_truth
 from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
-from crosscue.eval.logs.log import Log, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def _source(one: SourceFit) -> list[str]:
 
 
 def fit_odometry(
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     vehicle: Vehicle | Path | str | None = None,
     output: Path | str | None = None,
     *,
@@ -145,7 +146,8 @@ def fit_odometry(
     """
     check_output(vehicle, output, overwrite=overwrite)
     settings = vehicle_given(vehicle)
+    known = None if truth is None else of_truth(Path(truth), settings)
     with opened(log) as drive:
-        found = fit(drive.logs, settings, drive.selection, None if truth is None else Path(truth))
+        found = fit(drive.logs, settings, drive.selection, known)
     path = write_fit(vehicle, output, lambda text: with_section(text, found))
     return FittedOdometry(found, path)

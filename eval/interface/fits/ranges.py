@@ -158,9 +158,9 @@ def fit_ranges(
         [Path(one) for one in runs],
         min_score,
     )
+    others = together(pairs_of_truth(Path(one), cue) for one in test) if test else None
     found = FittedRanges(cue, tuple(fit_range(*pairs, name, bin_m) for name in names), None)
-    if test:
-        others = together(pairs_of_truth(Path(one), cue) for one in test)
+    if others is not None:
         if not len(others.range_m):
             raise EmptyResultError(f"--test: the drives contain no {cue}; use others")
         tested = residuals(*others, found.best.curve, bin_m)

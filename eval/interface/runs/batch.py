@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
@@ -18,7 +18,7 @@ from crosscue.eval.batch.jobs import (
     run_many,
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
-from crosscue.eval.logs.log import open as open_drive
+from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import FAILURE, create
 from crosscue.eval.runs.logs import files_named_in
@@ -31,11 +31,10 @@ from crosscue.replay.base import (
     visible,
 )
 from crosscue.replay.logs.log_part import LogPart
-from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
-from .make import replay_drive
+from .make import check_inputs, replay_drive
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -128,21 +127,19 @@ class _Work:
 
     def __call__(self, job: Job) -> Outcome:
         """Replay the drive into its run folder."""
-        with open_drive(*job.logs, limits=self.limits) as log, unless_damaged(log.logs):
-            part = LogPart(self.start, self.end, self.topics).selected(log.logs)
-            run = replay_drive(
-                replace(log, selection=part),
-                job.run,
-                self.settings(job),
-                self.detectors,
-                gnss=self.gnss,
-                landmarks=self.landmarks,
-                cache=self.cache,
-                draw=self.draw,
-                # The caller has already decided that an existing run may be replaced.
-                overwrite=True,
-                resume=self.resume,
-            )
+        run = replay_drive(
+            UnopenedLog(job.logs, LogPart(self.start, self.end, self.topics), self.limits),
+            job.run,
+            self.settings(job),
+            self.detectors,
+            gnss=self.gnss,
+            landmarks=self.landmarks,
+            cache=self.cache,
+            draw=self.draw,
+            # The caller has already decided that an existing run may be replaced.
+            overwrite=True,
+            resume=self.resume,
+        )
         assert isinstance(run.outcome, Outcome)
         return run.outcome
 
@@ -251,6 +248,7 @@ def replay_drives(
     nameless = [one for one in detectors or () if not isinstance(one, str)]
     if nameless:
         raise UsageError(f"detectors: {nameless[0]!r}: many drives need names, as module:Class")
+    check_inputs(vehicle, detectors, None, landmarks)
     found = drives if isinstance(drives, DriveList) else find_drives(*_several(drives), each=True)
     engine = engine_of(workers, ray, cores, memory_gib)
     folder = Path(output)

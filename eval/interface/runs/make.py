@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.eval.logs.log import Log, opened, vehicle_of
+from crosscue.eval.logs.log import Log, UnopenedLog, opened, vehicle_of
 from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.runs.folder import RunFolder, copy_files, created
 from crosscue.replay.base import OutputError, UsageError
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def replay_drive(
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     output: Path | str,
     vehicle: Vehicle | Path | str | None = None,
     detectors: str | Sequence[object] | None = None,
@@ -59,30 +59,29 @@ def replay_drive(
         RunError: The folder has other contents.
         EmptyResultError: The result is empty; the folder is unchanged.
     """
-    from crosscue.eval.fit.first_pose import with_start
+    from crosscue.eval.fit.first_pose import check_start, with_start
     from crosscue.eval.pipeline.landmarks import matcher_for, open_for
     from crosscue.eval.pipeline.replay import Detecting
     from crosscue.eval.pipeline.replay import replay_drive as replay_into
 
-    with opened(log) as drive, ExitStack() as stack:
-        settings = with_start(
-            drive.logs,
-            vehicle_of(drive, vehicle),
-            drive.selection,
-            gnss,
-            None if start is None else str(start),
-        )
-        detecting = Detecting(
-            choices_for(settings, detectors),
-            None if cache is None else Path(cache),
-            draw,
-            resume,
-            on_frames,
-        )
+    settings = vehicle_of(log, vehicle)
+    first_pose = None if start is None else str(start)
+    detecting = Detecting(
+        choices_for(settings, detectors),
+        None if cache is None else Path(cache),
+        draw,
+        resume,
+        on_frames,
+        is_required=bool(detectors),
+    )
+    with ExitStack() as stack:
         database = None
         if landmarks is not None:
             matcher = matcher_for(settings)
             database = stack.enter_context(open_for(Path(landmarks), matcher))
+        check_start(settings, first_pose)
+        drive = stack.enter_context(opened(log))
+        settings = with_start(drive.logs, settings, drive.selection, gnss, first_pose)
         folder = stack.enter_context(created(Path(output), overwrite=overwrite, resume=resume))
         outcome = replay_into(
             drive.logs,
@@ -98,7 +97,7 @@ def replay_drive(
 
 
 def detect_drive(
-    log: Log | Path | str,
+    log: Log | UnopenedLog | Path | str,
     output: Path | str,
     vehicle: Vehicle | Path | str | None = None,
     detectors: str | Sequence[object] | None = None,
@@ -112,22 +111,21 @@ def detect_drive(
     from crosscue.detectors.registry import known
     from crosscue.eval.pipeline.detect import detect_drive as detect_into
 
-    with opened(log) as drive:
-        settings = vehicle_of(drive, vehicle)
-        choices = choices_for(settings, detectors)
-        if not choices:
-            raise UsageError(f"--detectors: none named; expected some of {', '.join(known({}))}")
-        with created(Path(output), overwrite=overwrite) as folder:
-            outcome = detect_into(
-                drive.logs,
-                settings,
-                folder,
-                drive.selection,
-                choices,
-                None if cache is None else Path(cache),
-                draw,
-                on_frames,
-            )
+    settings = vehicle_of(log, vehicle)
+    choices = choices_for(settings, detectors)
+    if not choices:
+        raise UsageError(f"--detectors: none named; expected some of {', '.join(known({}))}")
+    with opened(log) as drive, created(Path(output), overwrite=overwrite) as folder:
+        outcome = detect_into(
+            drive.logs,
+            settings,
+            folder,
+            drive.selection,
+            choices,
+            None if cache is None else Path(cache),
+            draw,
+            on_frames,
+        )
     return Run(folder, outcome)
 
 
@@ -173,7 +171,12 @@ def _settings_again(
     folder: RunFolder, vehicle: Vehicle | None, gnss: GnssUse | None, start: str | None
 ) -> Vehicle | None:
     """Return the settings for another estimate of a run; None for those of the run."""
-    from crosscue.eval.fit.first_pose import with_start, with_start_of, without_found_start
+    from crosscue.eval.fit.first_pose import (
+        check_start,
+        with_start,
+        with_start_of,
+        without_found_start,
+    )
     from crosscue.eval.runs.logs import reopened
 
     if vehicle is None and gnss is None and start is None:
@@ -182,19 +185,49 @@ def _settings_again(
     if gnss is None and start is None:
         return with_start_of(manifest.settings, vehicle or manifest.settings)
     vehicle = vehicle or without_found_start(manifest.settings)
+    check_start(vehicle, start)
     with ExitStack() as stack:
         logs = [stack.enter_context(reopened(folder, row)) for row in manifest.logs]
         return with_start(logs, vehicle, manifest.selection.selection, gnss, start)
 
 
+def check_inputs(
+    vehicle: Vehicle | Path | str | None,
+    detectors: str | Sequence[object] | None,
+    start: str | None,
+    landmarks: Path | str | None,
+) -> None:
+    """Refuse what a replay names and does not exist, before its logs are found and hashed.
+
+    Without a vehicle file, detectors are checked later: the file next to a log may define them.
+    """
+    from crosscue.eval.fit.first_pose import check_start
+    from crosscue.localization.landmarks.database import LandmarkDatabase
+
+    settings = vehicle_given(vehicle)
+    if vehicle is not None:
+        choices_for(settings, detectors)
+    check_start(settings, start)
+    if landmarks is not None:
+        LandmarkDatabase(Path(landmarks)).close()
+
+
 def choices_for(vehicle: Vehicle, detectors: str | Sequence[object] | None) -> tuple[Choice, ...]:
-    """Return the requested detectors, or else those of the vehicle file, which may be none."""
-    from crosscue.detectors.registry import chosen
+    """Return the requested detectors, or else those of the vehicle file, which may be none.
+
+    Raises:
+        UsageError: A detector does not exist.
+        VehicleError: A model card or its weights cannot be read.
+    """
+    from crosscue.detectors.registry import check, chosen
     from crosscue.eval.pipeline.detect import choices_of
 
     sections = choices_of(vehicle)
     names = [*sections] if detectors is None else detectors
-    return chosen(names, sections) if len(names) else ()
+    choices = chosen(names, sections) if len(names) else ()
+    for choice in choices:
+        check(choice)
+    return choices
 
 
 def _copied(folder: RunFolder, output: Path) -> RunFolder:

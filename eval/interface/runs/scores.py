@@ -16,7 +16,7 @@ from crosscue.eval.interface.runs.score import (
     settings_given,
     write_files,
 )
-from crosscue.eval.pipeline.run import Run
+from crosscue.eval.pipeline.run import Run, moved_to
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.summary import (
     gate_lines,
@@ -218,7 +218,7 @@ def score_runs(
         tuple(rpe_m),
         has_smoother,
         any_log,
-        None if logs is None else Path(logs),
+        moved_to(logs),
         limits,
         has_figures,
         without_images,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import Done, Progress, exit_status_of
+from crosscue.eval.interface.runs.make import choices_for
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.intersections.report import StudyFiles, summary, write_study
 from crosscue.eval.studies.intersections.settings import IntersectionStudy
@@ -15,6 +16,7 @@ from crosscue.eval.studies.intersections.study import score_study
 from crosscue.eval.studies.intersections.tables import StudyScores
 from crosscue.eval.studies.simulated_drives import run_drives
 from crosscue.replay.base import RunError, door, json_tree, visible
+from crosscue.replay.vehicle.vehicle import vehicle_given
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -67,11 +69,12 @@ def run_intersection_study(
         on_progress: As in ``replay_drives``.
 
     Raises:
-        UsageError: ``workers`` is below 1.
-        VehicleError: The vehicle file cannot be read.
+        UsageError: ``workers`` is below 1, or a detector does not exist.
+        VehicleError: The vehicle file or a model card cannot be read.
         RunError: Every drive failed; the message contains the first reason.
         OutputError: A file cannot be written.
     """
+    choices_for(vehicle_given(study.vehicle), study.detectors.split(","))
     folder = Path(output)
     done = run_drives(
         folder,

@@ -175,13 +175,20 @@ def test_empty_landmark_database_leaves_pose_unchanged(
     assert "0 landmarks used, 0 rejected by the gate" in capsys.readouterr().out
 
 
-def test_landmarks_without_camera_are_reported(town: Town, tmp_path: Path) -> None:
+def test_landmarks_without_camera_are_refused(
+    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run"
     command = ["replay", str(town.drive.log), "--vehicle", str(town.vehicle), "-o", str(run)]
-    assert cli.run([*command, "--landmarks", str(town.database)]) == 0
+    assert cli.run(command) == 0
+    capsys.readouterr()
 
-    notices = RunFolder(run).drive_manifest().notices
-    assert "landmarks were given, but the logs have no camera: none is searched for" in notices
+    command[-1] = str(tmp_path / "other")
+    status, text = _refusal(capsys, *command, "--landmarks", str(town.database))
+
+    assert status == 1
+    assert "no camera in the logs" in text
+    assert not (tmp_path / "other").exists()
 
 
 def _refusal(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
