@@ -212,7 +212,11 @@ def _beside(place: Path) -> list[Path]:
         return []
     return [
         place.with_name(name)
-        for name in _names_beside(place.name, lambda name: place.with_name(name).is_file())
+        # Unlike ``Path.is_file``, this is False for a name that is too long.
+        for name in _names_beside(
+            place.name,
+            lambda name: os.path.isfile(place.with_name(name)),  # noqa: PTH113
+        )
     ]
 
 
