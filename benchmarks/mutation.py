@@ -43,7 +43,7 @@ import tempfile
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
@@ -454,7 +454,7 @@ def equivalents(part: Part) -> list[Equivalent]:
     return [
         Equivalent(one["file"], one["function"], one["was"], tuple(one["now"]), one["why"])
         for one in table.get("equivalent", [])
-        if any(fnmatch.fnmatch(one["file"], pattern) for pattern in part.files)
+        if any(PurePosixPath(one["file"]).match(pattern) for pattern in part.files)
     ]
 
 

@@ -219,6 +219,49 @@ def test_unsure_box_overlaps_the_prediction_and_hardly_grows(
     assert made.frames == 2 + is_continued
 
 
+def test_overlap_of_exactly_two_fifths_does_not_continue_a_track() -> None:
+    """Boxes of 70 px, shifted by 30 px: 40 / 100 = 0.4."""
+    box = (600.0, 300.0, 670.0, 362.0)
+    second = found(moved(30.0, box=box), scores=[0.4])
+
+    (made,) = followed(found(box), second, found(box))
+
+    assert made.frames == 2
+
+
+@pytest.mark.parametrize(("first", "second"), [(70.0, 50.0), (50.0, 70.0)])
+def test_height_changed_by_exactly_the_ratio_does_not_continue_a_track(
+    first: float, second: float
+) -> None:
+    """70 / 50 = 1.4."""
+    (made,) = followed(found(sized(first)), found(sized(second), scores=[0.4]), found(sized(first)))
+
+    assert made.frames == 2
+
+
+@pytest.mark.parametrize("longest", ["max_frames", "parked_frames", "past_frames"])
+def test_as_many_frames_are_stored_as_the_longest_fit_needs(longest: str) -> None:
+    """Of 8 frames, the longest fit uses 6 and the others 3."""
+    lengths = dict.fromkeys(("max_frames", "parked_frames", "past_frames"), 3) | {longest: 6}
+    tracks = CarTracks(CAMERA, RULES.model_copy(update=lengths))
+    for _ in range(8):
+        cars = tracks([found(CAR)], STILL)
+
+    frames = cars[0].frames, tracks.standing()[0].frames, tracks.longer()[0].frames
+    assert frames == tuple(lengths.values())
+
+
+def test_score_of_the_vehicle_file_decides_which_cars_are_sure() -> None:
+    """0.7 is above the default of 0.5, but not above 0.8. At exactly 20 m a car is near enough."""
+    tracks = CarTracks(CAMERA, RULES.model_copy(update={"score": 0.8, "within_m": 20.0}))
+    assert tracks.seen == 0
+    assert tracks.longer() == tracks.standing() == []
+
+    tracks([found(CAR, moved(0.0, 150.0), scores=[0.7, 0.9])], STILL)
+
+    assert tracks.seen == 1
+
+
 @pytest.mark.parametrize(
     ("last", "is_continued"), [(97.9, True), (98.3, False), (-7.9, True), (-8.3, False)]
 )
