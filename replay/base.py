@@ -65,9 +65,12 @@ from .files.closing import Closing
 from .files.tree_text import (
     MAX_DEPTH,
     json_tree,
+    spelled,
     strict_json,
     toml_document,
     toml_tree,
+    unspelled,
+    valid_text,
     yaml_tree,
 )
 from .files.whole_file import (
@@ -75,6 +78,7 @@ from .files.whole_file import (
     file_sha256,
     sha256_of,
     write_bytes,
+    write_table,
     write_text,
     write_whole,
 )
@@ -165,9 +169,12 @@ __all__ = [
     "read_at_most",
     "report_missing",
     "sha256_of",
+    "spelled",
     "strict_json",
     "toml_document",
     "toml_tree",
+    "unspelled",
+    "valid_text",
     "versions",
     "versions_and_commit",
     "visible",
@@ -175,6 +182,7 @@ __all__ = [
     "warn_of",
     "with_losses",
     "write_bytes",
+    "write_table",
     "write_text",
     "write_whole",
     "yaml_tree",

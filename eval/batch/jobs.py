@@ -37,6 +37,7 @@ from crosscue.replay.base import (
     door,
     losses_heard,
     one_line,
+    spelled,
     strict_json,
     versions,
     warn_again,
@@ -320,7 +321,7 @@ def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: s
     job = failed.job
     lines = {
         "drive": job.name,
-        "logs": " ".join(job.logs),
+        "logs": " ".join(map(spelled, job.logs)),
         "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "worker": signature(),
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),

@@ -34,7 +34,14 @@ from crosscue.eval.runs.folder import (
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
-from crosscue.replay.base import RunError, UnreadableRunError, UsageError, door, one_line
+from crosscue.replay.base import (
+    RunError,
+    UnreadableRunError,
+    UsageError,
+    door,
+    one_line,
+    spelled,
+)
 
 from .status import MERGED, NO_RUN, unfinished
 
@@ -93,7 +100,9 @@ def merge_runs(
         RunError: A run is damaged, or a column has different types in two runs.
         OutputError: The disk is full.
     """
-    drives = [_Drive(name, run, run.drive_manifest()) for name, run in sorted(runs.items())]
+    drives = [
+        _Drive(spelled(name), run, run.drive_manifest()) for name, run in sorted(runs.items())
+    ]
     kinds = sorted({path.stem for one in drives for path in one.run.path.glob("*.parquet")})
     with locked(out), staged(out, always=True) as new:
         clear(new)
@@ -170,7 +179,7 @@ def _manifest(
             )
             for one in drives
         ),
-        failures=dict(sorted(failures.items())),
+        failures={spelled(name): why for name, why in sorted(failures.items())},
         account=summed(one.manifest.account for one in drives),
         notices=dict(Counter(text for one in drives for text in _notices(one)).most_common()),
         versions=_versions(drives),

@@ -25,6 +25,7 @@ from crosscue.eval.runs.folder import (
     staged,
     write_manifest,
 )
+from crosscue.eval.runs.logs import log_names
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import (
@@ -38,7 +39,6 @@ from crosscue.replay.base import (
     Selection,
     Table,
     Topic,
-    name_of,
     versions,
 )
 from crosscue.replay.decode import Decoder, decoder_for
@@ -197,7 +197,7 @@ def decode_tables(
         EmptyResultError: The selected part contains no row; the folder is unchanged.
         OutputError: The disk is full.
     """
-    ledgers = tuple(Ledger(name_of(log)) for log in logs)
+    ledgers = tuple(map(Ledger, log_names(logs)))
     tables: dict[str, _Table] = {}
     declared = sum(map(rows_declared, logs))
     timeline = whole_timeline(logs, vehicle, selection)

@@ -66,7 +66,8 @@ def _in_folder(folder: Path) -> Iterator[Path]:
         # A damaged run is reported when it is opened.
         yield folder
         return
-    below = ((folder / one.run, one.file) for one in LocalRuns(folder).find())
+    runs = LocalRuns(folder)
+    below = ((runs.path(one.run), one.file) for one in runs.find())
     found = [run for run, file in below if not (_is_merged(run) or _is_bare(run, file))]
     if not found:
         raise UnreadableRunError(

@@ -13,7 +13,7 @@ from crosscue.detectors.images import Encoded, decode, size_of
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.stored_images import camera_of, pictures_at
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, write_bytes
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, spelled, write_bytes
 
 ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}
 """Encodings that every tool reads; others are converted to PNG, which is lossless."""
@@ -43,7 +43,7 @@ class ExportedRun:
         """Return the run's entry in ``crosscue_export.json``."""
         log = str(self.log)
         if isinstance(self.log, Path):
-            log = os.path.relpath(self.log.resolve(), folder.resolve())
+            log = spelled(os.path.relpath(self.log.resolve(), folder.resolve()))
         pictures = {
             one.name: {"t_ns": one.t_ns, "width": one.size_px[0], "height": one.size_px[1]}
             for one in self.pictures

@@ -13,9 +13,11 @@ from crosscue.replay.base import (
     AnnotationError,
     door,
     json_tree,
+    spelled,
     strict_json,
+    unspelled,
+    write_table,
     write_text,
-    write_whole,
 )
 
 if TYPE_CHECKING:
@@ -150,21 +152,13 @@ def write_failures(failures: Sequence[Failure], path: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    import pyarrow.parquet as pq
-
     folder = path.resolve().parent
-    failures = [replace(one, run=os.path.relpath(one.run, folder)) for one in failures]
+    failures = [replace(one, run=spelled(os.path.relpath(one.run, folder))) for one in failures]
     if path.suffix == ".json":
         rows = {"format": FORMAT, "failures": [asdict(one) for one in failures]}
         write_text(path, strict_json(rows) + "\n")
         return
-    table = failure_table(failures)
-    write_whole(
-        path,
-        lambda partial: pq.write_table(
-            table, partial, compression="zstd", write_page_checksum=True
-        ),
-    )
+    write_table(path, failure_table(failures))
 
 
 def read_failures(path: Path) -> tuple[Failure, ...]:
@@ -186,7 +180,7 @@ def read_failures(path: Path) -> tuple[Failure, ...]:
         if values["kind"] not in KINDS or not isinstance(values["t_ns"], int):
             raise _unreadable(path, f"row {number}: kind {values['kind']!r}, t_ns {row['t_ns']!r}")
         values["conditions"] = tuple(values["conditions"])
-        values["run"] = os.path.normpath(path.parent / values["run"])
+        values["run"] = os.path.normpath(path.parent / unspelled(values["run"]))
         found.append(Failure(**values))
     return tuple(found)
 

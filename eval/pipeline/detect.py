@@ -107,7 +107,7 @@ def detect_drive(
     The folder is locked meanwhile, and cleared first. See ``detect_into`` for the arguments.
     """
     with locked(run), staged(run) as new, nothing_left(new):
-        clear(new, input_of(logs, vehicle, selection, choices, draw, None))
+        clear(new, input_of(run, logs, vehicle, selection, choices, draw, None))
         outcome = detect_into(logs, vehicle, new, selection, choices, cache, draw, on_frames)
     return replace(outcome, run=run)
 

@@ -37,7 +37,7 @@ from crosscue.eval.runs.folder import (
     write_manifest,
     write_timings,
 )
-from crosscue.eval.runs.logs import log_names, log_rows, relative
+from crosscue.eval.runs.logs import log_names, log_rows
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink, StoredMobileye
@@ -244,7 +244,7 @@ def _manifest(
 def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUsed:
     """Return the manifest's record of the landmark database."""
     return LandmarksUsed(
-        database=relative(landmarks.path, run),
+        database=run.relative(landmarks.path),
         landmarks=len(landmarks),
         sha256=sha256_of(landmarks.path),
     )

@@ -96,6 +96,7 @@ def replay_drive(
         OutputError: The disk is full.
     """
     mine = input_of(
+        run,
         logs,
         vehicle,
         selection,

@@ -19,7 +19,7 @@ from crosscue.eval.runs.moments import part_of
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Block, Floats, write_whole
+from crosscue.replay.base import Block, Floats, spelled, write_whole
 
 from .part import WHOLE, Part
 
@@ -72,11 +72,13 @@ def save(
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
 
     def write(partial: Path) -> None:
-        recording = rr.RecordingStream("crosscue", recording_id=str(run.path.resolve().name))
-        recording.save(partial, default_blueprint=layout)
-        _log_all(recording, time, run, pose, truth, true_ranges, camera, part)
-        recording.flush()
-        recording.disconnect()
+        recording = rr.RecordingStream("crosscue", recording_id=spelled(run.path.resolve().name))
+        # By its number, because rerun takes no name that is not UTF-8.
+        with partial.open("wb") as file:
+            recording.save(f"/dev/fd/{file.fileno()}", default_blueprint=layout)
+            _log_all(recording, time, run, pose, truth, true_ranges, camera, part)
+            recording.flush()
+            recording.disconnect()
 
     write_whole(path, write)
 

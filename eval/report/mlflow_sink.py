@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import OutputError, UsageError, one_line
+from crosscue.replay.base import OutputError, UsageError, one_line, valid_text
 
 MAX_METRICS: Final = 1000
 """Max number of metrics in one request."""
@@ -78,7 +78,9 @@ class Experiment:
             if math.isfinite(value)
         ]
         with _reported(self.uri):
-            run: str = self.client.create_run(self.identity, run_name=one.name).info.run_id
+            run: str = self.client.create_run(
+                self.identity, run_name=valid_text(one.name)
+            ).info.run_id
             self.client.log_batch(run, tags=tags)
             for first in range(0, len(metrics), MAX_METRICS):
                 self.client.log_batch(run, metrics=metrics[first : first + MAX_METRICS])

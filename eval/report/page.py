@@ -24,7 +24,11 @@ from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.base import door, strict_json
+from crosscue.replay.base import (
+    door,
+    spelled,
+    strict_json,
+)
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .html import write_page
@@ -173,7 +177,7 @@ def _content(
 
 def _run(one: RunScored) -> _Run:
     manifest = one.run.drive_manifest()
-    reported = manifest.as_json()
+    reported = manifest.with_files(one.run.relative).as_json()
     scene = manifest.scene if isinstance(manifest, EstimateManifest) else None
     candidates, ranged = ({}, {}) if scene is None else (scene.candidates, scene.ranged)
     not_looked_for = {} if scene is None else scene.not_looked_for
@@ -192,7 +196,7 @@ def _run(one: RunScored) -> _Run:
 def _name(one: RunScored) -> str:
     """Return the folder's name, or its parent's if the folder has a generic name."""
     path = one.run.path.resolve()
-    return "/".join(path.parts[-2:]) if path.name.startswith("run") else path.name
+    return spelled("/".join(path.parts[-2:]) if path.name.startswith("run") else path.name)
 
 
 def _cue(name: str, score: Mapping[str, Any]) -> dict[str, Any]:

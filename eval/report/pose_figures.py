@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -50,12 +51,19 @@ def _draw(
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     paint(axes, poses)
-    axes.set_title(poses.title, fontsize=9, loc="left", color="0.35")
+    axes.set_title(poses.title, fontsize=9, loc="left", color="0.35", parse_math=False)
     axes.grid(alpha=0.3)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    # The library's own stamp would change the bytes with its version.
-    write_whole(path, lambda p: figure.savefig(p, dpi=130, format="png", metadata={"Software": ""}))
+
+    def save(partial: Path) -> None:
+        # The library's own stamp would change the bytes with its version.
+        figure.savefig(partial, dpi=130, format="png", metadata={"Software": ""})
+
+    with warnings.catch_warnings():
+        # The title may have characters that the font lacks.
+        warnings.filterwarnings("ignore", "Glyph")
+        write_whole(path, save)
     return path
 
 

@@ -25,7 +25,9 @@ from crosscue.replay.base import (
     cannot_write,
     door,
     json_tree,
+    spelled,
     strict_json,
+    unspelled,
     write_text,
 )
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
@@ -152,7 +154,7 @@ FAILURE: Final = "failure.log"
 TAGS: Final = "tags.json"
 """The user's tags of a run, see ``tags``; they are kept when the run is made again."""
 TIMINGS: Final = "timings.json"
-"""What took how long; a run without this file is complete."""
+"""Wall times of a run, which is complete without them."""
 STAGED: Final = ".new"
 """Folder inside a run with the files that will replace it when they are complete."""
 MAX_MANIFEST_BYTES: Final = 256 << 20
@@ -191,7 +193,7 @@ class RunFolder(TableFolder):
         """
         path = self.file(MANIFEST)
         try:
-            return parse_manifest(door.read(path, MAX_MANIFEST_BYTES))
+            found = parse_manifest(door.read(path, MAX_MANIFEST_BYTES))
         except FileNotFoundError:
             raise UnreadableRunError(
                 f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
@@ -205,6 +207,18 @@ class RunFolder(TableFolder):
             raise UnreadableRunError(
                 f"{path}: unreadable ({error}); run crosscue replay again"
             ) from None
+        if isinstance(found, MergedManifest):
+            return found
+        return found.with_files(lambda name: os.path.normpath(self.absolute(name)))
+
+    def relative(self, place: Path | str) -> str:
+        """Return a path relative to the run's folder, as it is spelled in its files."""
+        whole, home = Path(place).absolute(), (self.home or self.path).resolve()
+        return spelled(os.path.relpath(whole.parent.resolve() / whole.name, home))
+
+    def absolute(self, path: str) -> Path:
+        """Return the path that ``relative`` has spelled."""
+        return (self.home or self.path).resolve() / unspelled(path)
 
     def timings(self) -> Timings | None:
         """Read how long the run took; None if that is missing, damaged or of another version."""
@@ -585,7 +599,8 @@ def _started(pid: int) -> str:
 
 def write_manifest(run: RunFolder, content: Manifest) -> None:
     """Write the manifest; call it last, because a folder with a manifest is a finished run."""
-    write_text(run.file(MANIFEST), strict_json(content.as_json()) + "\n")
+    stored = content if isinstance(content, MergedManifest) else content.with_files(run.relative)
+    write_text(run.file(MANIFEST), strict_json(stored.as_json()) + "\n")
 
 
 def write_timings(run: RunFolder, content: Timings) -> None:

@@ -25,11 +25,14 @@ from crosscue.replay.base import (
     UnreadableRunError,
     UsageError,
     door,
+    file_sha256,
     is_remote,
     json_tree,
     origin,
     sha256_of,
+    spelled,
     strict_json,
+    unspelled,
     versions,
 )
 from crosscue.replay.files.identity import identity_of, identity_of_all, identity_of_log
@@ -56,10 +59,10 @@ def log_names(logs: Sequence[Log]) -> list[str]:
 
 
 def place_name(place: Path | str) -> str:
-    """Return the last part of a path or URL."""
+    """Return the last part of a path or URL, as it is spelled in a run."""
     if isinstance(place, str) and is_remote(place):
         return LogAddress(place).name
-    return Path(place).name or Path(place).resolve().name
+    return spelled(Path(place).name or Path(place).resolve().name)
 
 
 def log_rows(logs: Sequence[Log], run: RunFolder) -> tuple[LogRow, ...]:
@@ -70,7 +73,7 @@ def log_rows(logs: Sequence[Log], run: RunFolder) -> tuple[LogRow, ...]:
     return tuple(
         LogRow(
             name=name,
-            path=place if isinstance(place := origin(log), str) else relative(place, run),
+            path=place if isinstance(place := origin(log), str) else run.relative(place),
             format=log.format,
             identity=identity_of_log(log),
             cameras=tuple(sorted(o.name for o in log.topics if role_of(o) is Role.CAMERA)),
@@ -87,12 +90,6 @@ def is_simulated(log: Log) -> bool:
     return isinstance(place, Path) and (place.resolve().parent / SIMULATED).is_file()
 
 
-def relative(place: Path, run: RunFolder) -> str:
-    """Return a path relative to the run's folder, as in the manifest."""
-    whole = place.absolute()
-    return os.path.relpath(whole.parent.resolve() / whole.name, (run.home or run.path).resolve())
-
-
 def place_of(run: RunFolder, row: LogRow) -> Path | str:
     """Return the present location of a run's log, a URL or a path, after checking its identity.
 
@@ -105,9 +102,9 @@ def place_of(run: RunFolder, row: LogRow) -> Path | str:
     """
     where, wanted = row.path, row.identity
     if run.logs is not None:
-        places: list[Path | str] = [*_moved(run.logs, Path(where))]
+        places: list[Path | str] = [*_moved(run.logs, Path(unspelled(where)))]
     else:
-        places = [where if is_remote(where) else (run.home or run.path).resolve() / where]
+        places = [where if is_remote(where) else run.absolute(where)]
     others = []
     for place in places:
         if isinstance(place, Path) and not place.exists():
@@ -159,6 +156,7 @@ def reopened(run: RunFolder, row: LogRow) -> Log:
 
 
 def input_of(
+    run: RunFolder,
     logs: Sequence[Log],
     vehicle: Vehicle,
     selection: Selection,
@@ -169,6 +167,7 @@ def input_of(
     """Return the content of ``input.json``.
 
     Args:
+        run: The run.
         logs: All open logs of the drive.
         vehicle: Settings of the vehicle file.
         selection: The part of the logs.
@@ -185,10 +184,27 @@ def input_of(
         "versions": versions(),
     }
     identity = identity_of_all([identity_of_log(log) for log in logs])
-    return {
-        "identity": as_row(identity),
-        "settings": json_tree(strict_json({**settings, "files": files_named_in(settings)})),
-    }
+    return {"identity": as_row(identity), "settings": _stored(run, settings)}
+
+
+def _stored(run: RunFolder, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as JSON values, with the hashes of the files that they name, as ``files``.
+
+    Paths of files are relative to the run's folder.
+    """
+    names = {name: run.relative(name) for name in files_named_in(settings)}
+    files = {name: file_sha256(Path(name)) for name in names}
+    stored: dict[str, Any] = json_tree(strict_json(_renamed({**settings, "files": files}, names)))
+    return stored
+
+
+def _renamed(tree: object, names: Mapping[str, str]) -> Any:
+    """Return JSON values with other names of some files."""
+    if isinstance(tree, Mapping):
+        return {names.get(key, key): _renamed(value, names) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [_renamed(one, names) for one in tree]
+    return names.get(tree, tree) if isinstance(tree, str) else tree
 
 
 def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
@@ -255,7 +271,7 @@ def settings_changed(run: RunFolder, vehicle: Vehicle) -> dict[str, Any] | None:
     there = _read(run)
     if there is None:
         return None
-    settings = {**there["settings"], "vehicle": vehicle.model_dump(mode="json")}
-    settings.pop("files", None)
-    settings["files"] = files_named_in(settings)
-    return {**there, "settings": settings}
+    settings = dict(there["settings"])
+    names = {name: os.path.normpath(run.absolute(name)) for name in settings.pop("files", ())}
+    settings = _renamed(settings, names) | {"vehicle": vehicle.model_dump(mode="json")}
+    return {**there, "settings": _stored(run, settings)}

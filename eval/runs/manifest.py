@@ -7,10 +7,10 @@ Each stage that can finish a run folder has a record. ``RunFolder.manifest`` rea
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from textwrap import shorten
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
@@ -137,6 +137,11 @@ class DetectorRow(Record):
     boxes_only: tuple[str, ...] = ()
     """Labels of detections that never had a mask."""
 
+    def with_files(self, named: Callable[[str], str]) -> Self:
+        """Return the row with another name of the model card in its settings."""
+        card = {name: named(value) for name, value in self.settings.items() if name == "card"}
+        return self.model_copy(update={"settings": self.settings | card})
+
 
 class DetectCounts(Record):
     """Numbers of frames, detections and cues."""
@@ -209,6 +214,11 @@ class _Versioned(Record):
     format_version: Literal[7] = FORMAT_VERSION
     versions: dict[str, str]
     """Versions of crosscue, Python and the libraries that results depend on."""
+    settings: Settings
+
+    def with_files(self, named: Callable[[str], str]) -> Self:
+        """Return the manifest with other names of the files in its settings."""
+        return self.model_copy(update={"settings": self.settings.with_files(named)})
 
     def __repr__(self) -> str:
         """Return one line per field, for a notebook; long values are truncated."""
@@ -226,7 +236,6 @@ class _Drive(_Versioned):
 
     logs: tuple[LogRow, ...]
     selection: Part
-    settings: Settings
     clocks: tuple[dict[str, ClockRow], ...]
     """Clocks by topic, for each log that was read."""
     time: TimeSegments
@@ -250,6 +259,11 @@ class DetectManifest(_Drive):
     detectors: tuple[DetectorRow, ...]
     counts: DetectCounts
 
+    def with_files(self, named: Callable[[str], str]) -> Self:
+        """Return the manifest with other names of the files in its settings."""
+        rows = tuple(row.with_files(named) for row in self.detectors)
+        return super().with_files(named).model_copy(update={"detectors": rows})
+
     @property
     def detected(self) -> DetectManifest | None:
         """The detect part, which is this manifest itself."""
@@ -268,6 +282,11 @@ class EstimateManifest(_Drive):
     scene: SceneSummary | None
     detect: DetectManifest | None
     """The detect part; None if no detector ran."""
+
+    def with_files(self, named: Callable[[str], str]) -> Self:
+        """Return the manifest with other names of the files in its settings."""
+        detect = None if self.detect is None else self.detect.with_files(named)
+        return super().with_files(named).model_copy(update={"detect": detect})
 
     @property
     def detected(self) -> DetectManifest | None:
@@ -320,7 +339,6 @@ class DecodeManifest(_Versioned):
     """File of each topic."""
     rows: dict[str, int]
     """Number of rows by file."""
-    settings: Settings
     account: Account
     time: TimeSegments
 

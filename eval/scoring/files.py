@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import strict_json, write_text, write_whole
+from crosscue.replay.base import strict_json, write_table, write_text
 
 from .by_drive import BY_DRIVE, DriveMetric, parts_of, table_of
 from .by_drive import FOLDER as FOLDER
@@ -42,7 +42,7 @@ def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str
         APPROACHES: approach_table(judged),
     }
     for name, table in (tables | {BY_DRIVE: table_of(parts)}).items():
-        write_whole(folder / f"{name}.parquet", _writer(table))
+        write_table(folder / f"{name}.parquet", table)
 
 
 def _parts(one: RunScored) -> Iterator[DriveMetric]:
@@ -50,15 +50,6 @@ def _parts(one: RunScored) -> Iterator[DriveMetric]:
     rmse_m = None if one.pose is None else one.pose.ape["none"].translation_m.rmse
     is_lost = one.pose is not None and one.pose.lost_at_m is not None
     return parts_of(logs, as_metrics(score([one.judged])), rmse_m, is_lost)
-
-
-def _writer(table: pa.Table) -> Any:
-    import pyarrow.parquet as pq
-
-    def write(path: Path) -> None:
-        pq.write_table(table, path, compression="zstd", write_page_checksum=True)
-
-    return write
 
 
 def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:

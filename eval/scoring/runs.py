@@ -23,7 +23,7 @@ from crosscue.eval.runs.folder import (
 )
 from crosscue.eval.runs.logs import place_of
 from crosscue.eval.runs.tables.travelled import odometer_of
-from crosscue.replay.base import RunError, SchemaError, UsageError, is_remote
+from crosscue.replay.base import RunError, SchemaError, UsageError, is_remote, spelled
 
 from . import intervals
 from . import truth as score_truth
@@ -108,7 +108,7 @@ def _place(run: RunFolder, log: LogRow) -> Path:
     try:
         return Path(place_of(run, log))
     except RunError:
-        return Path(os.path.normpath(run.path.resolve() / log.path))
+        return Path(os.path.normpath(run.absolute(log.path)))
 
 
 def judge_run(
@@ -156,7 +156,7 @@ def judge_scene(
         SchemaError: The truth does not fit the run.
     """
     run.drive_manifest()
-    truth = score_truth.load(truth_path, str(run.path))
+    truth = score_truth.load(truth_path, spelled(str(run.path)))
     if not any_log:
         _check_log(run, truth.truth, truth_path)
     tables = tables_of(run)
@@ -172,7 +172,7 @@ def tables_of(run: RunFolder) -> RunTables:
     """
     timeline = run.drive_manifest().timeline
     found = {name: run.table(name) for name in TABLES if run.file(f"{name}.parquet").exists()}
-    return in_log_time(str(run.path), found, timeline)
+    return in_log_time(spelled(str(run.path)), found, timeline)
 
 
 def smoothed_ranges(one: RunScored) -> dict[str, FilterAndSmoother]:
@@ -236,7 +236,7 @@ def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
     """
     tree = as_metrics(scores)
     tree["account"] = account_of_scores(scored).as_json()
-    poses = {str(one.run.path): one.pose for one in scored if one.pose is not None}
+    poses = {spelled(str(one.run.path)): one.pose for one in scored if one.pose is not None}
     if not poses:
         tree["coverage"]["not_scored"]["pose"] = scored[0].why_no_pose
     if len(scored) == 1:
@@ -296,7 +296,7 @@ def same_logs(scored: Sequence[RunScored]) -> list[tuple[str, str]]:
     first: dict[str, str] = {}
     pairs: list[tuple[str, str]] = []
     for one in scored:
-        name = str(one.run.path)
+        name = spelled(str(one.run.path))
         logs = one.run.drive_manifest().logs
         for digest in {digest for log in logs for digest in _digests(log)}:
             if first.setdefault(digest, name) != name:

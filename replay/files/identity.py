@@ -26,7 +26,7 @@ from contextlib import closing, suppress
 from pathlib import Path, PurePosixPath
 from typing import Final, Protocol
 
-from crosscue.replay.base import MIB, Log, LogError, is_remote
+from crosscue.replay.base import MIB, Log, LogError, is_remote, spelled
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.remote.address import LogAddress
 from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch
@@ -68,7 +68,7 @@ def identity_of(place: Path | str) -> Identity:
             total += opened.size
     except OSError as error:
         raise LogError(f"{error.filename or path}: {error.strerror or error}; check it") from None
-    return Identity(path.name, total, digest_of_all.hexdigest())
+    return Identity(spelled(path.name), total, digest_of_all.hexdigest())
 
 
 def identity_of_log(log: Log) -> Identity:

@@ -15,7 +15,7 @@ class Identity:
     """Identity of a log, or of the logs of one drive.
 
     Attributes:
-        name: Name of the file or folder.
+        name: Name of the file or folder, as it is spelled in a run.
         size: Total size in bytes; None in runs of earlier versions.
         digest: SHA-256 as 64 hex digits.
     """

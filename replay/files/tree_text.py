@@ -1,13 +1,18 @@
-"""Parse JSON, TOML and YAML text with a limit on nesting.
+r"""Parse JSON, TOML and YAML text with a limit on nesting, and spell file names in such text.
 
 The parsers recurse, and so does most code that uses their results. The limit turns a hostile file
 into an error of one clear line in every command.
+
+A file name is bytes, but JSON, Parquet, TOML, HTML and recordings accept only valid text. Names are
+therefore stored in a spelling: control characters, line separators and bytes that are not UTF-8 are
+written as ``\xff``, a byte each, and a backslash as ``\\``. All other names are as they are.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import tomllib
 from collections.abc import Callable, Mapping
@@ -38,6 +43,8 @@ _TOML_KEY: Final = re.compile(
 _OPEN: Final = b"[{"
 _NO_BRACKET: Final = bytes(set(range(256)) - set(b"[]{}"))
 _TOO_DEEP: Final = f"nested over {MAX_DEPTH} levels deep"
+_SPELLED: Final = re.compile("[\\\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_ESCAPE: Final = re.compile(rb"\\(?:(\\)|x([0-9a-f]{2}))")
 
 
 def json_tree(
@@ -127,15 +134,41 @@ def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
 
 
 def strict_json(value: object) -> str:
-    """Return JSON text with sorted keys; NaN and infinities become null."""
+    """Return JSON text with sorted keys; NaN and infinities become null, all text valid."""
     return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
 
 
+def spelled(name: str) -> str:
+    """Return the spelling of a file name or path: one line of valid, printable text."""
+    return _SPELLED.sub(_escape, name)
+
+
+def unspelled(text: str) -> str:
+    """Return the file name or path of which ``text`` is the spelling."""
+    if "\\" not in text:
+        return text
+    raw = _ESCAPE.sub(lambda at: at[1] or bytes.fromhex(at[2].decode()), text.encode())
+    return os.fsdecode(raw)
+
+
+def valid_text(text: str) -> str:
+    """Return a sentence that may contain file names, with bytes that are not UTF-8 escaped."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _escape(found: re.Match[str]) -> str:
+    if found[0] == "\\":
+        return "\\\\"
+    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(found[0]))
+
+
 def _finite(value: object) -> object:
+    if isinstance(value, str):
+        return valid_text(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {valid_text(str(key)): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return value

@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from crosscue.replay.errors import OutputError
 
 from .partial_file import PartialFile
+from .tree_text import valid_text
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -58,7 +64,23 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
-    write_bytes(path, text.encode("utf-8"))
+    write_bytes(path, valid_text(text).encode("utf-8"))
+
+
+def write_table(path: Path, table: pa.Table) -> None:
+    """Write a table atomically, with page checksums.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    def write(partial: Path) -> None:
+        with pa.OSFile(os.fsencode(partial), "wb") as file:
+            pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+
+    write_whole(path, write)
 
 
 def sha256_of(path: Path) -> dict[str, str]:

@@ -20,7 +20,15 @@ from typing import Any, Final
 
 import xxhash
 
-from crosscue.replay.base import MIB, LogError, OutputError, door, json_tree, one_line
+from crosscue.replay.base import (
+    MIB,
+    LogError,
+    OutputError,
+    door,
+    json_tree,
+    one_line,
+    spelled,
+)
 
 SUFFIX: Final = ".seal"
 KIND: Final = "crosscue seal"
@@ -40,7 +48,7 @@ class SealedFile:
     """One file at the time of sealing.
 
     Attributes:
-        name: Name relative to the log's folder, with slashes; ``THE_LOG`` for a log of one file.
+        name: Spelling of its path in the log's folder; ``THE_LOG`` for a log of one file.
         size: Size in bytes.
         digests: Concatenated hashes of all blocks, with ``DIGEST_BYTES`` each.
     """
@@ -105,13 +113,13 @@ def files_of(log: Path) -> dict[str, Path]:
         OSError: A folder cannot be listed.
     """
     if log.is_dir():
-        return {path.relative_to(log).as_posix(): path for path in sorted(_walked(log))}
+        return {spelled(str(path.relative_to(log))): path for path in sorted(_walked(log))}
     from crosscue.replay.files.time_file_names import time_file_of_video
 
     beside = [log.with_name(log.name + suffix) for suffix in ("-wal", "-journal")]
     times = time_file_of_video(log) if _is_video(log) else None
     return {THE_LOG: log} | {
-        path.name: path for path in [*beside, times] if path is not None and path.is_file()
+        spelled(path.name): path for path in [*beside, times] if path is not None and path.is_file()
     }
 
 
@@ -342,7 +350,7 @@ def seal_over(log: Path) -> tuple[Path, Seal] | None:
     while (above := os.path.dirname(folder)) != folder:  # noqa: PTH120
         if os.path.exists(folder + SUFFIX):  # noqa: PTH110
             seal = read_seal(Path(folder + SUFFIX))
-            part = _part_of(seal, log, Path(place).relative_to(folder).as_posix())
+            part = _part_of(seal, log, spelled(str(Path(place).relative_to(folder))))
             return None if part is None else (Path(folder + SUFFIX), part)
         folder = above
     return None
@@ -358,7 +366,7 @@ def _part_of(seal: Seal, log: Path, name: str) -> Seal | None:
             if key.startswith(inside)
         ]
     elif name in seal.files:
-        place = name[: -len(log.name)]
+        place = name[: -len(spelled(log.name))]
         beside = [place + other for other in files_of(log) if other != THE_LOG]
         files = [replace(seal.files[name], name=THE_LOG)]
         files += [

@@ -10,13 +10,14 @@ This module also exports the table of cues that the file is checked against.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
+from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree, unspelled
 
 from .camera import Camera as Camera
 from .cue_spec import CueSpec as CueSpec
@@ -389,6 +390,18 @@ class Vehicle(Section):
         own = {name: one.labels for name, one in self.cues.own.items()}
         return {name: self.labels_of(cue) for name, cue in CUES.items()} | own
 
+    def with_files(self, named: Callable[[str], str]) -> Self:
+        """Return the settings with other names of DBC files and model cards."""
+        dbc = tuple(map(named, self.can.dbc))
+        detectors = {
+            name: section
+            if section.card is None
+            else section.model_copy(update={"card": named(section.card)})
+            for name, section in self.detectors.items()
+        }
+        changed = {"can": self.can.model_copy(update={"dbc": dbc}), "detectors": detectors}
+        return self.model_copy(update=changed)
+
     @property
     def counts_any_label(self) -> bool:
         """Return whether the rule of any object cue reads all labels, as a plug-in's may."""
@@ -418,16 +431,7 @@ def load(path: Path) -> Vehicle:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise VehicleError(f"{path}: {why}; make one with: crosscue vehicle init LOG") from None
     vehicle = parse(text, str(path))
-    can = vehicle.can
-    files = tuple(str((path.parent / name).resolve()) for name in can.dbc)
-    detectors = {
-        name: section
-        if section.card is None
-        else section.model_copy(update={"card": str((path.parent / section.card).resolve())})
-        for name, section in vehicle.detectors.items()
-    }
-    changed = {"can": can.model_copy(update={"dbc": files}), "detectors": detectors}
-    return vehicle.model_copy(update=changed)
+    return vehicle.with_files(lambda name: str((path.parent / unspelled(name)).resolve()))
 
 
 def vehicle_given(given: Vehicle | Path | str | None) -> Vehicle:

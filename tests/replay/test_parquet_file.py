@@ -11,7 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import door
+from crosscue.replay.base import (
+    door,
+)
 
 READS = """
 import sys

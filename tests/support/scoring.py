@@ -12,7 +12,6 @@ import pyarrow.parquet as pq
 
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
-from crosscue.eval.runs.logs import relative
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.run_tables import run_tables
@@ -206,7 +205,7 @@ def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> Log
     found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
     return LogRow(
         name=log.name,
-        path=relative(log, run),
+        path=run.relative(log),
         format="mcap",
         cameras=cameras,
         identity=found,

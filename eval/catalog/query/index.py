@@ -14,7 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from crosscue.replay.base import OutputError, UnreadableRunError, door, is_remote
+from crosscue.replay.base import (
+    OutputError,
+    UnreadableRunError,
+    door,
+    is_remote,
+    spelled,
+)
 
 from .columns import INDEXED, arrow_schema
 from .local import CUT_SHORT, Found
@@ -184,7 +190,8 @@ def _read_run(runs: Runs, found: Found) -> RunRows | None:
     if len(head) > MAX_BYTES:
         raise ValueError(f"{found.file}: over {MAX_BYTES >> 20} MiB; replay again")
     files = runs.files(found.run)
-    name = found.run.rpartition("/")[2] if found.run != "." else Path(runs.name).resolve().name
+    run = spelled(str(Path(runs.name).resolve())) if found.run == "." else found.run
+    name = run.rpartition("/")[2]
     return rows_of(found, name, head, files, lambda file: runs.read(found.run, file))
 
 

@@ -8,7 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, MAX_MANIFEST_BYTES, TAGS, TIMINGS
-from crosscue.replay.base import UnreadableRunError, door
+from crosscue.replay.base import (
+    UnreadableRunError,
+    door,
+    spelled,
+    unspelled,
+)
 
 if TYPE_CHECKING:
     import pyarrow.fs
@@ -28,7 +33,7 @@ class Found(NamedTuple):
     """A run folder.
 
     Attributes:
-        run: Path relative to the searched folder, with slashes; ``.`` for that folder itself.
+        run: Spelling of its path in the searched folder; ``.`` for that folder itself.
         stamp: Value that changes with the content of the run; ``CUT_SHORT`` without a manifest.
         made_ns: Time since 1970 when the manifest was written or the attempt failed.
         file: The file that records the outcome: the manifest, or the log of a failed run.
@@ -75,7 +80,7 @@ class LocalRuns:
         Raises:
             OSError: The folder cannot be listed, or a file is not a regular one.
         """
-        folder = self.folder / run
+        folder = self.path(run)
         names = sorted(os.listdir(folder))  # noqa: PTH208 (there may be 100,000)
         tables = [name for name in names if name.endswith(".parquet") or name in BESIDE]
         if SCORE in names and (folder / SCORE).is_dir():
@@ -92,16 +97,16 @@ class LocalRuns:
         Raises:
             OSError: The file cannot be read.
         """
-        place = door.inside(self.folder / run, file)
+        place = door.inside(self.path(run), file)
         return door.read(place, door.SMALL_BYTES if file in BESIDE else MAX_MANIFEST_BYTES)
 
     def place(self, run: str, file: str) -> str:
         """Return the path of a file in ``filesystem``."""
-        return str(self.folder / run / file)
+        return str(self.path(run) / file)
 
     def path(self, run: str) -> Path:
         """Return the folder of a run."""
-        return self.folder / run
+        return self.folder / unspelled(run)
 
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
@@ -129,11 +134,12 @@ def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
     for entry in sorted(entries, key=lambda entry: entry.name):
         if not entry.is_dir():
             continue
-        found = _found(entry.path, prefix + entry.name)
+        name = prefix + spelled(entry.name)
+        found = _found(entry.path, name)
         if found is not None:
             yield found
         elif not entry.is_symlink():
-            yield from _below(entry.path, f"{prefix}{entry.name}/", depth - 1)
+            yield from _below(entry.path, f"{name}/", depth - 1)
 
 
 def _found(folder: str, run: str) -> Found | None:

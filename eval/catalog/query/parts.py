@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+from crosscue.replay.base import door
 
 from .columns import FILES, OWN, arrow_schema
 
@@ -110,10 +113,16 @@ def _opened(
         except (OSError, pa.ArrowException) as error:
             return error
 
-    fragments = [
-        form.make_fragment(path, filesystem, partition_expression=ds.field("run") == run)
-        for run, path in runs.items()
-    ]
+    def fragment_of(run: str, path: str) -> ds.Fragment:
+        is_run = ds.field("run") == run
+        try:
+            return form.make_fragment(path, filesystem, partition_expression=is_run)
+        except UnicodeEncodeError:
+            # Arrow's file systems refuse a name that is not UTF-8. This file stays open.
+            file = door.arrow_file(Path(path))
+            return form.make_fragment(file, partition_expression=is_run)
+
+    fragments = [fragment_of(run, path) for run, path in runs.items()]
     with ThreadPoolExecutor(WORKERS) as pool:
         yield from zip(runs, fragments, pool.map(schema_of, fragments), strict=True)
 

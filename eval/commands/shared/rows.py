@@ -14,7 +14,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import UsageError, strict_json, write_bytes, write_text, write_whole
+from crosscue.replay.base import UsageError, strict_json, write_bytes, write_table, write_text
 from crosscue.replay.safe_text import table, terminal_width
 
 from .terminal import print_json
@@ -118,14 +118,8 @@ def _csv(found: pa.Table) -> str:
     return stream.getvalue()
 
 
-def _write_parquet(path: Path, found: pa.Table) -> None:
-    import pyarrow.parquet as pq
-
-    write_whole(path, lambda partial: pq.write_table(found, partial, write_page_checksum=True))
-
-
 WRITERS: Final[dict[str, Callable[[Path, Any], None]]] = {
-    ".parquet": _write_parquet,
+    ".parquet": write_table,
     ".csv": lambda path, found: write_bytes(path, _csv(found).encode()),
     ".json": lambda path, found: write_text(path, strict_json(_records(found)) + "\n"),
 }

@@ -32,6 +32,7 @@ from crosscue.replay.base import (
     cannot_write,
     door,
     json_tree,
+    unspelled,
     visible,
 )
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
@@ -350,4 +351,4 @@ def _format(folder: Path) -> str:
 
 
 def _log_of(log: str, folder: Path) -> Path:
-    return Path(os.path.normpath(folder / log))
+    return Path(os.path.normpath(folder / unspelled(log)))

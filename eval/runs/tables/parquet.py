@@ -9,7 +9,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from crosscue.replay.base import UnreadableRunError, cannot_write, door
+from crosscue.replay.base import (
+    UnreadableRunError,
+    cannot_write,
+    door,
+)
 from crosscue.replay.files.partial_file import PartialFile
 
 if TYPE_CHECKING:

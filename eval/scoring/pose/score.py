@@ -22,7 +22,7 @@ from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tu
 from crosscue.eval.runs.folder import OWN_FRAME, RunFolder
 from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, table_in_log_time
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.base import Floats, Int64s, SchemaError
+from crosscue.replay.base import Floats, Int64s, SchemaError, spelled
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .errors import (
@@ -238,7 +238,7 @@ def measure(
     folder = run.file("score")
     write_tum(folder / "estimate.tum", paired.estimate, "crosscue estimate, planar")
     write_tum(folder / "truth.tum", paired.truth, "truth, planar")
-    title = f"{run.path.name} against {truth.source or truth_path.name}"
+    title = f"{spelled(run.path.name)} against {truth.source or truth_path.name}"
     gaps = gaps_of(run.drive_manifest().timeline)
     return result, _scored(paired, values, table, vehicle.lost_above_m, title, gaps)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import EmptyResultError, Log, SchemaError, name_of
+from crosscue.replay.base import EmptyResultError, Log, SchemaError, name_of, spelled
 from crosscue.replay.vehicle.roles import Role, role_of
 
 from .agreement import Verdict
@@ -308,6 +308,6 @@ def _quoted(text: str) -> str:
 
 def _relative(path: Path, folder: Path) -> str:
     try:
-        return str(path.resolve().relative_to(folder.resolve()))
+        return spelled(str(path.resolve().relative_to(folder.resolve())))
     except ValueError:
-        return str(path.resolve())
+        return spelled(str(path.resolve()))
