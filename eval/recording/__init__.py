@@ -6,6 +6,7 @@ through as stored. ``save`` is the only entry point.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -19,7 +20,7 @@ from crosscue.eval.runs.moments import part_of
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Block, Floats, spelled, write_whole
+from crosscue.replay.base import Block, Floats, door, spelled, write_whole
 
 from .part import WHOLE, Part
 
@@ -74,7 +75,7 @@ def save(
     def write(partial: Path) -> None:
         recording = rr.RecordingStream("crosscue", recording_id=spelled(run.path.resolve().name))
         # By its number, because rerun takes no name that is not UTF-8.
-        with partial.open("wb") as file:
+        with os.fdopen(door.opened(partial, os.O_WRONLY), "wb") as file:
             recording.save(f"/dev/fd/{file.fileno()}", default_blueprint=layout)
             _log_all(recording, time, run, pose, truth, true_ranges, camera, part)
             recording.flush()
