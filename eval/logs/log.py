@@ -97,7 +97,7 @@ class UnopenedLog:
         limits: Largest chunk, message and file to read.
     """
 
-    paths: tuple[Path | str, ...]
+    paths: tuple[Path | str, ...] = field(repr=False)
     part: LogPart = field(default_factory=LogPart)
     limits: Limits = DEFAULT_LIMITS
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import crosscue
+from crosscue.eval.logs.log import UnopenedLog
 from crosscue.replay.base import LogError, UsageError, is_remote, one_line
 from crosscue.replay.errors import without_secrets
 from crosscue.replay.logs.opening import open_log
@@ -130,6 +131,10 @@ def test_one_module_reads_the_complete_form() -> None:
         "replay/remote/address.py",
         "replay/remote/logs.py",
     }
+
+
+def test_drive_that_is_not_open_does_not_show_its_addresses() -> None:
+    assert "hunter2" not in repr(UnopenedLog(("http://user:hunter2@host/a.log?hunter2",)))
 
 
 def test_error_of_a_store_carries_no_secret_in_any_attribute(
