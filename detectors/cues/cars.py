@@ -144,7 +144,7 @@ def _nearest(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.in
     for _, row, column in sorted(pairs):
         if all(row != r and column != c for r, c in kept):
             kept.append((row, column))
-    first, second = np.array(kept, np.intp).T
+    first, second = np.array(kept).T
     return first, second
 
 

@@ -237,6 +237,21 @@ def test_region_spans_rows_of_the_segmentation(height: int, min_rows: float, is_
     assert math.isnan(found.right) != is_seen
 
 
+@pytest.mark.parametrize(("more", "is_seen"), [(-0.01, True), (0.01, False)])
+def test_rows_of_a_tilted_region_are_between_the_middles_of_its_ends(
+    more: float, is_seen: bool
+) -> None:
+    """With a roll of 0.2 rad, no two corners are in one row."""
+    rolled = changed(roll_rad=0.2)
+    outline = outlines(rolled, REGIONS, PLACE, SIZE)[0]
+    assert outline is not None
+    y = outline[:, 1]
+
+    found = fractions(rolled, min_rows=(y[0] + y[1] - y[2] - y[3]) / 2.0 + more)
+
+    assert math.isnan(found.left) != is_seen
+
+
 def pixels_of(outline: NDArray[np.float64] | None, height: int, width: int) -> NDArray[np.bool_]:
     """Mark the pixels of an outline by the even-odd rule of regions in the picture."""
     assert outline is not None
@@ -249,9 +264,9 @@ def test_pixels_on_the_edge_of_a_ground_region_belong_to_it() -> None:
 
     8 and 16 m aside, it is from x = 150 to 100 at y = 112.5, and from 175 to 150 at 106.25. At
     y = 112.5 - k, for k = 0 to 6, it is from 100 + 8 k to 150 + 4 k: 50, 46, 42, 38, 34, 30 and 26
-    pixels, in all 266. The lowest row is on its edge.
+    pixels, in all 266. The lowest row is on its edge. The region is exactly 6.25 rows high.
     """
-    regions = REGIONS.model_copy(update={"aside_m": (8.0, 16.0)})
+    regions = REGIONS.model_copy(update={"aside_m": (8.0, 16.0), "min_rows": 6.25})
     for k, pixels in enumerate((50, 46, 42, 38, 34, 30, 26, 0)):
         road = np.zeros((200, 400), np.bool_)
         road[112 - k] = True
