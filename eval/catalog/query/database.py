@@ -26,6 +26,7 @@ LOCKED: Final[Mapping[str, str]] = {
     "allow_community_extensions": "false",
     "allow_persistent_secrets": "false",
     "python_enable_replacements": "false",
+    "enable_progress_bar": "false",
     "errors_as_json": "true",
     "enable_external_access": "false",
     "lock_configuration": "true",
@@ -50,8 +51,8 @@ def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Tabl
         known: Names of all existing tables, for messages.
 
     Raises:
-        UsageError: The text is not a single SELECT, or uses a name that does not exist; the
-            message suggests the nearest name.
+        UsageError: The text is not a single SELECT, or uses a name that does not exist (the
+            message suggests the nearest name), or its result does not fit in memory.
         FailedError: The query fails on a row, or a file cannot be read.
     """
     import duckdb
@@ -72,6 +73,11 @@ def select(sql: str, tables: Mapping[str, Any], known: Iterable[str]) -> pa.Tabl
             raise UsageError(_message(error, sorted(known), columns)) from None
         try:
             return database.sql(sql).to_arrow_table()
+        except (MemoryError, duckdb.OutOfMemoryException):
+            raise UsageError(
+                "query: the result does not fit in memory; select fewer rows or columns, or "
+                "count and sum them in SQL"
+            ) from None
         except duckdb.Error as error:
             raise FailedError(_message(error, sorted(known), columns)) from None
 

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pyarrow as pa
@@ -165,3 +167,37 @@ def test_database_settings_are_locked(runs: Path) -> None:
         "lock_configuration": "true",
         "autoload_known_extensions": "false",
     }
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory with /proc and RLIMIT_AS")
+@pytest.mark.parametrize("caller", ["cli.run(['query', {runs!r}, {sql!r}])", "catalog({runs!r})"])
+def test_result_that_exceeds_memory_is_refused_in_one_line(runs: Path, caller: str) -> None:
+    """3e8 rows of 8 bytes do not fit in another 2 GiB."""
+    call = caller.format(runs=str(runs), sql="select * from range(300000000)")
+    if call.startswith("catalog"):
+        call += ".query('select * from range(300000000)')"
+    script = (
+        "import resource, sys\n"
+        "import crosscue\n"
+        "from crosscue.eval import cli\n"
+        "from crosscue.eval.catalog.query.catalog import catalog\n"
+        "catalog(sys.argv[1]).query('select 1')\n"
+        "used = 4096 * int(open('/proc/self/statm').read().split()[0])\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), used + (2 << 30)))\n"
+        "try:\n"
+        f"    sys.exit({call})\n"
+        "except crosscue.UsageError as error:\n"
+        "    sys.exit(f'refused: {error}')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(runs)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+    assert "query: the result does not fit in memory; select fewer rows" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
+    assert done.returncode == (1 if "refused" in done.stderr else 2)
