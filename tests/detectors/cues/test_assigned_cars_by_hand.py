@@ -16,6 +16,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motion_of
 from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden, past_within_m
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import Motion
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
@@ -123,6 +124,21 @@ def test_distance_is_along_the_ego_vehicle_for_a_turned_camera() -> None:
     behind = CarTracks(CAMERA.model_copy(update={"yaw_rad": math.pi}), RULES)
     behind([found(middle)], STILL)
     assert behind.seen == 0
+
+
+@pytest.mark.parametrize("center_px", [(600.0, 400.0), None])
+def test_ends_of_a_car_are_seen_at_half_its_height(center_px: tuple[float, float] | None) -> None:
+    """The camera is pitched and rolled; ``GroundPlane`` converts pixels to directions."""
+    tilted = CAMERA.model_copy(update={"pitch_rad": 0.3, "roll_rad": 0.4, "center_px": center_px})
+    box = (700.0, 500.0, 824.0, 562.0)
+    tracks = CarTracks(tilted, RULES)
+    tracks([found(box)], STILL)
+
+    (made,) = tracks([found(box)], STILL)
+
+    (left, right) = GroundPlane.of(tilted, SIZE).rays(np.array([[700.0, 531.0], [824.0, 531.0]]))
+    assert made.distance_m == pytest.approx(20.0 * (left[0] + right[0]) / 2.0)
+    assert made.bearing == pytest.approx(-(left[1] / left[0] + right[1] / right[0]) / 2.0)
 
 
 @pytest.mark.parametrize(
