@@ -67,6 +67,7 @@ from crosscue.replay.base import (
     versions_and_commit,
 )
 from crosscue.replay.files.made_of import SIMULATED
+from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.plan import camera_of, pictures_only
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
@@ -199,13 +200,15 @@ def only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:
     Raises:
         VehicleError: The drive has several cameras.
         EmptyResultError: It has none.
+        LogError: It has none, and a log is damaged.
     """
     camera = camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
-    if camera is None:
-        raise EmptyResultError(
-            f"{logs[0].path}: no camera in the logs, which detectors and landmarks need; name its "
-            "topic under [topics], or leave them out"
-        )
+    with unless_damaged(logs, EmptyResultError):
+        if camera is None:
+            raise EmptyResultError(
+                f"{logs[0].path}: no camera in the logs, which detectors and landmarks need; name "
+                "its topic under [topics], or leave them out"
+            )
     return camera
 
 

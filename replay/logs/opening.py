@@ -10,6 +10,7 @@ from typing import cast
 
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
+    CrosscueError,
     Ledger,
     Limits,
     Log,
@@ -64,17 +65,19 @@ def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:
 
 
 @contextmanager
-def unless_damaged(logs: Sequence[Log]) -> Iterator[None]:
-    """Report a missing topic as damage of the log if a log is damaged.
+def unless_damaged(
+    logs: Sequence[Log], missing: type[CrosscueError] = MissingTopicError
+) -> Iterator[None]:
+    """Report a missing topic, by this type of error, as damage of the log if a log is damaged.
 
     The damaged part may contain the topic, so the vehicle file or option need not be wrong.
 
     Raises:
-        LogError: Instead of a ``MissingTopicError``, if a log is damaged.
+        LogError: Instead of ``missing``, if a log is damaged.
     """
     try:
         yield
-    except MissingTopicError as error:
+    except missing as error:
         for log in logs:
             ledger = Ledger(name_of(log))
             for _ in log.read(ledger):

@@ -20,6 +20,7 @@ NEEDS_CAMERA = {
     "fit signs": "{drive} --label stop_sign",
     "landmarks add": "{out}.db {log} --poses {truth} --vehicle {car}",
     "fit landmarks": "{log} --database {db} --poses {truth} --vehicle {car}",
+    "replay": "{log} -o {out} --vehicle {car} --detectors support.gap_drive:build",
     "detect": "{log} -o {out} --vehicle {car} --detectors support.gap_drive:build",
 }
 """Commands that need a camera, with arguments."""
@@ -60,11 +61,8 @@ ANY, NAMED = "", '[topics]\ncamera = "/camera"\n'
 
 
 @pytest.mark.parametrize("is_cut", [False, True])
-@pytest.mark.parametrize(
-    ("command", "camera"),
-    [(one, ANY) for one in NEEDS_CAMERA if one != "detect"]
-    + [(one, NAMED) for one in NEEDS_CAMERA],
-)
+@pytest.mark.parametrize("camera", [ANY, NAMED], ids=["any", "named"])
+@pytest.mark.parametrize("command", NEEDS_CAMERA)
 def test_camera_missing_from_log_is_blamed_on_its_truncation_alone(
     command: str, is_cut: bool, camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
