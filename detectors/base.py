@@ -297,7 +297,7 @@ class Choice:
         kind: Name, ``module:factory`` or model card, as in ``crosscue.detectors.registry``.
         settings: Keyword arguments of its factory.
         factory: The factory itself, of a detector that was passed as an object.
-        identity: Identity of such a detector, which no name tells; otherwise None.
+        identity: Identity of such a detector, which no name reports; otherwise None.
     """
 
     name: str

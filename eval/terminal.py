@@ -1,4 +1,4 @@
-"""What commands print: results, messages, and a progress line.
+"""Output of commands: results, messages, and a progress line.
 
 The line shows the amount done, the rate and the time left. rich draws it on stderr and removes it
 at the end. Without a terminal on stderr, or with ``--quiet``, rich is not imported.

@@ -177,10 +177,14 @@ def _serve(pipe: Connection, threads: int) -> None:
                 pipe.send(done)
             except (PicklingError, AttributeError, TypeError) as error:
                 pipe.send(Done(job, *reported_error(error)))
-    except (EOFError, BrokenPipeError):
+    except (EOFError, OSError):
+        # The parent was killed, and its end of the pipe is gone.
         return
     except _StoppedError:
         sys.exit(143)
+    finally:
+        # A signal that arrives later must not interrupt the exit with a traceback.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _leave_with_parent() -> None:

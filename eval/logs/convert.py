@@ -71,7 +71,7 @@ class Converted(Result):
 
     @property
     def integrity(self) -> str:
-        """What was verified of the log."""
+        """Verification of the log."""
         return self.ledger.integrity
 
     @property

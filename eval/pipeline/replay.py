@@ -133,7 +133,7 @@ def _camera(
     """Return the camera if detectors or landmarks need it.
 
     Raises:
-        EmptyResultError: There is none, but the user named detectors or landmarks.
+        EmptyResultError: No camera exists, but the user named detectors or landmarks.
     """
     if not detecting.choices and landmarks is None:
         return None

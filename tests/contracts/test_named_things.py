@@ -1,4 +1,4 @@
-"""What an option names is looked up before a log is read, and refused if it does not exist."""
+"""A name in an option is looked up before a log is read, and refused if nothing has it."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from crosscue.verb import HIDDEN, Option, compared, keywords
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Filled(Result):
-    """What the verb was called with."""
+    """Arguments that the verb was called with."""
 
     boxes: tuple[Path, ...] = field(metadata=json_key("box_files"))
     width_m: float

@@ -257,6 +257,27 @@ def test_signal_to_the_parent_stops_all_workers(
     assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
 
 
+def test_worker_whose_parent_was_killed_exits_without_traceback() -> None:
+    script = (
+        "import time\n"
+        "from pathlib import Path\n"
+        "from crosscue.eval.batch.jobs import Job\n"
+        "from crosscue.eval.batch.processes import _serve\n"
+        "class Pipe:\n"
+        "    sent = [len, Job('a', (), Path('gone'), '')]\n"
+        "    def recv(self):\n"
+        "        return self.sent.pop(0)\n"
+        "    def send(self, done):\n"
+        "        raise ConnectionResetError(104, 'Connection reset by peer')\n"
+        "_serve(Pipe(), 1)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+    )
+
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def _pids_of_two_workers(folder: Path) -> list[int]:
     _wait_until(lambda: len([p for p in folder.glob("*.begun") if p.read_text()]) == 2)
     return [int(path.read_text()) for path in folder.glob("*.begun")]
