@@ -37,6 +37,7 @@ EXECUTED: Final = {
 OTHERS: Final = {
     "--array": "SLURM",
     "--bind": "Rerun",
+    "--min-s": "the example of a command in CONTRIBUTING.md",
     "--decode_in_inference": "YOLOX",
     "--grid": "YOLOv7",
     "--include": "YOLOv5",
