@@ -149,7 +149,7 @@ def test_overwritten_run_contains_only_new_files(
     assert cli.run([*argv, "-o", str(out)]) == 0
     (out / "score").mkdir()
     capsys.readouterr()
-    (out / "old.parquet").write_bytes(b"")
+    (out / "cues.parquet").write_bytes(b"")
     assert cli.run([*argv, "-o", str(out), "--overwrite", "--to", "5", "--json"]) == 0
     message = capsys.readouterr().out
     assert cli.run([*argv, "-o", str(fresh), "--to", "5"]) == 0
