@@ -7,8 +7,9 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, ClassVar, Final, Self, TypeVar, overload
+from typing import Any, ClassVar, Final, Protocol, Self, TypeVar, overload, runtime_checkable
 
 from crosscue.replay.safe_text import table, terminal_width, visible
 
@@ -22,6 +23,15 @@ def json_key(name: str) -> dict[str, str]:
     return {"json": name}
 
 
+@runtime_checkable
+class HasJson(Protocol):
+    """A record of a run's files, which has its own form in JSON."""
+
+    def as_json(self) -> object:
+        """Return dictionaries, lists and scalars."""
+        ...
+
+
 class Result:
     """Base of what verbs return. Subclasses are frozen dataclasses with ``repr=False``.
 
@@ -30,7 +40,7 @@ class Result:
     ``crosscue.replay.progress``; the command prints them at once.
 
     Attributes:
-        also: Names of properties that are in JSON, by key.
+        also: Paths of attributes that are in JSON besides the fields, by key.
         formats: Methods that return another text, by name of the option, with its help.
         is_printed_in_parts: True if the command prints only the parts, unless as JSON.
     """
@@ -122,6 +132,8 @@ def plain(value: object) -> Any:
     """Return records as dictionaries, lists and scalars; control characters are escaped."""
     if isinstance(value, Result) and not isinstance(value, dict):
         return value.as_dict()
+    if isinstance(value, HasJson):
+        return value.as_json()
     if is_dataclass(value) and not isinstance(value, type):
         return plain(_entries(value))
     if isinstance(value, Enum):
@@ -149,7 +161,7 @@ def _entries(record: Any) -> dict[str, object]:
     """Return the values of fields and properties by their key in JSON."""
     named = {one.metadata.get("json", one.name): one.name for one in fields(record)}
     named |= getattr(record, "also", {})
-    return {key: getattr(record, name) for key, name in named.items() if key}
+    return {key: attrgetter(name)(record) for key, name in named.items() if key}
 
 
 def _cell(value: object) -> str:

@@ -34,8 +34,8 @@ class Option:
         may_be_empty: True for a sequence of positionals that may be empty.
         group: Options of the same group exclude each other; ``json`` excludes ``--json``.
         convert: Function that converts one word, which may raise ``UsageError``.
-        made_by: Function that makes the value. Its own parameters become options. If it returns a
-            context manager, the value is that of a ``with`` block around the verb.
+        is_one_word: True for a sequence that ``convert`` makes from one word.
+        made_by: Function that makes the value; its own parameters become options.
     """
 
     name: str | None = None
@@ -45,6 +45,7 @@ class Option:
     may_be_empty: bool = False
     group: str | None = None
     convert: Callable[[str], object] | None = None
+    is_one_word: bool = False
     made_by: Callable[..., object] | None = None
 
 
@@ -83,7 +84,7 @@ def keywords(record: Callable[..., Any], leading: int = 1) -> Any:
             first = [bound.pop(one.name) for one in own]
             return function(*first, record(**bound))
 
-        attributes = (inspect.getdoc(record) or "").partition("Attributes:\n")[2]
+        attributes = attributes_of(record)
         item = rf"^    {replaced}: .*\n?(?:     +.*\n?)*"
         text = inspect.getdoc(function) or ""
         call.__doc__ = re.sub(item, lambda _: f"{attributes}\n", text, flags=re.MULTILINE)
@@ -92,6 +93,14 @@ def keywords(record: Callable[..., Any], leading: int = 1) -> Any:
         return call
 
     return wrap
+
+
+def attributes_of(record: object) -> str:
+    """Return the descriptions of a record's fields, also of those that it inherits."""
+    kinds = reversed(record.__mro__) if isinstance(record, type) else ()
+    texts = [inspect.cleandoc(vars(kind).get("__doc__") or "") for kind in kinds]
+    found = [text.partition("Attributes:\n")[2].partition("\n\n")[0] for text in texts]
+    return "\n".join(filter(None, found))
 
 
 def compared(record: object) -> dict[str, object]:

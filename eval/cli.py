@@ -40,9 +40,9 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "vehicle init": ("vehicle.init", "write a first vehicle file from the contents of a log"),
     "vehicle check": ("vehicle.check", "draw a vehicle file on a picture, list contradictions"),
     "decode": "eval.catalog.decoded_logs:decode",
-    "detect": ("runs.detect", "run detectors on the camera images of a log"),
-    "estimate": ("runs.estimate", "repeat the estimate of a run from its stored detections"),
-    "replay": ("runs.replay", "detect and estimate: from a log to a run folder"),
+    "detect": "eval.drives.replay:detect_drive",
+    "estimate": "eval.drives.replay:estimate_run",
+    "replay": "eval.drives.many:replay",
     "score": ("runs.score", "score runs against truth: metrics, figures, report, gates"),
     "score detector": (
         "runs.score_detector",
@@ -240,7 +240,7 @@ def run(argv: Sequence[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     with losses_heard() as losses:
-        status = _guarded(module, args)
+        status = _guarded(module, args, parser)
     for loss in losses:
         print(visible(f"crosscue: dropped: {loss}"), file=sys.stderr)
     return 3 if losses and not status else status
@@ -271,13 +271,18 @@ def parser_of(name: str) -> tuple[Command, argparse.ArgumentParser]:
     return module, parser
 
 
-def _guarded(module: Command, args: argparse.Namespace) -> int:
+def _guarded(module: Command, args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
+    from crosscue.eval.command_line import with_options
+    from crosscue.eval.terminal import watched
+
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        status = module.run(args)
+        with watched(args):
+            status = module.run(args)
         sys.stdout.flush()
         return status
     except CrosscueError as error:
+        error.args = (with_options(str(error), parser),)
         return _complain(error, error.exit_status, args)
     except KeyboardInterrupt:
         print("crosscue: interrupted", file=sys.stderr)

@@ -14,15 +14,14 @@ import re
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.results import Result
-from crosscue.verb import Option
+from crosscue.verb import Option, attributes_of
 
 METAVARS: Final = {
     "vehicle": "V.toml",
@@ -79,50 +78,39 @@ class Call:
         function: The function to call.
         positional: Name of its parameters ``*names``, if it has such.
         values: For each parameter, its name among the parsed arguments or the call that makes it.
-        options: Option of each parameter, also of those of inner calls.
     """
 
     function: Callable[..., object]
     positional: str | None = None
     values: dict[str, str | Call] = field(default_factory=dict)
-    options: dict[str, str] = field(default_factory=dict)
 
-    def __call__(self, args: argparse.Namespace, stack: ExitStack) -> object:
-        """Call the function; context managers that make arguments are entered in ``stack``."""
+    def __call__(self, args: argparse.Namespace) -> object:
+        """Call the function."""
         made = {
-            name: _entered(value(args, stack), stack)
-            if isinstance(value, Call)
-            else getattr(args, value)
+            name: value(args) if isinstance(value, Call) else getattr(args, value)
             for name, value in self.values.items()
         }
         words = () if self.positional is None else made.pop(self.positional)
         assert isinstance(words, Sequence)
         return self.function(*words, **made)
 
-    def run(self, args: argparse.Namespace) -> object:
-        """Call the verb, and name options instead of parameters in what is wrong.
 
-        Raises:
-            CrosscueError: As the function, with the names of options.
-        """
-        try:
-            with ExitStack() as stack:
-                return self(args, stack)
-        except CrosscueError as error:
-            error.args = (self.with_options(str(error)), *error.args[1:])
-            raise
+def with_options(text: str, parser: argparse.ArgumentParser) -> str:
+    """Return an error about parameters with the names of their options.
 
-    def with_options(self, text: str) -> str:
-        """Return an error about parameters with the names of their options.
-
-        ``bin_m: -1, expected more than 0`` becomes ``--bin-m -1: expected more than 0``.
-        """
-        lead = _LEAD.match(text)
-        if lead is None or not self.options.keys() >= set(lead["names"].split(", ")):
-            return text
-        named = ", ".join(self.options[name] for name in lead["names"].split(", "))
-        value = "" if lead["value"] is None else f" {lead['value']}"
-        return f"{named}{value}: {text[lead.end() :]}"
+    ``bin_m: -1, expected more than 0`` becomes ``--bin-m -1: expected more than 0``.
+    """
+    options = {
+        action.dest.rpartition(".")[2]: action.option_strings[-1]
+        for action in parser._actions
+        if action.option_strings
+    }
+    lead = _LEAD.match(text)
+    if lead is None or not options.keys() >= set(lead["names"].split(", ")):
+        return text
+    named = ", ".join(options[name] for name in lead["names"].split(", "))
+    value = "" if lead["value"] is None else f" {lead['value']}"
+    return f"{named}{value}: {text[lead.end() :]}"
 
 
 def described(documented: object) -> Described:
@@ -130,7 +118,7 @@ def described(documented: object) -> Described:
     parts = _SECTION.split(inspect.getdoc(documented) or "")
     sections = dict(zip(parts[1::2], parts[2::2], strict=True))
     examples = sections.get("Examples", sections.get("Example", ""))
-    described_names = sections.get("Args", sections.get("Attributes", ""))
+    described_names = sections.get("Args", "") or attributes_of(documented)
     items = re.findall(r"^    (\w+): (.+(?:\n {5,}.*)*)", described_names, re.MULTILINE)
     return Described(
         parts[0].strip().replace("``", ""),
@@ -194,7 +182,6 @@ def add_parameters(
             assert callable(maker)
             inner = add_parameters(parser, maker, groups, f"{prefix}{name}.")
             call.values[name] = inner
-            call.options |= inner.options
             continue
         made = _Argument(name, parameter, kind, option)
         if parameter.kind is parameter.VAR_POSITIONAL:
@@ -208,7 +195,6 @@ def add_parameters(
             *made.flags, **made.reading(), **made.naming(f"{prefix}{name}"), help=made.help(text)
         )
         call.values[name] = action.dest
-        call.options[name] = action.option_strings[-1] if action.option_strings else name
     return call
 
 
@@ -258,7 +244,7 @@ class _Argument:
         """Return how words become the value: action, type, choices, number and default."""
         if self.kind is bool:
             return {"action": "store_false" if self.default is True else "store_true"}
-        item, count = _items(self.kind)
+        item, count = (str, None) if self.option.is_one_word else _items(self.kind)
         if self.parameter.kind is inspect.Parameter.VAR_POSITIONAL:
             count = "+"
         if self.is_positional and not self.is_required:
@@ -334,19 +320,14 @@ def _converter(convert: Callable[[str], object]) -> Callable[[str], object]:
     return converted
 
 
-def _entered(value: object, stack: ExitStack) -> object:
-    return stack.enter_context(value) if isinstance(value, AbstractContextManager) else value
-
-
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the annotations of a function's or record's parameters."""
+    if isinstance(function, type):
+        return typing.get_type_hints(function, include_extras=True)
     plain = inspect.unwrap(function)
-    source: Any = plain.__init__ if isinstance(plain, type) else plain  # type: ignore[misc]
-    notes = {name: kind for name, kind in source.__annotations__.items() if name != "return"}
-    of = typing.get_type_hints
-    module = inspect.getmodule(plain)
-    names = {**vars(typing), **(vars(module) if module else {})}
-    return of(types.SimpleNamespace(__annotations__=notes), names, include_extras=True)
+    notes = {name: kind for name, kind in plain.__annotations__.items() if name != "return"}
+    holder: Any = types.SimpleNamespace(__annotations__=notes)
+    return typing.get_type_hints(holder, vars(inspect.getmodule(plain)), include_extras=True)
 
 
 def _returned(verb: Callable[..., Any]) -> type:

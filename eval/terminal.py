@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from crosscue.eval.command_line import Call, fill
@@ -131,18 +132,23 @@ class VerbCommand:
     def run(self, args: argparse.Namespace) -> int:
         """Call the function and print its result; return the exit status."""
         assert self._call is not None
-        with ProgressLine("", is_shown=is_shown(args)) as line:
+        return print_found(self._call(args), args)
 
-            def show(event: object) -> None:
-                if isinstance(event, Progressed):
-                    line.at(Done(event.done, event.total, event.unit), event.doing)
-                    return
+
+@contextmanager
+def watched(args: argparse.Namespace) -> Iterator[None]:
+    """Show progress on a terminal, and print parts of a result as they are finished."""
+    with ProgressLine("", is_shown=is_shown(args)) as line:
+
+        def show(event: object) -> None:
+            if isinstance(event, Progressed):
+                line.at(Done(event.done, event.total, event.unit), event.doing)
+            else:
                 line.end()
                 _print_part(event, args)
 
-            with watching(show):
-                found = self._call.run(args)
-        return print_found(found, args)
+        with watching(show):
+            yield
 
 
 def _print_part(event: object, args: argparse.Namespace) -> None:

@@ -25,14 +25,16 @@ def engine_of(
         UsageError: A number is too small, or cores or memory are set without a cluster.
     """
     if ray is None and (cores is not None or memory_gib is not None):
-        raise UsageError("--cores-per-drive, --memory-per-drive: need --ray with an address")
+        raise UsageError(
+            "cores_per_drive, memory_per_drive_gib: need a cluster; name its address with ray"
+        )
     if (cores is not None and cores < 1) or (memory_gib is not None and not memory_gib > 0.0):
         raise UsageError(
-            f"--cores-per-drive {cores}, --memory-per-drive {memory_gib}: expected 1 core or more "
-            "and GiB above 0"
+            f"cores_per_drive, memory_per_drive_gib: {cores} and {memory_gib}; expected 1 core or "
+            "more and GiB above 0"
         )
     if workers is not None and workers < 1:
-        raise UsageError(f"--workers {workers}: expected 1 or more")
+        raise UsageError(f"workers: {workers}, expected 1 or more")
     if ray is not None:
         from crosscue.eval.batch.ray_jobs import MEMORY_BYTES, OnRay
 

@@ -46,6 +46,7 @@ from crosscue.replay.base import (
 from crosscue.replay.errors import without_secrets
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
+from crosscue.replay.progress import Progress, emit
 
 from .journal import STALE_S, beating, error_of, read_entry, silent_s, write_entry, write_plan
 
@@ -128,25 +129,6 @@ class Engine(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Progress of a batch of drives.
-
-    Attributes:
-        total: Number of jobs.
-        earlier: Jobs done before this start.
-        done: Jobs done since this start, including failures.
-        failed: Number of ``done`` that failed.
-        seconds: Seconds since the start.
-    """
-
-    total: int
-    earlier: int
-    done: int
-    failed: int
-    seconds: float
-
-
 class State(StrEnum):
     """Content of a job's run folder."""
 
@@ -162,9 +144,9 @@ def run_many(
     engine: Engine,
     *,
     overwrite: bool = False,
-    on_progress: Callable[[Progress], None] = lambda _: None,
+    doing: str = "replaying",
 ) -> tuple[Done[R], ...]:
-    """Process every drive that is not done yet.
+    """Process every drive that is not done yet, and report the progress about once a second.
 
     Args:
         jobs: Drives with unique names.
@@ -172,7 +154,7 @@ def run_many(
             It clears the run folder itself and writes its manifest last.
         engine: Engine that runs the work.
         overwrite: Replace run folders that hold a run of other logs or settings.
-        on_progress: Called about once a second.
+        doing: The work, in reports of the progress.
 
     Returns:
         One outcome for each job, in the order of ``jobs``.
@@ -181,7 +163,6 @@ def run_many(
         UsageError: Two jobs have the same name or the same run folder.
     """
     _check_unique(jobs)
-    began = time.monotonic()
     found: dict[str, Done[R]] = {}
     missing: list[Job] = []
     for job in jobs:
@@ -194,9 +175,9 @@ def run_many(
     refused = failed = sum(done.error is not None for done in found.values())
 
     def report() -> None:
-        now = time.monotonic() - began
-        done_now = len(found) - earlier_count
-        on_progress(Progress(len(jobs), earlier_count - refused, done_now, failed, now))
+        counted = f"{doing}, {failed} failed" if failed else doing
+        total = len(jobs) - (earlier_count - refused)
+        emit(Progress(counted, len(found) - earlier_count, total, "drives"))
 
     if missing:
         # Close the engine explicitly, so that no worker outlives an interrupt.

@@ -117,11 +117,11 @@ class Decoded(Result):
 
     path: Path = field(metadata=HIDDEN)
     rows: dict[str, int] = field(metadata=json_key("tables"))
-    account: Account = field(metadata=HIDDEN)
+    account: Account
     timeline: Timeline = field(metadata=HIDDEN)
     details: list[str] = field(metadata=HIDDEN)
 
-    also: ClassVar = {"account": "account_by_stage", "time": "time"}
+    also: ClassVar = {"time": "time"}
 
     def lines(self) -> Iterator[str]:
         """Yield the number of rows of each table, and the account."""
@@ -142,11 +142,6 @@ class Decoded(Result):
     def time(self) -> object:
         """Time segments, as in the manifest."""
         return time_segments(self.timeline).as_json()
-
-    @property
-    def account_by_stage(self) -> object:
-        """Account, as in the manifest."""
-        return self.account.as_json()
 
 
 def decode(

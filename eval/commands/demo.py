@@ -21,8 +21,6 @@ import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.eval.commands.shared.terminal import (
     Done,
-    DriveLine,
-    is_shown,
     print_json,
     progress_line,
 )
@@ -68,10 +66,7 @@ def run(args: argparse.Namespace) -> int:
     layout = args.layout or "C"
     if talk and not args.real:
         print(f"simulating a drive up to intersection {layout} ...", flush=True)
-    with (
-        progress_line(args, "fetching") as fetching,
-        DriveLine("replaying", is_shown=is_shown(args)) as line,
-    ):
+    with progress_line(args, "fetching") as fetching:
 
         def on_drive(drive: crosscue.KnownDrive) -> None:
             fetching.end()
@@ -89,8 +84,6 @@ def run(args: argparse.Namespace) -> int:
             overwrite=args.overwrite,
             on_fetch=lambda file, done, of: fetching.at(Done(done / 1e6, of / 1e6, "MB"), file),
             on_drive=on_drive,
-            on_frames=line.at_frame,
-            on_time=line.at_time,
         )
     if args.json:
         print_json(made.as_dict())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.eval.interface.runs.make import replay_drive
+from crosscue.eval.drives.replay import replay_drive
 from crosscue.eval.interface.runs.recording import save_recording
 from crosscue.eval.interface.runs.score import ScoredRun, score_run
 from crosscue.eval.interface.simulate import simulate_approach
@@ -131,8 +131,6 @@ def demo(
     overwrite: bool = False,
     on_fetch: Callable[[str, int, int], None] = lambda file, done, of: None,
     on_drive: Callable[[KnownDrive], None] = lambda drive: None,
-    on_frames: Callable[[int, int | None], None] = lambda done, of: None,
-    on_time: Callable[[float, float], None] = lambda done_s, of_s: None,
 ) -> Demo:
     """Replay a drive to an intersection, score it, and write a report and a recording.
 
@@ -148,8 +146,6 @@ def demo(
         overwrite: Replace an earlier demonstration.
         on_fetch: As in ``fetch_drive``.
         on_drive: Called with the drive before it is replayed.
-        on_frames: As in ``replay_drive``.
-        on_time: As in ``replay_drive``.
 
     Raises:
         CrosscueError: Recording or weights are missing and cannot be fetched.
@@ -164,7 +160,7 @@ def demo(
     else:
         raise UsageError("demo: source applies only to the real drive; add real=True")
     on_drive(drive)
-    return _shown(drive, place, overwrite, on_frames, on_time)
+    return _shown(drive, place, overwrite)
 
 
 def _simulated(
@@ -187,8 +183,6 @@ def _shown(
     drive: KnownDrive,
     folder: Path,
     overwrite: bool,
-    on_frames: Callable[[int, int | None], None],
-    on_time: Callable[[float, float], None],
 ) -> Demo:
     """Replay and score a drive in ``folder/run``; arguments as in ``replay_drive``."""
     run = replay_drive(
@@ -197,8 +191,6 @@ def _shown(
         drive.vehicle,
         drive.detectors,
         overwrite=overwrite,
-        on_frames=on_frames,
-        on_time=on_time,
     )
     scored = score_run(run, drive.truth)
     return Demo(drive, run, scored, save_recording(run, truth=drive.truth))

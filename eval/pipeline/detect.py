@@ -33,7 +33,6 @@ from crosscue.detectors.registry import is_plugin, knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
-from crosscue.eval.pipeline.progress import OnFrames, no_progress
 from crosscue.eval.runs.folder import (
     Account,
     DetectCounts,
@@ -68,6 +67,7 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.logs.opening import unless_damaged
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.plan import camera_of, pictures_only
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
@@ -101,7 +101,6 @@ def detect_drive(
     choices: Sequence[Choice],
     cache: Path | None = None,
     draw: int = 0,
-    on_frames: OnFrames = no_progress,
 ) -> DetectOutcome:
     """Run detectors over the only camera of a drive, into an empty run folder.
 
@@ -109,7 +108,7 @@ def detect_drive(
     """
     with locked(run), staged(run) as new, nothing_left(new):
         clear(new, input_of(run, logs, vehicle, selection, choices, draw, None))
-        outcome = detect_into(logs, vehicle, new, selection, choices, cache, draw, on_frames)
+        outcome = detect_into(logs, vehicle, new, selection, choices, cache, draw)
     return replace(outcome, run=run)
 
 
@@ -121,7 +120,6 @@ def detect_into(
     choices: Sequence[Choice],
     cache: Path | None = None,
     draw: int = 0,
-    on_frames: OnFrames = no_progress,
     timeline: Timeline | None = None,
 ) -> DetectOutcome:
     """Run detectors over the only camera of a drive, into a locked run folder.
@@ -134,7 +132,6 @@ def detect_into(
         choices: Detectors, in order.
         cache: File with results of earlier runs, or None.
         draw: Max number of pictures to write with detections drawn, spread over the drive.
-        on_frames: Called with the number of frames done, and the total if the log declares it.
         timeline: The drive's time segments, if already known.
 
     Raises:
@@ -169,7 +166,7 @@ def detect_into(
             reading.clock,
             notices=uncounted,
         )
-        _run_detectors(reading, runner, tables, on_frames)
+        _run_detectors(reading, runner, tables)
         frames = runner.counts.frames
         if not frames:
             raise empty_result(_no_frames(reading.topic, reading.ledger), logs, selection)
@@ -261,14 +258,14 @@ class _Reading:
             pass
 
 
-def _run_detectors(reading: _Reading, runner: Runner, tables: _Tables, on_frames: OnFrames) -> None:
+def _run_detectors(reading: _Reading, runner: Runner, tables: _Tables) -> None:
     """Run the detectors over all pictures and write the tables."""
     declared = _declared(reading.topic, reading.selection)
 
     def detect(block: Block) -> None:
         for result in runner(block):
             tables.add(result)
-            on_frames(runner.counts.frames, declared)
+            emit(Progress("detecting", runner.counts.frames, declared, "frames"))
 
     with tables:
         reading.pass_pictures(detect)

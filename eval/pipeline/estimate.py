@@ -65,7 +65,7 @@ from .drive_time import drive_timeline, refuse_other_segments, selections_of, ti
 from .empty_result import empty_result, silent_roles
 from .landmarks import landmark_stage
 from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
-from .progress import OnTime, report_time, unwatched_time
+from .progress import report_time
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -76,7 +76,6 @@ def estimate_into(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    on_time: OnTime = unwatched_time,
     landmarks: LandmarkDatabase | None = None,
     detected: DetectOutcome | None = None,
     earlier: DetectManifest | None = None,
@@ -90,7 +89,6 @@ def estimate_into(
         vehicle: Settings of the vehicle file.
         run: The run folder, with or without tables of the detect stage.
         selection: The part of the logs to use.
-        on_time: Called with the seconds done, and the total.
         landmarks: Database with which camera frames are compared, or None.
         detected: Outcome of the detect stage, if it ran just now.
         earlier: Manifest of the detect stage, if it ran earlier.
@@ -112,7 +110,7 @@ def estimate_into(
     stage = _pose_stage(reading)
     if detected is None:
         begin_again(run, found)
-    tally = _pose(reading, stage, run, on_time)
+    tally = _pose(reading, stage, run)
     silent = silent_roles(reading.planned, stage.received)
     _refuse_empty(reading, silent, tally)
     scene = None if found is None else _scene(run, vehicle, found, reading)
@@ -329,7 +327,7 @@ class _Reading:
         return self.timeline.clock(0 if source is None else source.log)
 
 
-def _pose(reading: _Reading, stage: PoseStage, run: RunFolder, on_time: OnTime) -> PoseTally:
+def _pose(reading: _Reading, stage: PoseStage, run: RunFolder) -> PoseTally:
     tally = PoseTally()
     timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
     with (
@@ -345,7 +343,7 @@ def _pose(reading: _Reading, stage: PoseStage, run: RunFolder, on_time: OnTime) 
                 tally.add(poses)
             _write_all(measured, stage.take_measured())
             mobileye.write(window.samples)
-            report_time(on_time, timeline, window.end_ns)
+            report_time("estimating the pose", timeline, window.end_ns)
         for poses in stage.finish():
             sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
             tally.add(poses)

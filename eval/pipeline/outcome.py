@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 from crosscue.detectors.runner import Counts
 from crosscue.eval.pipeline.scene.outcome import ApproachSummary, SceneOutcome
@@ -18,11 +20,12 @@ from crosscue.eval.runs.folder import (
 from crosscue.replay.base import Ledger, visible
 from crosscue.replay.safe_text import terminal_width, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, Segment
+from crosscue.results import HIDDEN, Result, json_key
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class DetectOutcome:
-    """Outcome of the detect stage; its ``repr`` is the output of ``crosscue detect``.
+class DetectOutcome(Result):
+    """Outcome of the detect stage; its text is the output of ``crosscue detect``.
 
     Attributes:
         run: The run folder.
@@ -36,41 +39,44 @@ class DetectOutcome:
         has_gaps: True if the drive has more than one time segment.
     """
 
-    run: RunFolder
-    ledger: Ledger
-    counts: Counts
+    run: RunFolder = field(metadata=HIDDEN)
+    ledger: Ledger = field(metadata=HIDDEN)
+    counts: Counts = field(metadata=HIDDEN)
     objects: dict[str, int]
     cues: dict[str, int]
     notices: tuple[str, ...]
     seconds: float
     account: Account
-    has_gaps: bool = False
+    has_gaps: bool = field(default=False, metadata=HIDDEN)
+
+    also: ClassVar = {
+        "run": "run.path",
+        "frames": "counts.frames",
+        "ran": "counts.ran",
+        "from_cache": "counts.from_cache",
+    }
 
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped or the drive has gaps, else 0."""
         return 0 if self.account.is_whole and not self.has_gaps else 3
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the object that ``crosscue detect --json`` prints."""
-        return {
-            "run": str(self.run.path),
-            "account": self.account.as_json(),
-            "frames": self.counts.frames,
-            "ran": self.counts.ran,
-            "from_cache": self.counts.from_cache,
-            "objects": self.objects,
-            "cues": self.cues,
-            "notices": list(self.notices),
-            "seconds": self.seconds,
-        }
-
-    def __repr__(self) -> str:
-        return _detect_text(self)
+    def lines(self) -> Iterator[str]:
+        """Yield counts of frames, objects and cues, and the account."""
+        counts, ledger = self.counts, self.ledger
+        yield f"run      {self.run.path}"
+        yield f"log      {ledger.log}"
+        yield f"frames   {counts.frames:,} in {self.seconds:.2f} s"
+        for name, ran in counts.ran.items():
+            yield f"  {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache"
+        yield from (f"found    {what}: {count:,}" for what, count in sorted(self.objects.items()))
+        yield from (f"cue      {cue}: in {count:,} frames" for cue, count in self.cues.items())
+        yield from (*account_lines(self.account), *details_of([ledger]))
+        yield from (f"note     {sentence}" for sentence in (*ledger.notices, *self.notices))
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Outcome:
+class Outcome(Result):
     """Outcome of a replay or an estimate; its ``repr`` is the output of ``crosscue replay``.
 
     Attributes:
@@ -89,69 +95,57 @@ class Outcome:
         segments: Number of time segments of the drive.
     """
 
-    run: RunFolder
-    ledgers: tuple[Ledger, ...]
-    rows: int
-    travelled_m: float
-    major_axis_m: float
+    run: RunFolder = field(metadata=HIDDEN)
+    ledgers: tuple[Ledger, ...] = field(metadata=HIDDEN)
+    rows: int = field(metadata=HIDDEN)
+    travelled_m: float = field(metadata=HIDDEN)
+    major_axis_m: float = field(metadata=HIDDEN)
     notices: tuple[str, ...]
     seconds: float
-    drive_seconds: float
-    landmark_counts: dict[str, int]
+    drive_seconds: float = field(metadata=HIDDEN)
+    landmark_counts: dict[str, int] = field(metadata=json_key("landmarks"))
     account: Account
-    detected: DetectOutcome | None = None
+    detected: DetectOutcome | None = field(default=None, metadata=HIDDEN)
     scene: SceneOutcome | None = None
-    segments: tuple[Segment, ...] = ONE_SEGMENT.segments
+    segments: tuple[Segment, ...] = field(default=ONE_SEGMENT.segments, metadata=HIDDEN)
+
+    also: ClassVar = {"run": "run.path", "pose": "pose", "detected": "detection_counts"}
 
     @property
     def exit_status(self) -> int:
         """3 when anything was dropped or the drive has gaps, else 0."""
         return 0 if self.account.is_whole and len(self.segments) == 1 else 3
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the object that ``crosscue replay --json`` prints."""
+    @property
+    def pose(self) -> dict[str, float]:
+        """Rows, length and final uncertainty of the track."""
         return {
-            "run": str(self.run.path),
-            "account": self.account.as_json(),
-            "pose": {
-                "rows": self.rows,
-                "travelled_m": self.travelled_m,
-                "major_axis_m": self.major_axis_m,
-            },
-            "landmarks": self.landmark_counts,
-            "detected": None
-            if self.detected is None
-            else {
-                "frames": self.detected.counts.frames,
-                "ran": self.detected.counts.ran,
-                "from_cache": self.detected.counts.from_cache,
-                "objects": self.detected.objects,
-            },
-            "scene": None if self.scene is None else asdict(self.scene),
-            "notices": list(self.notices),
-            "seconds": self.seconds,
+            "rows": self.rows,
+            "travelled_m": self.travelled_m,
+            "major_axis_m": self.major_axis_m,
         }
 
-    def __repr__(self) -> str:
-        return _outcome_text(self)
+    @property
+    def detection_counts(self) -> dict[str, object] | None:
+        """Counts of the detect stage, if it ran just now."""
+        if self.detected is None:
+            return None
+        counts = self.detected.counts
+        return {
+            "frames": counts.frames,
+            "ran": counts.ran,
+            "from_cache": counts.from_cache,
+            "objects": self.detected.objects,
+        }
+
+    def lines(self) -> Iterator[str]:
+        """Yield the account, the pose, cues and approaches, at most 80 columns wide."""
+        width = min(terminal_width(), 80)
+        for line in map(visible, _lines_of(self)):
+            yield wrapped(line[9:], width, lead=line[:9]) if len(line) > width else line
 
 
-def _detect_text(outcome: DetectOutcome) -> str:
-    """Return the text output of the detect stage."""
-    counts, ledger = outcome.counts, outcome.ledger
-    lines = [f"run      {outcome.run.path}", f"log      {ledger.log}"]
-    lines.append(f"frames   {counts.frames:,} in {outcome.seconds:.2f} s")
-    for name, ran in counts.ran.items():
-        lines.append(f"  {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache")
-    lines += [f"found    {what}: {count:,}" for what, count in sorted(outcome.objects.items())]
-    lines += [f"cue      {cue}: in {count:,} frames" for cue, count in outcome.cues.items()]
-    lines += [*account_lines(outcome.account), *details_of([ledger])]
-    lines += [f"note     {sentence}" for sentence in (*ledger.notices, *outcome.notices)]
-    return "\n".join(visible(line) for line in lines)
-
-
-def _outcome_text(outcome: Outcome) -> str:
-    """Return the text output of a replay, at most 80 columns wide."""
+def _lines_of(outcome: Outcome) -> list[str]:
     lines = [f"run      {outcome.run.path}"]
     for log in outcome.account.reading:
         lines.append(f"log      {log.log}")
@@ -176,11 +170,7 @@ def _outcome_text(outcome: Outcome) -> str:
     speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
     digits = 0 if speed >= 10 else 1
     lines.append(f"took     {outcome.seconds:.2f} s, {speed:.{digits}f} times real time")
-    width = min(terminal_width(), 80)
-    return "\n".join(
-        wrapped(visible(line[9:]), width, lead=line[:9]) if len(line) > width else visible(line)
-        for line in lines
-    )
+    return lines
 
 
 def _ledgers(outcome: Outcome) -> list[Ledger]:

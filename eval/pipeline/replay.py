@@ -35,7 +35,6 @@ from .detect import detect_into, only_camera
 from .drive_time import drive_timeline
 from .empty_result import nothing_left
 from .estimate import begin_again, estimate_into
-from .progress import OnFrames, OnTime, no_progress, unwatched_time
 
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
 """Tables of the first stage that the second stage reads."""
@@ -50,7 +49,6 @@ class Detecting:
         cache: File with results of earlier runs, or None.
         draw: Number of pictures to write with detections drawn.
         resume: Keep detections of an earlier start that would be the same.
-        on_frames: Called with the number of frames done, and the total if known.
         is_required: The user named the detectors, so a drive without a camera is an error.
     """
 
@@ -58,7 +56,6 @@ class Detecting:
     cache: Path | None = None
     draw: int = 0
     resume: bool = False
-    on_frames: OnFrames = no_progress
     is_required: bool = False
 
 
@@ -70,7 +67,6 @@ def replay_drive(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    on_time: OnTime = unwatched_time,
     landmarks: LandmarkDatabase | None = None,
     detecting: Detecting = NO_DETECTORS,
     *,
@@ -83,7 +79,6 @@ def replay_drive(
         vehicle: Settings of the vehicle file.
         run: The run folder; locked meanwhile, and cleared first unless its detections are kept.
         selection: The part of the logs to use.
-        on_time: Called with the seconds done, and the total.
         landmarks: Database with which camera frames are compared, or None.
         detecting: Detectors to run over the camera; without any, the run has only the pose.
         overwrite: Replace a run of other logs or settings even if ``detecting.resume`` is set.
@@ -118,7 +113,7 @@ def replay_drive(
             else:
                 found = None
             outcome = estimate_into(
-                logs, vehicle, new, selection, on_time, landmarks, found, earlier, timeline=timeline
+                logs, vehicle, new, selection, landmarks, found, earlier, timeline=timeline
             )
         detected = None if outcome.detected is None else replace(outcome.detected, run=run)
         return replace(outcome, run=run, detected=detected)
@@ -161,7 +156,6 @@ def _detect(
         detecting.choices,
         detecting.cache,
         detecting.draw,
-        detecting.on_frames,
         timeline,
     )
 
@@ -204,7 +198,6 @@ def _kept(
 def estimate_run(
     run: RunFolder,
     vehicle: Vehicle | None = None,
-    on_time: OnTime = unwatched_time,
 ) -> Outcome:
     """Estimate again into the same run folder; no picture is opened.
 
@@ -213,7 +206,6 @@ def estimate_run(
     Args:
         run: A finished run, or one whose detect stage has finished.
         vehicle: Settings; default: those of the run.
-        on_time: Called with the seconds done, and the total.
 
     Raises:
         RunError: The run's logs are missing or have changed, or it was made with landmarks.
@@ -243,7 +235,6 @@ def estimate_run(
             settings,
             new,
             manifest.selection.selection,
-            on_time,
             earlier=manifest.detected,
             reported=manifest.logs,
         )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from crosscue.eval.runs.folder import Manifest, RunFolder, json_schema
 from crosscue.eval.runs.folder import open_run as open_folder
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogError, RunError, UsageError, visible
+from crosscue.replay.base import DEFAULT_LIMITS, LogError, RunError, UsageError, visible
+from crosscue.replay.limits import LimitsGiven
 from crosscue.replay.vehicle.vehicle import Vehicle, load
-from crosscue.results import listing
+from crosscue.results import Result, listing
+from crosscue.verb import Option
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Run:
+class Run(Result):
     """A run folder, made by ``replay_drive`` or read by ``open_run``.
 
     Tables are read on access, and their checksums are verified: ``run["belief"]``, or
@@ -38,6 +41,11 @@ class Run:
     def path(self) -> Path:
         """Path of its folder."""
         return self.folder.path
+
+    @property
+    def reported(self) -> Result:
+        """The counts, which the commands that make a run print."""
+        return self.made
 
     @property
     def made(self) -> Outcome | DetectOutcome:
@@ -85,14 +93,15 @@ class Run:
         """Position, heading and their covariance over time."""
         return self["pose"]
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield the folder, a table of tables, and notices."""
         rows = []
         for name in self.tables:
             columns = self.folder.schema(name).names
             rows.append((name, ", ".join(columns), self._rows(name)))
-        tables = listing(("table", "columns", "rows"), rows, 2)
-        notices = (f"note: {visible(text)}" for text in self.folder.drive_manifest().notices)
-        return "\n".join((str(self.path), tables, *notices))
+        yield str(self.path)
+        yield listing(("table", "columns", "rows"), rows, 2)
+        yield from (f"note: {visible(text)}" for text in self.folder.drive_manifest().notices)
 
     def _rows(self, name: str) -> int:
         import pyarrow.parquet as pq
@@ -110,25 +119,25 @@ def load_vehicle(path: Path | str) -> Vehicle:
 
 
 def open_run(
-    path: Path | str,
-    logs: Path | str | None = None,
+    run: Path | str,
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None,
     *,
     without_images: bool = False,
-    limits: Limits = DEFAULT_LIMITS,
+    limits: LimitsGiven = DEFAULT_LIMITS,
 ) -> Run:
     """Open a finished run.
 
     Args:
-        path: Folder of the run.
-        logs: Folder that its logs have moved to.
-        without_images: Show the run without camera images, so that its logs are not needed.
+        run: Folder of the run.
+        logs: Folder that the run's logs have moved to; they are recognised by content.
+        without_images: Leave out camera images, so the run's logs are not needed.
         limits: Limits for reading its logs.
 
     Raises:
         RunError: The folder is not a run, is damaged or of another version, or contains merged
             drives.
     """
-    folder = open_folder(Path(path), moved_to(logs), without_images=without_images, limits=limits)
+    folder = open_folder(Path(run), moved_to(logs), without_images=without_images, limits=limits)
     # Refuses a folder of merged drives.
     folder.drive_manifest()
     return Run(folder)
@@ -141,8 +150,29 @@ def moved_to(logs: Path | str | None) -> Path | None:
         LogError: It is not a folder.
     """
     if logs is not None and not Path(logs).is_dir():
-        raise LogError(f"--logs {logs}: no such folder; name the one that the logs have moved to")
+        raise LogError(f"logs: {logs}, no such folder; name the one that the logs have moved to")
     return None if logs is None else Path(logs)
+
+
+def open_run_of_logs(
+    run: Path | str,
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None,
+    limits: LimitsGiven = DEFAULT_LIMITS,
+) -> Run:
+    """Open a finished run, for a verb that shows no pictures.
+
+    Args:
+        run: Run folder.
+        logs: Folder that the run's logs have moved to; they are recognised by content.
+        limits: Limits for reading its logs.
+    """
+    return open_run(run, logs, limits=limits)
+
+
+RunGiven: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run_of_logs)]
+"""A run, as a parameter of a verb: on the command line, ``RUN`` and where its logs are."""
+PicturedRun: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run)]
+"""A run of a verb that shows its pictures, unless ``--without-images`` is set."""
 
 
 def run_schema() -> dict[str, Any]:

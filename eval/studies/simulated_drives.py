@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -23,7 +23,7 @@ from crosscue.datasets.scenes.drive import (
 )
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED, chosen
-from crosscue.eval.batch.jobs import Done, Engine, Job, Progress, fingerprint_of, run_many
+from crosscue.eval.batch.jobs import Done, Engine, Job, fingerprint_of, run_many
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
@@ -118,7 +118,6 @@ def run_drives(
     scenes: Sequence[SceneSettings],
     detectors: str,
     engine: Engine,
-    on_progress: Callable[[Progress], None] = lambda _: None,
     *,
     vehicle: Path | None = None,
     imager: Imager = PHOTOGRAPHS,
@@ -130,7 +129,6 @@ def run_drives(
         scenes: Settings of the drives, in the order of processing.
         detectors: Comma-separated names, as for ``crosscue replay``.
         engine: Engine that runs the work.
-        on_progress: Called about once a second.
         vehicle: Vehicle file to replay with; default: that of each drive.
         imager: Camera that records the pictures.
 
@@ -155,4 +153,4 @@ def run_drives(
         for name in by_name
     ]
     work = Work(out / "drives", by_name, vehicle, detectors, out / "cache", made_by, imager)
-    return run_many(jobs, work, engine, overwrite=True, on_progress=on_progress)
+    return run_many(jobs, work, engine, overwrite=True, doing="driving")

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError, name_of
 from crosscue.replay.remote.logs import RangedLog
@@ -51,12 +51,12 @@ class LogPart:
     """The part of a drive to read, as the command line names it.
 
     Attributes:
-        start: Start time: seconds from the first message (12.5), or absolute nanoseconds (17...ns).
+        begin: Start time: seconds from the first message (12.5), or absolute nanoseconds (17...ns).
         end: End time, exclusive, in the same form.
         topics: Read only these topics.
     """
 
-    start: Annotated[str | None, Option("--from", metavar="T")] = None
+    begin: Annotated[str | None, Option("--from", metavar="T")] = None
     end: Annotated[str | None, Option("--to", metavar="T")] = None
     topics: Sequence[str] | None = None
 
@@ -68,13 +68,16 @@ class LogPart:
             MissingTopicError: No log has a topic of that name, or no log has a row.
         """
         wanted = named_topics(logs, self.topics) if self.topics else None
-        if self.start is None and self.end is None:
+        if self.begin is None and self.end is None:
             return Selection(wanted)
-        start_ns = _time_ns("start", self.start, logs)
+        start_ns = _time_ns("begin", self.begin, logs)
         end_ns = _time_ns("end", self.end, logs)
         if start_ns is not None and end_ns is not None and end_ns <= start_ns:
-            raise UsageError(f"end: {self.end}, expected a time after the start, {self.start}")
+            raise UsageError(f"end: {self.end}, not after {self.begin}; try a later time")
         return Selection(wanted, start_ns, end_ns)
+
+
+EVERY_PART: Final = LogPart()
 
 
 def _time_ns(name: str, text: str | None, logs: Sequence[Log]) -> int | None:
@@ -123,6 +126,6 @@ def first_ns(logs: Sequence[Log]) -> int:
                 break
     if not starts:
         raise MissingTopicError(
-            "start, end: the log holds no row, so it has no start; leave them out"
+            "begin, end: the log holds no row, so it has no start; leave them out"
         )
     return min(starts)

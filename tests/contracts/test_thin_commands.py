@@ -37,11 +37,6 @@ CALLS: Final = {
         "draw_contact_sheet",
     ),
     "demo": ("demo",),
-    "detect": ("detect_drive",),
-    "estimate": (
-        "open_run",
-        "estimate_run",
-    ),
     "view": (
         "open_run",
         "save_recording",
@@ -71,7 +66,6 @@ CALLS: Final = {
     "study landmarks": ("run_study",),
     "study field": ("run_field_study",),
     "study drive": ("run_study_drive",),
-    "replay": ("find_drives", "replay_drive", "replay_drives"),
     "train frames": ("render_training_frames",),
     "train road": ("train_road", "measure_road"),
     "train mask-rcnn": ("train_mask_rcnn", "measure_mask_rcnn"),

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -12,7 +11,7 @@ from typing import Annotated, ClassVar, Literal
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.command_line import Call, fill
+from crosscue.eval.command_line import Call, fill, with_options
 from crosscue.eval.terminal import print_found
 from crosscue.replay.errors import UsageError
 from crosscue.results import Result, json_key
@@ -51,20 +50,19 @@ class Shape:
     colour: Literal["red", "blue"] = "red"
     workers: int = field(default=1, compare=False)
 
+    def __post_init__(self) -> None:
+        """Refuse no workers."""
+        if self.workers < 1:
+            raise UsageError(f"workers: {self.workers}, expected 1 or more")
 
-ENTERED: list[str] = []
 
-
-@contextmanager
-def labelled(label: Annotated[str, Option("--from", metavar="L")] = "x") -> Iterator[str]:
+def labelled(label: Annotated[str, Option("--from", metavar="L")] = "x") -> str:
     """Make a label.
 
     Args:
         label: Label of all boxes.
     """
-    ENTERED.append(f"enter {label}")
-    yield f"<{label}>"
-    ENTERED.append(f"leave {label}")
+    return f"<{label}>"
 
 
 @keywords(Shape)
@@ -119,23 +117,12 @@ def parsed(words: str) -> tuple[Call, argparse.ArgumentParser, argparse.Namespac
 
 
 def test_options_become_arguments_with_defaults() -> None:
-    call, _, args = parsed("a.box b.box --width-m 4 --colour blue --seen x y")
+    call, _, args = parsed("a.box b.box --from y --width-m 4 --colour blue --seen x y")
 
-    assert call.run(args) == Filled(
-        (Path("a.box"), Path("b.box")), 4.0, "blue", "<x>", False, ("x", "y")
+    assert call(args) == Filled(
+        (Path("a.box"), Path("b.box")), 4.0, "blue", "<y>", False, ("x", "y")
     )
-    assert call.run(parsed("a.box")[2]) == Filled((Path("a.box"),), 2.5, "red", "<x>", False, ())
-
-
-def test_value_made_by_another_function_is_open_during_the_call() -> None:
-    ENTERED.clear()
-    call, _, args = parsed("a.box --from z")
-
-    found = call.run(args)
-
-    assert isinstance(found, Filled)
-    assert found.label == "<z>"
-    assert ENTERED == ["enter z", "leave z"]
+    assert call(parsed("a.box")[2]) == Filled((Path("a.box"),), 2.5, "red", "<x>", False, ())
 
 
 def test_help_comes_from_the_docstrings() -> None:
@@ -162,12 +149,12 @@ def test_help_comes_from_the_docstrings() -> None:
     ],
 )
 def test_errors_about_arguments_name_options(words: str, message: str) -> None:
-    call, _, args = parsed(words)
+    call, parser, args = parsed(words)
 
     with pytest.raises(UsageError) as error:
-        call.run(args)
+        call(args)
 
-    assert str(error.value) == message
+    assert with_options(str(error.value), parser) == message
 
 
 def test_function_takes_fields_of_its_record_as_keywords() -> None:
@@ -199,7 +186,7 @@ def test_result_is_printed_in_the_chosen_format(
     parser.add_argument("-q", dest="quiet", action="store_true")
     args = parser.parse_args(words.split())
 
-    assert print_found(call.run(args), args) == 0
+    assert print_found(call(args), args) == 0
 
     assert capsys.readouterr().out.startswith(printed)
 

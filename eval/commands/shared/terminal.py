@@ -12,7 +12,7 @@ import crosscue
 from crosscue.eval.command_line import add_parameters
 from crosscue.eval.terminal import Done as Done
 from crosscue.eval.terminal import ProgressLine as ProgressLine
-from crosscue.eval.terminal import is_shown as is_shown
+from crosscue.eval.terminal import is_shown
 from crosscue.eval.terminal import print_json as print_json
 from crosscue.eval.terminal import warn as warn
 from crosscue.replay import limits
@@ -24,7 +24,7 @@ from crosscue.replay.base import (
 )
 
 if TYPE_CHECKING:
-    from crosscue.eval.batch.jobs import Progress as Progressed
+    pass
 
 T = TypeVar("T")
 
@@ -50,23 +50,6 @@ def add_part_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="read only these topics")
     add_limit_arguments(parser)
-
-
-def add_first_pose_arguments(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add ``--gnss`` and ``--start``."""
-    parser.add_argument(
-        "--gnss",
-        choices=("start", "truth", "fuse", "off"),
-        help="use of GNSS: for the first pose and heading, only as truth, for the first pose and "
-        f"every later position, or not at all (default: {default})",
-    )
-    parser.add_argument(
-        "--start",
-        dest="first_pose",
-        metavar="POSE",
-        help="first pose: X,Y,HEADING in metres and degrees counter-clockwise from east, or a "
-        "truth file with a track",
-    )
 
 
 def add_annotated_runs(parser: argparse.ArgumentParser) -> None:
@@ -233,27 +216,6 @@ def print_schema(schema: object, args: argparse.Namespace) -> None:
         print_json(schema)
     else:
         write_text(args.output, strict_json(schema) + "\n")
-
-
-class DriveLine(ProgressLine):
-    """Progress line of one drive: frames while detectors run, then seconds of the log."""
-
-    def at_frame(self, done: int, of: int | None) -> None:
-        """Show the number of frames done."""
-        self.at(Done(done, of, "frames"), "detecting")
-
-    def at_time(self, done_s: float, of_s: float) -> None:
-        """Show the seconds of the log that are done."""
-        self.at(Done(done_s, of_s, "s of log"))
-
-
-class DrivesLine(ProgressLine):
-    """Progress line of many drives."""
-
-    def __call__(self, at: Progressed) -> None:
-        """Show the number of drives done."""
-        failed = f", {at.failed} failed" if at.failed else ""
-        self.at(Done(at.done, at.total - at.earlier, "drives"), f"{self._what}{failed}")
 
 
 def progress_line(args: argparse.Namespace, what: str) -> ProgressLine:

@@ -16,7 +16,7 @@ from pathlib import Path
 import crosscue
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.detectors.registry import EMBEDDED
-from crosscue.eval.commands.shared.terminal import DrivesLine, is_shown, print_result
+from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,14 +83,12 @@ def run(args: argparse.Namespace) -> int:
         vehicle=args.vehicle,
         detectors=args.detectors,
     )
-    with DrivesLine("driving", is_shown=is_shown(args)) as line:
-        found = crosscue.run_intersection_study(
-            study,
-            args.output,
-            args.workers,
-            ray=args.ray,
-            attribution=not args.no_attribution,
-            on_progress=line,
-        )
+    found = crosscue.run_intersection_study(
+        study,
+        args.output,
+        args.workers,
+        ray=args.ray,
+        attribution=not args.no_attribution,
+    )
     print_result(found, args)
     return found.exit_status

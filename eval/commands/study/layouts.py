@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 
 import crosscue
-from crosscue.eval.commands.shared.terminal import DrivesLine, is_shown, print_result
+from crosscue.eval.commands.shared.terminal import print_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,13 +74,11 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
         width_px=args.width,
     )
-    with DrivesLine("driving", is_shown=is_shown(args)) as line:
-        found = crosscue.run_layout_study(
-            study,
-            args.output,
-            args.workers,
-            ablation=not args.no_ablation,
-            on_progress=line,
-        )
+    found = crosscue.run_layout_study(
+        study,
+        args.output,
+        args.workers,
+        ablation=not args.no_ablation,
+    )
     print_result(found, args)
     return found.exit_status

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import Done, Progress, exit_status_of
-from crosscue.eval.interface.runs.make import choices_for
+from crosscue.eval.batch.jobs import Done, exit_status_of
+from crosscue.eval.drives.replay import choices_for
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.intersections.report import StudyFiles, summary, write_study
 from crosscue.eval.studies.intersections.settings import IntersectionStudy
@@ -54,7 +53,6 @@ def run_intersection_study(
     *,
     ray: str | None = None,
     attribution: bool = True,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> IntersectionResult:
     """Simulate every drive of a study, replay it from its pictures, and score it.
 
@@ -66,7 +64,6 @@ def run_intersection_study(
         workers: Number of drives in parallel.
         ray: Address of a Ray cluster that shares ``output``.
         attribution: Run an ablation of each cue.
-        on_progress: As in ``replay_drives``.
 
     Raises:
         UsageError: ``workers`` is below 1, or a detector does not exist.
@@ -81,7 +78,6 @@ def run_intersection_study(
         study.scenes(),
         study.detectors,
         engine_of(workers, ray),
-        on_progress,
         vehicle=study.vehicle,
     )
     names = [one.job.name for one in done if one.error is None]

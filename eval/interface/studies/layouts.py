@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
 from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import Progress, exit_status_of
+from crosscue.eval.batch.jobs import exit_status_of
 from crosscue.eval.studies.layouts.drives import open_drive
 from crosscue.eval.studies.layouts.report import (
     LayoutFiles,
@@ -69,7 +68,6 @@ def run_layout_study(
     workers: int = 1,
     *,
     ablation: bool = True,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
     on_step: OnStep = lambda what, done, of: None,
 ) -> LayoutResult:
     """Simulate every drive, find its cues, and score beliefs by cross-validation over layouts.
@@ -82,7 +80,6 @@ def run_layout_study(
         output: Folder for drives, runs, tables and page.
         workers: Number of drives in parallel.
         ablation: Run an ablation of each cue and each rule.
-        on_progress: As in ``replay_drives``.
         on_step: Called with the name of the current step, the amount done, and the total.
 
     Raises:
@@ -97,7 +94,6 @@ def run_layout_study(
         study.scenes(),
         detectors,
         engine_of(workers, None),
-        on_progress,
         imager=imager,
     )
     failures = {one.job.name: one.error for one in done if one.error is not None}

@@ -18,7 +18,7 @@ from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Place, Seen
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import Motion
-from crosscue.eval.pipeline.progress import OnTime, report_time, unwatched_time
+from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
@@ -61,7 +61,6 @@ def estimate_scene(
     sink: Sink,
     past: Callable[[int], PastCues | None] = nothing_past,
     without: frozenset[str] = frozenset(),
-    on_time: OnTime = unwatched_time,
     timeline: Timeline = ONE_SEGMENT,
     on_restart: Callable[[int], None] = lambda _: None,
 ) -> SceneOutcome:
@@ -74,7 +73,6 @@ def estimate_scene(
         sink: Called with the rows of ``cues``, ``range`` and ``belief``.
         past: Function from a time to the Mobileye's cues beyond the intersection.
         without: Cues to leave out, together with their ranges, as if they had not been evaluated.
-        on_time: Called with the seconds done, and the total.
         timeline: Time segments of the drive; after a long gap everything starts over.
         on_restart: Called with the drive time of each new start.
 
@@ -100,7 +98,7 @@ def estimate_scene(
             scene.restart(fresh_ns)
             on_restart(fresh_ns)
         scene.step(frame, past(frame.seen.t_ns), without | boxes_only)
-        report_time(on_time, timeline, frame.seen.t_ns)
+        report_time("estimating beliefs", timeline, frame.seen.t_ns)
     scene.rows.flush()
     scene.approaches.finish()
     return SceneOutcome(

@@ -15,7 +15,6 @@ from crosscue.eval.batch.jobs import (
     Done,
     Engine,
     Job,
-    Progress,
     State,
     exit_status_of,
     fingerprint_of,
@@ -27,6 +26,7 @@ from crosscue.eval.batch.jobs import (
 from crosscue.eval.batch.processes import Processes
 from crosscue.replay.base import UsageError
 from crosscue.replay.losses import losses_heard
+from crosscue.replay.progress import Progress, watching
 from support.drive_work import Letters, letters, write_jobs
 from support.trees import tree
 
@@ -171,14 +171,14 @@ def test_duplicate_job_names_and_zero_workers_are_refused(tmp_path: Path) -> Non
 
 
 def test_progress_counts_earlier_done_and_failed_drives(tmp_path: Path) -> None:
-    seen: list[Progress] = []
+    seen: list[object] = []
     jobs = write_jobs(tmp_path, ["plain", "damaged", "more"])
     run_many(jobs[:1], letters, in_turn)
 
-    run_many(jobs, letters, in_turn, on_progress=seen.append)
+    with watching(seen.append):
+        run_many(jobs, letters, in_turn)
 
-    last = seen[-1]
-    assert (last.total, last.earlier, last.done, last.failed) == (3, 1, 2, 1)
+    assert seen[-1] == Progress("replaying, 1 failed", 2, 2, "drives")
 
 
 def test_exit_status_combines_those_of_all_drives() -> None:
@@ -219,7 +219,8 @@ def run(args):
 if __name__ == "__main__":
     # Tests started in the background of a shell ignore this signal.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.exit(_guarded(types.SimpleNamespace(run=run), argparse.Namespace(verbose=False)))
+    args = argparse.Namespace(verbose=False, quiet=True, json=False)
+    sys.exit(_guarded(types.SimpleNamespace(run=run), args, argparse.ArgumentParser()))
 """
 
 

@@ -12,6 +12,8 @@ import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
+from crosscue.replay.logs.log_part import LogPart
+from crosscue.replay.progress import Progress, watching
 
 pytestmark = pytest.mark.slow
 
@@ -121,18 +123,16 @@ def test_replay_drives_function_matches_the_command(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "runs"
-    reported: list[int] = []
+    reported: list[object] = []
 
-    done = crosscue.replay_drives(
-        [drives / "monday", drives / "broken"],
-        out,
-        end=2.0,
-        on_progress=lambda at: reported.append(at.done),
-    )
+    with watching(reported.append):
+        done = crosscue.replay_drives(
+            [drives / "monday", drives / "broken"], out, part=LogPart(end="2.0")
+        )
 
     assert [one.error is None for one in done.drives] == [True, False]
     assert done.exit_status == 3
-    assert reported[-1] == 2
+    assert reported[-1] == Progress("replaying, 1 failed", 2, 2, "drives")
     assert "drives   1 of 2, 1 failed" in repr(done)
     assert done.merged == out / "merged"
     assert crosscue.find_drives(drives).is_many

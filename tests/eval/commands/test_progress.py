@@ -13,7 +13,6 @@ from typing import Final
 import pytest
 
 from crosscue.eval import terminal as progress
-from crosscue.eval.commands.shared.terminal import DriveLine
 from crosscue.eval.terminal import Done, ProgressLine
 from support.gap_drive import Clock, write_drive
 
@@ -86,19 +85,6 @@ def test_names_are_shown_without_markup_and_escapes(monkeypatch: pytest.MonkeyPa
         text = shown_text(line, terminal)
 
     assert "sealing [red]a\\x1b[2Jb.bag" in text
-
-
-def test_drive_line_counts_frames_then_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = replaced_stderr(monkeypatch)
-    with DriveLine("replaying", is_shown=True) as line:
-        line.at_frame(3, 10)
-        assert "3 of 10 frames" in shown_text(line, terminal)
-        line.at_time(2.0, 60.0)
-        text = shown_text(line, terminal)
-
-    assert "replaying" in text
-    assert "2 of 60 s of log" in text
-    assert "frames" not in text
 
 
 def test_hidden_line_writes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,1 @@
+"""From the logs of drives to run folders: replay, detect, estimate."""
