@@ -129,10 +129,6 @@ from crosscue.eval.interface.training.road import train_road as train_road
 from crosscue.eval.interface.truth import truth_from_gnss as truth_from_gnss
 from crosscue.eval.interface.truth import truth_schema as truth_schema
 from crosscue.eval.interface.truth import write_truth as write_truth
-from crosscue.eval.interface.vehicles import VehicleCheck as VehicleCheck
-from crosscue.eval.interface.vehicles import VehicleDraft as VehicleDraft
-from crosscue.eval.interface.vehicles import check_vehicle as check_vehicle
-from crosscue.eval.interface.vehicles import draft_vehicle as draft_vehicle
 from crosscue.eval.logs.convert import Converted as Converted
 from crosscue.eval.logs.convert import convert as convert
 from crosscue.eval.logs.log import CameraFrame as CameraFrame
@@ -157,6 +153,8 @@ from crosscue.eval.studies.layouts.settings import LayoutStudy as LayoutStudy
 from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
 from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
 from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
+from crosscue.eval.vehicle.draft import draft_vehicle as draft_vehicle
+from crosscue.eval.vehicle.drive_check import check_vehicle as check_vehicle
 from crosscue.replay.errors import AccountError as AccountError
 from crosscue.replay.errors import AnnotationError as AnnotationError
 from crosscue.replay.errors import CanDatabaseError as CanDatabaseError

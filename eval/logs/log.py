@@ -217,10 +217,24 @@ def unopened_one(log: str, part: LogPart, limits: LimitsGiven = DEFAULT_LIMITS) 
     return UnopenedLog((log,), part, limits)
 
 
+def unopened_whole(*logs: Path, limits: LimitsGiven = DEFAULT_LIMITS) -> UnopenedLog:
+    """Return a whole drive, as ``unopened`` returns a part.
+
+    Args:
+        logs: Recordings of one drive.
+        limits: Limits for reading.
+    """
+    return UnopenedLog(logs, limits=limits)
+
+
 DriveGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened)]
 """A drive, as a parameter of a verb: on the command line, ``LOG...`` and the part to read."""
 LogGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened_one)]
 """One log, as a parameter of a verb."""
+WholeDriveGiven: TypeAlias = Annotated[
+    Log | UnopenedLog | Path | str, Option(made_by=unopened_whole)
+]
+"""A drive of which a verb chooses the part itself."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -23,7 +23,7 @@ MISSING: Final[dict[str, tuple[str, int]]] = {
     "info": ("gone.mcap", INPUT),
     "convert": ("gone.mcap -o out.mcap", INPUT),
     "vehicle init": ("gone.mcap", INPUT),
-    "vehicle check": ("gone.mcap --vehicle gone.toml", INPUT),
+    "vehicle check": ("gone.mcap --vehicle gone.toml", SETTINGS),
     "decode": ("gone.mcap -o out", INPUT),
     "detect": ("gone.mcap -o out --detectors signs", INPUT),
     "estimate": ("gone", INPUT),

@@ -22,8 +22,6 @@ CALLS: Final = {
     "tag": ("tag_runs",),
     "status": ("batch_status",),
     "compare": ("compare_runs", "compare_many"),
-    "vehicle init": ("draft_vehicle",),
-    "vehicle check": ("check_vehicle",),
     "truth": ("write_truth",),
     "truth import": ("import_truth", "import_labels"),
     "truth check": ("check_truth",),

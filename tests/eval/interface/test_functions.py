@@ -191,7 +191,7 @@ def test_vehicle_draft_keeps_specified_mounting(tmp_path: Path) -> None:
     assert (camera.x_m, camera.z_m) == (1.7, 1.4)
     assert camera.pitch_rad == pytest.approx(0.0349, abs=1e-4)
     assert camera.yaw_rad == pytest.approx(-0.01745, abs=1e-4)
-    with pytest.raises(crosscue.UsageError, match="camera_height_m: expected"):
+    with pytest.raises(crosscue.UsageError, match=r"^camera_height_m: -1, expected 0.1 to 10$"):
         crosscue.draft_vehicle(log, camera_height_m=-1.0)
     # Four tiny pictures have no vanishing point: a comment reports it, and the default is kept.
     text = crosscue.draft_vehicle(log).text

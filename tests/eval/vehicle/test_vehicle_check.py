@@ -161,7 +161,7 @@ def test_check_page_and_json_have_equal_content(
     ("arguments", "status", "message"),
     [
         (["-o", "page.pdf"], 2, "expected a page or a picture"),
-        (["--seconds", "0"], 2, "seconds: expected more than 0"),
+        (["--seconds", "0"], 2, "--seconds 0: expected more than 0"),
         (["--start-s", "1000"], 1, "no signal and no picture"),
     ],
 )

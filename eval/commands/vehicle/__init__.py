@@ -1,1 +1,0 @@
-"""``crosscue vehicle ...``: draft and check vehicle files."""
