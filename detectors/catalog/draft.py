@@ -10,7 +10,7 @@ from typing import Final
 
 import tomlkit
 
-from crosscue.detectors.decoders.base import Guess, Interface, static
+from crosscue.detectors.decoders.base import DEFAULT_SCORE, Guess, Interface, static
 from crosscue.replay.errors import UsageError
 
 from .class_names import COCO_80, COCO_90, meaning_of
@@ -58,10 +58,12 @@ def draft(
     Raises:
         UsageError: The class names are missing, or their number differs from the output's.
     """
-    certain, assumed = list(guess.reasons), list(guess.assumptions)
+    certain = list(guess.reasons) if guess.is_decided else []
+    suggested = () if guess.is_decided else guess.reasons
+    assumed = [*(f"{guess.settings['kind']}: {why}" for why in suggested), *guess.assumptions]
     classes = _classes(path, model, guess, names, certain, assumed)
     given = _input(model, guess, size_px, certain, assumed)
-    output = {**guess.settings, "score": 0.3, "classes": classes}
+    output = {**guess.settings, "score": DEFAULT_SCORE, "classes": classes}
     labels = {name: label for name in classes if (label := meaning_of(name)) and label != name}
     lines = [
         f"# Written by crosscue model init for {path.name}.",

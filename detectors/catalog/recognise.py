@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.decoders.base import (
+    DEFAULT_SCORE,
     GRID_STRIDES,
     Guess,
     Interface,
@@ -20,6 +21,7 @@ from crosscue.detectors.decoders.base import (
     kind_of,
     static,
 )
+from crosscue.detectors.decoders.plausible import oddity
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.backends import Network, load_network
 from crosscue.detectors.networks.openvino import import_openvino
@@ -38,8 +40,6 @@ MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
 """Maximum number of values of one input: the largest picture that a card may specify."""
 _MANY_CLASSES: Final = 10_000
 """Number of classes to assume where the shapes do not determine it."""
-SENSIBLE_FRACTION: Final = 0.99
-"""Minimum fraction of boxes found in noise that are of sensible size if the layout is correct."""
 _ONNX_INTEGERS: Final = frozenset((6, 7))
 """ONNX's numbers of int32 and int64."""
 SPREAD_FRACTION: Final = 0.5
@@ -270,11 +270,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     except ValueError:
         return False
     size = np.array([width, height])
-    # Exports with built-in suppression pad their output with zeros.
-    boxes_px = found.boxes_px[found.boxes_px.any(axis=1)]
-    sides = boxes_px[:, 2:] - boxes_px[:, :2]
-    is_sensible = (sides >= 0.0) & (sides <= 4.0 * size)
-    if len(boxes_px) and is_sensible.mean() <= SENSIBLE_FRACTION:
+    if oddity(found, (width, height), DEFAULT_SCORE) is not None:
         return False
     cells = cell_count((width, height), GRID_STRIDES)
     if len(found) not in (cells, 3 * cells):

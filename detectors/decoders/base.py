@@ -23,6 +23,10 @@ Size: TypeAlias = tuple[int, int]
 """Width and height in pixels."""
 
 
+DEFAULT_SCORE: Final = 0.3
+"""Minimum score of a detection, where nothing else was fitted or asked for."""
+
+
 class Masks(Protocol):
     """Computes object masks, only for the candidates that remain after suppression."""
 
@@ -91,6 +95,8 @@ class Guess:
         network: Keys of the card's ``[network]``, for files that contain only tensors.
         usual_size_px: Width and height to run at, where the file does not declare them.
         numbers_as_coco: True if networks of this layout use COCO's class numbers, with gaps.
+        is_decided: False if other layouts may have such shapes, so that the reasons only suggest
+            this one.
     """
 
     settings: Mapping[str, object]
@@ -101,6 +107,7 @@ class Guess:
     network: Mapping[str, object] | None = None
     usual_size_px: tuple[int, int] = (640, 640)
     numbers_as_coco: bool = False
+    is_decided: bool = True
 
 
 class BoxOutput(Settings):
@@ -109,7 +116,7 @@ class BoxOutput(Settings):
     kind: str
     classes: tuple[str, ...]
     """Class names, in the order of the network's class numbers."""
-    score: Proportion = 0.3
+    score: Proportion = DEFAULT_SCORE
     """Minimum score of a detection."""
     overlap: Proportion = 0.45
     """Intersection over union above which only the better of two boxes of one class is kept."""
@@ -199,6 +206,12 @@ GRID_STRIDES: Final = (8, 16, 32)
 def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False) -> int:
     """Total number of cells of the grids of all strides over a picture."""
     return sum(w * h for w, h in _grids(size_px, strides, round_up))
+
+
+def grid_cells(model: Interface) -> int | None:
+    """Number of cells of strides 8, 16 and 32; None if the input's size is variable."""
+    height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+    return cell_count((width, height), GRID_STRIDES) if width and height else None
 
 
 @lru_cache(maxsize=8)

@@ -19,6 +19,7 @@ from .base import (
     best_class,
     class_numbers,
     from_centers,
+    grid_cells,
     named,
     rows_of,
     sigmoid,
@@ -89,6 +90,10 @@ class DetrOutput(BoxOutput):
         logits = next((out for out in tables if out is not boxes), None)
         if boxes is None or logits is None or len(tables) != 2:
             return None
+        rows = static(boxes.shape, 1)
+        # A box for each cell of a grid is not a query, and such boxes are in pixels.
+        if rows is not None and (rows > _MAX_QUERIES or rows == grid_cells(model)):
+            return None
         columns = static(logits.shape, 2)
         settings = {"kind": "detr", "boxes": boxes.name, "logits": logits.name, "overlap": 1.0}
         why = f"{boxes.name} has 4 columns, {logits.name} the classes of the same queries"
@@ -104,6 +109,7 @@ class DetrOutput(BoxOutput):
                     are_fractions,
                 ),
                 {**picture, **_IMAGENET},
+                is_decided=False,
             )
         is_rf_detr = (boxes.name, logits.name) == _RF_DETR_NAMES
         return Guess(
@@ -119,6 +125,7 @@ class DetrOutput(BoxOutput):
                 else "pixels are scaled to 0..1, without a mean",
             ),
             {**picture, **_IMAGENET} if is_rf_detr else picture,
+            is_decided=is_rf_detr,
         )
 
 
@@ -149,6 +156,7 @@ def _of_one(output: Tensor, model: Interface, picture: dict[str, object]) -> Gue
             (why, f"its head is {ULTRALYTICS_HEAD}") if is_known else (why,),
             () if is_known else ("boxes are center and size in fractions",),
             picture,
+            is_decided=is_known,
         )
     if columns != names + 4:
         return None

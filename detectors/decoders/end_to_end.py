@@ -66,4 +66,5 @@ class EndToEndOutput(BoxOutput):
             (f"rows of {columns}: box, score, class" + (", mask weights" if prototypes else ""),),
             ("boxes are in input pixels",),
             PICTURE,
+            is_decided=bool(names),
         )

@@ -101,6 +101,7 @@ class TorchvisionOutput(BoxOutput):
             },
             usual_size_px=_USUAL_SIZE_PX,
             numbers_as_coco=True,
+            is_decided=named_outputs is not None,
         )
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
-    GRID_STRIDES,
     Array,
     BoxOutput,
     Candidates,
@@ -19,8 +18,8 @@ from .base import (
     Outputs,
     Size,
     best_class,
-    cell_count,
     from_centers,
+    grid_cells,
     named,
     rows_of,
     sigmoid,
@@ -58,7 +57,7 @@ class YoloV5Output(BoxOutput):
             or any(len(out.shape) == 4 for out in model.outputs)
         ):
             return None
-        rows, cells = static(output.shape, 1), _cells(model)
+        rows, cells = static(output.shape, 1), grid_cells(model)
         # Three anchors per cell; one if the network decodes the boxes of YOLOX itself.
         if rows is not None and (rows <= columns or (cells and rows not in (cells, 3 * cells))):
             return None
@@ -74,6 +73,7 @@ class YoloV5Output(BoxOutput):
                 (why, f"{rows} rows are the cells of strides 8, 16, 32"),
                 ("boxes are in input pixels, as YOLOX exports with --decode_in_inference",),
                 YOLOX_PICTURE,
+                is_decided=False,
             )
         return Guess(
             settings,
@@ -81,6 +81,7 @@ class YoloV5Output(BoxOutput):
             (why, *((f"its metadata names {names} classes",) if names else ())),
             () if names else ("boxes are in input pixels, with an objectness",),
             PICTURE,
+            is_decided=bool(names),
         )
 
 
@@ -114,6 +115,7 @@ class YoloV8Output(BoxOutput):
             (why, *((f"its metadata names {names} classes",) if names else ())),
             () if names else ("class scores without an objectness",),
             PICTURE,
+            is_decided=bool(names),
         )
 
 
@@ -190,12 +192,6 @@ def _columns(output: Array, rows: int) -> NDArray[np.float64]:
     if output.ndim != 3 or output.shape[:2] != (1, rows):
         raise ValueError(f"expected (1, {rows}, N) for these classes, got {output.shape}")
     return np.asarray(output[0].T, np.float64)
-
-
-def _cells(model: Interface) -> int | None:
-    """Number of cells of strides 8, 16 and 32; None if the input's size is variable."""
-    height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
-    return cell_count((width, height), GRID_STRIDES) if width and height else None
 
 
 def _transposed(model: Interface) -> tuple[str, int] | None:

@@ -71,4 +71,5 @@ class YoloxOutput(BoxOutput):
             (f"{rows} rows are the cells of strides 8, 16, 32 at {width} x {height}",),
             ("rows are relative to their cells, as YOLOX exports without --decode_in_inference",),
             YOLOX_PICTURE,
+            is_decided=False,
         )

@@ -378,7 +378,7 @@ def _uncounted(named: Sequence[Named], choices: Sequence[Choice], vehicle: Vehic
         if not labels or not counted.isdisjoint(labels):
             continue
         shown = f"({', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''})"
-        near = difflib.get_close_matches(labels[0].replace("_", " "), counted, n=1)
+        near = difflib.get_close_matches(labels[0].replace("_", " "), counted, n=1, cutoff=0.75)
         shown += f"; did you mean {near[0]!r}?" if near else ""
         own = f'[cues.own.NAME] labels = ["{labels[0]}"]'
         if not is_plugin(choice):

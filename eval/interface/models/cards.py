@@ -18,6 +18,7 @@ from crosscue.detectors.catalog.recognise import closed, guesses, plausible, rea
 from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.model_detector import build
+from crosscue.detectors.networks.trial import fault_seen
 from crosscue.detectors.overlay import picture_of
 from crosscue.replay.base import (
     Bytes,
@@ -130,8 +131,9 @@ def draft_card(
     Raises:
         UsageError: The card exists, the file is damaged or of another kind, no layout or several
             layouts fit, or class names are missing.
-        VehicleError: The network does not run with the card, or a weights file contains more than
-            tensors; no card is written.
+        VehicleError: The network does not run with the card, its boxes in noise, in grey or in the
+            picture cannot be right, or a weights file contains more than tensors; no card is
+            written.
         LogError: The picture cannot be read or decoded.
     """
     path = Path(weights)
@@ -156,8 +158,7 @@ def draft_card(
         return CardDraft(place, written)
     seen = Path(picture)
     # Errors in the picture are reported before a card is written.
-    _pixels_of(seen)
-    _try(place, written)
+    _try(place, written, _pixels_of(seen)[0])
     found = _look(build(card=str(place)), seen, drawing := _drawing(place, seen))
     return CardDraft(place, written, drawing, None if found is None else len(found))
 
@@ -175,12 +176,17 @@ def check_card(
 
     Raises:
         UsageError: The catalog has no such model.
-        VehicleError: Card, weights and back end do not fit each other.
+        VehicleError: Card, weights and back end do not fit each other, or the boxes found in noise,
+            in grey or in the picture cannot be right.
         LogError: The picture cannot be read or decoded.
         OutputError: The drawing cannot be written.
     """
     card = card_named(str(model))
     detector = build(card=str(card))
+    pixels = None if picture is None else _pixels_of(Path(picture))[0]
+    fault = fault_seen(detector, pixels)
+    if fault is not None:
+        raise VehicleError(f"{card}: {fault}; correct its [input] and [output], or kind")
     if picture is None:
         return CardCheck(card, detector.identity)
     seen = Path(picture)
@@ -237,17 +243,19 @@ def _drawing(card: Path, picture: Path) -> Path:
     return card.with_name(f"{card.stem}.{picture.stem}.found.jpg")
 
 
-def _try(place: Path, written: Draft) -> None:
-    """Write the card if the network runs with it.
+def _try(place: Path, written: Draft, picture: Bytes | None = None) -> None:
+    """Write the card if the network runs with it and finds no nonsense.
 
     Raises:
-        VehicleError: The network does not run; no card is written.
+        VehicleError: The network does not run, or its boxes cannot be right; no card is written.
     """
     trial = place.with_name(f".{place.stem}.trial.toml")
     write_text(trial, written.text)
     try:
-        build(card=str(trial))
-        trial.replace(place)
+        fault = fault_seen(build(card=str(trial)), picture)
+        if fault is None:
+            trial.replace(place)
+            return
     except VehicleError as error:
         said = str(error).removeprefix(f"{trial}: ").removesuffix("; correct the card")
         raise VehicleError(
@@ -256,6 +264,10 @@ def _try(place: Path, written: Draft) -> None:
         ) from None
     finally:
         trial.unlink(missing_ok=True)
+    raise VehicleError(
+        f"{place}: not written: {fault}, so {written.kind} is not its layout; choose another "
+        "--kind, write a card by hand, or a detector (docs: Write a detector)"
+    )
 
 
 def _pixels_of(picture: Path) -> tuple[Bytes, tuple[int, int]]:

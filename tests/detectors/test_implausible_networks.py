@@ -1,0 +1,126 @@
+"""A network whose boxes cannot be right gets no card, and an existing card fails its check."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import crosscue
+from crosscue.detectors.catalog.recognise import guesses, read_interface
+from crosscue.replay.base import VehicleError
+from support.onnx_models import constant_model
+
+CELLS = 32 * 16 + 16 * 8 + 8 * 4
+"""Cells of strides 8, 16 and 32 at 256 x 128."""
+SHAPE = (1, 3, 128, 256)
+END_TO_END = 'kind = "end-to-end"\nclasses = ["dog", "cat"]\nscore = 0.3\noverlap = 1.0'
+Table = NDArray[np.float32]
+
+
+def rows(count: int = 200) -> Table:
+    """Sensible boxes with scores from 0.31 to 0.9."""
+    left = np.linspace(0.0, 200.0, count)
+    table = np.column_stack([left, left / 4, left + 40.0, left / 4 + 30.0, left, 0 * left])
+    table[:, 4] = np.linspace(0.31, 0.9, count)
+    return table[None].astype(np.float32)
+
+
+def changed(**columns: float) -> Table:
+    """The sensible boxes with other values in columns named x0, y0, x1, y1 and score."""
+    table = rows()
+    for name, value in columns.items():
+        table[0, :, ("x0", "y0", "x1", "y1", "score").index(name)] = value
+    return table
+
+
+GARBAGE = {
+    "200 boxes cover the whole picture": changed(x0=-5.0, y0=-5.0, x1=900.0, y1=300.0),
+    "200 detections have the score 0.7": changed(score=0.7),
+    "200 of 200 boxes are outside the picture": changed(x0=300.0, x1=400.0),
+    "200 of 200 boxes have a negative size": changed(x0=300.0, x1=10.0),
+    "200 of 200 boxes are more than four times as large": changed(x0=0.0, x1=90_000.0),
+    "within 2 pixels of the corner": changed(x0=0.2, y0=0.3, x1=0.5, y1=0.9),
+    "scores from -4 to -4": changed(score=-4.0),
+}
+"""What is seen, with the output in which it is seen."""
+
+
+def card(folder: Path, model: bytes, output: str) -> Path:
+    """Write ``net.onnx`` and a card for it, and return the card."""
+    (folder / "net.onnx").write_bytes(model)
+    text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
+    text += f"[input]\nwidth_px = 256\nheight_px = 128\n[output]\n{output}\n"
+    path = folder / "net.toml"
+    path.write_text(text)
+    return path
+
+
+def names(folder: Path) -> Path:
+    """Write a file of two class names."""
+    path = folder / "names.txt"
+    path.write_text("dog\ncat\n")
+    return path
+
+
+@pytest.mark.parametrize("seen", GARBAGE)
+def test_card_is_refused_with_what_was_seen(tmp_path: Path, seen: str) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(constant_model(SHAPE, {"rows": GARBAGE[seen]}))
+
+    with pytest.raises(VehicleError, match=f"net.toml: not written: on noise, .*{seen}"):
+        crosscue.draft_card(net, kind="end-to-end", class_names=names(tmp_path))
+
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["names.txt", "net.onnx"]
+
+
+@pytest.mark.parametrize("seen", GARBAGE)
+def test_check_refuses_the_card(tmp_path: Path, seen: str) -> None:
+    model = constant_model(SHAPE, {"rows": GARBAGE[seen]})
+
+    with pytest.raises(VehicleError, match=f"net.toml: on noise, .*{seen}"):
+        crosscue.check_card(card(tmp_path, model, END_TO_END))
+
+
+def test_sensible_boxes_pass(tmp_path: Path) -> None:
+    model = constant_model(SHAPE, {"rows": rows()})
+
+    found = crosscue.check_card(card(tmp_path, model, END_TO_END))
+
+    assert str(found) == f"{tmp_path / 'net.toml'}: fits its network"
+
+
+def pixel_boxes_and_scores() -> dict[str, Table]:
+    """Outputs in YOLO-NAS's layout: corners in pixels, and final scores of three classes."""
+    boxes = np.tile(rows()[:, :1, :4], (1, CELLS, 1))
+    return {"904": boxes, "913": np.full((1, CELLS, 3), 0.01, np.float32)}
+
+
+def test_boxes_in_pixels_are_not_taken_for_queries_in_fractions(tmp_path: Path) -> None:
+    net = tmp_path / "nas.onnx"
+    net.write_bytes(constant_model(SHAPE, pixel_boxes_and_scores()))
+
+    kinds = [guess.settings["kind"] for guess in guesses(read_interface(net))]
+
+    assert "detr" not in kinds
+
+
+def test_pixel_boxes_read_as_fractions_are_refused(tmp_path: Path) -> None:
+    output = 'kind = "detr"\nboxes = "904"\nlogits = "913"\nclasses = ["a", "b", "c"]'
+    model = constant_model(SHAPE, pixel_boxes_and_scores())
+
+    with pytest.raises(VehicleError, match=r"on noise, .* boxes are more than four times as large"):
+        crosscue.check_card(card(tmp_path, model, output))
+
+
+def test_interpretation_of_shapes_is_assumed_not_certain(tmp_path: Path) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(constant_model(SHAPE, {"rows": rows()}))
+
+    found = crosscue.draft_card(net, kind="end-to-end", class_names=names(tmp_path)).draft
+
+    assert found.certain == ("its input is 256 x 128",)
+    assert "end-to-end: rows of 6: box, score, class" in found.assumed
