@@ -1,6 +1,9 @@
 """The public interface: one line for each name, read by ``crosscue/__init__.py``."""
 
-from crosscue.datasets.scenes.drive import SceneFiles as SceneFiles
+from crosscue.datasets.simulate import Approaches as Approaches
+from crosscue.datasets.simulate import simulate_approach as simulate_approach
+from crosscue.datasets.simulate import simulate_approaches as simulate_approaches
+from crosscue.datasets.simulate import simulate_drive as simulate_drive
 from crosscue.detectors.base import Detections as Detections
 from crosscue.detectors.base import Detector as Detector
 from crosscue.detectors.base import Frame as Frame
@@ -11,6 +14,7 @@ from crosscue.detectors.result_cache import default_cache as default_cache
 from crosscue.detectors.settings import Settings as Settings
 from crosscue.detectors.settings import identity_of as identity_of
 from crosscue.detectors.settings import settings_of as settings_of
+from crosscue.detectors.signs.templates import draw_sign as draw_sign
 from crosscue.eval.batch.drive_list import DriveList as DriveList
 from crosscue.eval.catalog.compare import Comparison as Comparison
 from crosscue.eval.catalog.decoded_logs import Decoded as Decoded
@@ -58,13 +62,6 @@ from crosscue.eval.interface.fits.ranges import FittedRanges as FittedRanges
 from crosscue.eval.interface.fits.ranges import fit_ranges as fit_ranges
 from crosscue.eval.interface.fits.temporal import FittedTemporal as FittedTemporal
 from crosscue.eval.interface.fits.temporal import fit_temporal as fit_temporal
-from crosscue.eval.interface.landmarks import AddedLandmarks as AddedLandmarks
-from crosscue.eval.interface.landmarks import LandmarkList as LandmarkList
-from crosscue.eval.interface.landmarks import LandmarkMatches as LandmarkMatches
-from crosscue.eval.interface.landmarks import add_landmark_images as add_landmark_images
-from crosscue.eval.interface.landmarks import add_landmarks as add_landmarks
-from crosscue.eval.interface.landmarks import list_landmarks as list_landmarks
-from crosscue.eval.interface.landmarks import match_landmarks as match_landmarks
 from crosscue.eval.interface.models.cards import CardCheck as CardCheck
 from crosscue.eval.interface.models.cards import CardDraft as CardDraft
 from crosscue.eval.interface.models.cards import check_card as check_card
@@ -94,12 +91,6 @@ from crosscue.eval.interface.runs.tags import TaggedRuns as TaggedRuns
 from crosscue.eval.interface.runs.tags import tag_runs as tag_runs
 from crosscue.eval.interface.runs.tracking import MlflowSink as MlflowSink
 from crosscue.eval.interface.runs.tracking import open_mlflow as open_mlflow
-from crosscue.eval.interface.simulate import SimulatedDrives as SimulatedDrives
-from crosscue.eval.interface.simulate import draw_contact_sheet as draw_contact_sheet
-from crosscue.eval.interface.simulate import draw_sign as draw_sign
-from crosscue.eval.interface.simulate import simulate_approach as simulate_approach
-from crosscue.eval.interface.simulate import simulate_approaches as simulate_approaches
-from crosscue.eval.interface.simulate import simulate_drive as simulate_drive
 from crosscue.eval.interface.studies.drive import StudyDrive as StudyDrive
 from crosscue.eval.interface.studies.drive import run_study_drive as run_study_drive
 from crosscue.eval.interface.studies.intersections import IntersectionResult as IntersectionResult
@@ -113,22 +104,12 @@ from crosscue.eval.interface.studies.town import StudyResult as StudyResult
 from crosscue.eval.interface.studies.town import calibrate_study as calibrate_study
 from crosscue.eval.interface.studies.town import run_field_study as run_field_study
 from crosscue.eval.interface.studies.town import run_study as run_study
-from crosscue.eval.interface.training.frames import TrainingFrames as TrainingFrames
-from crosscue.eval.interface.training.frames import render_training_frames as render_training_frames
-from crosscue.eval.interface.training.mask_rcnn import (
-    MaskRcnnTrainingSettings as MaskRcnnTrainingSettings,
-)
-from crosscue.eval.interface.training.mask_rcnn import MeasuredMaskRcnn as MeasuredMaskRcnn
-from crosscue.eval.interface.training.mask_rcnn import TrainedMaskRcnn as TrainedMaskRcnn
-from crosscue.eval.interface.training.mask_rcnn import measure_mask_rcnn as measure_mask_rcnn
-from crosscue.eval.interface.training.mask_rcnn import train_mask_rcnn as train_mask_rcnn
-from crosscue.eval.interface.training.road import RoadTrainingSettings as RoadTrainingSettings
-from crosscue.eval.interface.training.road import TrainedRoad as TrainedRoad
-from crosscue.eval.interface.training.road import measure_road as measure_road
-from crosscue.eval.interface.training.road import train_road as train_road
 from crosscue.eval.interface.truth import truth_from_gnss as truth_from_gnss
 from crosscue.eval.interface.truth import truth_schema as truth_schema
 from crosscue.eval.interface.truth import write_truth as write_truth
+from crosscue.eval.landmarks import add_landmarks as add_landmarks
+from crosscue.eval.landmarks import list_landmarks as list_landmarks
+from crosscue.eval.landmarks import match_landmarks as match_landmarks
 from crosscue.eval.logs.convert import Converted as Converted
 from crosscue.eval.logs.convert import convert as convert
 from crosscue.eval.logs.log import CameraFrame as CameraFrame
@@ -153,6 +134,12 @@ from crosscue.eval.studies.layouts.settings import LayoutStudy as LayoutStudy
 from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
 from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
 from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy
+from crosscue.eval.training.frames import render_training_frames as render_training_frames
+from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings as MaskRcnnTrainingSettings
+from crosscue.eval.training.mask_rcnn import Measuring as Measuring
+from crosscue.eval.training.mask_rcnn import train_mask_rcnn as train_mask_rcnn
+from crosscue.eval.training.road import RoadTrainingSettings as RoadTrainingSettings
+from crosscue.eval.training.road import train_road as train_road
 from crosscue.eval.vehicle.draft import draft_vehicle as draft_vehicle
 from crosscue.eval.vehicle.drive_check import check_vehicle as check_vehicle
 from crosscue.replay.errors import AccountError as AccountError

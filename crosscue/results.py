@@ -142,7 +142,10 @@ def plain(value: object) -> Any:
         return {visible(str(key)): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item) for item in value]
-    return visible(str(value)) if isinstance(value, str | PurePath | BaseException) else value
+    if isinstance(value, str | PurePath | BaseException):
+        return visible(str(value))
+    # An array or a number of NumPy.
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def listing(head: Sequence[str], rows: Sequence[Sequence[object]], text_columns: int = 1) -> str:

@@ -51,7 +51,7 @@ TYPES: Final[dict[Any, str]] = {int: "N", float: "X", Path: "FILE", str: "NAME"}
 Groups = dict[str, argparse._MutuallyExclusiveGroup]
 _SECTION: Final = re.compile(r"^(Args|Attributes|Returns|Yields|Raises|Examples?):$", re.MULTILINE)
 _LEAD: Final = re.compile(
-    r"(?P<names>\w+(?:, \w+)*): (?:(?P<value>[^\s,]+|[^,]*(?=, expected )), )?"
+    r"(?P<names>\w+(?:, \w+)*): (?:(?P<value>[^\s,]+|(?:\S+|[^,]*)(?=, expected )), )?"
 )
 
 
@@ -274,7 +274,8 @@ class _Argument:
         if found[:1].isupper() and not any(c.isupper() for c in found.split()[0][1:]):
             found = found[:1].lower() + found[1:]
         value = () if self.is_required else self.default
-        if value not in (None, True, False, "", ()) and "(default" not in found:
+        is_plain = not isinstance(value, bool) and value not in (None, "", ())
+        if is_plain and "(default" not in found:
             found += f" (default: {_shown(value)})"
         return found.replace("%", "%%")
 

@@ -155,6 +155,9 @@ def _print_part(event: object, args: argparse.Namespace) -> None:
     """Print a part of a result; one that is an error or has losses goes to stderr."""
     if isinstance(event, Exception):
         warn(one_line(event))
+    elif isinstance(event, str):
+        if not args.quiet:
+            print(event, file=sys.stderr if args.json else sys.stdout, flush=True)
     elif args.json:
         pass
     elif isinstance(event, Result) and event.exit_status:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,7 @@ from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
 from crosscue.replay.files.made_of import SIMULATED, made_of, refuse_another
 from crosscue.replay.write.convert import LogWriter
+from crosscue.results import Result
 
 from .car_file import vehicle_text
 from .conditions import Conditions
@@ -77,8 +78,8 @@ TOPICS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class SceneFiles:
+@dataclass(frozen=True, slots=True, repr=False)
+class SceneFiles(Result):
     """The files of one simulated drive.
 
     Attributes:
@@ -94,6 +95,16 @@ class SceneFiles:
     truth: Path
     pictures: int
     seconds: float
+    also: ClassVar = {"name": "name"}
+
+    @property
+    def name(self) -> str:
+        """Name of the drive."""
+        return self.log.parent.name
+
+    def lines(self) -> Iterator[str]:
+        """Yield the drive's folder, duration and number of pictures."""
+        yield f"{self.log.parent}: {self.seconds:.1f} s, {self.pictures} pictures"
 
 
 class Imager(NamedTuple):

@@ -61,7 +61,7 @@ def camera_of_width(width_px: int) -> Camera:
         UsageError: The width is not supported.
     """
     if not 64 <= width_px <= 3840 or width_px % 16:
-        raise UsageError(f"--width {width_px}: expected a multiple of 16 from 64 to 3840")
+        raise UsageError(f"width_px: {width_px}, expected a multiple of 16 from 64 to 3840")
     return Camera(width_px=width_px, height_px=width_px * 9 // 16)
 
 

@@ -14,6 +14,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.errors import UsageError
+
 Kind = Literal["one way left", "one way right", "do not enter", "no entry"]
 KINDS: Final[tuple[Kind, ...]] = ("one way left", "one way right", "do not enter", "no entry")
 AMERICAN: Final[tuple[Kind, ...]] = KINDS[:3]
@@ -63,6 +65,28 @@ def draw(kind: Kind, height_px: int) -> Drawing:
     grey = np.full((size[1] + 2 * MARGIN_PX, size[0] + 2 * MARGIN_PX), _AROUND, np.uint8)
     grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] = sign
     return Drawing(kind, np.asarray(cv2.GaussianBlur(grey, (3, 3), 0.6), np.uint8), size)
+
+
+def draw_sign(kind: str, height_px: int) -> NDArray[np.uint8]:
+    """Draw the template of a sign, to compose test pictures.
+
+    Args:
+        kind: ``one way left``, ``one way right``, ``do not enter`` or ``no entry``.
+        height_px: Height of the sign.
+
+    Returns:
+        Grey picture, uint8, shape (H, W).
+
+    Raises:
+        UsageError: The sign does not exist, or ``height_px`` is too small.
+    """
+    known = next((one for one in KINDS if one == kind), None)
+    if known is None:
+        raise UsageError(f"kind: expected one of {', '.join(KINDS)}; found {kind!r}")
+    try:
+        return draw(known, height_px).grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+    except ValueError as error:
+        raise UsageError(f"draw_sign: {error}") from None
 
 
 def size_of(kind: Kind, height_px: int) -> tuple[int, int]:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from crosscue.datasets.simulate import simulate_approach
 from crosscue.eval.drives.replay import replay_drive
 from crosscue.eval.interface.runs.recording import save_recording
 from crosscue.eval.interface.runs.score import ScoredRun, score_run
-from crosscue.eval.interface.simulate import simulate_approach
 from crosscue.eval.pipeline.run import Run
 from crosscue.replay.base import CrosscueError, UsageError, door, write_text
 

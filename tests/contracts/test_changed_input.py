@@ -75,7 +75,7 @@ def _prepare(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch
         raise OutputError("the disk is full")
 
     with monkeypatch.context() as patched:
-        patched.setattr("crosscue.eval.interface.training.road.SAVED_EVERY", 1)
+        patched.setattr("crosscue.eval.training.road.SAVED_EVERY", 1)
         for writer in WRITERS:
             patched.setattr(writer, full)
         assert cli.run(argv) == 1

@@ -30,10 +30,6 @@ CALLS: Final = {
     "score": ("score_runs", "open_mlflow"),
     "score detector": ("score_detector",),
     "fit detector": ("fit_detector",),
-    "simulate": (
-        "simulate_approaches",
-        "draw_contact_sheet",
-    ),
     "demo": ("demo",),
     "view": (
         "open_run",
@@ -43,12 +39,6 @@ CALLS: Final = {
     "browse": ("browse",),
     "export": ("export",),
     "plugins": ("plugins",),
-    "landmarks add": (
-        "add_landmarks",
-        "add_landmark_images",
-    ),
-    "landmarks list": ("list_landmarks",),
-    "landmarks match": ("match_landmarks",),
     "fit compass": ("fit_compass",),
     "truth from-gnss": ("truth_from_gnss",),
     "fit odometry": ("fit_odometry",),
@@ -64,9 +54,6 @@ CALLS: Final = {
     "study landmarks": ("run_study",),
     "study field": ("run_field_study",),
     "study drive": ("run_study_drive",),
-    "train frames": ("render_training_frames",),
-    "train road": ("train_road", "measure_road"),
-    "train mask-rcnn": ("train_mask_rcnn", "measure_mask_rcnn"),
     "study intersections": ("run_intersection_study",),
     "study layouts": ("run_layout_study",),
     "model list": ("models",),

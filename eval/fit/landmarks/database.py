@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded
+from crosscue.eval.logs.log import Log as Drive
 from crosscue.eval.pipeline.landmarks import UNDECODABLE
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth, mounting_of
@@ -32,6 +34,7 @@ from crosscue.replay.base import (
     Selection,
     UsageError,
     read_at_most,
+    warn_of,
 )
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
@@ -146,6 +149,15 @@ def camera_frames(
     for block, pictures in pictures_of(log, camera[0], topic, vehicle, ledger, selection):
         for row, t_ns in enumerate(block.log_ns.tolist()):
             yield Frame(t_ns, topic.name, picture_of(pictures, row))
+
+
+@contextmanager
+def frames_of(drive: Drive, vehicle: Vehicle) -> Iterator[tuple[Iterator[Frame], list[Ledger]]]:
+    """Yield the camera's pictures; warn about missing ones at the end."""
+    ledgers = [Ledger(str(log.path)) for log in drive.logs]
+    yield camera_frames(drive.logs, vehicle, drive.selection, ledgers), ledgers
+    for ledger in ledgers:
+        warn_of(ledger)
 
 
 def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> None:
@@ -326,7 +338,5 @@ def near_of(text: str | None) -> tuple[Floats, float] | None:
     except ValueError:
         x = y = radius = math.nan
     if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(radius) and radius >= 0.0):
-        raise UsageError(
-            f"--near {text}: expected x,y,radius in metres, such as --near=-12.5,80,50"
-        )
+        raise UsageError(f"near: {text}, expected x,y,radius in metres, such as --near=-12.5,80,50")
     return np.array([x, y]), radius

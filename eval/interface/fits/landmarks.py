@@ -6,10 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crosscue.eval.fit.landmarks.database import read_poses
+from crosscue.eval.fit.landmarks.database import frames_of, read_poses
 from crosscue.eval.fit.landmarks.pairs import pairs_of_drive, pairs_of_table, with_min_score
 from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
-from crosscue.eval.interface.landmarks import frames_of
 from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.fit import fit_landmarks as fit_threshold

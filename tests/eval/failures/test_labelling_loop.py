@@ -16,6 +16,7 @@ from crosscue.detectors.training.annotations import read_coco as read_to_train
 from crosscue.eval.failures.record import Failure
 from crosscue.eval.runs.folder import EstimateManifest, write_manifest
 from crosscue.replay.base import AnnotationError, OutputError, SchemaError, UsageError
+from crosscue.replay.progress import watching
 from support.scene_run import SIZE, scene_run
 from support.scoring import at, truth_folder
 
@@ -97,10 +98,11 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
         data=found.coco, images=found.images, classes=("car",), steps=1, batch=1, check_images=1
     )
     small = replace(settings, width_px=SIZE[0], window_px=(64, 64), device="cpu")
-    lines: list[str] = []
-    trained = crosscue.train_mask_rcnn(small, tmp_path / "net.safetensors", on_line=lines.append)
+    lines: list[object] = []
+    with watching(lines.append):
+        trained = crosscue.train_mask_rcnn(small, tmp_path / "net.safetensors")
     assert trained.path.stat().st_size > 0
-    counts = [re.search(r"(\d+) pictures, \d+ of (\d+) objects", line) for line in lines[:2]]
+    counts = [re.search(r"(\d+) pictures, \d+ of (\d+) objects", str(line)) for line in lines[:2]]
     assert [sum(int(one[n]) for one in counts if one) for n in (1, 2)] == [len(original)] * 2
 
 

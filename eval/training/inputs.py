@@ -6,11 +6,12 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.replay.base import UsageError, write_text
 
+Device: TypeAlias = Literal["auto", "cpu", "cuda", "mps"]
 MAX_LAYOUTS: Final = 100_000
 """Max number of layouts of a command, far more than can be rendered in practice."""
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rendered
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.eval.interface.training.inputs import check_place, layouts_of, training_layouts_of
+from crosscue.eval.training.inputs import Device, check_place, layouts_of, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.made_of import made_of
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import Result
+from crosscue.verb import Option
 
 if TYPE_CHECKING:
     import torch
@@ -24,13 +27,9 @@ if TYPE_CHECKING:
 Size: TypeAlias = tuple[int, int]
 """Width and height, pixels."""
 Reported: TypeAlias = dict[str, str | int | float]
-OnCount: TypeAlias = Callable[[int, int], None]
+Layouts: TypeAlias = Annotated[Sequence[str], Option(metavar="LAYOUT")]
 HELD_EVERY: Final = 10
 SAVED_EVERY: Final = 100
-
-
-def _ignore(done: int, of: int) -> None:
-    """Ignore progress."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,35 +39,33 @@ class RoadTrainingSettings:
     Set either ``layouts`` to simulate, or ``data`` with pictures.
 
     Attributes:
-        layouts: Simulated layouts to train on, names and ranges: L400, L400-L519. A to H are
-            allowed only as ``test_layouts``.
-        val_layouts: Layouts to validate on, different from ``layouts``.
-        test_layouts: Layouts to measure on at the end.
-        data: Folder with ``images/NAME.jpg`` and ``masks/NAME.png``, white where there is road;
-            every tenth picture is held out.
-        init: Checkpoint with the initial weights; default: random weights.
-        per_layout: Number of pictures of each layout.
-        steps: Number of training steps.
-        stop_at: Stop after this many steps of the schedule.
-        batch: Pictures per step.
-        seed: Seed of all random numbers.
-        width_px: Width of the network's input, a multiple of 16; the height is 9/16 of it.
-        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        layouts: Layouts to train on: L400 or a range, L400-L519.
+        val_layouts: Layouts to validate on, different from --layouts.
+        test_layouts: Layouts to measure on at the end, such as A-H.
+        data: Folder with your own images/ and masks/.
+        init: Initial weights.
+        per_layout: Images per layout.
+        steps: Training steps.
+        stop_at: Stop after N steps of the schedule.
+        batch: Images per batch.
+        seed: Random seed.
+        width_px: Input width in pixels; height is 9/16.
+        device: Device to train on.
         threads: CPU threads; 0 for all.
     """
 
-    layouts: Sequence[str] = ()
-    val_layouts: Sequence[str] = ()
-    test_layouts: Sequence[str] = ()
-    data: Path | str | None = None
+    layouts: Layouts = ()
+    val_layouts: Layouts = ()
+    test_layouts: Layouts = ()
+    data: Annotated[Path | str | None, Option(metavar="DIR")] = None
     init: Path | str | None = None
     per_layout: int = 12
     steps: int = 1500
     stop_at: int | None = None
     batch: int = 12
     seed: int = 0
-    width_px: int = 384
-    device: str = "auto"
+    width_px: Annotated[int, Option("--width")] = 384
+    device: Device = "auto"
     threads: int = 0
 
     @property
@@ -78,7 +75,7 @@ class RoadTrainingSettings:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class TrainedRoad:
+class TrainedRoad(Result):
     """A trained or measured road network; its repr is its name and one line per fact.
 
     Attributes:
@@ -94,33 +91,41 @@ class TrainedRoad:
         """Return the JSON output of ``crosscue train road``."""
         return {"checkpoint": self.checkpoint, **self.facts}
 
-    def __repr__(self) -> str:
-        return "\n".join(
-            [self.checkpoint, *(f"  {name:22} {value}" for name, value in self.facts.items())]
-        )
+    def lines(self) -> Iterator[str]:
+        """Yield the checkpoint, and a line for each fact."""
+        yield self.checkpoint
+        yield from (f"  {name:22} {value}" for name, value in self.facts.items())
 
 
 def train_road(
     settings: RoadTrainingSettings,
-    output: Path | str,
+    output: Annotated[Path | str | None, Option(metavar="OUT.safetensors")] = None,
     *,
+    measure: Annotated[Path | str | None, Option(metavar="NETWORK")] = None,
     resume: bool = False,
     overwrite: bool = False,
-    on_runs: OnCount = _ignore,
-    on_steps: OnCount = _ignore,
 ) -> TrainedRoad:
-    """Train a road network on simulated intersections, or on pictures with masks.
+    r"""Train the road network on simulated images, or on your own with masks.
 
-    The same settings and seed yield the same bytes on the same machine's CPU.
+    Simulated images: --per-layout images of each of --layouts (L0, L1, and so on) are rendered to
+    train on, and other layouts, --val-layouts, to validate on. Layouts A to H are allowed only as
+    --test-layouts. Your own images: --data is a folder with images/NAME.jpg and masks/NAME.png,
+    white where there is road; every tenth image is held out. --measure measures a network on
+    --test-layouts or --data, without training. The same settings and seed yield the same bytes on
+    the same machine's CPU.
+
+    Examples:
+        crosscue train road --layouts L400-L519 --val-layouts L600-L611 \
+            --test-layouts A-H -o road.safetensors
+        crosscue train road --data my_frames --init road.safetensors -o mine.safetensors
+        crosscue train road --measure embedded --test-layouts A-H
 
     Args:
         settings: Data and schedule of the training.
-        output: Checkpoint to write, ``.safetensors``. Until the training ends, its state is stored
-            next to it, with the suffix ``.state``.
-        resume: Continue an interrupted training from its state.
-        overwrite: Replace an existing checkpoint.
-        on_runs: Called with the number of simulated runs rendered, and their total.
-        on_steps: Called with the number of steps done, and their total.
+        output: Checkpoint to write.
+        measure: Measure this network instead of training: embedded, or a file.
+        resume: Continue an interrupted training from OUT.state.
+        overwrite: Replace an existing OUT.
 
     Raises:
         UsageError: A value is out of range, a layout to train on is one of A to H, a layout is
@@ -130,10 +135,18 @@ def train_road(
         SchemaError: The state is damaged.
         VehicleError: ``init`` is not a road network, or the device is missing.
     """
-    path = Path(output)
+    if measure is not None:
+        if output is not None or settings.layouts:
+            raise UsageError(
+                "measure: cannot be combined with -o or --layouts, because nothing is trained"
+            )
+        return _measure(str(measure), settings)
+    if output is None:
+        raise UsageError("train road: expected -o OUT.safetensors, or --measure")
     _check(settings)
+    path = Path(output)
     if path.suffix != ".safetensors":
-        raise UsageError(f"-o {path}: expected a name that ends in .safetensors")
+        raise UsageError(f"output: {path}, expected a name that ends in .safetensors")
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists; give another name or --overwrite")
     if (settings.data is None) == (not settings.layouts):
@@ -148,7 +161,7 @@ def train_road(
     if settings.threads:
         torch.set_num_threads(settings.threads)
     check_place(path)
-    learn, held_out = _frames(settings, on_runs)
+    learn, held_out = _frames(settings)
     schedule = RoadSchedule(settings.steps, settings.batch, seed=settings.seed)
     device = chosen_device(settings.device, "train road")
     state = path.with_suffix(".state")
@@ -160,8 +173,8 @@ def train_road(
         made = _made_of(settings)
         if resume and state.exists():
             training.resume(state, made)
-        loss = _trained(training, learn, settings, state, made, on_steps)
-    scored = _test_frames(settings, settings.size_px, on_runs)
+        loss = _trained(training, learn, settings, state, made)
+    scored = _test_frames(settings, settings.size_px)
     recipe: Reported = {
         "layouts": " ".join(settings.layouts),
         "pictures": len(learn),
@@ -182,66 +195,37 @@ def train_road(
     return TrainedRoad(str(path), recipe)
 
 
-def measure_road(
-    network: Path | str,
-    *,
-    test_layouts: Sequence[str] = (),
-    data: Path | str | None = None,
-    per_layout: int = 12,
-    seed: int = 0,
-    device: str = "auto",
-    on_runs: OnCount = _ignore,
-) -> TrainedRoad:
-    """Measure the accuracy of a road network, without training it.
-
-    Set either ``test_layouts`` or ``data``.
-
-    Args:
-        network: ``embedded``, or a checkpoint.
-        test_layouts: Simulated layouts to measure on, names and ranges.
-        data: Folder with ``images`` and ``masks``, as in ``RoadTrainingSettings``.
-        per_layout: Number of pictures of each layout.
-        seed: Seed of everything that differs between runs.
-        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
-        on_runs: Called with the number of simulated runs rendered, and their total.
-
-    Raises:
-        UsageError: A value is out of range, or both or neither of ``test_layouts`` and ``data`` are
-            set.
-        LogError: A picture or its mask is missing or cannot be decoded.
-        VehicleError: The network is not a road network, or the device is missing.
-    """
-    settings = RoadTrainingSettings(
-        test_layouts=test_layouts, data=data, per_layout=per_layout, seed=seed, device=device
-    )
+def _measure(network: str, settings: RoadTrainingSettings) -> TrainedRoad:
+    """Measure the accuracy of a network on ``test_layouts`` or ``data``, without training it."""
     _check(settings)
-    if (data is None) == (not test_layouts):
-        raise UsageError("--measure: expected --test-layouts with layouts, or --data with pictures")
+    if (settings.data is None) == (not settings.test_layouts):
+        raise UsageError("measure: expected --test-layouts with layouts, or --data with pictures")
     from crosscue.datasets.adapters.road_folder import load_folder
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road
     from crosscue.detectors.networks.road.network import embedded_path
 
-    chosen = chosen_device(device, "train road")
-    checkpoint = load_road(embedded_path() if str(network) == "embedded" else Path(network))
+    chosen = chosen_device(settings.device, "train road")
+    checkpoint = load_road(embedded_path() if network == "embedded" else Path(network))
     size = (checkpoint.facts.width_px, checkpoint.facts.height_px)
-    frames = (
-        _test_frames(settings, size, on_runs) if data is None else load_folder(Path(data), size)
-    )
+    if settings.data is None:
+        frames = _test_frames(settings, size)
+    else:
+        frames = load_folder(Path(settings.data), size)
     measured = _measured(checkpoint.network.to(chosen), chosen, "measured", frames)
-    return TrainedRoad(str(network), measured)
+    return TrainedRoad(network, measured)
 
 
 def _check(settings: RoadTrainingSettings) -> None:
     width_px = settings.width_px
     if width_px % 16 or not 128 <= width_px <= 1024:
-        raise UsageError(f"--width {width_px}: expected a multiple of 16 from 128 to 1024")
+        raise UsageError(f"width_px: {width_px}, expected a multiple of 16 from 128 to 1024")
     stop_at = 1 if settings.stop_at is None else settings.stop_at
     if min(settings.per_layout, settings.steps, settings.batch, stop_at) < 1:
-        raise UsageError("--per-layout, --steps, --stop-at, --batch: expected 1 or more")
+        raise UsageError("per_layout, steps, stop_at, batch: expected 1 or more")
     if min(settings.seed, settings.threads) < 0:
-        raise UsageError("--seed, --threads: expected 0 or more")
-    layouts_of(settings.test_layouts, "--test-layouts")
+        raise UsageError("seed, threads: expected 0 or more")
+    layouts_of(settings.test_layouts, "test_layouts")
 
 
 def _trained(
@@ -250,13 +234,12 @@ def _trained(
     settings: RoadTrainingSettings,
     state: Path,
     made: dict[str, Any],
-    on_steps: OnCount,
 ) -> float:
     """Train, save the state to resume from at intervals, and return the last loss."""
     loss = float("nan")
     for done, now in training.steps(learn.pixels, learn.road):
         loss = now
-        on_steps(done, settings.steps)
+        emit(Progress("training", done, settings.steps, "steps"))
         if done % SAVED_EVERY == 0:
             training.save(state, made)
         if done == settings.stop_at:
@@ -297,9 +280,7 @@ def _measured(
     }
 
 
-def _frames(
-    settings: RoadTrainingSettings, on_runs: OnCount
-) -> tuple[RoadFrames, RoadFrames | None]:
+def _frames(settings: RoadTrainingSettings) -> tuple[RoadFrames, RoadFrames | None]:
     """Return the frames to train on, and the held-out frames."""
     size = settings.size_px
     if settings.data is not None:
@@ -310,22 +291,20 @@ def _frames(
         out = [i for i in range(len(whole)) if i not in set(kept)]
         held = RoadFrames(whole.pixels[out], whole.road[out]) if out else None
         return RoadFrames(whole.pixels[kept], whole.road[kept]), held
-    layouts = training_layouts_of(settings.layouts, "--layouts")
-    held_out = layouts_of(settings.val_layouts, "--val-layouts")
+    layouts = training_layouts_of(settings.layouts, "layouts")
+    held_out = layouts_of(settings.val_layouts, "val_layouts")
     if both := sorted({*layouts} & {*held_out}):
-        raise UsageError(f"--val-layouts {both[0]}: also in --layouts; choose other layouts")
-    learn = _rendered(layouts, size, settings, on_runs)
-    return learn, _rendered(held_out, size, settings, on_runs) if held_out else None
+        raise UsageError(f"val_layouts: {both[0]}: also in --layouts; choose other layouts")
+    learn = _rendered(layouts, size, settings)
+    return learn, _rendered(held_out, size, settings) if held_out else None
 
 
-def _test_frames(settings: RoadTrainingSettings, size: Size, on_runs: OnCount) -> RoadFrames | None:
-    names = layouts_of(settings.test_layouts, "--test-layouts")
-    return _rendered(names, size, settings, on_runs) if names else None
+def _test_frames(settings: RoadTrainingSettings, size: Size) -> RoadFrames | None:
+    names = layouts_of(settings.test_layouts, "test_layouts")
+    return _rendered(names, size, settings) if names else None
 
 
-def _rendered(
-    names: list[str], size: Size, settings: RoadTrainingSettings, on_runs: OnCount
-) -> RoadFrames:
+def _rendered(names: list[str], size: Size, settings: RoadTrainingSettings) -> RoadFrames:
     camera, seed = Camera(width_px=2 * size[0], height_px=2 * size[1]), settings.seed
     # There are ten kinds of conditions, by number of the run; this uses each equally often.
     runs = [
@@ -341,5 +320,5 @@ def _rendered(
     parts: list[RoadFrames] = []
     for part in rendered(runs, settings.per_layout, size):
         parts.append(part)
-        on_runs(len(parts), len(runs))
+        emit(Progress("rendering", len(parts), len(runs), "runs"))
     return joined(parts)

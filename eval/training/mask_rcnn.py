@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, overload
 
 from crosscue.detectors.training.summary import measured_text, measured_tree
-from crosscue.eval.interface.training.inputs import check_place
+from crosscue.eval.training.inputs import Device, check_place
 from crosscue.replay.base import UsageError
 from crosscue.replay.files.made_of import made_of
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import Result
+from crosscue.verb import Option
 
 if TYPE_CHECKING:
     from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts
@@ -32,51 +35,67 @@ class MaskRcnnTrainingSettings:
     """Settings of a Mask R-CNN training.
 
     Attributes:
-        data: COCO annotations to train on.
+        data: Annotations to train on.
         images: Folder of their images.
-        val_data: Annotations to validate on; default: every tenth image of ``data``.
+        val_data: Annotations to validate on (default: every 10th image of --data).
         val_images: Folder of their images.
-        init: Initial weights: ``compact``, ``resnet50``, ``resnet50-v2``, ``embedded``, or a
-            checkpoint.
-        classes: Names of the classes to train.
-        steps: Number of training steps.
-        batch: Images per step.
+        init: Initial weights: compact, resnet50, resnet50-v2, embedded, or a file.
+        classes: Classes to train (default: car, stop sign, traffic light).
+        steps: Training steps.
+        batch: Images per batch.
         learning_rate: Max learning rate.
-        seed: Seed of all random numbers.
+        seed: Random seed.
         width_px: Width that images are scaled to.
-        crop_top: Fraction of an image's height to skip at the top.
-        crop_bottom: Fraction of an image's height to skip at the bottom.
-        window_px: Width and height of the training windows, multiples of 32.
+        crop_top: Top fraction of the image to skip.
+        crop_bottom: Bottom fraction of the image to skip.
+        window_px: Width and height of the training windows, in pixels.
         balance: 0 samples every object equally often, 1 every class.
         check_every: Steps between validations.
-        check_images: Images per validation during training; the last validation uses all.
-        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
+        check_images: Images per validation during training.
+        device: Device to train on.
         threads: CPU threads.
     """
 
-    data: Path | str
-    images: Path | str
-    val_data: Path | str | None = None
-    val_images: Path | str | None = None
-    init: Path | str = "compact"
+    data: Annotated[Path | str, Option(metavar="COCO")]
+    images: Annotated[Path | str, Option(metavar="DIR")]
+    val_data: Annotated[Path | str | None, Option(metavar="COCO")] = None
+    val_images: Annotated[Path | str | None, Option(metavar="DIR")] = None
+    init: Annotated[str | Path, Option(metavar="NETWORK")] = "compact"
     classes: Sequence[str] = CLASSES
     steps: int = 4000
     batch: int = 8
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, Option(metavar="R")] = 1e-3
     seed: int = 0
-    width_px: int = 1280
-    crop_top: float = 0.0
-    crop_bottom: float = 0.0
-    window_px: tuple[int, int] = (544, 288)
-    balance: float = 1.0
+    width_px: Annotated[int, Option("--width")] = 1280
+    crop_top: Annotated[float, Option(metavar="FRACTION")] = 0.0
+    crop_bottom: Annotated[float, Option(metavar="FRACTION")] = 0.0
+    window_px: Annotated[tuple[int, int], Option("--window", metavar=("W", "H"))] = (544, 288)
+    balance: Annotated[float, Option(metavar="FRACTION")] = 1.0
     check_every: int = 500
     check_images: int = 60
-    device: str = "auto"
+    device: Device = "auto"
     threads: int = 1
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measuring:
+    """Measurement of a Mask R-CNN in place of a training.
+
+    Attributes:
+        measure: Measure this network instead of training; names as for --init.
+        subset: Measure on these images of --data: ::4 is every 4th.
+        proposals: Measure with N region proposals; may have several values.
+        backend: Inference engine to measure with.
+    """
+
+    measure: Annotated[str | None, Option(metavar="NETWORK")] = None
+    subset: Annotated[str | None, Option(metavar="A:B:N")] = None
+    proposals: Annotated[Sequence[int], Option(metavar="N")] = (PROPOSALS,)
+    backend: Literal["torch", "openvino"] = "torch"
+
+
 @dataclass(frozen=True, slots=True, repr=False)
-class TrainedMaskRcnn:
+class TrainedMaskRcnn(Result):
     """A trained Mask R-CNN; its repr is one line.
 
     Attributes:
@@ -91,13 +110,14 @@ class TrainedMaskRcnn:
         """Return the JSON output of ``crosscue train mask-rcnn``: the facts."""
         return self.facts.model_dump(mode="json")
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield size and accuracy of the checkpoint."""
         size = self.path.stat().st_size / 1e6
-        return f"{self.path}: {size:.1f} MB, {_precision_text(self.facts.measured)}"
+        yield f"{self.path}: {size:.1f} MB, {_precision_text(self.facts.measured)}"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class MeasuredMaskRcnn:
+class MeasuredMaskRcnn(Result):
     """Accuracy of a Mask R-CNN on labelled images; its repr is tables.
 
     Attributes:
@@ -115,35 +135,59 @@ class MeasuredMaskRcnn:
         measured = [measured_tree(count, reached) for count, reached in self.by_proposals.items()]
         return {"network": self.network, "pictures": self.pictures, "measured": measured}
 
-    def __repr__(self) -> str:
-        return "\n".join(
-            measured_text(self.network, self.pictures, count, reached)
-            for count, reached in self.by_proposals.items()
-        )
+    def lines(self) -> Iterator[str]:
+        """Yield a table for each number of proposals."""
+        for count, reached in self.by_proposals.items():
+            yield measured_text(self.network, self.pictures, count, reached)
 
 
+@overload
 def train_mask_rcnn(
     settings: MaskRcnnTrainingSettings,
     output: Path | str,
     *,
     resume: bool = False,
     overwrite: bool = False,
-    on_line: Callable[[str], None] = lambda text: None,
-) -> TrainedMaskRcnn:
-    """Train a Mask R-CNN on COCO annotations, either a compact one from scratch or an existing one.
+) -> TrainedMaskRcnn: ...
+@overload
+def train_mask_rcnn(
+    settings: MaskRcnnTrainingSettings, output: None = None, *, measuring: Measuring
+) -> MeasuredMaskRcnn: ...
+def train_mask_rcnn(
+    settings: MaskRcnnTrainingSettings,
+    output: Annotated[Path | str | None, Option(metavar="OUT.safetensors")] = None,
+    *,
+    measuring: Measuring = Measuring(),
+    resume: bool = False,
+    overwrite: bool = False,
+) -> TrainedMaskRcnn | MeasuredMaskRcnn:
+    r"""Train a Mask R-CNN on COCO annotations, from scratch or from a network.
 
-    The same settings and seed yield the same bytes on the same machine's CPU.
+    OUT is a checkpoint (.safetensors) for the detector mask-rcnn. The training curve (JSON and PNG)
+    is written next to it and, until the training ends, so is the state that --resume continues
+    from. The same settings and seed yield the same bytes on the same machine's CPU. With --measure,
+    nothing is trained: a network's average precision (by COCO's rules), and its precision and
+    recall at the cues' thresholds are reported.
+
+    Examples:
+        crosscue train frames L0-L319 --per-layout 8 -o frames
+        crosscue train frames L900-L959 --per-layout 5 -o held_out
+        crosscue train mask-rcnn --data frames/coco.json --images frames/images \
+            --val-data held_out/coco.json --val-images held_out/images -o mine.safetensors
+        crosscue train mask-rcnn --data own.json --images photos --init resnet50 -o own.safetensors
+        crosscue train mask-rcnn --measure embedded --data held_out/coco.json \
+            --images held_out/images
 
     Args:
         settings: Data and schedule of the training.
-        output: Checkpoint to write, ``.safetensors``. The curve (JSON and PNG) is written next to
-            it and, until the training ends, so is the state to resume from.
-        resume: Continue an interrupted training from its state.
+        output: Checkpoint to write.
+        measuring: The network to measure instead of training.
+        resume: Continue an interrupted training.
         overwrite: Replace existing results.
-        on_line: Called with a line of text for each set of images and after each validation.
 
     Raises:
-        UsageError: A value is out of range, or the state is of another training.
+        UsageError: A value is out of range, the subset has no images, or the state is of another
+            training.
         OutputError: Results exist, or cannot be written.
         LogError: An image cannot be read.
         SchemaError: The annotations are not a COCO file or contain nothing usable, the folder of
@@ -151,82 +195,65 @@ def train_mask_rcnn(
         VehicleError: ``init`` is not a suitable Mask R-CNN, or the device is missing.
         CrosscueError: The loss is no longer finite.
     """
+    if measuring.measure is not None:
+        if output is not None or settings.val_data is not None:
+            raise UsageError(
+                "measure: cannot be combined with -o or --val-data, because nothing is trained"
+            )
+        return _measure(measuring.measure, measuring, settings)
+    if output is None:
+        raise UsageError("train mask-rcnn: expected -o OUT.safetensors, or --measure")
     path = Path(output)
     _check(settings, path)
     job = _job(settings, path)
     check_place(path)
     train, held_out = _sets(settings)
     for name, one in (("training", train), ("held out", held_out)):
-        on_line(f"{name}: {_set_text(one)}")
+        emit(f"{name}: {_set_text(one)}")
 
     def report(point: Point) -> None:
-        on_line(
+        emit(
             f"step {point.step} of {settings.steps}: loss {point.loss:.3f}, "
             f"{_precision_text(point.ap)}, {point.seconds:.0f} s"
         )
 
     from crosscue.detectors.training.job import run_job
-    from crosscue.eval.interface.training.curve import draw_curve
+    from crosscue.eval.training.curve import draw_curve
 
     facts = run_job(job, train, held_out, resume=resume, overwrite=overwrite, report=report)
     draw_curve(job.curve_path, path.with_suffix(".curve.png"))
     return TrainedMaskRcnn(path, facts)
 
 
-def measure_mask_rcnn(
-    network: str,
-    data: Path | str,
-    images: Path | str,
-    *,
-    subset: str | None = None,
-    proposals: Sequence[int] = (PROPOSALS,),
-    backend: str = "torch",
-    device: str = "auto",
-    threads: int = 1,
-    on_measured: Callable[[int, int], None] = lambda done, of: None,
+def _measure(
+    network: str, measuring: Measuring, settings: MaskRcnnTrainingSettings
 ) -> MeasuredMaskRcnn:
-    """Measure the accuracy of a Mask R-CNN on COCO annotations, without training it.
-
-    Args:
-        network: ``compact``, ``resnet50``, ``resnet50-v2``, ``embedded``, or a checkpoint.
-        data: COCO annotations.
-        images: Folder of their images.
-        subset: Slice ``A:B:N`` of the images to measure on: ``::4`` is every fourth.
-        proposals: Numbers of region proposals to measure with, in turn.
-        backend: Inference engine, ``torch`` or ``openvino``.
-        device: ``auto``, ``cpu``, ``cuda`` or ``mps``.
-        threads: CPU threads.
-        on_measured: Called with the number of entries of ``proposals`` done, and their total.
-
-    Raises:
-        UsageError: A value is out of range, or the subset has no images.
-        LogError: An image cannot be read.
-        SchemaError: The annotations are not a COCO file or contain nothing usable, or the folder of
-            images is missing.
-        VehicleError: The network is not a Mask R-CNN, or the device is missing.
-    """
-    if not all(1 <= count <= 2000 for count in proposals):
-        raise UsageError("--proposals: expected 1 to 2000")
+    """Measure the accuracy of a network on COCO annotations, without training it."""
+    if not all(1 <= count <= 2000 for count in measuring.proposals):
+        raise UsageError("proposals: expected 1 to 2000")
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
     from crosscue.detectors.training.annotations import read_coco
     from crosscue.detectors.training.measure import measure
 
-    chosen = chosen_device(device if backend == "torch" else "cpu", "train mask-rcnn")
+    device = settings.device if measuring.backend == "torch" else "cpu"
+    chosen = chosen_device(device, "train mask-rcnn")
     checkpoint = checkpoint_named(network)
     classes = [name for name in checkpoint.facts.plan.classes if name]
-    whole = read_coco(Path(data), Path(images), classes)
-    labelled = replace(whole, pictures=whole.pictures[_slice(subset)])
+    whole = read_coco(Path(settings.data), Path(settings.images), classes)
+    labelled = replace(whole, pictures=whole.pictures[_slice(measuring.subset)])
     if not labelled.pictures:
         count = len(whole.pictures)
-        raise UsageError(f"--subset {subset}: selects none of {count} pictures; select others")
-    measured: dict[int, Measured] = {}
-    for count in proposals:
-        settings = MaskRcnnSettings.model_validate(
-            {"proposals": count, "threads": threads, "backend": backend}
+        raise UsageError(
+            f"subset: {measuring.subset}: selects none of {count} pictures; select others"
         )
-        measured[count] = measure(checkpoint, labelled, settings, chosen)
-        on_measured(len(measured), len(proposals))
+    measured: dict[int, Measured] = {}
+    for count in measuring.proposals:
+        how = {"proposals": count, "threads": settings.threads, "backend": measuring.backend}
+        measured[count] = measure(
+            checkpoint, labelled, MaskRcnnSettings.model_validate(how), chosen
+        )
+        emit(Progress("measuring", len(measured), len(measuring.proposals), "measurements"))
     return MeasuredMaskRcnn(network, len(labelled.pictures), measured)
 
 
@@ -246,25 +273,26 @@ def _precision_text(ap: Mapping[str, float | None]) -> str:
 
 def _check(settings: MaskRcnnTrainingSettings, output: Path) -> None:
     if output.suffix != ".safetensors":
-        raise UsageError(f"-o {output}: expected a name that ends in .safetensors")
+        raise UsageError(f"output: {output}, expected a name that ends in .safetensors")
     for name in ("steps", "batch", "check_every", "check_images", "threads"):
         if getattr(settings, name) < 1:
-            raise UsageError(f"--{name.replace('_', '-')}: expected 1 or more")
+            raise UsageError(f"{name}: expected 1 or more")
     if not 0.0 < settings.learning_rate < 1.0 or settings.seed < 0:
         raise UsageError(
-            "--learning-rate, --seed: expected a rate between 0 and 1, and a seed of 0 or more"
+            "learning_rate, seed: expected a rate between 0 and 1, and a seed of 0 or more"
         )
     if not 0.0 <= settings.balance <= 1.0:
-        raise UsageError(f"--balance {settings.balance}: expected 0 to 1")
+        raise UsageError(f"balance: {settings.balance}, expected 0 to 1")
     width_px, height_px = settings.window_px
     if any(side % 32 or not 64 <= side <= MAX_WINDOW_PX for side in (width_px, height_px)):
         raise UsageError(
-            f"--window {width_px} {height_px}: expected multiples of 32 from 64 to {MAX_WINDOW_PX}"
+            f"window_px: {width_px} {height_px}, expected multiples of 32 from 64 to "
+            f"{MAX_WINDOW_PX}"
         )
     if not all(settings.classes) or len(set(settings.classes)) != len(settings.classes):
-        raise UsageError("--classes: a name is empty or repeated; name each class once")
+        raise UsageError("classes: a name is empty or repeated; name each class once")
     if (settings.val_data is None) != (settings.val_images is None):
-        raise UsageError("--val-data, --val-images: expected both or neither")
+        raise UsageError("val_data, val_images: expected both or neither")
 
 
 def _slice(text: str | None) -> slice:
@@ -275,7 +303,7 @@ def _slice(text: str | None) -> slice:
     """
     match = re.fullmatch(r"(\d{0,9}):(\d{0,9})(?::([1-9]\d{0,8})?)?", text or ":")
     if match is None:
-        raise UsageError(f"--subset {text}: expected A:B:N, as 300: or 300:600 or ::4")
+        raise UsageError(f"subset: {text}, expected A:B:N, as 300: or 300:600 or ::4")
     return slice(*(int(part) if part else None for part in match.groups()))
 
 

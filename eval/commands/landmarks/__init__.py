@@ -1,1 +1,0 @@
-"""``crosscue landmarks ...``: add, list and match landmarks of a database."""

@@ -1,1 +1,0 @@
-"""``crosscue train ...``: render training pictures, and train the built-in networks."""

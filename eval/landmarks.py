@@ -1,0 +1,349 @@
+"""Landmark databases: add, list and match landmarks."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+from crosscue.eval.fit.landmarks.database import (
+    AddCounts,
+    add_from_images,
+    add_from_log,
+    frames_of,
+    near_of,
+    read_poses,
+)
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
+from crosscue.eval.pipeline.landmarks import matcher_for, open_for
+from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.localization.landmarks.images import grey_of, read_picture
+from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Floats, UsageError, visible
+from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.logs.log_part import LogPart
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.results import HIDDEN, Result, json_key
+from crosscue.verb import Option
+
+if TYPE_CHECKING:
+    from crosscue.localization.landmarks.features import Match, Matcher
+
+NearGiven: TypeAlias = Annotated[
+    tuple[float, float, float] | str | None, Option("--near", metavar="X,Y,R")
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class AddedLandmarks(Result):
+    """Result of adding landmarks; its repr is one line.
+
+    Attributes:
+        path: The database.
+        counts: Numbers of pictures that were added or left out, by reason.
+        is_whole: True if nothing of the log was dropped.
+    """
+
+    path: Path
+    counts: AddCounts
+    is_whole: bool = True
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 when something of the log was dropped."""
+        return 0 if self.is_whole else 3
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the JSON output of ``crosscue landmarks add``."""
+        return {"database": visible(str(self.path)), **asdict(self.counts)}
+
+    def lines(self) -> Iterator[str]:
+        """Yield the numbers of pictures."""
+        counts = self.counts
+        left_out = [
+            f"{count} {why}"
+            for count, why in (
+                (counts.too_near, "too near the last"),
+                (counts.without_pose, "without a pose at their time"),
+                (counts.undecodable, "cannot be decoded"),
+                (counts.blank, "with too few features"),
+            )
+            if count
+        ]
+        rest = f"; left out: {', '.join(left_out)}" if left_out else ""
+        yield f"{self.path}: {counts.added} landmarks added from {counts.pictures} pictures{rest}"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LandmarkList(Result):
+    """Landmarks of a database; its repr has one line per landmark.
+
+    Attributes:
+        path: The database.
+        kind: Name of the matcher that its features belong to.
+        total: Number of landmarks in the database.
+        places: The selected landmarks.
+    """
+
+    path: Path = field(metadata=HIDDEN)
+    kind: str = field(metadata=json_key("matcher"))
+    total: int = field(metadata=json_key("landmarks"))
+    places: tuple[Place, ...] = field(metadata=json_key("listed"))
+
+    def lines(self) -> Iterator[str]:
+        """Yield a line for the database, and one for each landmark."""
+        head = f"{self.path}: {self.total} landmarks of matcher {self.kind}; "
+        yield f"{head}listed: {len(self.places)}"
+        yield from map(_place_line, self.places)
+
+
+def _place_line(place: Place) -> str:
+    sd_x, sd_y = math.sqrt(place.cov_m2[0, 0]), math.sqrt(place.cov_m2[1, 1])
+    turn = "      -" if place.heading_rad is None else f"{math.degrees(place.heading_rad):7.1f}"
+    x, y = place.xy_m
+    return (
+        f"{x:12.2f} {y:12.2f} m  +- {sd_x:6.2f} {sd_y:6.2f} m  heading {turn} deg  "
+        f"{visible(place.name)}"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkMatch:
+    """Similarity of a picture to one landmark.
+
+    Attributes:
+        name: Name of the landmark.
+        score: Score of the match, higher for a more certain one.
+        pairs: Number of points with similar descriptors.
+        agreeing: Number of those that are consistent with one rigid scene.
+        is_match: True if the score is at least the lowest score of a match.
+    """
+
+    name: str
+    score: float
+    pairs: int
+    agreeing: int
+    is_match: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LandmarkMatches(Result):
+    """The landmarks that are most similar to a picture; its repr has one line per landmark.
+
+    Attributes:
+        points: Number of feature points found in the picture.
+        compared: Number of landmarks that it was compared with.
+        min_score: Lowest score of a match.
+        best: The matches, best first.
+    """
+
+    points: int
+    compared: int
+    min_score: float
+    best: tuple[LandmarkMatch, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Yield a line for the picture, and one for each landmark."""
+        yield (
+            f"{self.points} points; {self.compared} landmarks compared; min score of a match "
+            f"{self.min_score:g}"
+        )
+        for one in self.best:
+            word = "match" if one.is_match else "no"
+            yield (
+                f"{one.score:8.1f}  {word:5}  {one.agreeing:4} of {one.pairs:4} agree  "
+                f"{visible(one.name)}"
+            )
+
+
+def metres(text: str) -> float:
+    """Parse a length in metres.
+
+    Raises:
+        UsageError: Not a finite number above 0.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise UsageError(f"{text!r}: expected metres, above 0")
+    return value
+
+
+def drive_or_none(
+    *logs: Annotated[Path, Option(may_be_empty=True)],
+    part: LogPart,
+    limits: LimitsGiven = DEFAULT_LIMITS,
+) -> UnopenedLog | None:
+    """Return a part of a drive, or None without logs.
+
+    Args:
+        logs: Recordings of one drive.
+        part: The part to read.
+        limits: Limits for reading.
+    """
+    return UnopenedLog(logs, part, limits) if logs else None
+
+
+def add_landmarks(
+    database: Path | str,
+    log: Annotated[Log | UnopenedLog | Path | str | None, Option(made_by=drive_or_none)] = None,
+    *,
+    poses: Annotated[Path | str | None, Option(metavar="RUN|T.json")] = None,
+    images: Annotated[Path | str | None, Option(metavar="DIR")] = None,
+    coordinates: Annotated[Path | str | None, Option(metavar="FILE.csv")] = None,
+    every_m: Annotated[float, Option("--every", convert=metres)] = 10.0,
+    sd_m: Annotated[float, Option("--sd", convert=metres)] = 3.0,
+    source: str | None = None,
+    vehicle: Vehicle | Path | str | None = None,
+    matcher: str | None = None,
+) -> AddedLandmarks:
+    """Add landmarks from a log with poses, or from pictures with coordinates.
+
+    Either all pictures of a call are added, or none. Coordinates are in metres in the map frame: x
+    east, y north. The CSV file has the columns image,x_m,y_m,sd_m (or var_x_m2,cov_xy_m2,var_y_m2
+    instead of sd_m) and, optionally, heading_rad.
+
+    Examples:
+        crosscue landmarks add town.sqlite drive.mcap --poses runs/drive --every 10
+        crosscue landmarks add town.sqlite --images photos --coordinates photos.csv
+
+    Args:
+        database: Landmark database; created if missing.
+        log: The drive.
+        poses: Poses of the vehicle: a run or a truth file.
+        images: Folder of images.
+        coordinates: Position of each image.
+        every_m: Distance between landmarks from a log, in metres.
+        sd_m: Standard deviation of the vehicle's position at a match, in metres, added to the error
+            of the poses.
+        source: Name of the source (default: the log's name).
+        vehicle: Vehicle file: camera and matcher.
+        matcher: ``orb``, or your own ``module:factory``.
+
+    Raises:
+        UsageError: There are not exactly a log and poses, or images and coordinates.
+        EmptyResultError: No picture became a landmark; the database is unchanged.
+        SchemaError: The coordinates are not valid; the message names the line.
+        VehicleError: The drive has no camera, or several.
+    """
+    if log is not None and poses is not None and images is None and coordinates is None:
+        settings = vehicle_given(vehicle)
+        describing = matcher_for(settings, matcher)
+        known = read_poses(Path(poses), settings)
+        with opened(log) as drive:
+            name = visible(source or drive.logs[0].path.resolve().stem)
+
+            def add(writer: LandmarkWriter) -> tuple[AddCounts, bool]:
+                with frames_of(drive, settings) as (frames, ledgers):
+                    counts = add_from_log(
+                        writer, describing, frames, known, every_m, sd_m, name, ledgers
+                    )
+                return counts, all(ledger.is_whole for ledger in ledgers)
+
+            return _added(Path(database), describing, add)
+    if log is None and poses is None and images is not None and coordinates is not None:
+        describing, folder = matcher_for(vehicle_given(vehicle), matcher), Path(images)
+        table, name = Path(coordinates), visible(source or folder.resolve().name)
+        return _added(
+            Path(database),
+            describing,
+            lambda writer: (add_from_images(writer, describing, folder, table, name), True),
+        )
+    raise UsageError("landmarks add: expected LOG... with --poses, or --images with --coordinates")
+
+
+def _added(
+    path: Path, matcher: Matcher, add: Callable[[LandmarkWriter], tuple[AddCounts, bool]]
+) -> AddedLandmarks:
+    with LandmarkWriter(path, matcher.kind) as writer:
+        found = AddedLandmarks(path, *add(writer))
+        if not found.counts.added:
+            # Raised inside the writer's block, so that the writer undoes all changes.
+            raise EmptyResultError(f"{found}; give other pictures or poses")
+    return found
+
+
+def list_landmarks(
+    database: Path | str, *, near: NearGiven = None, limit: int = 100
+) -> LandmarkList:
+    """List all landmarks of a database, or those near a place.
+
+    Example:
+        crosscue landmarks list town.sqlite --near=-12.5,80,50
+
+    Args:
+        database: Landmark database.
+        near: Only landmarks within R metres of a place; --near=-5,3,10 for x < 0.
+        limit: Max landmarks to list.
+
+    Raises:
+        UsageError: ``near`` is not a place, or ``limit`` is below 0.
+        LogError: The file cannot be read.
+    """
+    place = _near(near)
+    if limit < 0:
+        raise UsageError(f"limit: {limit}, expected 0 or more")
+    with LandmarkDatabase(Path(database)) as known:
+        found = iter(known) if place is None else known.within(*place)
+        places = tuple(one.place for one in islice(found, limit))
+        return LandmarkList(Path(database), known.kind, len(known), places)
+
+
+def _near(near: tuple[float, float, float] | str | None) -> tuple[Floats, float] | None:
+    return near_of(near if near is None or isinstance(near, str) else ",".join(map(repr, near)))
+
+
+def match_landmarks(
+    database: Path | str,
+    image: Annotated[Path | str, Option(metavar="IMAGE")],
+    *,
+    near: NearGiven = None,
+    best: int = 5,
+    vehicle: Vehicle | Path | str | None = None,
+    matcher: str | None = None,
+) -> LandmarkMatches:
+    """Match one picture against a database's landmarks, or those near a place.
+
+    Example:
+        crosscue landmarks match town.sqlite photo.jpg --near 120,80,50
+
+    Args:
+        database: Landmark database.
+        image: PNG, JPEG or WebP.
+        near: Only landmarks within R metres of a place; --near=-5,3,10 for x < 0.
+        best: Number of matches to show.
+        vehicle: Vehicle file: camera and matcher.
+        matcher: ``orb``, or your own ``module:factory``.
+
+    Raises:
+        UsageError: ``near`` is not a place, or the database has features of another matcher.
+        LogError: The picture or the file cannot be read.
+    """
+    place = _near(near)
+    if best < 1:
+        raise UsageError(f"best: {best}, expected 1 or more")
+    settings = vehicle_given(vehicle)
+    comparing = matcher_for(settings, matcher)
+    seen = comparing.describe(grey_of(read_picture(Path(image))))
+    compared = 0
+    found: list[tuple[float, int, Match, str]] = []
+    with open_for(Path(database), comparing) as known:
+        for one in iter(known) if place is None else known.within(*place):
+            match = comparing.match(seen, known.features(one.key))
+            compared += 1
+            # Equal scores are in the order in which landmarks were added.
+            found.append((match.score, -one.key, match, one.place.name))
+            if len(found) > 2 * best:
+                found = heapq.nlargest(best, found, key=lambda row: row[:2])
+    kept = heapq.nlargest(best, found, key=lambda row: row[:2])
+    min_score = settings.landmarks.min_score
+    matches = [
+        LandmarkMatch(name, score, match.pairs, match.agreeing, score >= min_score)
+        for score, _, match, name in kept
+    ]
+    return LandmarkMatches(len(seen), compared, min_score, tuple(matches))
