@@ -11,6 +11,7 @@ from .picodet import PicodetOutput
 from .ssd import DetectionOutput, TensorflowSsdOutput
 from .torchvision_export import TorchvisionOutput
 from .yolo import YoloV5Output, YoloV8Output, YoloV8SegOutput
+from .yolo_nas import YoloNasOutput
 from .yolox import YoloxOutput
 
 AnyBoxOutput: TypeAlias = (
@@ -20,6 +21,7 @@ AnyBoxOutput: TypeAlias = (
     | YoloV8SegOutput
     | EndToEndOutput
     | DetrOutput
+    | YoloNasOutput
     | TorchvisionOutput
     | PicodetOutput
     | TensorflowSsdOutput

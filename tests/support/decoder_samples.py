@@ -94,6 +94,15 @@ def _detr() -> Sample:
     )
 
 
+def _yolo_nas() -> Sample:
+    cells = sum(SIZE[0] * SIZE[1] // s**2 for s in (8, 16, 32))
+    boxes, scores = np.zeros((1, cells, 4)), np.zeros((1, cells, 3))
+    boxes[0, 3], scores[0, 3] = BOX, _scores()
+    return Sample(
+        {"kind": "yolo-nas", "boxes": "904", "scores": "913"}, {"904": boxes, "913": scores}
+    )
+
+
 def _torchvision() -> Sample:
     masks = np.zeros((2, 1, SIZE[1], SIZE[0]))
     masks[0, 0, :, : int(BOX[[0, 2]].mean())] = 0.9
@@ -157,6 +166,7 @@ SAMPLES = {
     "yolov8-seg": _yolov8_seg,
     "end-to-end": _end_to_end,
     "detr": _detr,
+    "yolo-nas": _yolo_nas,
     "torchvision": _torchvision,
     "picodet": _picodet,
     "ssd-tensorflow": _ssd_tensorflow,
