@@ -188,7 +188,9 @@ def add_parameters(
             call.positional = name
         container: Any = parser
         if option.group is not None:
-            container = groups.setdefault(option.group, parser.add_mutually_exclusive_group())
+            if option.group not in groups:
+                groups[option.group] = parser.add_mutually_exclusive_group()
+            container = groups[option.group]
         if (text := says.parameters.get(name)) is None:
             raise TypeError(f"{function.__name__}: no description of {name}")
         action = container.add_argument(

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 from crosscue.eval.command_line import Call, fill
 from crosscue.replay.errors import one_line
 from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.progress import Notice, watching
 from crosscue.replay.progress import Progress as Progressed
-from crosscue.replay.progress import watching
 from crosscue.replay.safe_text import visible
 from crosscue.results import Result
 
@@ -158,6 +158,9 @@ def _print_part(event: object, args: argparse.Namespace) -> None:
     elif isinstance(event, str):
         if not args.quiet:
             print(event, file=sys.stderr if args.json else sys.stdout, flush=True)
+    elif isinstance(event, Notice):
+        if not args.quiet:
+            warn(event.text)
     elif args.json:
         pass
     elif isinstance(event, Result) and event.exit_status:

@@ -31,6 +31,17 @@ class Progress:
     unit: str
 
 
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A remark on the work, for stderr.
+
+    Attributes:
+        text: One sentence.
+    """
+
+    text: str
+
+
 Watcher = Callable[[object], None]
 _WATCHER: Final[ContextVar[tuple[int, Watcher] | None]] = ContextVar("watcher", default=None)
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from crosscue.replay.base import (
     json_tree,
     visible,
 )
+from crosscue.results import HIDDEN, Result
 
 from .paired import FALSE_ALARMS, MIN_DRIVES, PairedMetric, Verdict, compare_drives
 
@@ -123,7 +124,7 @@ class MetricChange:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Comparison:
+class Comparison(Result):
     """Everything that differs between two runs; its ``repr`` is the output of ``crosscue compare``.
 
     Attributes:
@@ -148,9 +149,22 @@ class Comparison:
     tables_same: int
     drives: tuple[int, int, int]
     why_no_metrics: str
-    is_whole: bool = True
+    is_whole: bool = field(default=True, metadata=HIDDEN)
     left_out: Mapping[str, str] = field(default_factory=dict)
-    is_many: bool = False
+    is_many: bool = field(default=False, metadata=HIDDEN)
+
+    also: ClassVar = {"worse": "worse", "better": "better"}
+    formats: ClassVar = {"markdown": "print a short table, for a pull request"}
+
+    @property
+    def exit_status(self) -> int:
+        """1 when a metric is worse, 3 when either side has drops, else 0."""
+        return 0 if self.is_passed and self.is_whole else 3 if self.is_passed else 1
+
+    @property
+    def better(self) -> tuple[str, ...]:
+        """Metrics that are better."""
+        return self.of("better")
 
     @property
     def worse(self) -> tuple[str, ...]:
@@ -177,14 +191,9 @@ class Comparison:
         """Return a short table of better, worse and undecided metrics for a pull request."""
         return "\n".join(_markdown_lines(self))
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the object that ``crosscue compare --json`` prints."""
-        tree = asdict(self)
-        del tree["is_whole"], tree["is_many"]
-        return tree | {"worse": self.worse, "better": self.of("better")}
-
-    def __repr__(self) -> str:
-        return "\n".join(_lines(self))
+    def lines(self) -> Iterator[str]:
+        """Yield changes of settings and tables, and the verdict on each metric."""
+        yield from _lines(self)
 
 
 def read_tolerance(text: str) -> Tolerance:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
@@ -20,7 +20,8 @@ from crosscue.eval.scoring.change_points import (
     Results,
     change_points,
 )
-from crosscue.replay.base import EmptyResultError, visible
+from crosscue.replay.base import EmptyResultError
+from crosscue.results import Result
 
 from .paired import pooled
 
@@ -78,8 +79,8 @@ class MetricHistory:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class History:
-    """Metrics over versions; its ``repr`` is the output of ``crosscue history``.
+class History(Result):
+    """Metrics over versions; its text is the output of ``crosscue history``.
 
     Attributes:
         by: Kind of the versions: ``commit``, ``version`` or a tag's name.
@@ -100,12 +101,9 @@ class History:
         """Metrics with a change point."""
         return tuple(one for one in self.metrics if one.changes)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the object that ``crosscue history --json`` prints."""
-        return asdict(self)
-
-    def __repr__(self) -> str:
-        return "\n".join(map(visible, _lines(self)))
+    def lines(self) -> Iterator[str]:
+        """Yield each change, and the number of metrics."""
+        yield from _lines(self)
 
 
 def _lines(found: History) -> Iterator[str]:

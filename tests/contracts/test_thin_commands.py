@@ -16,12 +16,6 @@ from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[2]
 CALLS: Final = {
-    "merge": ("merge",),
-    "history": ("history",),
-    "query": ("catalog",),
-    "tag": ("tag_runs",),
-    "status": ("batch_status",),
-    "compare": ("compare_runs", "compare_many"),
     "truth": ("write_truth",),
     "truth import": ("import_truth", "import_labels"),
     "truth check": ("check_truth",),
@@ -31,10 +25,6 @@ CALLS: Final = {
     "score detector": ("score_detector",),
     "fit detector": ("fit_detector",),
     "demo": ("demo",),
-    "view": (
-        "open_run",
-        "save_recording",
-    ),
     "failures": ("failures",),
     "browse": ("browse",),
     "export": ("export",),

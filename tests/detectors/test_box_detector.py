@@ -137,8 +137,8 @@ def test_near_label_is_named(tmp_path: Path) -> None:
     item = ("stop_sign", 0.9, (10, 8, 15, 12))
     run = crosscue.detect_drive(log, tmp_path / "run", detectors=[Near.build(item=item)])
 
-    assert run.manifest is not None
-    (notice,) = [one for one in run.manifest.notices if "no cue counts" in one]
+    notices = run.folder.drive_manifest().notices
+    (notice,) = [one for one in notices if "no cue counts" in one]
     assert "did you mean 'stop sign'?" in notice
 
 

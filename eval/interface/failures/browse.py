@@ -11,8 +11,8 @@ from typing import Final
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
-from crosscue.eval.interface.runs.recording import save_recording
 from crosscue.eval.pipeline.run import moved_to, open_run
+from crosscue.eval.recording.view import save_recording
 from crosscue.eval.runs import owned
 from crosscue.replay.base import (
     DEFAULT_LIMITS,

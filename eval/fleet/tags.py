@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.runs import tags as stored
 from crosscue.eval.runs.folder import RunFolder, locked
-from crosscue.replay.base import visible
+from crosscue.replay.base import UsageError
+from crosscue.results import Result
+from crosscue.verb import Option
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class TaggedRuns:
+class TaggedRuns(Result):
     """Runs and their tags.
 
     Attributes:
@@ -23,15 +26,39 @@ class TaggedRuns:
     tags: Mapping[Path, Mapping[str, str]]
 
     def as_dict(self) -> dict[str, dict[str, str]]:
-        """Return the JSON output of ``crosscue tag``."""
+        """Return tags by run folder."""
         return {str(path): dict(tags) for path, tags in self.tags.items()}
 
-    def __repr__(self) -> str:
-        lines = (
-            f"{path}  {' '.join(f'{key}={value}' for key, value in tags.items()) or 'no tags'}"
-            for path, tags in self.tags.items()
-        )
-        return "\n".join(visible(line) for line in lines)
+    def lines(self) -> Iterator[str]:
+        """Yield one line for each run."""
+        for path, tags in self.tags.items():
+            text = " ".join(f"{key}={value}" for key, value in tags.items())
+            yield f"{path}  {text or 'no tags'}"
+
+
+def tag(
+    runs: Sequence[str], *, remove: Annotated[Sequence[str], Option(metavar="KEY")] = ()
+) -> TaggedRuns:
+    """Set tags of runs, remove them, or list them.
+
+    A tag is a key and a value, such as weather=rain. It is stored in the run's tags.json, can be
+    queried with crosscue query, and is kept when the run is repeated. Without KEY=VALUE and
+    --remove, tags are listed.
+
+    Examples:
+        crosscue tag runs/drive-1f0e runs/drive-93aa weather=rain route=north
+        crosscue tag runs --remove route
+        crosscue tag runs
+
+    Args:
+        runs: Run folders, or folders of them; then KEY=VALUE for each tag to set.
+        remove: Tags to remove.
+    """
+    tags = [word for word in runs if "=" in word and not Path(word).exists()]
+    folders = [word for word in runs if word not in tags]
+    if not folders:
+        raise UsageError("tag: no run named; give run folders before KEY=VALUE")
+    return tag_runs(folders, tags, remove)
 
 
 def tag_runs(

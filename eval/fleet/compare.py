@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from crosscue.eval.catalog import compare, many_runs
 from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.report.junit import cases_text
 from crosscue.replay.base import UsageError, is_remote, write_text
+from crosscue.verb import Option
 
 
 def compare_runs(
@@ -74,6 +76,54 @@ def compare_many(
         here = (_selected(against, folder), _selected(runs, folder))
         judged = many_runs.compare_many(*here, allowed)
     return _reported(judged, junit)
+
+
+def compare_command(
+    first: Annotated[str, Option(metavar="RUN_A")],
+    second: Annotated[str | None, Option(metavar="RUN_B", is_positional=True)] = None,
+    *,
+    runs: Annotated[str | None, Option(metavar="QUERY")] = None,
+    against: Annotated[str | None, Option(metavar="QUERY")] = None,
+    tolerance: Annotated[Sequence[str], Option(metavar="T")] = (),
+    junit: Path | None = None,
+) -> compare.Comparison:
+    """Compare two runs, with tolerances.
+
+    Two runs, or two sets of runs, are compared: each metric is better, worse or undecided. It is
+    judged drive by drive, over the drives that both sides have (six or more). A metric that did not
+    change gets a verdict in at most 5 % of comparisons, over all cues and conditions together. Each
+    line shows the 95 % interval of the difference, the smallest difference that these drives can
+    detect, and the number of further drives needed for a decision.
+
+    With --runs and --against, two queries on a folder of runs select the runs to judge and the runs
+    to compare them with, one run per drive.
+
+    The exit status is 1 when a metric is worse by more than its tolerance (default: 0), or is no
+    longer scored. Noise alone never causes it. A tolerance is a number in the metric's unit or a
+    fraction of the first value (2%), for all metrics or for those of a pattern. The last tolerance
+    that matches a metric applies. If the two runs are not scored, the exit status is 1 when a table
+    differs. Folders that crosscue score -o wrote for several runs can be compared as well.
+
+    Examples:
+        crosscue compare runs/before runs/after
+        crosscue compare runs/before runs/after --tolerance 1% 'cues.*.precision=0.02'
+        crosscue compare runs --runs "tags['model'] = 'new'" --against "tags['model'] = 'old'"
+
+    Args:
+        first: Reference run; with --runs, a folder of runs, or its URL.
+        second: Run to compare with it.
+        runs: Selects the runs to judge from the folder RUN_A.
+        against: Selects the runs to compare them with.
+        tolerance: Allowed deterioration of metrics: 0.01, 2% or PATTERN=0.01.
+        junit: Write a JUnit file with a test case per judged metric.
+    """
+    if runs is None and against is None:
+        if second is None:
+            raise UsageError("compare: expected two runs, or --runs and --against")
+        return compare_runs(first, second, tolerance, junit)
+    if runs is None or against is None or second is not None:
+        raise UsageError("compare: expected one folder with both --runs and --against")
+    return compare_many(runs, against, first, tolerance, junit)
 
 
 def _reported(found: compare.Comparison, junit: Path | str | None) -> compare.Comparison:

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, ClassVar
 
-from crosscue.eval.batch.status import (
-    DriveState,
-    DriveStatus,
-    Pace,
-    drives_of_folder,
-    pace_of,
-)
-from crosscue.replay.base import UsageError, visible
+from crosscue.replay.base import UsageError
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option
+
+from .status import DriveState, DriveStatus, Pace, drives_of_folder, pace_of
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class BatchStatus:
-    """Progress of batches of drives; its repr is the output of ``crosscue status``.
+class BatchStatus(Result):
+    """Progress of batches of drives; its text is the output of ``crosscue status``.
 
     Attributes:
         drives: Run folder, state and error of each drive.
@@ -27,7 +25,9 @@ class BatchStatus:
     """
 
     drives: tuple[DriveStatus, ...]
-    pace: Pace
+    pace: Pace = field(metadata=HIDDEN)
+
+    also: ClassVar = {"per_hour": "pace.per_hour", "seconds_left": "pace.left_s"}
 
     def count(self, state: str) -> int:
         """Return the number of drives in a state: done, running, failed, stale or waiting."""
@@ -38,44 +38,37 @@ class BatchStatus:
         """True if no drive has failed or is stale."""
         return not any(self.count(state) for state in (DriveState.FAILED, DriveState.STALE))
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue status``."""
-        states = Counter(one.state.value for one in self.drives)
-        return {
-            **{state.value: states[state.value] for state in DriveState},
-            "per_hour": self.pace.per_hour,
-            "seconds_left": self.pace.left_s,
-            "drives": [
-                {
-                    "run": str(one.run),
-                    "state": one.state.value,
-                    "silent_s": one.silent_s,
-                    "host": one.host,
-                    "error": one.error,
-                    "log": None if one.log is None else str(one.log),
-                }
-                for one in self.drives
-            ],
-        }
+    @property
+    def exit_status(self) -> int:
+        """3 when a drive has failed or is stale, else 0."""
+        return 0 if self.is_whole else 3
 
-    def __repr__(self) -> str:
-        lines = []
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of drives in each state."""
+        return {state.value: self.count(state) for state in DriveState}
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the number of drives in each state, the pace, and each drive."""
+        return {**self.counts, **Result.as_dict(self)}
+
+    def lines(self) -> Iterator[str]:
+        """Yield failed and stale drives, the number in each state, and the pace."""
         for one in self.drives:
             if one.error is not None:
-                lines.append(f"failed    {one.run.name}: {one.error}")
-                lines += [] if one.log is None else [f"          {one.log}"]
+                yield f"failed    {one.run.name}: {one.error}"
+                if one.log is not None:
+                    yield f"          {one.log}"
             elif one.state is DriveState.STALE:
                 where = f" on {one.host}" if one.host else ""
-                lines.append(f"stale     {one.run.name}: its worker{where} is gone, {_heard(one)}")
-        total = len(self.drives)
-        counted = (f"{self.count(state)} {state}" for state in DriveState)
-        lines.append(f"drives    {total}: {', '.join(counted)}")
+                yield f"stale     {one.run.name}: its worker{where} is gone, {_heard(one)}"
+        counted = (f"{count} {state}" for state, count in self.counts.items())
+        yield f"drives    {len(self.drives)}: {', '.join(counted)}"
         if math.isfinite(self.pace.per_hour):
             digits = 0 if self.pace.per_hour >= 10.0 else 1
-            lines.append(f"rate      {self.pace.per_hour:,.{digits}f} drives per hour")
+            yield f"rate      {self.pace.per_hour:,.{digits}f} drives per hour"
         if math.isfinite(self.pace.left_s):
-            lines.append(f"time left {_duration(self.pace.left_s)}")
-        return "\n".join(map(visible, lines))
+            yield f"time left {_duration(self.pace.left_s)}"
 
 
 def _heard(one: DriveStatus) -> str:
@@ -91,14 +84,21 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def batch_status(*folders: Path | str) -> BatchStatus:
-    """Return the states of the drives in folders of runs.
+def batch_status(*folders: Annotated[Path | str, Option(metavar="RUNS")]) -> BatchStatus:
+    """Show the progress of batches of drives.
 
-    A state is done, running, failed, stale or waiting. Nothing is written, so the function works on
-    any machine that has access to the folders.
+    A drive is done, running, failed, stale or waiting. It is stale when its worker's process has
+    ended or, on another machine, has been silent for two minutes. To process stale and failed
+    drives, start the same replay again; to process only failed drives, use replay --retry-failed.
+    Nothing is written, so any machine that has access to the folders can show it. The exit status
+    is 3 when a drive has failed or is stale.
+
+    Examples:
+        crosscue status runs
+        crosscue status shards/1 shards/2 --json
 
     Args:
-        folders: Output folders of ``replay_drives``, of one batch or several.
+        folders: Folders that replay writes runs to.
 
     Raises:
         UsageError: There is no folder, or one is named twice.

@@ -4,28 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from crosscue.eval.catalog.history import History, MetricHistory, history_of, limits
 from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.eval.report.history_page import Chart, Mark, write_history_page
 from crosscue.replay.base import OutputError
+from crosscue.verb import Option
 
 
 def history(
-    folder: Path | str,
-    output: Path | str | None = None,
-    by: str = "commit",
-    metrics: Sequence[str] = (),
+    folder: Annotated[Path | str, Option(metavar="RUNS")],
+    output: Annotated[Path | str | None, Option(metavar="HTML")] = None,
+    by: Annotated[str, Option(metavar="WHAT")] = "commit",
+    metrics: Annotated[Sequence[str], Option(metavar="PATTERN")] = (),
     *,
     overwrite: bool = False,
 ) -> History:
-    """Return each metric by version of the runs, with its change points.
+    """Show metrics over versions, and where they changed.
+
+    The page needs no network and runs no script. For each metric, it shows the value and its 95 %
+    interval under each version, and marks change points. From a change point on, the metric differs
+    by more than chance, judged drive by drive. A history without any change shows a change point in
+    at most 5 % of cases, over all metrics together. With fewer than six drives, nothing is decided.
+
+    Versions are ordered by the time of their first run. If a drive has several runs under one
+    version, the latest counts.
+
+    Examples:
+        crosscue history runs -o history.html
+        crosscue history runs --by model -o history.html --metrics 'cues.*.recall' 'approaches.*'
 
     Args:
         folder: Folder of scored runs.
-        output: HTML page to write; None for none.
-        by: ``commit`` or ``version`` of crosscue, or the name of a tag.
-        metrics: Patterns of metrics' names, such as ``cues.*.recall``; default: all metrics.
+        output: Page to write.
+        by: Group runs by commit, by version of crosscue, or by this tag.
+        metrics: Only these metrics.
         overwrite: Replace an existing page.
 
     Raises:

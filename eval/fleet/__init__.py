@@ -1,0 +1,1 @@
+"""Many runs together: compare, query, tag, and their history."""
