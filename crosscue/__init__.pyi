@@ -32,6 +32,12 @@ from crosscue.eval.drives.many import replay_drives as replay_drives
 from crosscue.eval.drives.replay import detect_drive as detect_drive
 from crosscue.eval.drives.replay import estimate_run as estimate_run
 from crosscue.eval.drives.replay import replay_drive as replay_drive
+from crosscue.eval.drives.score import ScoredRun as ScoredRun
+from crosscue.eval.drives.score import score_run as score_run
+from crosscue.eval.drives.score_runs import ScoredRuns as ScoredRuns
+from crosscue.eval.drives.score_runs import score_runs as score_runs
+from crosscue.eval.drives.tracking import MlflowSink as MlflowSink
+from crosscue.eval.drives.tracking import open_mlflow as open_mlflow
 from crosscue.eval.failures.record import Failure as Failure
 from crosscue.eval.fit.signs.threshold import SignFit as SignFit
 from crosscue.eval.fit.signs.threshold import fit_signs as fit_signs
@@ -84,12 +90,6 @@ from crosscue.eval.interface.models.catalog import models as models
 from crosscue.eval.interface.plugins import plugins as plugins
 from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
 from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
-from crosscue.eval.interface.runs.score import ScoredRun as ScoredRun
-from crosscue.eval.interface.runs.score import score_run as score_run
-from crosscue.eval.interface.runs.scores import ScoredRuns as ScoredRuns
-from crosscue.eval.interface.runs.scores import score_runs as score_runs
-from crosscue.eval.interface.runs.tracking import MlflowSink as MlflowSink
-from crosscue.eval.interface.runs.tracking import open_mlflow as open_mlflow
 from crosscue.eval.interface.studies.drive import StudyDrive as StudyDrive
 from crosscue.eval.interface.studies.drive import run_study_drive as run_study_drive
 from crosscue.eval.interface.studies.intersections import IntersectionResult as IntersectionResult

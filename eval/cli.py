@@ -43,7 +43,7 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "detect": "eval.drives.replay:detect_drive",
     "estimate": "eval.drives.replay:estimate_run",
     "replay": "eval.drives.many:replay",
-    "score": ("runs.score", "score runs against truth: metrics, figures, report, gates"),
+    "score": "eval.drives.score_runs:score_runs",
     "score detector": (
         "runs.score_detector",
         "score a detector of a run against labelled boxes of its images",

@@ -121,7 +121,7 @@ def described(documented: object) -> Described:
     described_names = sections.get("Args", "") or attributes_of(documented)
     items = re.findall(r"^    (\w+): (.+(?:\n {5,}.*)*)", described_names, re.MULTILINE)
     return Described(
-        parts[0].strip().replace("``", ""),
+        parts[0].strip().replace("``", "").replace("::\n", ":\n"),
         inspect.cleandoc(examples),
         {name: " ".join(text.split()) for name, text in items},
     )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 from crosscue.eval.runs.folder import FAILURE, MANIFEST, is_alive
 from crosscue.replay.base import UnreadableRunError
@@ -48,6 +48,8 @@ class DriveStatus:
     silent_s: float
     error: str | None = None
     host: str = ""
+
+    also: ClassVar = {"log": "log"}
 
     @property
     def log(self) -> Path | None:

@@ -9,7 +9,7 @@ from typing import Final
 
 from crosscue.datasets.simulate import simulate_approach
 from crosscue.eval.drives.replay import replay_drive
-from crosscue.eval.interface.runs.score import ScoredRun, score_run
+from crosscue.eval.drives.score import ScoredRun, score_run
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.recording.view import save_recording
 from crosscue.replay.base import CrosscueError, UsageError, door, write_text

@@ -121,10 +121,23 @@ class Recording(Result):
             yield str(self.recording)
 
 
+def recording_file(text: str) -> Path:
+    """Return the file of a recording.
+
+    Raises:
+        UsageError: Its name does not end in ``.rrd``.
+    """
+    if not text.endswith(".rrd"):
+        raise UsageError(f"{text}: expected a name that ends in .rrd")
+    return Path(text)
+
+
 def view(
     run: PicturedRun,
     *,
-    output: Annotated[Path | None, Option(metavar="X.rrd", group="how")] = None,
+    output: Annotated[
+        Path | None, Option(metavar="X.rrd", convert=recording_file, group="how")
+    ] = None,
     web: Annotated[bool, Option(group="how")] = False,
     at: Annotated[str | None, Option(metavar="T", group="part")] = None,
     approach: Annotated[int | None, Option(group="part")] = None,
@@ -156,8 +169,6 @@ def view(
         truth: Truth file, to also draw the true track and ranges.
         overwrite: Replace an existing recording.
     """
-    if output is not None and output.suffix != ".rrd":
-        raise UsageError(f"{output}: expected a name that ends in .rrd")
     if output is not None and output.exists() and not overwrite:
         raise OutputError(f"{output}: exists; give another name or --overwrite")
     made = run_given(run)

@@ -21,7 +21,6 @@ CALLS: Final = {
     "truth check": ("check_truth",),
     "truth schema": ("truth_schema",),
     "run schema": ("run_schema",),
-    "score": ("score_runs", "open_mlflow"),
     "score detector": ("score_detector",),
     "fit detector": ("fit_detector",),
     "demo": ("demo",),

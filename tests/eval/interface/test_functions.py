@@ -159,20 +159,21 @@ def test_runs_are_scored_together_and_failed_run_is_reported(drive: Path, tmp_pa
     gates.write_text(
         'version = 1\n[[gate]]\nmetric = "cues.stop_sign.precision"\nmin = 1.1\n', "utf-8"
     )
-    seen: list[str] = []
+    seen: list[object] = []
 
-    found = crosscue.score_runs(
-        [run, tmp_path / "gone"],
-        drive.parent / "truth.json",
-        tmp_path / "pooled",
-        gates=gates,
-        has_figures=False,
-        on_run=lambda one: seen.append(one.headline),
-        on_failed=lambda path, error: seen.append(f"{path.name}: {error}"),
-    )
+    with watching(seen.append):
+        found = crosscue.score_runs(
+            [run, tmp_path / "gone"],
+            drive.parent / "truth.json",
+            tmp_path / "pooled",
+            gates=gates,
+            has_figures=False,
+        )
 
-    assert seen[0].startswith(str(run.path))
-    assert seen[1].startswith("gone: ")
+    parts = [one for one in seen if not isinstance(one, Progress)]
+    assert str(parts[0]).startswith(str(run.path))
+    assert "gone: " in str(parts[1])
+    assert str(parts[1]).endswith("; this run is left out")
     assert [path.name for path in found.failed] == ["gone"]
     assert found.has_failed_gate
     assert not found.is_whole

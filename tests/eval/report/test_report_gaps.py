@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 from rerun.chunk import RrdReader
 
-from crosscue.eval.interface.runs.score import ScoreWork
+from crosscue.eval.drives.score import ScoreWork
 from crosscue.eval.recording import save
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import Gap, broken_at, gaps_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.eval.interface.runs.score import ScoreWork
+from crosscue.eval.drives.score import ScoreWork
 from crosscue.eval.report.summary import pose_summary, summary
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import ambiguous

@@ -27,6 +27,7 @@ from crosscue.eval.scoring.runs import (
 )
 from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError
 from crosscue.replay.processes import in_processes
+from crosscue.results import Result
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -150,8 +151,8 @@ def settings_given(threshold: float, detection: Definition) -> ScoreSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ScoredRun:
-    """Scores of a run; its repr is the output of ``crosscue score``.
+class ScoredRun(Result):
+    """Scores of a run; its text is the output of ``crosscue score``.
 
     Attributes:
         scored: The run, compared with its truth.
@@ -204,12 +205,13 @@ class ScoredRun:
         columns = {f"{axis}_m": track.xyz_m[:, i] for i, axis in enumerate("xyz")}
         return pa.table({"t_ns": track.t_ns, **columns})
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield the scores of cues, approaches and ranges, and of the pose."""
         one = self.scored.one
-        lines = [summary(scores_of([one]), one.why_no_pose)]
+        yield summary(scores_of([one]), one.why_no_pose)
         if one.pose is not None:
-            lines += ["", pose_summary(one.pose)]
-        return "\n".join(lines)
+            yield ""
+            yield pose_summary(one.pose)
 
 
 def score_run(

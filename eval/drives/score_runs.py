@@ -1,0 +1,362 @@
+"""Score runs against their truth, each alone and all together, with gates and ablations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.pipeline.run import Run, moved_to
+from crosscue.eval.report.junit import write_junit
+from crosscue.eval.report.summary import (
+    gate_lines,
+    pose_summary,
+    poses_summary,
+    reported_line,
+    summary,
+)
+from crosscue.eval.runs.folder import account_lines, locked
+from crosscue.eval.scoring.drives import Definition, Scores, ScoreSettings
+from crosscue.eval.scoring.files import FOLDER
+from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
+from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.pose.smoother import smoother_text
+from crosscue.eval.scoring.runs import RunScored, account_of_scores, metrics_of, scores_of
+from crosscue.eval.studies.attribution import (
+    Attribution,
+    Drive,
+    attribute,
+    attribution_lines,
+    attribution_tree,
+)
+from crosscue.eval.studies.estimated_again import estimate_of
+from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, UsageError, one_line, visible
+from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option, keywords
+
+from .score import Failed, ScoredRun, ScoreWork, score_each, settings_given, write_files
+from .tracking import open_mlflow
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ScoredRuns(Result):
+    """Scores of runs; its text is the output of ``crosscue score``.
+
+    Attributes:
+        runs: The scored runs.
+        failed: Errors of the runs that could not be scored, by folder.
+        metrics: Metrics of all runs together, as in ``metrics.json``.
+        scores: The scores that the metrics are computed from.
+        gates: Outcome of each gate.
+        attribution: Effect of each cue on the scores, if requested.
+        report: Page with the scores; None for several runs without ``output``.
+    """
+
+    runs: tuple[ScoredRun, ...] = field(metadata=HIDDEN)
+    failed: Mapping[Path, CrosscueError] = field(metadata=HIDDEN)
+    metrics: Mapping[str, Any]
+    scores: Scores = field(metadata=HIDDEN)
+    gates: tuple[GateResult, ...] = field(metadata=HIDDEN)
+    attribution: Mapping[str, Attribution] = field(metadata=HIDDEN)
+    report: Path | None = field(metadata=HIDDEN)
+
+    also: ClassVar = {"gates": "gate_outcomes", "runs": "metrics_by_run"}
+
+    @property
+    def is_many(self) -> bool:
+        """True if several runs were to be scored."""
+        return len(self.runs) + len(self.failed) > 1
+
+    @property
+    def is_whole(self) -> bool:
+        """True if every run was scored, and nothing was dropped in any."""
+        return not self.failed and bool(self.metrics["account"]["is_whole"])
+
+    @property
+    def has_failed_gate(self) -> bool:
+        """True if a metric violates a bound."""
+        return any(one.failure for one in self.gates)
+
+    @property
+    def exit_status(self) -> int:
+        """1 for a failed gate, 3 for runs or rows that were dropped, else 0."""
+        if self.has_failed_gate:
+            return 1
+        return 0 if self.is_whole else 3
+
+    @property
+    def gate_outcomes(self) -> list[dict[str, object]]:
+        """Each gate with its value, and whether it passed."""
+        return [
+            {
+                "metric": one.gate.metric,
+                "min": one.gate.min,
+                "max": one.gate.max,
+                "use": one.gate.use,
+                "value": one.value,
+                "passed": not one.failure,
+                "failure": one.failure,
+            }
+            for one in self.gates
+        ]
+
+    @property
+    def metrics_by_run(self) -> dict[str, Mapping[str, Any]]:
+        """Metrics of each run, by its folder."""
+        return {str(one.scored.one.run.path): one.metrics for one in self.runs}
+
+    def lines(self) -> Iterator[str]:
+        """Yield the scores, where they were written, and the gates."""
+        yield from _lines_together(self) if self.is_many else _lines_of_one(self)
+        if self.report is not None:
+            yield f"written to {visible(str(self.report))}"
+        if self.gates:
+            yield gate_lines(self.gates)
+
+
+def _lines_of_one(found: ScoredRuns) -> list[str]:
+    (run,) = found.runs
+    one = run.scored.one
+    lines = [f"run        {visible(str(one.run.path))}", *_account(found)]
+    lines += [reported_line("note", visible(text)) for text in one.run.drive_manifest().notices]
+    lines.append("")
+    lines += _scores(found, one.why_no_pose)
+    if one.pose is not None:
+        lines += ["", pose_summary(one.pose)]
+    if run.scored.smoothed is not None:
+        lines.append(smoother_text(run.scored.smoothed))
+    return lines
+
+
+def _lines_together(found: ScoredRuns) -> list[str]:
+    lines = []
+    if found.failed:
+        every = len(found.failed) + len(found.runs)
+        lines.append(f"failed     {len(found.failed)} of {every} runs, left out")
+    if same := found.metrics["coverage"].get("same_log", ()):
+        first, second = map(visible, same[0])
+        more = f" (and {len(same) - 1} pairs more)" if len(same) > 1 else ""
+        text = f"{first} and {second} are runs of one log{more}: each run counts"
+        lines.append(reported_line("twice", text))
+    ones = _ones(found)
+    why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
+    lines += [*_account(found), "", *_scores(found, why)]
+    poses = [one.pose for one in ones if one.pose is not None]
+    return [*lines, "", poses_summary(poses)] if poses else lines
+
+
+def _account(found: ScoredRuns) -> list[str]:
+    return [visible(line) for line in account_lines(account_of_scores(_ones(found)))]
+
+
+def _scores(found: ScoredRuns, why_no_pose: str) -> list[str]:
+    lines = [summary(found.scores, why_no_pose)]
+    if found.attribution:
+        lines += ["", *attribution_lines(found.attribution)]
+    return lines
+
+
+def _ones(found: ScoredRuns) -> list[RunScored]:
+    return [run.scored.one for run in found.runs]
+
+
+@dataclass(frozen=True, slots=True)
+class ScoringSettings:
+    """Settings of the scores of runs.
+
+    Attributes:
+        truth: Truth of all runs (default: truth.json next to each run's log).
+        output: Folder for metrics, report and junit.xml, pooled over all runs.
+        gates: File with bounds on metrics; the exit status is 1 when one is violated.
+        threshold: Probability above which a feature counts as detected.
+        detection: Confirmed: a detection counts when 3 frames confirm it and its range is within
+            its 95 % interval; published: from the first frame, with any range.
+        rpe_m: Distances of the relative pose error, in metres.
+        has_attribution: Run an ablation: estimate without each cue, and report the change in every
+            metric.
+        smoother: Also run a batch smoother on the same measurements and compare its error.
+        any_log: Accept truth made for another file of the same drive, such as a converted log.
+        logs: Folder that the run's logs have moved to; they are recognised by content.
+        without_images: Leave out camera images, so the run's logs are not needed.
+        limits: Limits for reading the runs' logs.
+        has_figures: Write a report without figures, which is much faster.
+        workers: Number of runs in parallel.
+        mlflow: Also log scores, tags and report to the MLflow server or store at this address.
+        experiment: Experiment in MLflow.
+    """
+
+    truth: Path | str | None = None
+    output: Path | str | None = None
+    _: KW_ONLY
+    gates: Annotated[Path | str | None, Option("--gate", metavar="G.toml")] = None
+    threshold: float = 0.9
+    detection: Definition = "confirmed"
+    rpe_m: Annotated[Sequence[float], Option("--rpe", metavar="M")] = (10.0, 100.0)
+    has_attribution: bool = False
+    smoother: Literal["gtsam"] | None = None
+    any_log: bool = False
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
+    without_images: bool = False
+    limits: LimitsGiven = DEFAULT_LIMITS
+    has_figures: bool = True
+    workers: int = 1
+    mlflow: Annotated[str | None, Option(metavar="URI")] = None
+    experiment: str = "crosscue"
+
+    def __post_init__(self) -> None:
+        """Check numbers.
+
+        Raises:
+            UsageError: A number is out of range.
+        """
+        if self.workers < 1:
+            raise UsageError(f"workers: {self.workers}, expected 1 or more")
+        for distance_m in self.rpe_m:
+            if not (math.isfinite(distance_m) and distance_m > 0.0):
+                raise UsageError(f"rpe_m: {distance_m}, expected metres, above 0")
+
+    def work(self) -> ScoreWork:
+        """Return the scoring of one run with these settings."""
+        return ScoreWork(
+            None if self.truth is None else Path(self.truth),
+            settings_given(self.threshold, self.detection),
+            tuple(self.rpe_m),
+            self.smoother is not None,
+            self.any_log,
+            moved_to(self.logs),
+            self.limits,
+            self.has_figures,
+            self.without_images,
+        )
+
+
+@keywords(ScoringSettings)
+def score_runs(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> ScoredRuns:
+    """Score runs against truth: metrics, figures, report, gates.
+
+    Metrics and figures of each run are written to RUN/score. Several runs (folders, a folder of
+    runs, a quoted pattern, @list.txt) are also scored together, and the pooled result is written to
+    the folder of -o. A run that cannot be scored does not stop the rest. Without --truth, each
+    run's truth is the truth.json next to its log.
+
+    A gate file (TOML) sets bounds on metrics. The exit status is 1 when a gate fails::
+
+        version = 1
+        [[gate]]
+        metric = "cues.stop_sign.precision"
+        min = 0.9
+        use = "low"
+
+    Examples:
+        crosscue score runs/A-01 --truth drives/A-01/truth.json
+        crosscue score runs -o scored --gate gates.toml --workers 8
+
+    Args:
+        runs: Run folders, or folders of them.
+        settings: How to score.
+
+    Raises:
+        UsageError: A setting is out of range, or the gate file is not valid.
+        CrosscueError: No run can be scored; the error of the first.
+    """
+    # Opened first, so that a wrong address is reported before anything is scored.
+    sink = None if settings.mlflow is None else open_mlflow(settings.mlflow, settings.experiment)
+    found = _scored(runs, settings)
+    if sink is not None:
+        sink.log(found)
+    return found
+
+
+def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> ScoredRuns:
+    paths = runs_of([str(one.path if isinstance(one, Run) else one) for one in runs])
+    folder = None if settings.output is None else Path(settings.output)
+    is_many = len(paths) > 1
+    if settings.gates is not None and is_many and folder is None:
+        raise UsageError("score: several runs with --gate: add -o DIR, the folder for junit.xml")
+    work = settings.work()
+    bounds = () if settings.gates is None else load_gates(Path(settings.gates))
+    scored: list[ScoredRun] = []
+    failed: dict[Path, CrosscueError] = {}
+    for one in score_each(paths, work, settings.workers):
+        if isinstance(one, Failed):
+            failed[one.path] = one.error
+            if is_many:
+                emit(CrosscueError(f"{one_line(one.error)}; this run is left out"))
+        else:
+            scored.append(ScoredRun(one, one.metrics, one.report))
+            if is_many:
+                emit(scored[-1].headline)
+        emit(Progress("scoring", len(scored) + len(failed), len(paths), "runs"))
+    if not scored:
+        raise next(iter(failed.values()))
+    if is_many:
+        # Between the headlines of the runs and the scores of all.
+        emit("")
+    together = _pool if is_many else _one
+    found = together(
+        scored, failed, work.settings, folder, settings.has_attribution, settings.has_figures
+    )
+    if not bounds:
+        return found
+    tree = found.metrics
+    results = check_gates(bounds, metric_values(tree), tree["coverage"]["not_scored"])
+    suite = f"{len(paths)} runs" if is_many else str(paths[0])
+    place = folder or scored[0].scored.one.run.file(FOLDER)
+    write_junit(place / "junit.xml", results, suite)
+    return replace(found, gates=results)
+
+
+def _one(
+    runs: Sequence[ScoredRun],
+    failed: Mapping[Path, CrosscueError],
+    settings: ScoreSettings,
+    output: Path | None,
+    has_attribution: bool,
+    has_figures: bool,
+) -> ScoredRuns:
+    """Return the scores of one run, with the attribution added to its files."""
+    (run,) = runs
+    one, metrics, report = run.scored.one, run.scored.metrics, run.report
+    scores = scores_of([one], settings)
+    worth = _attribution([one], metrics, settings) if has_attribution else {}
+    if worth:
+        with locked(one.run):
+            write_files(one.run.file(FOLDER), [one], scores, metrics, has_figures=has_figures)
+    if output is not None:
+        report = write_files(output, [one], scores, metrics, has_figures=has_figures)
+    return ScoredRuns(tuple(runs), failed, metrics, scores, (), worth, report)
+
+
+def _pool(
+    runs: Sequence[ScoredRun],
+    failed: Mapping[Path, CrosscueError],
+    settings: ScoreSettings,
+    output: Path | None,
+    has_attribution: bool,
+    has_figures: bool,
+) -> ScoredRuns:
+    """Return the scores of all runs together, written to ``output`` if it is not None."""
+    ones = [run.scored.one for run in runs]
+    scores = scores_of(ones, settings)
+    tree = metrics_of(ones, scores)
+    tree["coverage"]["failed"] = {str(path): str(error) for path, error in failed.items()}
+    worth = _attribution(ones, tree, settings) if has_attribution else {}
+    report = None
+    if output is not None:
+        report = write_files(output, ones, scores, tree, has_figures=has_figures)
+    return ScoredRuns(tuple(runs), failed, tree, scores, (), worth, report)
+
+
+def _attribution(
+    ones: Sequence[RunScored], tree: dict[str, Any], settings: ScoreSettings
+) -> dict[str, Attribution]:
+    """Return the effect of each cue on the scores, and add it to the metrics."""
+    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
+    found = attribute(drives, settings=settings)
+    tree["attribution"] = attribution_tree(found)
+    return found
