@@ -15,6 +15,7 @@ from crosscue.replay.errors import UsageError
 
 from .class_names import COCO_80, COCO_90, meaning_of
 from .recognise import size_in
+from .segmentation import drivable
 
 _LINE: Final = 100
 _DECODE: Final = 'decode = "full"  # as scripts around networks do; "reduced" is faster'
@@ -63,8 +64,13 @@ def draft(
     assumed = [*(f"{guess.settings['kind']}: {why}" for why in suggested), *guess.assumptions]
     classes = _classes(path, model, guess, names, certain, assumed)
     given = _input(model, guess, size_px, certain, assumed)
-    output = {**guess.settings, "score": DEFAULT_SCORE, "classes": classes}
-    labels = {name: label for name in classes if (label := meaning_of(name)) and label != name}
+    output: dict[str, object]
+    if guess.settings["kind"] == "segmentation":
+        road, labels = _road(path, classes, assumed), {}
+        output = {**guess.settings, "classes": classes, "road": road}
+    else:
+        output = {**guess.settings, "score": DEFAULT_SCORE, "classes": classes}
+        labels = {name: label for name in classes if (label := meaning_of(name)) and label != name}
     lines = [
         f"# Written by crosscue model init for {path.name}.",
         *(f"# Found in the file: {reason}." for reason in certain),
@@ -105,7 +111,16 @@ def _classes(
     assumed: list[str],
 ) -> tuple[str, ...]:
     count = guess.class_count
-    if count is not None and len(names) == count + 1 and names[0].strip("_").lower() in _NOTHING:
+    is_road = guess.settings["kind"] == "segmentation"
+    if is_road and count is not None and len(names) == count - 1:
+        assumed.append("class 0 is the background")
+        return ("background", *names)
+    if (
+        not is_road
+        and count is not None
+        and len(names) == count + 1
+        and names[0].strip("_").lower() in _NOTHING
+    ):
         names = names[1:]
     if names:
         if count is not None and len(names) != count:
@@ -115,16 +130,29 @@ def _classes(
         certain.append(f"{len(model.class_names)} class names in its metadata")
         return model.class_names
     usual = COCO_90 if guess.numbers_as_coco else COCO_80
-    for known in (COCO_80, COCO_90):
+    for known in (COCO_80, COCO_90) if not is_road else ():
         if count == len(known) or (count is None and known is usual):
             assumed.append(f"the {len(known)} classes are COCO's, in its order")
             return known
-    if count == len(COCO_90) + 1:
+    if count == len(COCO_90) + 1 and not is_road:
         assumed.append("the 91 classes are COCO's numbers, 0 unused")
         return ("unused 0", *COCO_90)
     raise UsageError(
-        f"{path}: {count} classes without names; list the names, one per line: --class-names FILE"
+        f"{path}: {count or 'its'} classes without names; name them in their order, such as "
+        f"--classes {'road,curb,mark' if is_road else 'car,truck'}, or one per line in "
+        "--class-names FILE"
     )
+
+
+def _road(path: Path, classes: Sequence[str], assumed: list[str]) -> tuple[str, ...]:
+    found = drivable(classes)
+    if not found:
+        raise UsageError(
+            f"{path}: none of the classes {', '.join(classes)} is known to be drivable; name that "
+            "class road"
+        )
+    assumed.append(f"drivable are: {', '.join(found)} (output.road)")
+    return found
 
 
 def _input(

@@ -31,6 +31,7 @@ from crosscue.replay.base import UsageError, one_line, read_at_most, yaml_tree
 
 from .architectures import WEIGHTS_SUFFIXES
 from .card import MAX_BYTES, Input
+from .segmentation import recognise_segmentation
 
 _MAX_NAMES_CHARACTERS: Final = 100_000
 """Maximum number of brackets in metadata; parsing more is slow."""
@@ -284,4 +285,8 @@ def guesses(model: Interface) -> list[Guess]:
     """List all layouts that a model file may have, in the order of the table."""
     if not model.inputs or not model.outputs:
         return []
-    return [guess for decoder in DECODERS if (guess := decoder.recognise(model)) is not None]
+    found = [guess for decoder in DECODERS if (guess := decoder.recognise(model)) is not None]
+    road = recognise_segmentation(model)
+    # Integers are class numbers, never boxes.
+    is_road = road is not None and (not found or model.outputs[0].is_integer)
+    return [road] if road is not None and is_road else found

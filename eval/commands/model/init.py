@@ -46,6 +46,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="class names, one per line, for a file without them",
     )
     parser.add_argument(
+        "--classes", metavar="NAME,NAME", help="the same names in one argument: road,curb,mark"
+    )
+    parser.add_argument(
         "--size", metavar="WxH", help="input size, such as 1280x736, for a network that accepts any"
     )
     parser.add_argument(
@@ -64,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
         args.output,
         kind=args.kind,
         class_names=args.class_names,
+        classes=args.classes,
         size_px=args.size,
         picture=args.picture,
         overwrite=args.overwrite,

@@ -109,6 +109,7 @@ def draft_card(
     *,
     kind: str | None = None,
     class_names: Sequence[str] | Path | str | None = None,
+    classes: str | None = None,
     size_px: tuple[int, int] | str | None = None,
     picture: Path | str | None = None,
     overwrite: bool = False,
@@ -122,6 +123,7 @@ def draft_card(
         kind: Layout of the outputs, or torchvision's name of the network, if several fit.
         class_names: Names in the order of the outputs, or a file with one name per line, if the
             model file has none.
+        classes: The same names as text, separated by commas: ``road,curb,mark``.
         size_px: Width and height of the input, also as text, ``1280x736``, if the network accepts
             any.
         picture: Picture to detect in; a copy with detections is written next to the card, as
@@ -142,6 +144,10 @@ def draft_card(
         raise UsageError(f"{place}: exists; give another name or --overwrite")
     if place.resolve().parent != path.resolve().parent:
         raise UsageError(f"{place}: expected a card in the folder of its weights, {path.parent}")
+    if classes is not None:
+        if class_names is not None:
+            raise UsageError("--classes and --class-names: give one of the two")
+        class_names = [name.strip() for name in classes.split(",")]
     size = _size(size_px) if isinstance(size_px, str) else size_px
     if path.suffix.lower() in WEIGHTS_SUFFIXES:
         from crosscue.detectors.catalog.recognise_weights import recognise_weights

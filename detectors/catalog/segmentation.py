@@ -1,0 +1,67 @@
+"""Recognise networks that give each pixel a class, by the shape of their output."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from crosscue.detectors.decoders.base import Guess, Interface, Tensor, static
+
+_MAX_CLASSES: Final = 256
+_COARSEST: Final = 8
+"""Maximum size of an output's pixel, in pixels of the input."""
+_CAFFE_INPUT: Final = "data"
+"""Usual name of the input of networks from Caffe, as those of Open Model Zoo."""
+_DRIVABLE: Final = frozenset(
+    {"road", "mark", "roadmark", "marking", "lanemarking", "drivable", "drivablearea", "lane"}
+)
+"""Names of drivable classes, without blanks and underscores."""
+
+
+def recognise_segmentation(model: Interface) -> Guess | None:
+    """Return the settings with which a model file is a segmentation; None if it cannot be one."""
+    maps = [_classes_of(out, model.inputs[0]) for out in model.outputs]
+    first = model.outputs[0]
+    count = maps[0]
+    if count is None or any(out.shape != first.shape for out in model.outputs):
+        return None
+    others = ", ".join(out.name for out in model.outputs[1:])
+    is_caffe = model.inputs[0].name == _CAFFE_INPUT
+    return Guess(
+        {"kind": "segmentation", **({"name": first.name} if others else {})},
+        count or None,
+        (f"{first.name} has {f'{count} scores' if count else 'a class'} for each pixel",),
+        (
+            *((f"{first.name} is the road, not {others} (output.name)",) if others else ()),
+            "pixels are BGR, from 0 to 255, as Open Model Zoo's networks expect"
+            if is_caffe
+            else "pixels are RGB, scaled to 0..1",
+        ),
+        {"colour": "bgr", "fit": "stretch"}
+        if is_caffe
+        else {"colour": "rgb", "fit": "stretch", "scale": (1 / 255,) * 3},
+        is_decided=False,
+    )
+
+
+def _classes_of(output: Tensor, given: Tensor) -> int | None:
+    """Number of an output's scores per pixel, 0 for class numbers; None for another output."""
+    sides = static(output.shape, -2), static(output.shape, -1)
+    of_input = static(given.shape, -2), static(given.shape, -1)
+    if len(given.shape) != 4 or not all(sides) or not all(of_input):
+        return None
+    height, width, rows, columns = (side or 1 for side in sides + of_input)
+    if rows % height or rows * width != columns * height or rows // height > _COARSEST:
+        return None
+    count = static(output.shape, 1)
+    if len(output.shape) == 4 and count is not None and 2 <= count <= _MAX_CLASSES:
+        return count
+    is_numbers = len(output.shape) == 3 or (len(output.shape) == 4 and count == 1)
+    return 0 if is_numbers and output.is_integer else None
+
+
+def drivable(names: Sequence[str]) -> tuple[str, ...]:
+    """Select the names of drivable classes."""
+    return tuple(
+        name for name in names if name.lower().replace("_", "").replace(" ", "") in _DRIVABLE
+    )

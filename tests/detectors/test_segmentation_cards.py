@@ -1,0 +1,116 @@
+"""A card is drafted for segmentation networks as well, and the road is drawn in a picture."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import crosscue
+from crosscue.detectors.base import Frame
+from crosscue.detectors.catalog.card import SegmentationOutput, read_card
+from crosscue.detectors.networks.model_detector import RoadModel, build
+from crosscue.eval import cli
+from crosscue.replay.base import UsageError
+from support.data import shared
+from support.onnx_models import constant_model
+
+ROAD_NETWORKS = {
+    "road-segmentation-adas-0001/road-segmentation-adas-0001.xml": "road,curb,mark",
+    "twinlitenet/twinlitenet_best.onnx": "road",
+}
+"""Real networks, with their class names behind the background."""
+PICTURE = Path("sequences", "pandaset_002", "camera", "front_camera", "00.jpg")
+
+
+def scores(size: tuple[int, int], classes: int = 3) -> NDArray[np.float32]:
+    """Class scores (1, C, h, w): class 1 in the lower half, class 0 above it."""
+    values = np.zeros((1, classes, size[1], size[0]), np.float32)
+    values[0, 0, : size[1] // 2] = values[0, 1, size[1] // 2 :] = 1.0
+    return values
+
+
+def network(folder: Path, **outputs: object) -> Path:
+    """Write a network for pictures of 64 x 32."""
+    path = folder / "road.onnx"
+    values = {name: np.asarray(value) for name, value in outputs.items()}
+    path.write_bytes(constant_model((1, 3, 32, 64), values))
+    return path
+
+
+@pytest.mark.parametrize("size", [(64, 32), (16, 8)], ids=["whole size", "a quarter"])
+@pytest.mark.parametrize("names", ["sky,road,curb", "road,curb"], ids=["all", "no background"])
+def test_card_is_written_and_road_is_found(
+    tmp_path: Path, size: tuple[int, int], names: str
+) -> None:
+    card = crosscue.draft_card(network(tmp_path, mask=scores(size)), classes=names).path
+
+    detector = build(card=str(card))
+    assert isinstance(detector, RoadModel)
+    mask = detector.road_mask(Frame(0, "", np.zeros((64, 128, 3), np.uint8), (128, 64)))
+    np.testing.assert_array_equal(mask.mean(axis=1), np.arange(size[1]) >= size[1] // 2)
+
+
+def test_class_numbers_are_read(tmp_path: Path) -> None:
+    numbers = scores((64, 32)).argmax(axis=1)
+    card = crosscue.draft_card(network(tmp_path, mask=numbers), classes="sky,road").path
+
+    output = read_card(card).output
+    assert isinstance(output, SegmentationOutput)
+    assert (output.classes, output.road) == (("sky", "road"), ("road",))
+
+
+def test_names_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = network(tmp_path, mask=scores((64, 32)))
+
+    assert cli.run(["model", "init", str(path)]) == 2
+    assert capsys.readouterr().err == (
+        f"crosscue: {path}: 3 classes without names; name them in their order, such as "
+        "--classes road,curb,mark, or one per line in --class-names FILE\n"
+    )
+    assert cli.run(["model", "init", str(path), "--classes", "sky,way,curb"]) == 2
+    assert "none of the classes sky, way, curb is known to be drivable" in capsys.readouterr().err
+    assert cli.run(["model", "init", str(path), "--classes", "sky,road,curb"]) == 0
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [
+        {"depth": np.zeros((1, 1, 32, 64), np.float32)},
+        {"cells": np.zeros((1, 85, 2, 4), np.float32)},
+        {"a": scores((64, 32), 4), "b": scores((16, 8), 4)},
+    ],
+    ids=["one channel", "cells of stride 16", "maps of two sizes"],
+)
+def test_other_maps_are_not_taken_for_classes(
+    tmp_path: Path, outputs: dict[str, NDArray[np.float32]]
+) -> None:
+    with pytest.raises(UsageError, match="not supported"):
+        crosscue.draft_card(network(tmp_path, **outputs), classes="road")
+
+
+@pytest.mark.parametrize("weights", ROAD_NETWORKS)
+def test_real_network_draws_its_road(tmp_path: Path, weights: str) -> None:
+    given = shared("weights") / weights
+    for path in (given, given.with_suffix(".bin")):
+        if path.exists():
+            shutil.copy(path, tmp_path)
+
+    picture = shared(*PICTURE.parts)
+    found = crosscue.draft_card(
+        tmp_path / given.name, classes=ROAD_NETWORKS[weights], picture=picture
+    )
+
+    detector = build(card=str(found.path))
+    assert isinstance(detector, RoadModel)
+    pixels = np.asarray(cv2.imread(str(picture)), np.uint8)
+    mask = detector.road_mask(Frame(0, "", pixels, (pixels.shape[1], pixels.shape[0])))
+    above, below = np.array_split(mask, 2)
+    assert below.mean() > 0.3
+    assert above.mean() < 0.1
+    drawn = np.asarray(cv2.imread(str(found.picture)), np.int64)
+    assert np.abs(drawn - pixels).max(axis=2).mean() > 10.0
