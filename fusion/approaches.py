@@ -13,8 +13,9 @@ The dissertation scores one approach per run, but a drive has many. The life of 
 
 Only signs with a range and cues with ``can_start`` keep evidence fresh, because road straight
 ahead is seen everywhere. Staleness depends on distance, not on time, so the approach of a car that
-waits at the stop line remains open. Without odometry, the distance is estimated with
-``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
+waits at the stop line remains open. While it stands, only cues of moving objects are evidence; only
+the published belief (``source``) counts every frame. Without odometry, the distance is estimated
+with ``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
 """
 
 from __future__ import annotations
@@ -61,6 +62,9 @@ from .temporal import (
 
 TURN_FADES_M: Final = 25.0
 """Distance over which an accumulated turn decays, so that bends of a road do not add up to one."""
+STANDING_M: Final = 0.1
+"""Distance since the last evidence of static objects below which the car stands, as in
+``Fusion.dissent_every_m``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +110,14 @@ class _Moved(NamedTuple):
 
     Attributes:
         advanced_m: Signed distance, negative in reverse.
+        is_standing: True if only cues of moving objects count.
     """
 
     way_m: float
     time_s: float
     advanced_m: float
     advanced_var_m2: float
+    is_standing: bool = False
 
 
 @dataclass(slots=True)
@@ -150,14 +156,43 @@ class Approaches:
         self._last_ns: int | None = None
         self._rest_m = 0.0
         self._since_range_m = math.inf
+        self._since_static_m = math.inf
+        self._static = frozenset(cue.name for cue in graph.cues if not cue.moves)
+        self._is_published = fusion.kind in ("source", None)
 
     def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
         """Process the next evidence; it is ignored if it is not later than the previous one."""
+        if evidence.travelled_m == 0.0 and not self._is_published:
+            # A car that stands does not turn, whatever the gyroscope's bias.
+            evidence = replace(evidence, travelled_var_m2=0.0, turned_rad=None)
         moved = self._moved(evidence)
         if moved is None:
             return Step(evidence.t_ns, None, {})
         if self._open is not None:
             self._advance(self._open, evidence, moved.way_m)
+        moved, looked_for = self._with_standing(moved), evidence.counts
+        if moved.is_standing:
+            moving = self._without_static(evidence.counts, moved)
+            evidence = replace(evidence, counts=moving, signs=(), posteriors=())
+        step = self._judged(evidence, past, moved)
+        return replace(step, counts={**looked_for, **step.counts})
+
+    def _with_standing(self, moved: _Moved) -> _Moved:
+        """Say whether the car stands, except for the published method, which counts all frames."""
+        self._since_static_m += moved.way_m
+        is_standing = self._since_static_m < STANDING_M and not self._is_published
+        if not is_standing:
+            self._since_static_m = 0.0
+        return moved._replace(is_standing=is_standing)
+
+    def _without_static(self, counts: Mapping[str, int], moved: _Moved) -> Mapping[str, int]:
+        """Counts that are evidence: those of moving objects only, while the car stands."""
+        if not moved.is_standing:
+            return counts
+        return {cue: count for cue, count in counts.items() if cue not in self._static}
+
+    def _judged(self, evidence: FrameEvidence, past: PastCues, moved: _Moved) -> Step:
+        """Update the belief with what counts as evidence."""
         self._rest_m = max(0.0, self._rest_m - moved.way_m)
         self._since_range_m += moved.way_m
         signs = self._plausible(evidence.signs)
@@ -187,6 +222,7 @@ class Approaches:
         self._last_ns = None
         self._rest_m = 0.0
         self._since_range_m = math.inf
+        self._since_static_m = math.inf
 
     def finish(self) -> None:
         """End the drive; an open approach is counted as closed by it."""
@@ -311,12 +347,14 @@ class Approaches:
         more = past(best, reference)
         counts = {**evidence.counts, **more}
         if more:
-            also = self._confirmed(more, evidence.is_new_picture)
+            usable = self._without_static(more, moved)
+            also = self._confirmed(usable, evidence.is_new_picture)
             confirmed = Confirmed(
                 {**confirmed.counts, **also.counts}, {**confirmed.silent, **also.silent}
             )
         is_near = best is not None and best.mean_m <= self._fusion.dissent_within_m
-        may_dissent = is_near and current.since_dissent_m >= self._fusion.dissent_every_m
+        is_fresh = current.since_dissent_m >= self._fusion.dissent_every_m
+        may_dissent = is_near and is_fresh and not moved.is_standing
         if may_dissent:
             current.since_dissent_m = 0.0
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
@@ -365,6 +403,7 @@ class Approaches:
             advanced_m=moved.advanced_m,
             advanced_var_m2=moved.advanced_var_m2,
             ranges=ranges,
+            is_standing=moved.is_standing,
         )
 
     def _to_start(

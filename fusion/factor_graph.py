@@ -79,6 +79,11 @@ class CueNode:
     within_m: float = math.inf
     fade: Fade = USUAL_FADE
 
+    @property
+    def moves(self) -> bool:
+        """Whether it detects moving objects, which a standing car sees come and go."""
+        return self.fade.time_s is not None
+
 
 @dataclass(frozen=True, slots=True)
 class Edge:

@@ -4,7 +4,7 @@ It is meant for real drives, where one false frame in eighty is typical. A posit
 message under two conditions:
 
 * It was positive in at least k of the last n frames in which it was evaluated. A repeated picture
-  is not a new frame.
+  is not a new frame, nor is one of a standing car, except for moving objects.
 * The intersection is not known to be further away than the cue's validated range.
 
 The message is the published one (eq. 18), sent once per frame regardless of the count, because the

@@ -23,6 +23,7 @@ class Situation:
         advanced_m: As ``moved_m``, but negative in reverse.
         advanced_var_m2: Variance of ``advanced_m``.
         ranges: Ranges to the intersection's start measured in this frame, with their variances.
+        is_standing: True if the car stands, so that ``counts`` has cues of moving objects only.
     """
 
     counts: Mapping[str, int]
@@ -37,3 +38,4 @@ class Situation:
     advanced_m: float = 0.0
     advanced_var_m2: float = 0.0
     ranges: tuple[tuple[float, float], ...] = ()
+    is_standing: bool = False

@@ -9,8 +9,10 @@ higher than the belief in the intersection itself, and is withdrawn with it.
   within reach every ``spacing_m``.
 * *Cues.* Given the state, a cue is a Markov chain with two values, positive or not. Its transitions
   depend on the features that it supports and on the distance. A cue that is not evaluated has no
-  effect, and its chain restarts. Cues are evaluated once per step (of distance, or of time while
-  the car stands), so that the result does not depend on the frame rate.
+  effect, and its chain restarts. Cues are evaluated once per step of distance, so that the result
+  depends neither on the frame rate nor on the time that the car stands.
+* *Moving objects.* Cues of moving objects also count if they appear between two such steps: the
+  first appearance, once. The time without any depends on the traffic, which is not modelled.
 * *Ranges.* A sign's range is Gaussian about the distance, or stray and uniform. A false sign
   without an intersection also has a fixed position, and its ranges agree with each other. That
   state therefore has a distance, too, and ranges alone are evidence of position, not of existence.
@@ -36,7 +38,7 @@ from numpy.typing import NDArray
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
-from .factor_graph import FactorGraph, log_odds
+from .factor_graph import CueNode, FactorGraph, log_odds
 from .independence import effective_sample_fraction
 from .intersection_range import Reference
 
@@ -94,13 +96,23 @@ class _Chain(NamedTuple):
     """Probabilities that one cue is positive: at first, after a negative and a positive step.
 
     Attributes:
+        moves: True if it detects moving objects.
         nowhere: Shape (3,): without an intersection ahead.
         ahead: Shape (3, distances, ways): with an intersection ahead.
     """
 
     cue: str
+    moves: bool
     nowhere: NDArray[np.float64]
     ahead: NDArray[np.float64]
+
+
+class _Said(NamedTuple):
+    """What one cue says: its value now, and in the previous step (None if not evaluated)."""
+
+    chain: _Chain
+    before: bool | None
+    is_positive: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,9 +156,9 @@ def temporal_model(graph: FactorGraph, settings: Temporal) -> TemporalModel:
     ways = tuple(ways_of(name) for name in settings.ways)
     probabilities = np.array(list(settings.ways.values()))
     has = [[float(name == PRESENCE or name in way) for way in ways] for name in graph.feature_names]
-    known = {cue.name for cue in graph.cues}
+    known = {cue.name: cue for cue in graph.cues}
     names = dict.fromkeys(one.cue for one in settings.chains if one.cue in known)
-    chains = tuple(_chain(name, settings, ways) for name in names)
+    chains = tuple(_chain(known[name], settings, ways) for name in names)
     return TemporalModel(settings, ways, probabilities / probabilities.sum(), chains, np.array(has))
 
 
@@ -155,8 +167,8 @@ def ways_of(name: str) -> tuple[str, ...]:
     return () if name == "none" else tuple(name.split("+"))
 
 
-def _chain(cue: str, settings: Temporal, ways: Sequence[tuple[str, ...]]) -> _Chain:
-    mine = [one for one in settings.chains if one.cue == cue]
+def _chain(cue: CueNode, settings: Temporal, ways: Sequence[tuple[str, ...]]) -> _Chain:
+    mine = [one for one in settings.chains if one.cue == cue.name]
     nowhere = np.full(3, 0.5)
     ahead = np.full((3, len(settings.edges_m) - 1, len(ways)), 0.5)
     for one in mine:
@@ -167,7 +179,7 @@ def _chain(cue: str, settings: Temporal, ways: Sequence[tuple[str, ...]]) -> _Ch
         for column, way in enumerate(ways):
             if _fits(one, way):
                 ahead[:, :, column] = columns
-    return _Chain(cue, nowhere, ahead)
+    return _Chain(cue.name, cue.moves, nowhere, ahead)
 
 
 def _fits(chain: CueChain, way: tuple[str, ...]) -> bool:
@@ -194,6 +206,7 @@ class TemporalFilter:
     _since_m: float = math.inf
     _since_s: float = math.inf
     _before: dict[str, bool] = field(default_factory=dict)
+    _appeared: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         """Start with the prior."""
@@ -230,6 +243,7 @@ class TemporalFilter:
         passed_s: float = 0.0,
         *,
         is_new_picture: bool = True,
+        is_standing: bool = False,
     ) -> None:
         """Process one frame.
 
@@ -240,16 +254,22 @@ class TemporalFilter:
             moved_var_m2: Variance of the distance.
             passed_s: Time since the previous frame.
             is_new_picture: False if the picture repeats the previous one.
+            is_standing: True if only cues of moving objects count.
         """
         self._move(moved_m, moved_var_m2)
+        if not is_standing:
+            self._spread()
         self._since_m += abs(moved_m)
         self._since_s += passed_s
         settings = self.model.settings
         log_nowhere, log_ahead = np.zeros_like(self.nowhere), np.zeros_like(self.ahead)
-        is_step = self._since_m >= settings.step_m or self._since_s >= settings.step_s
-        if is_step and is_new_picture:
-            self._since_m = self._since_s = 0.0
-            nowhere, ahead = self._cues(counts)
+        is_step = self._since_m >= settings.step_m and not is_standing
+        if is_new_picture and (is_step or self._since_s >= settings.step_s):
+            self._since_s = 0.0
+            if is_step:
+                self._since_m = 0.0
+            said = self._all_cues(counts) if is_step else self._appearances(counts)
+            nowhere, ahead = self._likelihoods(said)
             log_nowhere += settings.exponent * nowhere
             log_ahead += settings.exponent * ahead
         for one in ranges:
@@ -266,23 +286,40 @@ class TemporalFilter:
         self.nowhere /= total
         self.ahead /= total
 
-    def _cues(self, counts: Mapping[str, int]) -> tuple[float, NDArray[np.float64]]:
-        """Log likelihoods of all evaluated cues."""
+    def _all_cues(self, counts: Mapping[str, int]) -> list[_Said]:
+        """Return what all evaluated cues say after a step of distance."""
+        heard = {one.cue: counts[one.cue] > 0 for one in self.model.chains if one.cue in counts}
+        before, self._before = self._before, heard
+        self._appeared.clear()
+        return [
+            _Said(chain, before.get(chain.cue), heard[chain.cue])
+            for chain in self.model.chains
+            if chain.cue in heard
+        ]
+
+    def _appearances(self, counts: Mapping[str, int]) -> list[_Said]:
+        """Return the cues of moving objects that appear for the first time since that step."""
+        new = []
+        for chain in self.model.chains:
+            if not chain.moves or chain.cue not in counts:
+                continue
+            before = self._before.get(chain.cue)
+            self._before[chain.cue] = is_positive = counts[chain.cue] > 0
+            if is_positive and not before and chain.cue not in self._appeared:
+                self._appeared.add(chain.cue)
+                new.append(_Said(chain, before, is_positive))
+        return new
+
+    def _likelihoods(self, said: Sequence[_Said]) -> tuple[float, NDArray[np.float64]]:
+        """Log likelihoods of what cues say, nowhere and by cell and way."""
         settings = self.model.settings
         at = np.searchsorted(np.array(settings.edges_m[1:-1]), self.centers_m(), side="right")
         nowhere, by_distance = 0.0, np.zeros((len(settings.edges_m) - 1, len(self.model.ways)))
-        heard: dict[str, bool] = {}
-        for chain in self.model.chains:
-            count = counts.get(chain.cue)
-            if count is None:
-                continue
-            before = self._before.get(chain.cue)
+        for chain, before, is_positive in said:
             row = 0 if before is None else 1 + before
-            heard[chain.cue] = is_positive = count > 0
             p, q = chain.ahead[row], float(chain.nowhere[row])
             by_distance += np.log(p if is_positive else 1.0 - p)
             nowhere += math.log(q if is_positive else 1.0 - q)
-        self._before = heard
         return nowhere, np.asarray(by_distance[at])
 
     def _range(self, one: MeasuredRange) -> NDArray[np.float64]:
@@ -305,7 +342,6 @@ class TemporalFilter:
         while self._moved_m < 0.0:
             self._moved_m += cell_m
             self._shift_back()
-        self._spread()
 
     def _shift(self) -> None:
         """Move all mass one cell nearer; the nearest cell is passed, and a new one is in reach."""
@@ -368,4 +404,5 @@ def update_with(over_drive: TemporalFilter, situation: Situation) -> None:
         situation.advanced_var_m2,
         situation.passed_s,
         is_new_picture=situation.is_new_picture,
+        is_standing=situation.is_standing,
     )

@@ -180,14 +180,13 @@ def _frames(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
 
 
 def _steps(drive: AnnotatedDrive, about: Temporal) -> np.typing.NDArray[np.bool_]:
-    """Mark the frames in which the filter evaluates cues."""
+    """Mark the frames in which the filter evaluates all cues."""
     is_step = np.zeros(len(drive.start_m), np.bool_)
-    since_m = since_s = np.inf
+    since_m = np.inf
     for i in range(len(is_step)):
         since_m += abs(drive.advanced_m[i])
-        since_s += drive.passed_s[i]
-        if since_m >= about.step_m or since_s >= about.step_s:
-            is_step[i], since_m, since_s = True, 0.0, 0.0
+        if since_m >= about.step_m:
+            is_step[i], since_m = True, 0.0
     return is_step
 
 

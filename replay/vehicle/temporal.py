@@ -62,9 +62,9 @@ class Temporal(Section):
     stray: Probability = 0.05
     """Probability that a sign's range is unrelated to the intersection."""
     step_m: Positive = 1.5
-    """Distance after which a cue is evaluated again, unless ``step_s`` has passed earlier."""
+    """Distance after which a cue is evaluated again; standing adds no evidence."""
     step_s: Positive = 0.5
-    """Time after which a cue is evaluated again."""
+    """Time after which cues of moving objects are searched for an appearance in between."""
     spacing_m: Positive = 150.0
     """Mean distance between intersections."""
     cell_m: Positive = 2.0

@@ -207,7 +207,7 @@ def test_evidence_over_distance_is_bounded_for_any_number_of_frames(
 def test_continuous_cue_beyond_validated_range_reports_reason() -> None:
     far = RangePosterior(Reference.END, 130.0, 4.0, 130.0)
     frames = [
-        replace(frame, posteriors=(far,)) for frame in frames_of("stop_sign", [1] * 8, step_m=0.0)
+        replace(frame, posteriors=(far,)) for frame in frames_of("stop_sign", [1] * 8, step_m=0.1)
     ]
 
     steps = fusion_steps(frames)

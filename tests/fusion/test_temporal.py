@@ -26,7 +26,7 @@ from crosscue.fusion.temporal import (
     ways_of,
 )
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
+from crosscue.replay.vehicle.fusion import Fade, Fusion, RangeFilter
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
 FILTER: Final = RangeFilter()
@@ -157,8 +157,8 @@ def detection_probability(
 def test_filter_equals_sum_over_all_state_paths(exponent: float) -> None:
     frames: list[Frame] = [
         ({"sign": 0, "road": 1}, 0.0, []),
-        ({"road": 1}, 1.0, [MeasuredRange(4.5, 2.0)]),
-        ({"sign": 2, "road": 0}, 2.0, [MeasuredRange(1.0, 1.0)]),
+        ({"road": 1}, 1.5, [MeasuredRange(4.5, 2.0)]),
+        ({"sign": 2, "road": 0}, 1.5, [MeasuredRange(1.0, 1.0)]),
     ]
     about = learned(exponent=exponent)
     belief = TemporalFilter(temporal_model(GRAPH, about))
@@ -292,17 +292,84 @@ def test_range_weighs_cells_by_gaussian_of_range_and_cell_or_uniform_strays() ->
     assert belief.ahead[:, 0] == pytest.approx(belief.nowhere)
 
 
-def test_cue_is_evaluated_after_either_step_and_not_before() -> None:
-    """Steps of 0.5 s or 1.5 m in either direction: a quarter of a second twice, 1 m and -0.5 m."""
+def test_cue_is_evaluated_after_a_step_of_distance_and_not_before() -> None:
+    """A step is 1.5 m in either direction, here 1 m and -0.5 m, in whatever time.
+
+    A frame in which the car stands, or that repeats a picture, leaves the step to the next one.
+    """
     belief = TemporalFilter(temporal_model(GRAPH, learned()))
     belief.update({"sign": 1})
-    for moves, passed_s in (((0.0, 0.0), 0.25), ((1.0, -0.5), 0.0)):
+    for _ in range(2):
         before = belief.probabilities()[0]
         belief.update({"sign": 1})
-        belief.update({"sign": 1}, moved_m=moves[0], passed_s=passed_s)
+        belief.update({"sign": 1}, moved_m=1.0, passed_s=60.0)
         assert belief.probabilities()[0] == pytest.approx(before)
-        belief.update({"sign": 1}, moved_m=moves[1], passed_s=passed_s)
+        belief.update({"sign": 1}, moved_m=-0.5, is_standing=True)
+        belief.update({"sign": 1}, is_new_picture=False)
+        assert belief.probabilities()[0] == pytest.approx(before)
+        belief.update({"sign": 1})
         assert belief.probabilities()[0] > before + 1e-6
+
+
+MOVING: Final = FactorGraph(
+    GRAPH.features,
+    (
+        CueNode("sign", 0.9, can_start=True),
+        *(CueNode(name, 0.8, fade=Fade(time_s=2.0)) for name in ("crossing", "oncoming")),
+    ),
+    (Edge("sign", "intersection"), Edge("crossing", "left"), Edge("oncoming", "left")),
+)
+
+
+def odds_of_presence(belief: TemporalFilter) -> float:
+    """Odds of an intersection, which are 0.6 / 0.4 at first."""
+    p = float(belief.probabilities()[0])
+    return p / (1.0 - p)
+
+
+def test_moving_object_counts_where_it_first_appears_between_two_steps() -> None:
+    """Cues first found, appearing and staying 4, 3 and 2 times as often at an intersection.
+
+    The oncoming car appears 0.5 s after the step, the crossing one is not evaluated before; later
+    appearances do not count, but the value of the last one is that before the next step.
+    """
+    chains = tuple(
+        one
+        for cue in ("crossing", "oncoming")
+        for one in (
+            chain(cue, (0.1,), (0.3,), (0.2,)),
+            chain(cue, (0.4, 0.4), (0.6, 0.6), (0.6, 0.6), ("intersection",)),
+        )
+    )
+    about = learned(chains=(*chains, *CHAINS[:2]), exponent=1.0)
+    belief = TemporalFilter(temporal_model(MOVING, about))
+    belief.nowhere = np.array([0.0, 0.0, 0.4, 0.0, 0.0])
+    belief.ahead = np.zeros((5, 2))
+    belief.ahead[2, 0] = 0.6
+    expected = 1.5
+
+    def odds_after(counts: dict[str, int], passed_s: float = 0.5, moved_m: float = 0.0) -> float:
+        belief.update(counts, (), moved_m, 0.0, passed_s, is_standing=moved_m == 0.0)
+        return odds_of_presence(belief)
+
+    belief.update({"oncoming": 0})
+    expected *= (1.0 - 0.4) / (1.0 - 0.1)
+    assert odds_of_presence(belief) == pytest.approx(expected)
+    # Not before 0.5 s, and a cue of a static object does not count at all.
+    assert odds_after({"oncoming": 1}, 0.3) == pytest.approx(expected)
+    expected *= 0.6 / 0.2
+    assert odds_after({"oncoming": 1, "sign": 1}, 0.2) == pytest.approx(expected)
+    assert odds_after({"oncoming": 2}) == pytest.approx(expected)
+    assert odds_after({"oncoming": 0}) == pytest.approx(expected)
+    expected *= 0.4 / 0.1
+    assert odds_after({"oncoming": 1, "crossing": 1}, 0.5) == pytest.approx(expected)
+    assert odds_after({"crossing": 0}, 0.4) == pytest.approx(expected)
+    assert odds_after({"crossing": 0}, 0.1) == pytest.approx(expected)
+    # After the step both are judged again: the one stays, the other is still absent.
+    expected *= 0.6 / 0.3 * (1.0 - 0.6) / (1.0 - 0.2)
+    assert odds_after({"oncoming": 1, "crossing": 0}, 0.0, 1.5) == pytest.approx(expected)
+    expected *= 0.6 / 0.2
+    assert odds_after({"crossing": 1}) == pytest.approx(expected)
 
 
 def test_probabilities_stay_a_billionth_from_zero_and_one() -> None:
@@ -363,8 +430,10 @@ def test_ranges_to_start_have_variances_of_independent_ones(
 def test_filter_receives_all_of_a_situation(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[object] = []
 
-    def update(_filter: TemporalFilter, *values: object, is_new_picture: bool) -> None:
-        seen.extend([*values, is_new_picture])
+    def update(
+        _filter: TemporalFilter, *values: object, is_new_picture: bool, is_standing: bool
+    ) -> None:
+        seen.extend([*values, is_new_picture, is_standing])
 
     belief = hand_filter()
     monkeypatch.setattr(TemporalFilter, "update", update)
@@ -380,11 +449,12 @@ def test_filter_receives_all_of_a_situation(monkeypatch: pytest.MonkeyPatch) -> 
             advanced_m=-1.5,
             advanced_var_m2=0.7,
             ranges=ranges,
+            is_standing=True,
         ),
     )
 
     expected = [MeasuredRange(*one) for one in ranges]
-    assert seen == [{"sign": 2}, expected, -1.5, 0.7, 0.3, False]
+    assert seen == [{"sign": 2}, expected, -1.5, 0.7, 0.3, False, True]
 
 
 STEPS = st.lists(

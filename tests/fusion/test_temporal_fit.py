@@ -69,13 +69,13 @@ def hand_drive(
 NONE_AHEAD: Final = [float("nan")] * 4
 SEEN: Final = hand_drive(
     "a",
-    # Frames 1 and 3 are no steps: after 1 m (then -0.5 m), and after a quarter of a second (twice).
+    # Frames 1 and 3 are no steps: after 1 m (then -0.5 m), and after 9 s and 0.75 m (then as far).
     [1, 0, 1, 1, 0, 1, 1, 1],
     [60.0, 44.0, 43.0, 9.0, 9.0, 0.0, 0.0, 0.0],
     left=True,
     ranges_m=(69.0, 69.01, 60.0, 60.0, 60.0),
-    advanced_m=[0.0, 1.0, -0.5, 0.0, 0.0, 1.5, 1.5, 1.5],
-    passed_s=[0.0, 0.0, 0.0, 0.25, 0.25, 0.0, 0.0, 0.0],
+    advanced_m=[0.0, 1.0, -0.5, 0.75, 0.75, 1.5, 1.5, 1.5],
+    passed_s=[0.0, 0.0, 0.0, 9.0, 0.0, 0.0, 0.0, 0.0],
 )
 UNSEEN: Final = hand_drive("b", [0, 1, -1, 0], NONE_AHEAD, left=False, ranges_m=(30.0,))
 

@@ -1,0 +1,183 @@
+"""A standing car gains no evidence of static things, however long it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from crosscue.fusion.approaches import Approaches, Step
+from crosscue.fusion.evidence import FrameEvidence, RangePosterior, SignRange
+from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
+from crosscue.replay.vehicle.temporal import CueChain, Temporal
+from support.fusion import NONE_SEEN
+
+STATIC: Final = ("traffic_light", "stop_sign", "road_left", "parked_left", "one_way_left")
+FRAME_NS: Final = 100_000_000
+
+
+def chain(cue: str, rate: float, there: tuple[str, ...] = ()) -> CueChain:
+    """Return a cue with the same rate at all distances, which stays more often."""
+    stays = (1.0 + rate) / 2.0
+    return CueChain(cue=cue, there=there, first=(rate,), stays=(stays,), appears=(rate / 2.0,))
+
+
+TEMPORAL: Final = Temporal(
+    ahead=0.5,
+    ways={"left": 0.5, "none": 0.5},
+    edges_m=(0.0, 60.0),
+    chains=(
+        *(chain(cue, 0.1) for cue in (*STATIC, "cross_traffic_left")),
+        *(chain(cue, 0.3, ("intersection",)) for cue in (*STATIC, "cross_traffic_left")),
+        chain("cross_traffic_left", 0.5, ("intersection", "left")),
+    ),
+    exponent=0.5,
+)
+CALIBRATED: Final = Calibrated(
+    rates=tuple(
+        Rates(cue=cue, feature=feature, near=near, if_there=0.6, if_not=0.2)
+        for cue, feature in (("traffic_light", "intersection"), ("road_left", "left"))
+        for near in (False, True)
+    )
+)
+KINDS: Final = {
+    "persistent": Fusion(kind="persistent"),
+    "calibrated": Fusion(kind="calibrated", calibrated=CALIBRATED),
+    "temporal": Fusion(kind="temporal", temporal=TEMPORAL),
+}
+LIGHT: Final = {**dict.fromkeys(STATIC, 0), "traffic_light": 1}
+
+Look = tuple[Mapping[str, int], SignRange | None, RangePosterior | None, bool]
+"""What one frame shows: counts, a sign's range, a range from motion, and whether it is new."""
+
+RANGES_M: Final = st.floats(-5.0, 160.0)
+REFERENCES: Final = st.sampled_from([*Reference])
+LOOKS: Final = st.tuples(
+    st.dictionaries(st.sampled_from(STATIC), st.integers(0, 2)),
+    st.none() | st.builds(SignRange, REFERENCES, RANGES_M, st.floats(0.1, 50.0)),
+    st.none() | st.builds(RangePosterior, REFERENCES, RANGES_M, st.floats(0.1, 50.0), RANGES_M),
+    st.booleans(),
+)
+MOVES: Final = st.tuples(LOOKS, st.floats(-1.0, 6.0) | st.floats(0.0, 0.09), st.floats(0.0, 9.0))
+
+
+def evidence(
+    look: Look, moved_m: float = 0.0, var_m2: float = 0.0, turned_rad: float = 0.0
+) -> FrameEvidence:
+    counts, sign, posterior, is_new = look
+    signs = () if sign is None else (sign,)
+    posteriors = () if posterior is None else (posterior,)
+    return FrameEvidence(
+        0, moved_m, var_m2, signs, counts, {}, is_new, turned_rad, posteriors=posteriors
+    )
+
+
+def believed(frames: Sequence[FrameEvidence], fusion: Fusion) -> list[Step]:
+    loop = Approaches(graph_of(fusion), fusion, RangeFilter())
+    return [loop(replace(frame, t_ns=i * FRAME_NS)) for i, frame in enumerate(frames)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(
+    moves=st.lists(MOVES, min_size=2, max_size=12),
+    at=st.integers(1, 12),
+    pause=st.lists(LOOKS, min_size=1, max_size=4),
+    times=st.sampled_from([1, 10, 60]),
+)
+@example(
+    moves=[((LIGHT, None, None, True), 2.0, 0.0)] * 6,
+    at=3,
+    pause=[(dict.fromkeys(STATIC, 0), None, None, True)],
+    times=600,
+)
+@settings(max_examples=40, deadline=None)
+def test_pause_of_any_length_leaves_belief_unchanged(
+    kind: str,
+    moves: list[tuple[Look, float, float]],
+    at: int,
+    pause: list[Look],
+    times: int,
+) -> None:
+    """Whatever a standing car sees, and although its odometry is uncertain and its gyro drifts."""
+    drive = [evidence(*move) for move in moves]
+    standing = [evidence(look, 0.0, 1e-3, 0.01) for look in pause] * times
+
+    without = believed(drive, KINDS[kind])[at:]
+    after = believed([*drive[:at], *standing, *drive[at:]], KINDS[kind])[at + len(standing) :]
+
+    assert [one.approach for one in after] == [one.approach for one in without]
+    assert [one.established for one in after] == [one.established for one in without]
+    for one, other in zip(after, without, strict=True):
+        assert one.probabilities == pytest.approx(other.probabilities, abs=1e-9)
+        assert [(row.range_m, row.var_m2) for row in one.ranges] == [
+            pytest.approx((row.range_m, row.var_m2), rel=1e-9) for row in other.ranges
+        ]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_light_seen_from_first_frame_on_is_believed_as_long_as_the_car_stands(kind: str) -> None:
+    first, *rest = believed([evidence((LIGHT, None, None, True))] * 100, KINDS[kind])
+
+    assert all(one.probabilities == pytest.approx(first.probabilities) for one in rest)
+    assert {**rest[-1].counts} == LIGHT
+
+
+def test_published_belief_counts_every_frame_of_a_standing_car() -> None:
+    """Equation 18 multiplies one message per frame: 0.95 twice is 0.9972."""
+    steps = believed([evidence((LIGHT, None, None, True))] * 2, Fusion(kind="source"))
+
+    found = [one.probabilities["intersection"] for one in steps]
+    assert found == pytest.approx([0.95, 0.95**2 / (0.95**2 + 0.05**2)])
+
+
+def left_while_standing(seen: Sequence[int], kind: str = "temporal") -> list[float]:
+    """Return the belief in left, at two frames per second, after a light opened an approach."""
+    light = [evidence((LIGHT, None, None, True), 2.0)] * 3
+    cars = [
+        evidence(({**NONE_SEEN, "cross_traffic_left": count}, None, None, True)) for count in seen
+    ]
+    loop = Approaches(graph_of(KINDS[kind]), KINDS[kind], RangeFilter())
+    steps = [loop(replace(one, t_ns=i * 5 * FRAME_NS)) for i, one in enumerate([*light, *cars])]
+    return [one.probabilities["left"] for one in steps[len(light) :]]
+
+
+def test_cross_traffic_counts_when_it_appears_and_once_while_standing() -> None:
+    """Neither how long a car is seen, nor how often, nor for how long none is, changes anything."""
+    none, car, last = left_while_standing([0] * 50), left_while_standing([0, 1]), [0, 1, 1, 0, 1]
+
+    assert none == pytest.approx([none[0]] * 50)
+    assert car[1] > car[0] + 0.01
+    assert left_while_standing(last * 10)[1:] == pytest.approx([car[1]] * 49)
+
+
+def test_cross_traffic_is_judged_again_after_the_next_step_of_distance() -> None:
+    """Each standstill has its own first appearance."""
+    loop = Approaches(graph_of(KINDS["temporal"]), KINDS["temporal"], RangeFilter())
+    seen = [(0, 2.0), (1, 0.0), (0, 2.0), (1, 0.0), (1, 0.0)]
+    frames = [
+        evidence(({**LIGHT, "cross_traffic_left": count}, None, None, True), moved_m)
+        for count, moved_m in seen
+    ]
+    steps = [loop(replace(one, t_ns=i * 5 * FRAME_NS)) for i, one in enumerate(frames)]
+
+    left = [one.probabilities["left"] for one in steps]
+    assert left[1] > left[0] + 0.01
+    assert left[3] > left[2] + 0.01
+    assert left[4] == pytest.approx(left[3])
+
+
+def test_creeping_car_counts_a_frame_for_each_tenth_of_a_metre() -> None:
+    """Three of five frames confirm a cue: at 3 cm per frame these are frames 0, 4 and 8."""
+    steps = believed([evidence((LIGHT, None, None, True), 0.03)] * 9, KINDS["persistent"])
+
+    assert [bool(one.not_believed) for one in steps] == [i in (0, 4) for i in range(9)]
+    assert steps[8].probabilities["intersection"] == pytest.approx(0.95)
+    assert believed([evidence((LIGHT, None, None, True), 0.1)] * 3, KINDS["persistent"])[
+        2
+    ].probabilities["intersection"] == pytest.approx(0.95)
