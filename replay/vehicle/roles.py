@@ -59,6 +59,11 @@ OF_TABLES: Final[Mapping[str, Role | None]] = {
 """Types whose rows are plain columns: ``convert`` may change the type, but not the role."""
 
 
+def is_table(topic: Topic) -> bool:
+    """Return whether a topic has plain columns and no role, so that a vehicle file may name it."""
+    return (topic.converted_from or topic.type_name) == "crosscue/Table"
+
+
 def role_of(topic: Topic) -> Role | None:
     """Return the role of ``topic`` without configuration, or None."""
     if topic.converted_from in OF_TABLES:

@@ -1,5 +1,6 @@
 """comma2k19 segments: the real one, and the treatment of damaged arrays."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from crosscue.datasets.adapters.comma2k19 import STREAMS
 from crosscue.datasets.adapters.comma2k19_truth import write
 from crosscue.datasets.adapters.npy import read_column
+from crosscue.eval import cli
 from crosscue.replay.base import (
     CanFrames,
     Ledger,
@@ -18,6 +20,9 @@ from crosscue.replay.base import (
     UnknownFormatError,
 )
 from crosscue.replay.logs.opening import open_log
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
+from crosscue.replay.vehicle.vehicle import load
 from support.accounted import read
 from support.data import shared
 
@@ -195,3 +200,17 @@ def test_array_of_unexpected_type_is_reported(kind: str, tmp_path: Path) -> None
             with pytest.raises(LogFormatError, match="global_pose"):
                 write(log, tmp_path / "truth")
         file.write_bytes(whole)
+
+
+def test_drafted_vehicle_reads_the_speed_of_a_car_without_wheel_speeds(tmp_path: Path) -> None:
+    """Some of the published cars have none. The magnetometer is cut, as published: exit 3."""
+    segment, car = tmp_path / "segment", tmp_path / "car.toml"
+    shutil.copytree(shared(*SEGMENT), segment, ignore=shutil.ignore_patterns("wheel_speed"))
+
+    assert cli.run(["vehicle", "init", str(segment), "-o", str(car)]) == 3
+
+    with open_log(segment) as log:
+        planned = plan([(0, topic) for topic in log.topics], load(car))
+    assert [one.topic.name for one in planned.sources if Signal.WHEEL_SPEEDS in one.signals] == [
+        "car/speed"
+    ]

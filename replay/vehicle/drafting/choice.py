@@ -90,6 +90,7 @@ class Choices:
         speeds: Vehicle speeds, for a car without wheel speeds.
         yaw_rates: CAN signals and inertial units with yaw rates.
         steering: CAN signals with steering angles.
+        tables: Topics with a speed, which ``topics.odometry`` may name.
         reference: Name of the reference for speeds; empty if none exists.
         speed: The best available speed of the car, m/s.
     """
@@ -98,6 +99,7 @@ class Choices:
     speeds: tuple[Choice, ...]
     yaw_rates: tuple[Choice, ...]
     steering: tuple[Choice, ...]
+    tables: tuple[Choice, ...]
     reference: str
     speed: Series | None
 
@@ -105,7 +107,7 @@ class Choices:
         """Return whether it is the best of its kind and free of contradictions."""
         of_kind: Sequence[Choice | WheelSet] = next(
             kind
-            for kind in (self.wheels, self.speeds, self.yaw_rates, self.steering)
+            for kind in (self.wheels, self.speeds, self.yaw_rates, self.steering, self.tables)
             if choice in kind
         )
         return choice is of_kind[0] and not choice.verdict.wrong
@@ -122,8 +124,14 @@ def choose(seen: Observed) -> Choices:
         Choice(one.name, bus.topic, series, judge_speed(series, speed, grid, True))
         for bus, one, series in seen.of_kind(Kind.SPEED)
     )
-    if speed is None and speeds and not speeds[0].verdict.wrong:
-        speed = speeds[0].series
+    tables = _ranked(
+        Choice(one.name, "", one, judge_speed(one, speed, grid, True))
+        for one in seen.tables
+        if chosen is None and len(one) > 1
+    )
+    for best in (*speeds[:1], *tables[:1]):
+        if speed is None and not best.verdict.wrong:
+            speed = best.series
     turnings = [turn for track in seen.tracks if (turn := of_course(track, grid)) is not None][:1]
     if chosen is not None and (not chosen.is_turning or chosen.radius_m is not None):
         scale = chosen.radius_m if chosen.is_turning and chosen.radius_m else 1.0
@@ -158,6 +166,7 @@ def choose(seen: Observed) -> Choices:
         speeds,
         yaw_rates,
         steering,
+        tables,
         reference.name if reference is not None else "",
         speed,
     )

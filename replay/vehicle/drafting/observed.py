@@ -21,7 +21,7 @@ from crosscue.replay.base import (
     warn_of,
 )
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.vehicle.roles import Role, role_of
+from crosscue.replay.vehicle.roles import Role, is_table, role_of
 
 from .candidates import Candidate, Kind, candidates
 from .series import Series, Track
@@ -81,6 +81,7 @@ class Observed:
         tracks: Speed and course over ground of every topic that reports them.
         yaw_rates: Yaw rates of inertial units and odometry, by topic.
         speeds: Speeds of wheel-speed and odometry topics, by topic.
+        tables: Speeds of tables without a role, by topic, if there are no such topics.
         start_ns: Earliest time observed.
         end_ns: Latest time observed.
     """
@@ -91,6 +92,7 @@ class Observed:
     speeds: tuple[Series, ...]
     start_ns: int
     end_ns: int
+    tables: tuple[Series, ...] = ()
 
     def of_kind(self, kind: Kind) -> list[tuple[Bus, Candidate, Series]]:
         """Return the candidate signals of a kind with their buses."""
@@ -103,23 +105,27 @@ class Observed:
 
 
 _MOTION: Final = (Role.GNSS, Role.IMU, Role.ODOMETRY, Role.WHEELS)
+_SPEED: Final = (Role.ODOMETRY, Role.WHEELS)
 
 
 def observe(logs: Sequence[Log], database: CanDatabase | None) -> Observed:
     """Read the first minutes of every log, and warn of losses in them."""
     found = _Collected(database)
+    has_speed = any(role_of(topic) in _SPEED for log in logs for topic in log.topics)
     for log in logs:
         roles = {
             topic.name: role
             for topic in log.topics
-            if (role := role_of(topic)) is Role.CAN or role in _MOTION
+            if (role := role_of(topic)) is Role.CAN
+            or role in _MOTION
+            or (is_table(topic) and not has_speed)
         }
         if roles:
             _read(log, roles, found)
     return found.result()
 
 
-def _read(log: Log, roles: Mapping[str, Role], found: _Collected) -> None:
+def _read(log: Log, roles: Mapping[str, Role | None], found: _Collected) -> None:
     ledger = Ledger(name_of(log))
     decoders = {
         topic.name: decoder_for(topic) if topic.encoding != "columns" else None
@@ -155,9 +161,9 @@ class _Collected:
         self._first_ns: list[int] = []
         self._last_ns: list[int] = []
 
-    def take(self, block: Block, role: Role) -> None:
-        """Add a decoded block of a topic."""
-        if not len(block):
+    def take(self, block: Block, role: Role | None) -> None:
+        """Add a decoded block of a topic; a table without a role only if it has a speed."""
+        if not len(block) or (role is None and not _has_speed(block)):
             return
         self._first_ns.append(int(block.log_ns.min()))
         self._last_ns.append(int(block.log_ns.max()))
@@ -167,7 +173,8 @@ class _Collected:
             for column in _COLUMNS[role]:
                 if column in block.rows.columns:
                     values = np.asarray(block.rows[column], np.float64)
-                    self._add(block.topic, role.name, column, block.log_ns, values)
+                    part = "" if role is None else role.name
+                    self._add(block.topic, part, column, block.log_ns, values)
 
     def _take_frames(self, block: Block, rows: CanFrames) -> None:
         bus = self.buses.setdefault(block.topic, Bus(block.topic))
@@ -229,8 +236,9 @@ class _Collected:
                 if part == Role.GNSS.name and (track := _track(topic, found)) is not None
             ),
             tuple(_series(columns, (Role.IMU, Role.ODOMETRY), _YAW_COLUMNS)),
-            tuple(_series(columns, (Role.ODOMETRY, Role.WHEELS), _SPEED_COLUMNS)),
+            tuple(_series(columns, _SPEED, _SPEED_COLUMNS)),
             *self._span_ns(),
+            tuple(_series(columns, (None,), _TABLE_COLUMNS)),
         )
 
     def _span_ns(self) -> tuple[int, int]:
@@ -247,7 +255,9 @@ class _Collected:
 _Columns = Mapping[str, tuple[Int64s, Floats]]
 _YAW_COLUMNS: Final = ("gyro_z_radps", "yaw_rate_radps")
 _SPEED_COLUMNS: Final = ("speed_x_mps", "rear_left_mps")
-_COLUMNS: Final[dict[Role, tuple[str, ...]]] = {
+_TABLE_COLUMNS: Final = ("speed_x_mps", "speed_mps")
+_COLUMNS: Final[dict[Role | None, tuple[str, ...]]] = {
+    None: _TABLE_COLUMNS,
     Role.GNSS: (
         "speed_mps",
         "course_rad",
@@ -262,10 +272,18 @@ _COLUMNS: Final[dict[Role, tuple[str, ...]]] = {
 }
 
 
+def _has_speed(block: Block) -> bool:
+    """Return whether a table has the car's speed; with positions, the speed is from GNSS."""
+    names = block.rows.columns.keys() if isinstance(block.rows, Table) else ()
+    return not {*_TABLE_COLUMNS}.isdisjoint(names) and "latitude_deg" not in names
+
+
 def _series(
-    columns: Mapping[tuple[str, str], _Columns], roles: Iterable[Role], wanted: Sequence[str]
+    columns: Mapping[tuple[str, str], _Columns],
+    roles: Iterable[Role | None],
+    wanted: Sequence[str],
 ) -> Iterable[Series]:
-    names = {role.name for role in roles}
+    names = {"" if role is None else role.name for role in roles}
     for (topic, part), found in columns.items():
         name = next((name for name in wanted if name in found), None)
         if part in names and name is not None:

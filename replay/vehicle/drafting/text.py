@@ -161,8 +161,19 @@ def _topic_lines(logs: Sequence[Log], choices: Choices) -> Iterator[str]:
             chosen += [
                 line for one in units for line in _comment(f"{one.name}: {_as_text(one.verdict)}")
             ]
+    chosen += _speed_lines(choices.tables)
     if chosen:
         yield from ("[topics]", *chosen, "")
+
+
+def _speed_lines(tables: Sequence[Choice]) -> Iterator[str]:
+    """Yield the topic with the car's speed, which has no role until the vehicle file names it."""
+    sound = [one for one in tables if not one.verdict.wrong]
+    if sound:
+        others = f"  # or: {', '.join(one.name for one in sound[1:])}" if sound[1:] else ""
+        yield from _comment(f"The vehicle speed, of no axle: {_as_text(sound[0].verdict)}")
+        yield f"odometry = {_quoted(sound[0].name)}{others}"
+    yield from _not_chosen((one.name, one.bus, one.verdict) for one in tables if one not in sound)
 
 
 def _can_lines(examined: Examined, folder: Path) -> Iterator[str]:
