@@ -51,6 +51,27 @@ def best_of(
     return np.array(kept, np.int64)
 
 
+def is_best_label(
+    boxes: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    groups: NDArray[np.int64],
+    labels: NDArray[np.int64],
+    max_overlap: float,
+) -> NDArray[np.bool_]:
+    """Mark the boxes that no better box of their group with another label suppresses, shape (N,).
+
+    Boxes of one label are left to the network's own suppression. Arguments are those of
+    ``best_of``; ``labels`` has shape (N,).
+    """
+    is_kept = np.zeros(len(scores), np.bool_)
+    order = np.lexsort([-scores, groups])
+    for some in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1):
+        for i in some:
+            rivals = some[is_kept[some] & (labels[some] != labels[i])]
+            is_kept[i] = not (overlaps(boxes[i], boxes[rivals]) > max_overlap).any()
+    return is_kept
+
+
 def _rivals(
     boxes: NDArray[np.float64],
     groups: NDArray[np.int64],

@@ -25,6 +25,8 @@ Size: TypeAlias = tuple[int, int]
 
 DEFAULT_SCORE: Final = 0.3
 """Minimum score of a detection, where nothing else was fitted or asked for."""
+DEFAULT_OVERLAP: Final = 0.45
+"""Default intersection over union above which two boxes are of one object."""
 
 
 class Masks(Protocol):
@@ -118,7 +120,7 @@ class BoxOutput(Settings):
     """Class names, in the order of the network's class numbers."""
     score: Proportion = DEFAULT_SCORE
     """Minimum score of a detection."""
-    overlap: Proportion = 0.45
+    overlap: Proportion = DEFAULT_OVERLAP
     """Intersection over union above which only the better of two boxes of one class is kept."""
 
     @abstractmethod

@@ -19,8 +19,10 @@ import numpy as np
 from crosscue.datasets.truth.annotations import time_in_name
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
 from crosscue.detectors.base import MIN_SCORE
+from crosscue.detectors.boxes import is_best_label
 from crosscue.detectors.catalog.class_names import meaning_of
 from crosscue.detectors.cues.observed import Role
+from crosscue.detectors.decoders.base import DEFAULT_OVERLAP
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import reopened
 from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
@@ -31,6 +33,7 @@ from .matching import NOBODY, Boxes
 
 OTHER_LOG: Final = "images that are not in the run"
 OTHER_CLASS: Final = "boxes of classes that the detector does not report"
+OTHER_LABEL: Final = "on a better one with another label"
 FAR: Final = 0.4
 """Max time between a picture and its frame, as a fraction of the time between frames."""
 _FOUND: Final = ("log_t_ns", "detector", "label", "score", "x0", "y0", "x1", "y1", "range_m")
@@ -52,7 +55,8 @@ class LabelledRun:
         names: Name of each frame in the labels.
         rule: Rule by which pictures were matched to frames, as text.
         frames: Number of frames of the run.
-        left_out: Number of labels left out or repaired, by reason.
+        left_out: Number of labels left out or repaired, and of detections on one object with other
+            labels of their class, by reason.
         not_judged: Number of detections of classes that the labels lack, by label.
     """
 
@@ -134,7 +138,7 @@ def labelled_run(
     sizes = [frames[t][1] for t in order]
     truth = _truth([placed[t] for t in order], sizes, of_labels, left_out)
     numbers = {name: k for k, name in enumerate(classes)}
-    found, not_judged = _found(run, chosen.name, order, of_found, numbers)
+    found, not_judged = _found(run, chosen.name, order, of_found, numbers, left_out)
     return LabelledRun(
         run,
         chosen,
@@ -340,11 +344,14 @@ def _found(
     times: Sequence[int],
     of_found: Mapping[str, str | None],
     numbers: Mapping[str, int],
+    left_out: Counter[str],
 ) -> tuple[Boxes, dict[str, int]]:
     """Return the detector's boxes in labelled frames, and counts of unjudged ones by label.
 
-    Boxes of objects for which another detector had priority are included.
+    Boxes of objects for which another detector had priority are included. Of labels that count as
+    one class, the best on each object is kept, as if the network had only that class.
     """
+    order = {label: i for i, label in enumerate(of_found)}
     place = {t: i for i, t in enumerate(times)}
     rows = []
     not_judged: Counter[str] = Counter()
@@ -358,9 +365,22 @@ def _found(
             if means not in numbers:
                 not_judged[label] += 1
                 continue
-            rows.append((place[t], numbers[means], *rest))
+            rows.append((place[t], numbers[means], *rest, order.get(label, -1)))
     columns = np.array([[np.nan if v is None else v for v in row] for row in rows], np.float64)
-    columns = columns.reshape(-1, 8)
+    columns = columns.reshape(-1, 9)
+    picture_and_class = columns[:, 0] * len(numbers) + columns[:, 1]
+    is_kept = is_best_label(
+        columns[:, 3:7],
+        columns[:, 2],
+        picture_and_class.astype(np.int64),
+        columns[:, 8].astype(np.int64),
+        DEFAULT_OVERLAP,
+    )
+    for name, number in numbers.items():
+        count = int((columns[~is_kept, 1] == number).sum())
+        if count:
+            left_out[f"detections of {name} {OTHER_LABEL}"] += count
+    columns = columns[is_kept]
     boxes = Boxes(
         columns[:, 0].astype(np.int64),
         columns[:, 1].astype(np.int64),

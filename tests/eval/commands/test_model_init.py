@@ -95,6 +95,7 @@ def test_layout_without_metadata_is_recognised_by_box_size(
     tmp_path: Path, row: tuple[float, ...], kind: str
 ) -> None:
     rows = np.tile(np.array(row, np.float32), (1, 300, 1))
+    rows[0, :, 4] = np.linspace(0.0, 0.8, 300)
     path = tmp_path / "my.onnx"
     path.write_bytes(constant_model((1, 3, 64, 128), {"output0": rows}))
 
@@ -379,7 +380,8 @@ def test_ambiguous_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "several kinds fit: yolox (" in message
     assert "; yolov5 (" in message
     assert "choose one with --kind" in message
-    assert run(["model", "init", str(path), "--kind", "yolox"]) == 0
+    assert run(["model", "init", str(path), "--kind", "yolox"]) == 2
+    assert "not written: on noise, there are scores from 400 to 400" in capsys.readouterr().err
 
 
 def test_published_yolox_is_recognised_by_running_it(

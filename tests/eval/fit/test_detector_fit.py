@@ -23,7 +23,7 @@ from crosscue.eval.fit.detector.threshold import (
 )
 from crosscue.eval.scoring.boxes.reliability import reliability
 from crosscue.replay.base import SchemaError, UsageError
-from support.onnx_models import bright_box_model
+from support.onnx_models import bright_box_model, constant_model
 
 
 def test_lower_bound_equals_clopper_pearson() -> None:
@@ -249,6 +249,45 @@ def test_invalid_labels_are_refused_in_one_line_without_output(
 
     assert "\n" not in str(raised.value)
     assert not out.exists()
+
+
+def two_labels_on_one_object(folder: Path) -> crosscue.Run:
+    """Run a network that reports a car (0.9) and a truck (0.8) on one object, and another car."""
+    rows = np.array([[[8, 8, 24, 24, 0.9, 0], [9, 8, 24, 24, 0.8, 1], [40, 8, 60, 24, 0.7, 0]]])
+    weights = constant_model((1, 3, SIZE[1], SIZE[0]), {"rows": rows.astype(np.float32)})
+    (folder / "net.onnx").write_bytes(weights)
+    (folder / "net.toml").write_text(
+        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(weights).hexdigest()}"\n'
+        f"[input]\nwidth_px = {SIZE[0]}\nheight_px = {SIZE[1]}\n"
+        '[output]\nkind = "end-to-end"\nclasses = ["car", "truck"]\noverlap = 1.0\n'
+    )
+    (folder / "log").mkdir()
+    for number in range(3):
+        pixels = np.full((SIZE[1], SIZE[0]), number, np.uint8)
+        cv2.imwrite(str(folder / "log" / f"frame_{number}.png"), pixels)
+    (folder / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
+    return detect_with_card(folder, "net")
+
+
+def test_labels_mapped_to_one_class_count_once_per_object(tmp_path: Path) -> None:
+    run = two_labels_on_one_object(tmp_path)
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    (labels / "classes.txt").write_text("car\ntruck\n")
+    for number in range(3):
+        text = "0 .25 .3333 .25 .3333\n0 .78125 .3333 .3125 .3333\n"
+        (labels / f"frame_{number}.txt").write_text(text)
+    meanings = {"car": "vehicle", "truck": "vehicle"}
+
+    found = crosscue.score_detector(run, labels, meanings=meanings, has_figures=False)
+    apart = crosscue.score_detector(run, labels, has_figures=False)
+
+    assert (found.scores[0].right, found.scores[0].wrong) == (6, 0)
+    assert found.scores[0].ap50.value == pytest.approx(1.0)
+    why = "detections of vehicle on a better one with another label"
+    assert dict(found.labelled.left_out) == {why: 3}
+    assert dict(apart.labelled.left_out) == {}
+    assert apart.scores[0].right == 6
 
 
 def test_left_out_labels_are_counted_by_reason(drive: Path, tmp_path: Path) -> None:
