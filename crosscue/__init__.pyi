@@ -10,6 +10,13 @@ from crosscue.detectors.base import Frame as Frame
 from crosscue.detectors.base import View as View
 from crosscue.detectors.base import nothing_found as nothing_found
 from crosscue.detectors.box_detector import BoxDetector as BoxDetector
+from crosscue.detectors.catalog.known_models import FetchedModel as FetchedModel
+from crosscue.detectors.catalog.known_models import Model as Model
+from crosscue.detectors.catalog.known_models import Models as Models
+from crosscue.detectors.catalog.known_models import fetch_model as fetch_model
+from crosscue.detectors.catalog.known_models import model as model
+from crosscue.detectors.catalog.known_models import models as models
+from crosscue.detectors.plugins import plugins as plugins
 from crosscue.detectors.result_cache import default_cache as default_cache
 from crosscue.detectors.settings import Settings as Settings
 from crosscue.detectors.settings import identity_of as identity_of
@@ -81,13 +88,6 @@ from crosscue.eval.interface.models.cards import CardCheck as CardCheck
 from crosscue.eval.interface.models.cards import CardDraft as CardDraft
 from crosscue.eval.interface.models.cards import check_card as check_card
 from crosscue.eval.interface.models.cards import draft_card as draft_card
-from crosscue.eval.interface.models.catalog import FetchedModel as FetchedModel
-from crosscue.eval.interface.models.catalog import Model as Model
-from crosscue.eval.interface.models.catalog import Models as Models
-from crosscue.eval.interface.models.catalog import fetch_model as fetch_model
-from crosscue.eval.interface.models.catalog import model as model
-from crosscue.eval.interface.models.catalog import models as models
-from crosscue.eval.interface.plugins import plugins as plugins
 from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
 from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
 from crosscue.eval.interface.studies.drive import StudyDrive as StudyDrive

@@ -42,7 +42,7 @@ nitpick_ignore_regex = [
     # Types of libraries whose own documentation is not consulted offline.
     ("py:.*", r"(numpy|np|pyarrow|pa|pathlib|collections|typing|NDArray|polars|pandas)(\..*)?"),
     # Private modules: the interface documents what is public of them under its public name.
-    ("py:.*", r"crosscue\.(replay|detectors|fusion|localization|datasets|eval)\..*"),
+    ("py:.*", r"crosscue\.(replay|detectors|fusion|localization|datasets|eval|results)\..*"),
     # Private types in annotations, and what pydantic says of a field with limits.
     ("py:class", r"[A-Z]\w*|.*[ =(].*"),
     ("py:.*", r"(contextlib|ExitStack|Bytes)(\..*)?"),

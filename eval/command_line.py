@@ -333,6 +333,26 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     return typing.get_type_hints(holder, vars(inspect.getmodule(plain)), include_extras=True)
 
 
+def types_of(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the types of a verb's parameters and result, without options, for documentation.
+
+    A type that is only known to type checkers stays a text.
+    """
+    raw = inspect.unwrap(function)
+    names = vars(inspect.getmodule(raw))
+    found: dict[str, Any] = {}
+    for name, kind in raw.__annotations__.items():
+        holder: Any = types.SimpleNamespace(__annotations__={name: kind})
+        try:
+            found |= typing.get_type_hints(holder, names)
+        except NameError:
+            found[name] = kind
+        record = found[name]
+        if hasattr(function, "takes_record") and is_dataclass(record) and name != "return":
+            found |= typing.get_type_hints(record)
+    return found
+
+
 def _returned(verb: Callable[..., Any]) -> type:
     """Return the class of a verb's result."""
     plain = inspect.unwrap(verb)

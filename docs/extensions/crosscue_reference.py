@@ -10,6 +10,7 @@ can be outdated.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import inspect
 import io
 import types
@@ -223,15 +224,33 @@ def _keep_examples(
     app: Sphinx, kind: str, name: str, found: object, options: object, lines: list[str]
 ) -> None:
     """Show the examples of a verb as they are, one command a line."""
-    for place, line in enumerate(lines):
-        if line == "Examples:":
-            lines[place] = "Examples::"
+    if "Examples:" in lines:
+        place = lines.index("Examples:")
+        lines[place : place + 1] = ["Examples::", ""]
+
+
+def _show_plain_types(app: Sphinx) -> None:
+    """Show the types of public names without how the command line reads them."""
+    import crosscue
+    from crosscue.eval.command_line import types_of
+
+    for found in map(crosscue.__getattr__, crosscue.__all__):
+        if isinstance(found, types.FunctionType):
+            found.__annotations__ = types_of(found)
+        elif dataclasses.is_dataclass(found):
+            for kind in filter(dataclasses.is_dataclass, found.__mro__):
+                # A class with types that only type checkers know has no options either.
+                with contextlib.suppress(NameError):
+                    plain = typing.get_type_hints(kind)
+                    kind.__annotations__ = {name: plain[name] for name in kind.__annotations__}
+                    kind.__init__.__annotations__ = plain
 
 
 def setup(app: Sphinx) -> dict[str, object]:
     """Register the directives."""
     app.add_directive("crosscue-columns", Columns)
     app.connect("autodoc-process-docstring", _keep_examples, priority=400)
+    app.connect("builder-inited", _show_plain_types)
     app.add_directive("crosscue-commands", Commands)
     app.add_directive("crosscue-names", Names)
     app.add_directive("crosscue-settings", SettingsFile)

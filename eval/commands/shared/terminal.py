@@ -19,8 +19,6 @@ from crosscue.replay import limits
 from crosscue.replay.base import (
     Limits,
     OutputError,
-    strict_json,
-    write_text,
 )
 
 if TYPE_CHECKING:
@@ -195,27 +193,6 @@ def print_result(found: Result, args: argparse.Namespace) -> None:
         print_json(found.as_dict())
     elif not args.quiet:
         print(found)
-
-
-def add_schema_output(parser: argparse.ArgumentParser) -> None:
-    """Add ``-o`` and ``--overwrite``, for commands that print a JSON Schema."""
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", help="file to write (default: print it)"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace the output")
-
-
-def print_schema(schema: object, args: argparse.Namespace) -> None:
-    """Print a JSON Schema, or write it to the file of ``--output``.
-
-    Raises:
-        OutputError: The file exists, or cannot be written.
-    """
-    refuse_existing(args)
-    if args.output is None:
-        print_json(schema)
-    else:
-        write_text(args.output, strict_json(schema) + "\n")
 
 
 def progress_line(args: argparse.Namespace, what: str) -> ProgressLine:

@@ -2,29 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 from crosscue.detectors.registry import BUILTIN
-from crosscue.eval.interface.show import Listing
 from crosscue.replay.formats import FORMATS, DataSet, Format
 from crosscue.replay.plugins import GROUPS, Kind, Plugin, described, load, offered
 from crosscue.replay.vehicle.vehicle import BUILTIN_CUES, CueSpec
+from crosscue.results import Listing
 
 
 class Plugins(Listing[Plugin]):
     """Plug-ins; its repr is a table."""
 
     head = ("name", "kind", "package", "version", "state")
+    root = "plugins"
+
+    @property
+    def exit_status(self) -> int:
+        """1 when a plug-in does not load, else 0."""
+        return 1 if any(one.problem for one in self) else 0
 
     def cells(self, row: Plugin) -> tuple[object, ...]:
         """Return the cells of a row."""
         return (row.name, row.kind, row.package, row.version, row.problem or "loaded")
 
+    def lines(self) -> Iterator[str]:
+        """Yield a table, or a sentence where nothing is installed."""
+        yield from Listing.lines(self) if len(self) else ("no plug-in is installed",)
+
 
 def plugins() -> Plugins:
-    """Return the detectors, cues, readers and data sets that installed packages register.
+    """List the extensions that installed packages register.
 
-    Each plug-in is loaded; ``problem`` is the reason why one cannot be loaded.
+    These are detectors, cues, readers and data sets. A package registers them as entry points in
+    the groups crosscue.detectors, crosscue.cues, crosscue.readers and crosscue.datasets. Each
+    plug-in is loaded; the exit status is 1 when one cannot be loaded.
+
+    Examples:
+        crosscue plugins
     """
     taken: dict[Kind, Collection[str]] = {
         "detector": BUILTIN,

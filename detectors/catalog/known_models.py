@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from crosscue.detectors.catalog.card import Evidence, ModelCard, read_card
 from crosscue.detectors.catalog.class_names import CUE_LABELS
 from crosscue.detectors.catalog.entries import entry, place_of
 from crosscue.detectors.catalog.fetch import Fetched, fetch
 from crosscue.detectors.catalog.places import card_named, names
-from crosscue.eval.interface.show import Listing
+from crosscue.replay.errors import UsageError
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import Listing, Result
+from crosscue.verb import Option
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Model:
-    """A network described by a card; its repr is the output of ``crosscue model show``.
+class Model(Result):
+    """A network described by a card; its text is the output of ``crosscue model show``.
 
     Attributes:
         name: Name in the catalog, or file name of the card.
@@ -44,29 +48,29 @@ class Model:
         return sorted(meant & {*CUE_LABELS})
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue model show``."""
+        """Return the card."""
         return self.card.model_dump(mode="json")
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield the origin of the network, its input and output, and what was measured."""
         card, given = self.card, self.card.input
         resizable = ", resizable" if given.is_resizable else ""
         network = "" if card.network is None else f"{card.network.architecture}, "
         decoded = given.decode if card.network is None else "full"
         cues = ", ".join(self.cue_labels) or "no default cue uses any of its classes"
-        lines = [
-            f"{self.name}: {card.about or 'no description'}",
-            f"licence    {card.licence or 'not named'}",
-            f"source     {card.source or 'not named'}",
-            f"weights    {card.weights}, SHA-256 {card.sha256}",
+        yield f"{self.name}: {card.about or 'no description'}"
+        yield f"licence    {card.licence or 'not named'}"
+        yield f"source     {card.source or 'not named'}"
+        yield f"weights    {card.weights}, SHA-256 {card.sha256}"
+        yield (
             f"input      {given.width_px} x {given.height_px}{resizable}, {given.colour}, "
-            f"{given.fit}, JPEGs decoded {decoded}",
-            f"output     {network}{card.output.kind}, {len(card.output.classes)} classes",
-            f"cues       {cues}",
-        ]
-        lines += [f"evidence   {_evidence(one)}" for one in card.evidence]
+            f"{given.fit}, JPEGs decoded {decoded}"
+        )
+        yield f"output     {network}{card.output.kind}, {len(card.output.classes)} classes"
+        yield f"cues       {cues}"
+        yield from (f"evidence   {_evidence(one)}" for one in card.evidence)
         if not card.evidence:
-            lines.append("evidence   nothing measured yet")
-        return "\n".join(lines)
+            yield "evidence   nothing measured yet"
 
 
 def _evidence(one: Evidence) -> str:
@@ -103,14 +107,14 @@ class Models(Listing[Model]):
             for one in self
         ]
 
-    def __repr__(self) -> str:
-        return "\n".join(
-            "{:34} {:>6} MB  {:12} {:12} {}".format(*self.cells(model)) for model in self
-        )
+    def lines(self) -> Iterator[str]:
+        """Yield one line for each model."""
+        for one in self:
+            yield "{:34} {:>6} MB  {:12} {:12} {}".format(*self.cells(one))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FetchedModel:
+class FetchedModel(Result):
     """Weights of a model on this machine; its repr has one line per file.
 
     Attributes:
@@ -122,23 +126,49 @@ class FetchedModel:
     files: tuple[Fetched, ...]
 
     def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue model fetch``."""
+        """Return the paths of the files, by the model's name."""
         return {self.name: [str(file.path) for file in self.files]}
 
-    def __repr__(self) -> str:
-        return "\n".join(f"{self.name}: {file.path} (from {file.came_from})" for file in self.files)
+    def lines(self) -> Iterator[str]:
+        """Yield one line for each file."""
+        yield from (f"{self.name}: {file.path} (from {file.came_from})" for file in self.files)
+
+
+class FetchedModels(Listing[FetchedModel]):
+    """Models whose weights are on this machine."""
+
+    head = ("name", "files")
+    is_printed_in_parts = True
+
+    def cells(self, row: FetchedModel) -> tuple[object, ...]:
+        """Return the cells of a row."""
+        return (row.name, len(row.files))
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the paths of the files, by the model's name."""
+        return {name: paths for one in self for name, paths in one.as_dict().items()}
 
 
 def models() -> Models:
-    """Return the models of the catalog."""
+    """List the networks of the catalog.
+
+    Examples:
+        crosscue model list
+    """
     return Models([Model(name, entry(name)) for name in names()])
 
 
-def model(name: Path | str) -> Model:
-    """Return a model: its input and output, the cues' labels of its classes, its performance.
+def model(name: Annotated[str | Path, Option(metavar="MODEL")]) -> Model:
+    """Show a network's origin, classes and measurements.
+
+    The cues' labels of its classes, and its measured performance, are part of it.
+
+    Examples:
+        crosscue model show yolox-nano
+        crosscue model show my.toml --json
 
     Args:
-        name: Name in the catalog, or file name of a card, which ends in ``.toml``.
+        name: Name in the catalog, or model card.
 
     Raises:
         UsageError: The catalog has no such model; the message suggests the nearest.
@@ -148,12 +178,7 @@ def model(name: Path | str) -> Model:
     return Model(str(name), read_card(card_named(str(name))))
 
 
-def fetch_model(
-    name: str,
-    weights: Path | str | None = None,
-    *,
-    on_bytes: Callable[[str, int, int], None] = lambda file, done, of: None,
-) -> FetchedModel:
+def fetch_model(name: str, weights: Path | str | None = None) -> FetchedModel:
     """Fetch the weights of a model of the catalog, and verify them by their SHA-256.
 
     They are kept in the user's cache, or in ``$CROSSCUE_MODELS``. Sources are, in this order,
@@ -162,12 +187,43 @@ def fetch_model(
     Args:
         name: Name in the catalog.
         weights: File, or folder with the files, to copy instead of downloading.
-        on_bytes: Called with a file's name, the number of bytes present, and their total.
 
     Raises:
         UsageError: The model does not exist, or ``weights`` is missing or another file.
         CrosscueError: A file cannot be downloaded, or its SHA-256 differs from the catalog's.
         OutputError: The cache cannot be written.
     """
+
+    def show(file: str, done: int, of: int) -> None:
+        emit(Progress(file, done / 1e6, of / 1e6, "MB"))
+
     given = None if weights is None else Path(weights)
-    return FetchedModel(name, tuple(fetch(name, given, on_bytes)))
+    return FetchedModel(name, tuple(fetch(name, given, show)))
+
+
+def fetch_models(
+    *names: Annotated[str, Option(metavar="MODEL")],
+    weights: Annotated[Path | None, Option("--from")] = None,
+) -> FetchedModels:
+    """Fetch the weights of a network of the catalog.
+
+    They are downloaded and verified by their SHA-256. Files that exist below $CROSSCUE_DATA/weights
+    are copied from there. An interrupted download continues where it stopped.
+    $CROSSCUE_MODEL_MIRROR is a server to download from instead of the publisher's, and
+    $CROSSCUE_MODELS is the folder to keep the weights in.
+
+    Examples:
+        crosscue model fetch yolox-nano
+        crosscue model fetch yolox-s --from Downloads/object_detection_yolox_2022nov.onnx
+
+    Args:
+        names: Names from crosscue model list.
+        weights: Copy the weights from this file or folder instead of downloading them.
+    """
+    if weights is not None and len(names) > 1:
+        raise UsageError("weights: one model at a time")
+    found = []
+    for name in names:
+        found.append(fetch_model(name, weights))
+        emit(found[-1])
+    return FetchedModels(found)
