@@ -15,16 +15,15 @@ from crosscue.eval.fit.landmarks.database import (
     add_from_images,
     add_from_log,
     frames_of,
+    metres,
     near_of,
     read_poses,
 )
-from crosscue.eval.logs.log import Log, UnopenedLog, opened
+from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Floats, UsageError, visible
-from crosscue.replay.limits import LimitsGiven
-from crosscue.replay.logs.log_part import LogPart
+from crosscue.replay.base import EmptyResultError, Floats, UsageError, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option
@@ -159,39 +158,9 @@ class LandmarkMatches(Result):
             )
 
 
-def metres(text: str) -> float:
-    """Parse a length in metres.
-
-    Raises:
-        UsageError: Not a finite number above 0.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
-        raise UsageError(f"{text!r}: expected metres, above 0")
-    return value
-
-
-def drive_or_none(
-    *logs: Annotated[Path, Option(may_be_empty=True)],
-    part: LogPart,
-    limits: LimitsGiven = DEFAULT_LIMITS,
-) -> UnopenedLog | None:
-    """Return a part of a drive, or None without logs.
-
-    Args:
-        logs: Recordings of one drive.
-        part: The part to read.
-        limits: Limits for reading.
-    """
-    return UnopenedLog(logs, part, limits) if logs else None
-
-
 def add_landmarks(
     database: Path | str,
-    log: Annotated[Log | UnopenedLog | Path | str | None, Option(made_by=drive_or_none)] = None,
+    log: DriveIfGiven = None,
     *,
     poses: Annotated[Path | str | None, Option(metavar="RUN|T.json")] = None,
     images: Annotated[Path | str | None, Option(metavar="DIR")] = None,

@@ -61,7 +61,7 @@ def read_labels(path: Path, sizes: Sizes, kind: str | None = None) -> Annotation
         AnnotationError: The export cannot be read.
     """
     if kind is not None and kind not in LABEL_FORMATS:
-        raise UsageError(f"--format {kind}: expected one of {', '.join(LABEL_FORMATS)}")
+        raise UsageError(f"kind: {kind}, expected one of {', '.join(LABEL_FORMATS)}")
     return LABEL_FORMATS[kind or _recognised(path)].read(path, sizes)
 
 

@@ -270,10 +270,12 @@ def meanings(
     cues = (*CUES, *own_cues)
     for label, cue in own.items():
         if label not in annotations.labels:
-            raise UsageError(f"--map {label}={cue}: no such label; {_choices(annotations.labels)}")
+            raise UsageError(
+                f"meanings: {label}={cue}, no such label; {_choices(annotations.labels)}"
+            )
         if cue and cue not in cues:
             raise UsageError(
-                f"--map {label}={cue}: no such cue; {_choices(cues)}; --vehicle names your own"
+                f"meanings: {label}={cue}, no such cue; {_choices(cues)}; --vehicle names your own"
             )
     found: dict[str, str | None] = {}
     for label in annotations.labels:

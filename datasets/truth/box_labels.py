@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from crosscue.replay.base import (
     read_at_most,
     yaml_tree,
 )
+from crosscue.verb import Option
 
 from .coco import read_coco
 from .voc import read_voc
@@ -45,6 +46,30 @@ DONT_CARE: Final = "DontCare"
 OUTSIDE: Final = "boxes outside the picture, or without area"
 CUT: Final = "boxes cut off at the picture's edge"
 _KITTI_COLUMNS: Final = 15
+
+
+def meanings_of(
+    *, meanings: Annotated[Sequence[str], Option("--map", metavar="LABEL=NAME")] = ()
+) -> dict[str, str]:
+    """Return names by label.
+
+    Args:
+        meanings: Class or cue that a label counts as; LABEL= ignores it.
+
+    Raises:
+        UsageError: A text is not ``LABEL=NAME``.
+    """
+    found = {}
+    for text in meanings:
+        name, equals, means = text.rpartition("=")
+        if not equals or not name:
+            raise UsageError(f"meanings: {text}, expected LABEL=NAME")
+        found[name] = means
+    return found
+
+
+Meanings: TypeAlias = Annotated[Mapping[str, str], Option(made_by=meanings_of)]
+"""Class or cue of each label, as a parameter of a verb: on the command line, ``--map``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +161,7 @@ def read_box_labels(
         EmptyResultError: There are no labelled pictures.
     """
     if kind not in (None, *FORMATS):
-        raise UsageError(f"--format {kind}: expected one of {', '.join(FORMATS)}")
+        raise UsageError(f"kind: {kind}, expected one of {', '.join(FORMATS)}")
     files = _files(path)
     known = kind or _recognised(path, files)
     if known == "coco":

@@ -41,7 +41,7 @@ CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 
 
 @dataclass(slots=True)
-class Annotated:
+class AnnotatedRuns:
     """Annotated approaches of runs.
 
     Attributes:
@@ -54,7 +54,7 @@ class Annotated:
 
 
 def check_arguments(
-    command: str, runs: int, truth: int, output: Path | str | None, *, overwrite: bool
+    runs: int, truth: int, output: Path | str | None, *, overwrite: bool
 ) -> Path | None:
     """Check the arguments of a fit before any run is read.
 
@@ -67,7 +67,7 @@ def check_arguments(
     """
     if runs != truth:
         raise UsageError(
-            f"{command}: {runs} runs, {truth} truth files; give one for each, in the same order"
+            f"truth: {runs} runs, {truth} truth files; give one for each, in the same order"
         )
     path = None if output is None else Path(output)
     if path is not None and path.exists() and not overwrite:
@@ -93,7 +93,7 @@ def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
     return graphs[0], vehicles[0]
 
 
-def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotated) -> None:
+def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: AnnotatedRuns) -> None:
     """Add the approaches of one run.
 
     Raises:

@@ -2,19 +2,124 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
 import tomlkit
 
+from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
-from crosscue.localization.fit.compass import CompassFit, fit_compass
+from crosscue.localization.fit.compass import CompassFit
+from crosscue.localization.fit.compass import fit_compass as fit_readings
 from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError, toml_document
 from crosscue.replay.signals.kinds import Signal
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option
 
 from .log_signals import plan_of, read_signals
+from .vehicle_output import check_output, write_fit
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedCompass(Result):
+    """Fitted mounting, hard and soft iron of a compass.
+
+    Attributes:
+        fitted: Fitted values, their uncertainty, and the parameters that are not observable.
+        path: Vehicle file that was written; None without one.
+    """
+
+    fitted: CompassFit = field(metadata=HIDDEN)
+    path: Path | None = field(metadata=HIDDEN)
+
+    also: ClassVar = {
+        "compass": "section",
+        "observable": "fitted.observable",
+        "not_observable": "not_observable",
+        "readings": "fitted.readings",
+        "readings_used": "fitted.readings_used",
+        "coverage_deg": "fitted.coverage_deg",
+        "residual_sd_rad": "fitted.residual_sd_rad",
+        "persists_s": "fitted.persists_s",
+        "persists_is_bound": "fitted.persists_is_bound",
+        "mounting_yaw_sd_rad": "fitted.mounting_yaw_sd_rad",
+    }
+
+    @property
+    def section(self) -> dict[str, object]:
+        """The vehicle file's section ``[compass]``."""
+        return section_of(self.fitted)
+
+    @property
+    def not_observable(self) -> dict[str, str]:
+        """Reason why a parameter keeps its value, by parameter."""
+        return dict(self.fitted.not_observable)
+
+    def lines(self) -> Iterator[str]:
+        """Yield the quality of the fit, and the section."""
+        fitted = self.fitted
+        yield (
+            f"readings    {fitted.readings_used} of {fitted.readings} used; headings cover "
+            f"{fitted.coverage_deg} degrees of the circle"
+        )
+        yield f"fitted      {', '.join(fitted.observable) or 'nothing'}"
+        yield from (f"not fitted  {name}: {reason}" for name, reason in fitted.not_observable)
+        yield from (*_residual(fitted), "", "[compass]")
+        yield from (f"{key} = {value}" for key, value in self.section.items())
+        if self.path is not None:
+            yield f"written to {self.path}"
+
+
+def _residual(fitted: CompassFit) -> list[str]:
+    if math.isnan(fitted.residual_sd_rad):
+        return ["residual    unknown: there is no reference heading"]
+    yaw_deg = math.degrees(fitted.settings.mounting_yaw_rad)
+    bound = "at least " if fitted.persists_is_bound else ""
+    return [
+        f"mounting    {yaw_deg:.2f} +- {math.degrees(fitted.mounting_yaw_sd_rad):.2f} degrees",
+        f"residual    s.d. {math.degrees(fitted.residual_sd_rad):.2f} degrees, persists for {bound}"
+        f"{fitted.persists_s:.1f} s",
+    ]
+
+
+def fit_compass(
+    log: DriveGiven,
+    vehicle: Vehicle | Path | str | None = None,
+    output: Annotated[Path | str | None, Option(metavar="V.toml")] = None,
+    *,
+    overwrite: bool = False,
+) -> FittedCompass:
+    """Fit compass mounting, hard iron and soft iron to a drive.
+
+    The reference is the GNSS course. Parameters that the drive does not determine keep their values
+    and are listed. For example, a straight drive determines only the mounting angle.
+
+    Examples:
+        crosscue fit compass drive.mcap --vehicle car.toml -o car.toml
+
+    Args:
+        log: The drive, or its path; ``log.part(...)`` for a part of it.
+        vehicle: Vehicle file; without one, the defaults.
+        output: Vehicle file to write: a copy of --vehicle with the fit; may be the same file.
+        overwrite: Replace another existing file.
+
+    Raises:
+        EmptyResultError: The drive has no magnetometer.
+        VehicleError: The drive has too few readings with a reference.
+        OutputError: The output exists, or cannot be written.
+    """
+    check_output(vehicle, output, overwrite=overwrite)
+    settings = vehicle_given(vehicle)
+    with opened(log) as drive:
+        fitted = fit(drive.logs, settings, drive.selection)
+    path = write_fit(vehicle, output, lambda text: with_section(text, fitted))
+    return FittedCompass(fitted, path)
 
 
 def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
@@ -32,14 +137,14 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
     if magnetometer is None:
         raise EmptyResultError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")
     found = read_signals(logs, planned, vehicle, selection, (Signal.MAGNETIC_FIELD, Signal.COURSE))
-    field = found.get(Signal.MAGNETIC_FIELD)
-    if field is None:
+    readings = found.get(Signal.MAGNETIC_FIELD)
+    if readings is None:
         raise VehicleError(f"{magnetometer.topic.name}: not one magnetometer reading in this part")
     reference = None
     ground = found.get(Signal.COURSE)
     if ground is not None:
-        reference = course_at(field.t_ns, ground.t_ns, ground.values[:, 0], ground.values[:, 1])
-    return fit_compass(field.t_ns, field.values, reference, compass_settings(vehicle))
+        reference = course_at(readings.t_ns, ground.t_ns, ground.values[:, 0], ground.values[:, 1])
+    return fit_readings(readings.t_ns, readings.values, reference, compass_settings(vehicle))
 
 
 def section_of(fitted: CompassFit) -> dict[str, object]:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import tomlkit
 
+from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import circular_mean, wrap_all
 from crosscue.localization.fit.compass import persistence
 from crosscue.localization.fit.known_drive import KnownDrive, whitened
-from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit, fit_odometry
+from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit
+from crosscue.localization.fit.odometry import fit_odometry as fit_parameters
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.replay.base import (
     EmptyResultError,
@@ -28,11 +31,14 @@ from crosscue.replay.base import (
 )
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import OdometryFitted
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option
 
 from .log_signals import plan_of, read_signals
-from .reference import Reference, of_gnss
+from .reference import Reference, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
+from .vehicle_output import check_output, write_fit
 
 SHARED: Final = (
     "wheel_scale",
@@ -128,6 +134,149 @@ class DriveFit:
     nees_band: tuple[float, float]
 
 
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedOdometry(Result):
+    """Odometry fitted to the first half of a drive and tested on the second.
+
+    Attributes:
+        fitted: Fit for each source of the turn rate, with errors before and after on both halves.
+        path: Vehicle file that was written; None without one.
+    """
+
+    fitted: DriveFit = field(metadata=HIDDEN)
+    path: Path | None = field(metadata=HIDDEN)
+
+    also: ClassVar = {
+        "odometry": "section",
+        "camera_yaw_rad": "camera_yaw_rad",
+        "log": "fitted.log",
+        "reference": "fitted.reference",
+        "start_ns": "fitted.start_ns",
+        "middle_ns": "fitted.middle_ns",
+        "end_ns": "fitted.end_ns",
+        "nees_band": "fitted.nees_band",
+        "not_fitted": "fitted.not_fitted",
+        "sources": "sources",
+    }
+
+    @property
+    def section(self) -> dict[str, object]:
+        """The vehicle file's section ``[odometry]``."""
+        return section_of(self.fitted)
+
+    @property
+    def camera_yaw_rad(self) -> float | None:
+        """Mounting yaw of the camera; None unless the positions are the camera's track."""
+        return camera_yaw_of(self.fitted)
+
+    @property
+    def sources(self) -> list[dict[str, Any]]:
+        """The fit with each source of the turn rate, as in JSON."""
+        return [
+            {
+                "source": one.fit.source,
+                "fitted": [value._asdict() for value in one.fit.fitted],
+                "not_observable": dict(one.fit.not_observable),
+                "positions": one.fit.fixes,
+                "outliers": one.fit.outliers,
+                "position_sd_m": one.fit.fix_sd_m,
+                "residual_rms": one.fit.residual_rms,
+                "before": asdict(one.before),
+                "after": asdict(one.after),
+            }
+            for one in self.fitted.sources
+        ]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the parameters and errors of each source, and the section."""
+        found = self.fitted
+        middle_s, end_s = ((t - found.start_ns) * 1e-9 for t in (found.middle_ns, found.end_ns))
+        yield f"positions   {found.reference}"
+        yield f"fitted to   the first {middle_s:.1f} s of {end_s:.1f} s; the rest is held out"
+        for one in found.sources:
+            yield from ("", *_source(one))
+        low, high = found.nees_band
+        yield ""
+        yield f"NEES of x, y is consistent for one drive between {low:.2f} and {high:.2f}"
+        yield from (f"not fitted  {name}: {why}" for name, why in found.not_fitted.items())
+        yield from ("", "[odometry]")
+        yield from (f"{key} = {value}" for key, value in self.section.items() if key != "fitted")
+        if self.camera_yaw_rad is not None:
+            yield from ("", "[camera]", f"yaw_rad = {self.camera_yaw_rad}")
+        if self.path is not None:
+            yield f"written to {self.path}"
+
+
+def _source(one: SourceFit) -> list[str]:
+    fit, before, after = one.fit, one.before, one.after
+    width = max(len(name) for name in [*(v.parameter for v in fit.fitted), "gyro_bias_radps"])
+    lines = [
+        f"turns from {fit.source}: {fit.fixes} positions of s.d. {fit.fix_sd_m:.2f} m, "
+        f"{fit.outliers} outliers"
+    ]
+    lines += [
+        f"  {value.parameter:{width}}  {value.value:.6g} +- {value.sd:.2g}  (was {value.given:.6g})"
+        for value in fit.fitted
+    ]
+    lines += [f"  {name:{width}}  not observable: {why}" for name, why in fit.not_observable]
+    if one.camera_yaw_rad is not None:
+        degrees = math.degrees(one.camera_yaw_rad)
+        sure = math.degrees(one.camera_yaw_sd_rad)
+        lines.append(
+            f"  heading of the true track minus the car's: {degrees:.2f} +- {sure:.2f} deg"
+        )
+    lines += [
+        f"  odometry alone, rms    fitted half {before.fitted_m:9.2f} m -> {after.fitted_m:8.2f} m"
+        f"   NEES {after.fitted_nees:6.2f}",
+        f"                            held out {before.held_out_m:9.2f} m -> "
+        f"{after.held_out_m:8.2f} m   NEES {after.held_out_nees:6.2f}",
+        f"                           whole log {before.all_m:9.2f} m -> {after.all_m:8.2f} m"
+        f"   NEES {after.all_nees:6.2f}",
+    ]
+    return lines
+
+
+def fit_odometry(
+    log: DriveGiven,
+    vehicle: Vehicle | Path | str | None = None,
+    output: Annotated[Path | str | None, Option(metavar="V.toml")] = None,
+    *,
+    truth: Path | str | None = None,
+    overwrite: bool = False,
+) -> FittedOdometry:
+    """Fit wheels, gyro, steering and noise to a drive.
+
+    Scales, biases, geometry, delays and noise are fitted to the first half of the drive and tested
+    on the second. The reference positions are the log's GNSS or, with --truth, a true track.
+    Parameters that the drive does not determine keep their values and are listed. For example, a
+    straight drive determines neither the gyro's scale nor the steering ratio.
+
+    Examples:
+        crosscue fit odometry drive.mcap --vehicle car.toml -o car.toml
+        crosscue fit odometry drive.mcap --vehicle car.toml --truth truth/ -o car.toml
+
+    Args:
+        log: The drive, or its path; ``log.part(...)`` for a part of it.
+        vehicle: Vehicle file; without one, the defaults.
+        output: Vehicle file to write: a copy of --vehicle with the fit; may be the same file.
+        truth: Truth file with the true track, or its folder (default: the log's GNSS).
+        overwrite: Replace another existing file.
+
+    Raises:
+        EmptyResultError: The drive has no wheel speeds, or no positions.
+        VehicleError: The drive has too few positions, or is too short.
+        SchemaError: The truth file does not fit the drive, or contains no pose.
+        OutputError: The output exists, or cannot be written.
+    """
+    check_output(vehicle, output, overwrite=overwrite)
+    settings = vehicle_given(vehicle)
+    known = None if truth is None else of_truth(Path(truth), settings)
+    with opened(log) as drive:
+        found = fit(drive.logs, settings, drive.selection, known)
+    path = write_fit(vehicle, output, lambda text: with_section(text, found))
+    return FittedOdometry(found, path)
+
+
 def fit(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, known: Reference | None = None
 ) -> DriveFit:
@@ -214,7 +363,7 @@ def _middle_ns(drive: KnownDrive) -> int:
 def _fitted(drive: KnownDrive, given: OdometrySettings, reference: Reference) -> SourceFit:
     whole_s = float(drive.seconds[-1]) if len(drive.seconds) else None
     half = drive.until(_middle_ns(drive)) if len(drive.fixes) else drive
-    fit = fit_odometry(half, given, whole_s)
+    fit = fit_parameters(half, given, whole_s)
     before, after = (_errors(drive, car, fit) for car in (given, fit.settings))
     if reference.heading_rad is None:
         return SourceFit(fit, before, after)

@@ -227,8 +227,27 @@ def unopened_whole(*logs: Path, limits: LimitsGiven = DEFAULT_LIMITS) -> Unopene
     return UnopenedLog(logs, limits=limits)
 
 
+def unopened_if_any(
+    *logs: Annotated[Path, Option(may_be_empty=True)],
+    part: LogPart,
+    limits: LimitsGiven = DEFAULT_LIMITS,
+) -> UnopenedLog | None:
+    """Return a part of a drive, as ``unopened`` does; None without logs.
+
+    Args:
+        logs: Recordings of one drive.
+        part: The part to read.
+        limits: Limits for reading.
+    """
+    return UnopenedLog(logs, part, limits) if logs else None
+
+
 DriveGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened)]
 """A drive, as a parameter of a verb: on the command line, ``LOG...`` and the part to read."""
+DriveIfGiven: TypeAlias = Annotated[
+    Log | UnopenedLog | Path | str | None, Option(made_by=unopened_if_any)
+]
+"""A drive, as a parameter of a verb that can do without one."""
 LogGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened_one)]
 """One log, as a parameter of a verb."""
 WholeDriveGiven: TypeAlias = Annotated[

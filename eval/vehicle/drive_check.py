@@ -91,10 +91,11 @@ def check_vehicle(
     seconds: Annotated[float, Option(metavar="S")] = 10.0,
     overwrite: bool = False,
 ) -> VehicleCheck:
-    """Check a vehicle file on part of a drive: list the values of signals, and contradictions.
+    """Check a vehicle file on part of a drive, and list contradictions.
 
-    The page shows a picture with the horizon, distances along the road, and the regions searched
-    for road. The exit status is 1 when signals contradict each other.
+    The values of each signal are listed. The page shows a picture with the horizon, distances along
+    the road, and the regions searched for road. The exit status is 1 when signals contradict each
+    other.
 
     Examples:
         crosscue vehicle check drive.mcap --vehicle car.toml -o check.html

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import crosscue
+from crosscue.datasets.truth.box_labels import meanings_of as meanings_of
 
 FORMATS = ("coco", "yolo", "voc", "kitti")
 
@@ -15,7 +14,7 @@ FORMATS = ("coco", "yolo", "voc", "kitti")
 def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--format``, ``--class-names``, ``--map``, ``--detector`` and ``--overlap``."""
     parser.add_argument(
-        "--format", choices=FORMATS, help="format of the labels (default: detected)"
+        "--format", dest="kind", choices=FORMATS, help="format of the labels (default: detected)"
     )
     parser.add_argument(
         "--class-names",
@@ -26,6 +25,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--map",
+        dest="meanings",
         nargs="+",
         default=[],
         metavar="LABEL=NAME",
@@ -51,23 +51,8 @@ def label_options(args: argparse.Namespace) -> dict[str, Any]:
     """
     return {
         "detector": args.detector,
-        "kind": args.format,
+        "kind": args.kind,
         "class_names": args.class_names,
-        "meanings": meanings_of(args.map),
+        "meanings": meanings_of(meanings=args.meanings),
         "overlap": args.overlap,
     }
-
-
-def meanings_of(texts: Sequence[str]) -> dict[str, str]:
-    """Return the class of each label in ``--map LABEL=NAME...``.
-
-    Raises:
-        UsageError: A text is not ``LABEL=NAME``.
-    """
-    found = {}
-    for text in texts:
-        name, equals, means = text.rpartition("=")
-        if not equals or not name:
-            raise crosscue.UsageError(f"--map {text}: expected LABEL=NAME")
-        found[name] = means
-    return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -162,21 +161,6 @@ def refuse_existing(args: argparse.Namespace) -> None:
     """
     if args.output is not None and args.output.exists() and not args.overwrite:
         raise OutputError(f"{args.output}: exists; give another name or --overwrite")
-
-
-def metres(text: str) -> float:
-    """Parse a length in metres.
-
-    Raises:
-        argparse.ArgumentTypeError: Not a finite number above 0.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected metres, above 0")
-    return value
 
 
 class Result(Protocol):

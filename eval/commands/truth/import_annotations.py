@@ -55,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--map",
+        dest="meanings",
         nargs="+",
         default=[],
         metavar="LABEL=NAME",
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
                 args.export,
                 args.output,
                 args.vehicle,
-                labels=meanings_of(args.map),
+                labels=meanings_of(meanings=args.meanings),
                 add=args.add,
                 overwrite=args.overwrite,
                 kind=args.format,
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         args.log,
         args.output,
         args.vehicle,
-        labels=meanings_of(args.map),
+        labels=meanings_of(meanings=args.meanings),
         add=args.add,
         overwrite=args.overwrite,
         kind=args.format,

@@ -325,6 +325,21 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
         raise AnnotationError(f"{where}: {error}; correct it") from None
 
 
+def metres(text: str) -> float:
+    """Parse a length in metres.
+
+    Raises:
+        UsageError: Not a finite number above 0.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise UsageError(f"{text!r}: expected metres, above 0")
+    return value
+
+
 def near_of(text: str | None) -> tuple[Floats, float] | None:
     """Parse ``x,y,r`` as a position and a radius in metres.
 

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 
 from crosscue.detectors.signs.detector import build
-from crosscue.detectors.signs.templates import AMERICAN, KINDS
+from crosscue.detectors.signs.templates import AMERICAN, KINDS, Kind
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
 from crosscue.eval.fit.signs.scores import Rules, judged_pictures
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
-from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, Limits, UsageError
-
-Progress = Callable[[Iterable[Judged], Callable[[], tuple[int, int]]], Iterable[Judged]]
-"""Function that passes parts through and shows progress; the second argument returns the number of
-parts done and the total."""
+from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, UsageError
+from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import HIDDEN, Result, json_key
+from crosscue.verb import Option, keywords
 
 LOWEST: Final = 0.05
 
@@ -32,8 +32,8 @@ class SignRates:
     recall: Proportion
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SignFit:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SignFit(Result):
     """A threshold and the judged detections behind it.
 
     Attributes:
@@ -42,9 +42,31 @@ class SignFit:
         others: Detections on which it is measured, in the same form.
     """
 
-    threshold: float | None
-    chosen_on: Sequence[Judged]
-    others: Sequence[Judged]
+    threshold: float | None = field(metadata=json_key("min_score"))
+    chosen_on: Sequence[Judged] = field(metadata=HIDDEN)
+    others: Sequence[Judged] = field(metadata=HIDDEN)
+
+    also: ClassVar = {"chosen_on": "chosen_rates", "other_frames": "other_rates"}
+
+    @property
+    def exit_status(self) -> int:
+        """1 when no threshold is precise enough, else 0."""
+        return 1 if self.threshold is None else 0
+
+    @property
+    def chosen_rates(self) -> dict[str, Any] | None:
+        """Rates on the pictures of the choice, as in JSON."""
+        return self._rates(on_others=False)
+
+    @property
+    def other_rates(self) -> dict[str, Any] | None:
+        """Rates on the held-out pictures, as in JSON."""
+        return self._rates(on_others=True)
+
+    def _rates(self, *, on_others: bool) -> dict[str, Any] | None:
+        if self.threshold is None:
+            return None
+        return _tree(self.rates(self.threshold, on_others=on_others))
 
     def rates(self, threshold: float, *, on_others: bool = True) -> SignRates:
         """Return precision and recall at any threshold, by default on the held-out pictures."""
@@ -55,114 +77,126 @@ class SignFit:
             _fraction([(one.right, one.signs) for one in counts]),
         )
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the object that ``crosscue fit signs --json`` prints."""
-        tree: dict[str, object] = {"min_score": self.threshold}
-        of = self.threshold
-        for name, on_others in (("chosen_on", False), ("other_frames", True)):
-            tree[name] = None if of is None else _tree(self.rates(of, on_others=on_others))
-        return tree
-
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield the threshold, and precision and recall on both halves."""
         if self.threshold is None:
             signs = sum(part.signs for part in self.chosen_on)
-            return f"no threshold is precise enough on {signs} signs"
-        lines = [f"min_score = {self.threshold:g}"]
+            yield f"no threshold is precise enough on {signs} signs"
+            return
+        yield f"min_score = {self.threshold:g}"
         for name, on_others in (("chosen on", False), ("other frames", True)):
             rates = self.rates(self.threshold, on_others=on_others)
-            lines.append(f"{name:13} {_proportion_text('precision', rates.precision)}")
-            lines.append(f"{'':13} {_proportion_text('recall', rates.recall)}")
-        return "\n".join(lines)
+            yield f"{name:13} {_proportion_text('precision', rates.precision)}"
+            yield f"{'':13} {_proportion_text('recall', rates.recall)}"
 
 
-def fit_signs(
-    labels: Sequence[Path | str],
-    label: Sequence[str],
-    *,
-    test: Sequence[Path | str] = (),
-    test_every: int = 1,
-    kinds: Sequence[str] = AMERICAN,
-    precision: float = 0.95,
-    threshold: float | None = None,
-    overlap: float = 0.4,
-    min_height_px: float = 0.0,
-    crop_top: float = 0.0,
-    crop_bottom: float = 0.25,
-    enlarge: float = 2.5,
-    levels: int = 14,
-    points: int = 4000,
-    limits: Limits = DEFAULT_LIMITS,
-    progress: Progress = lambda parts, done: parts,
-) -> SignFit:
-    """Choose the sign detector's threshold for a required precision.
+Fraction = Annotated[float, Option(metavar="FRACTION")]
 
-    The threshold is chosen on every second picture and measured on the others, unless ``test``
-    names other pictures.
+
+@dataclass(frozen=True, slots=True)
+class SignFitSettings:
+    """Which signs are searched for, how, and how the threshold is chosen.
+
+    Attributes:
+        label: Labels that share the threshold.
+        test: Other files or drives to measure on.
+        test_every: Measure on every Nth image.
+        kinds: Templates to search for: one way left, one way right, do not enter, or no entry.
+        crop_top: Top fraction of the image to skip.
+        crop_bottom: Bottom fraction of the image to skip.
+        enlarge: Magnification of the first pyramid level.
+        levels: Pyramid levels, each smaller by 1.25.
+        points: Keypoints per level.
+        precision: Required precision.
+        threshold: Measure this threshold instead of choosing one.
+        overlap: Min IoU with the true box of a true positive.
+        min_height_px: Ignore true signs lower than this, in pixels.
+        limits: Limits for reading drives' logs.
+    """
+
+    label: Annotated[Sequence[str], Option("--label", metavar="LABEL")]
+    _: KW_ONLY
+    test: Annotated[Sequence[Path | str], Option(metavar="LABELS")] = ()
+    test_every: int = 1
+    kinds: Annotated[Sequence[Kind], Option(metavar="KIND")] = AMERICAN
+    crop_top: Fraction = 0.0
+    crop_bottom: Fraction = 0.25
+    enlarge: float = 2.5
+    levels: int = 14
+    points: int = 4000
+    precision: float = 0.95
+    threshold: float | None = None
+    overlap: float = 0.4
+    min_height_px: Annotated[float, Option("--min-height")] = 0.0
+    limits: LimitsGiven = DEFAULT_LIMITS
+
+    def __post_init__(self) -> None:
+        """Check numbers and names.
+
+        Raises:
+            UsageError: A value is out of range.
+        """
+        for name in ("precision", "overlap"):
+            value: float = getattr(self, name)
+            if not 0.0 < value <= 1.0:
+                raise UsageError(f"{name}: {value}, expected above 0, at most 1")
+        if self.test_every < 1:
+            raise UsageError(f"test_every: {self.test_every}, expected 1 or more")
+        if self.threshold is not None and not LOWEST <= self.threshold <= 1.0:
+            raise UsageError(f"threshold: {self.threshold}, expected {LOWEST} to 1")
+        for kind in self.kinds:
+            if kind not in KINDS:
+                raise UsageError(f"kinds: {kind}, expected one of {', '.join(KINDS)}")
+
+
+@keywords(SignFitSettings)
+def fit_signs(labels: Sequence[Path | str], settings: SignFitSettings) -> SignFit:
+    """Fit the sign threshold to a required precision.
+
+    LABELS is a CSV file with the columns picture,label,x0,y0,x1,y1 and one row per sign (an empty
+    label for a picture without signs), a COCO file as crosscue train frames writes it, or the
+    folder of a drive with annotated objects. The threshold is chosen on every second picture and
+    measured on the others, unless --test names other files or drives. --threshold measures the
+    given threshold instead.
+
+    Examples:
+        crosscue fit signs labels.csv --label "do not enter" --kinds "no entry" --precision 0.95
+        crosscue fit signs fit/coco.json --test drives/* --label "one way left" "one way right"
 
     Args:
-        labels: CSV files ``picture,label,x0,y0,x1,y1``, COCO files, or folders of drives.
-        label: The labels to choose one threshold for.
-        test: Other files or drives to measure on.
-        test_every: Measure on every Nth picture only.
-        kinds: Drawings to search for.
-        precision: Required precision, above 0 and up to 1.
-        threshold: Measure this threshold instead of choosing one.
-        overlap: Min intersection over union of a right detection with the true box.
-        min_height_px: Min height of a true sign; smaller ones count neither as found nor as missed.
-        crop_top: Fraction of the picture that is not searched, at the top.
-        crop_bottom: Fraction that is not searched, at the bottom.
-        enlarge: Enlargement of the first level of the pyramid, for small signs.
-        levels: Number of levels of the pyramid.
-        points: Number of points kept at a level.
-        limits: Limits for reading drives' logs.
-        progress: Function that passes the parts through and shows progress.
+        labels: CSV or COCO files of boxes, or folders of drives.
+        settings: Which signs are searched for, and how.
 
     Raises:
         UsageError: A value is out of range.
         EmptyResultError: The pictures contain no such sign.
     """
-    _check(precision, overlap, test_every, threshold, kinds)
+    threshold, test = settings.threshold, settings.test
     detector = build(
-        kinds=tuple(kinds),
+        kinds=tuple(settings.kinds),
         min_score=LOWEST,
-        crop_top=crop_top,
-        crop_bottom=crop_bottom,
-        enlarge=enlarge,
-        levels=levels,
-        points=points,
+        crop_top=settings.crop_top,
+        crop_bottom=settings.crop_bottom,
+        enlarge=settings.enlarge,
+        levels=settings.levels,
+        points=settings.points,
     )
-    rules = Rules(label, overlap, min_height_px)
+    rules = Rules(settings.label, settings.overlap, settings.min_height_px)
     fit = slice(0, None, 1 if test else 2)
-    rest = slice(0 if test else 1, None, test_every * fit.step)
+    rest = slice(0 if test else 1, None, settings.test_every * fit.step)
     work = [(Path(path), fit) for path in labels]
     work += [(Path(path), rest) for path in test or labels]
     parts: list[Judged] = []
-    made = (judged_pictures(path, detector, rules, which, limits) for path, which in work)
-    for part in progress(made, lambda: (len(parts), len(work))):
-        parts.append(part)
+    for path, which in work:
+        parts.append(judged_pictures(path, detector, rules, which, settings.limits))
+        emit(Progress("looking", len(parts), len(work), "sets"))
     chosen_on, others = parts[: len(labels)], parts[len(labels) :]
     if not sum(part.signs for part in chosen_on):
-        raise EmptyResultError(
-            f"{labels[0]}: no {' or '.join(label)} in the pictures to choose on; add some"
-        )
+        wanted = " or ".join(settings.label)
+        raise EmptyResultError(f"{labels[0]}: no {wanted} in the pictures to choose on; add some")
     if threshold is None:
-        threshold = _shown(threshold_for(together(chosen_on), precision))
+        threshold = _shown(threshold_for(together(chosen_on), settings.precision))
     return SignFit(threshold, chosen_on, others)
-
-
-def _check(
-    precision: float, overlap: float, every: int, threshold: float | None, kinds: Sequence[str]
-) -> None:
-    for name, value in (("precision", precision), ("overlap", overlap)):
-        if not 0.0 < value <= 1.0:
-            raise UsageError(f"--{name} {value}: expected above 0, at most 1")
-    if every < 1:
-        raise UsageError(f"--test-every {every}: expected 1 or more")
-    if threshold is not None and not LOWEST <= threshold <= 1.0:
-        raise UsageError(f"--threshold {threshold}: expected {LOWEST} to 1")
-    for kind in kinds:
-        if kind not in KINDS:
-            raise UsageError(f"--kinds {kind}: no such drawing; there are: {', '.join(KINDS)}")
 
 
 def _shown(score: float | None) -> float | None:

@@ -166,7 +166,7 @@ def _detector(run: RunFolder, detected: DetectManifest, asked: str | None) -> De
         return named[0]
     there = ", ".join(one.name for one in some) or "none that finds objects"
     if asked is not None:
-        raise UsageError(f"--detector {asked}: not in {run.path}; there are: {there}")
+        raise UsageError(f"detector: {asked}, not in {run.path}; there are: {there}")
     raise UsageError(f"{run.path}: name one detector with --detector; there are: {there}")
 
 
@@ -255,8 +255,8 @@ def _classes(
     for name, means in meanings.items():
         if name not in (*labels.classes, *reported):
             raise UsageError(
-                f"--map {name}={means}: no such class; the labels have {_listed(labels.classes)}; "
-                f"{detector} reports {_listed(reported)}"
+                f"meanings: {name}={means}, no such class; the labels have "
+                f"{_listed(labels.classes)}; {detector} reports {_listed(reported)}"
             )
     of_found = {name: meanings.get(name, name) or None for name in reported}
     plain = {_plain(name): name for name in reported}

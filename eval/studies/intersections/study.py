@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.truth.truth import FILE
-from crosscue.eval.fit.annotated_runs import Annotated, annotate, graph_of_runs
+from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, graph_of_runs
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.drives import ScoreSettings, judge, score
 from crosscue.eval.scoring.runs import RunScored, judge_run
@@ -88,7 +88,7 @@ def _place(one: RunScored) -> str:
 
 def _learned(scored: Sequence[RunScored]) -> Calibrated:
     graph, vehicle = graph_of_runs([one.run for one in scored])
-    found = Annotated([], Counter())
+    found = AnnotatedRuns([], Counter())
     for one in scored:
         annotate(one.run, one.truth.truth, vehicle, found)
     return fit_messages(found.approaches, graph).calibrated

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crosscue.eval.fit.annotated_runs import (
-    Annotated,
+    AnnotatedRuns,
     annotate,
     annotated_drives,
     graph_of_runs,
@@ -51,7 +51,7 @@ def lessons_of(drives: Sequence[StudyDrive]) -> Lessons:
     approaches, parts = {}, {}
     for drive in drives:
         vehicle = drive.run.drive_manifest().settings
-        found = Annotated([], Counter())
+        found = AnnotatedRuns([], Counter())
         annotate(drive.run, drive.truth.truth, vehicle, found)
         approaches[drive.name] = [replace(one, place=drive.layout) for one in found.approaches]
         parts[drive.name] = [

@@ -217,7 +217,12 @@ def test_class_with_few_labels_is_not_fitted(drive: Path, tmp_path: Path) -> Non
     ("rows", "meanings", "error", "message"),
     [
         ({"frame_9999.txt": "0 .5 .5 .2 .2"}, {}, SchemaError, "none of its 1 images is in"),
-        ({"frame_1.txt": "1 .5 .5 .2 .2"}, {"cat": "dog"}, UsageError, "--map cat=dog: no such"),
+        (
+            {"frame_1.txt": "1 .5 .5 .2 .2"},
+            {"cat": "dog"},
+            UsageError,
+            "meanings: cat=dog, no such",
+        ),
         (
             {"frame_1.txt": "7 .5 .5 .2 .2"},
             {},

@@ -11,7 +11,7 @@ import pytest
 
 from crosscue.datasets.truth.truth import load
 from crosscue.eval.cli import run as crosscue
-from crosscue.eval.fit.annotated_runs import Annotated, annotate, graph_of_runs
+from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, graph_of_runs
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.replay.base import RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
@@ -39,8 +39,8 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[P
     return runs, truths
 
 
-def annotated_run(run: RunFolder, truth: Path) -> Annotated:
-    found = Annotated([], Counter())
+def annotated_run(run: RunFolder, truth: Path) -> AnnotatedRuns:
+    found = AnnotatedRuns([], Counter())
     annotate(run, load(truth), Vehicle(version=1), found)
     return found
 

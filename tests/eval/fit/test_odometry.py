@@ -9,7 +9,8 @@ import pytest
 import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
-from crosscue.eval.interface.fits.vehicle_output import check_output, write_fit
+from crosscue.eval.fit.odometry import FittedOdometry
+from crosscue.eval.fit.vehicle_output import check_output, write_fit
 from crosscue.replay.base import EmptyResultError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -23,7 +24,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
 
 
 @pytest.fixture(scope="module")
-def fitted(files: DriveFiles) -> crosscue.FittedOdometry:
+def fitted(files: DriveFiles) -> FittedOdometry:
     calibrated = files.vehicle.read_text().splitlines(keepends=True)
     vehicle, output = (files.vehicle.with_name(f"{name}.toml") for name in ("any", "fitted"))
     kept = [line for line in calibrated if not line.startswith(("gyro_", "slip_", "scale_sd"))]
@@ -31,7 +32,7 @@ def fitted(files: DriveFiles) -> crosscue.FittedOdometry:
     return crosscue.fit_odometry(files.log, vehicle, output, truth=files.truth)
 
 
-def test_simulated_gyro_bias_is_estimated(fitted: crosscue.FittedOdometry) -> None:
+def test_simulated_gyro_bias_is_estimated(fitted: FittedOdometry) -> None:
     fit = fitted.fitted.sources[0].fit
     (bias,) = (one for one in fit.fitted if one.parameter == "gyro_bias_radps")
 
@@ -39,7 +40,7 @@ def test_simulated_gyro_bias_is_estimated(fitted: crosscue.FittedOdometry) -> No
 
 
 def test_fit_reduces_held_out_error_and_nees_is_within_band(
-    fitted: crosscue.FittedOdometry,
+    fitted: FittedOdometry,
 ) -> None:
     one = fitted.fitted.sources[0]
 
@@ -48,7 +49,7 @@ def test_fit_reduces_held_out_error_and_nees_is_within_band(
 
 
 def test_vehicle_file_records_the_source_of_its_odometry(
-    fitted: crosscue.FittedOdometry, files: DriveFiles
+    fitted: FittedOdometry, files: DriveFiles
 ) -> None:
     assert fitted.path is not None
     written = crosscue.load_vehicle(fitted.path).odometry

@@ -207,4 +207,4 @@ def test_unequal_numbers_of_runs_and_drives_are_refused(
     assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--runs", here]) == 2
     assert "1 runs for 2 drives" in capsys.readouterr().err
     assert run(["fit", "ranges", "--cue", "stop_sign"]) == 2
-    assert "expected a TABLE, or --truth" in capsys.readouterr().err
+    assert "--truth: expected drives, or else a TABLE" in capsys.readouterr().err

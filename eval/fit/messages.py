@@ -1,28 +1,31 @@
-"""Learn the reliability of each cue from annotated drives."""
+"""Fit of the reliability of each cue to annotated drives, for ``fusion.kind = "calibrated"``."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from crosscue.datasets.truth.truth import load
-from crosscue.eval.fit.annotated_runs import Annotated, annotate, check_arguments, graph_of_runs
+from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, check_arguments, graph_of_runs
 from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
 from crosscue.replay.base import EmptyResultError, write_text
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedMessages:
+class FittedMessages(Result):
     """Learned reliability of each cue.
 
     Attributes:
@@ -32,48 +35,61 @@ class FittedMessages:
         path: File that the section was written to; None without one.
     """
 
-    fitted: MessageFit
+    fitted: MessageFit = field(metadata=HIDDEN)
     used: Counter[str]
-    runs: int
-    path: Path | None
+    runs: int = field(metadata=HIDDEN)
+    path: Path | None = field(metadata=HIDDEN)
+
+    also: ClassVar = {
+        "approaches": "fitted.approaches",
+        "calibrated": "calibrated",
+        "rates": "rates",
+        "fades": "fades",
+    }
 
     @property
     def section(self) -> str:
         """The vehicle file's section ``[fusion.calibrated]``."""
         return _section_of(self.fitted)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue fit messages``."""
-        return {
-            "approaches": self.fitted.approaches,
-            "used": dict(self.used),
-            "calibrated": self.fitted.calibrated.model_dump(mode="json"),
-            "rates": [
-                {
-                    "cue": one.cue,
-                    "feature": one.feature,
-                    "near": one.near,
-                    "learned": one.rates is not None,
-                    "there": _side_json(one.there),
-                    "missing": _side_json(one.missing),
-                }
-                for one in self.fitted.rates
-            ],
-            "fades": [
-                {
-                    "cue": one.cue,
-                    "positives": one.positives,
-                    "frames": one.observations,
-                    "learned": one.is_learned,
-                    **one.fade.model_dump(),
-                }
-                for one in self.fitted.fades
-            ],
-        }
+    @property
+    def calibrated(self) -> dict[str, Any]:
+        """The section as values."""
+        return self.fitted.calibrated.model_dump(mode="json")
 
-    def __repr__(self) -> str:
-        end = self.section if self.path is None else f"written to {self.path}"
-        return f"{_report_text(self.fitted, self.used, self.runs)}\n{end}"
+    @property
+    def rates(self) -> list[dict[str, Any]]:
+        """Rate of each cue and feature with its intervals, as in JSON."""
+        return [
+            {
+                "cue": one.cue,
+                "feature": one.feature,
+                "near": one.near,
+                "learned": one.rates is not None,
+                "there": _side_json(one.there),
+                "missing": _side_json(one.missing),
+            }
+            for one in self.fitted.rates
+        ]
+
+    @property
+    def fades(self) -> list[dict[str, Any]]:
+        """Scale on which the frames of each cue become independent, as in JSON."""
+        return [
+            {
+                "cue": one.cue,
+                "positives": one.positives,
+                "frames": one.observations,
+                "learned": one.is_learned,
+                **one.fade.model_dump(),
+            }
+            for one in self.fitted.fades
+        ]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the rates, scales and exponents, and the section."""
+        yield _report_text(self.fitted, self.used, self.runs)
+        yield self.section if self.path is None else f"written to {self.path}"
 
 
 def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
@@ -196,33 +212,39 @@ def _rate_line(one: RateFit) -> str:
 
 def fit_messages(
     runs: Sequence[Run | Path | str],
-    truth: Sequence[Path | str],
-    output: Path | str | None = None,
+    truth: Annotated[Sequence[Path | str], Option("--truth")],
+    output: Annotated[Path | str | None, Option(metavar="TOML")] = None,
     *,
     overwrite: bool = False,
-    on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> FittedMessages:
-    """Learn the reliability of each cue, for ``fusion.kind = "calibrated"``.
+    """Fit the reliability of each cue to annotated drives.
+
+    Pass finished runs and the truth of each, in the same order. The result is the section
+    [fusion.calibrated] of a vehicle file, for fusion.kind = "calibrated", with the counts behind
+    each line. Frames of one approach resemble each other, so counts and intervals use the effective
+    number of independent frames.
+
+    Examples:
+        crosscue fit messages runs/* --truth drives/*/truth.json -o calibrated.toml
 
     Args:
         runs: Finished runs.
-        truth: The truth of each, in the same order.
-        output: TOML file for the section; default: it is only returned.
+        truth: Truth of each run, in the same order.
+        output: File to write the section to (default: print it).
         overwrite: Replace an existing file.
-        on_runs: Called with the number of runs read, and their total.
 
     Raises:
         UsageError: The numbers of runs and truth files differ, or runs have different cues.
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
-    path = check_arguments("fit messages", len(runs), len(truth), output, overwrite=overwrite)
+    path = check_arguments(len(runs), len(truth), output, overwrite=overwrite)
     folders = [run_given(one).folder for one in runs]
     graph, vehicle = graph_of_runs(folders)
-    found = Annotated([], Counter())
+    found = AnnotatedRuns([], Counter())
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
         annotate(folder, load(Path(known)), vehicle, found)
-        on_runs(done, len(folders))
+        emit(Progress("reading", done, len(folders), "runs"))
     if not found.approaches:
         raise EmptyResultError(
             "fit messages: no approach of any run matches an annotated one; use more drives"

@@ -1,10 +1,11 @@
-"""Learn the belief over time from annotated drives."""
+"""Fit of the belief over time to annotated drives, for ``fusion.kind = "temporal"``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
 from crosscue.eval.fit.annotated_runs import annotated_drives, check_arguments, graph_of_runs
 from crosscue.eval.pipeline.run import Run, run_given
@@ -12,11 +13,14 @@ from crosscue.eval.scoring.truth import load
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
 from crosscue.replay.base import EmptyResultError, write_text
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.vehicle.temporal import CueChain
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedTemporal:
+class FittedTemporal(Result):
     """Learned Markov chains of cues along a drive.
 
     Attributes:
@@ -25,43 +29,51 @@ class FittedTemporal:
         path: File that the section was written to; None without one.
     """
 
-    fitted: TemporalFit
+    fitted: TemporalFit = field(metadata=HIDDEN)
     runs: int
-    path: Path | None
+    path: Path | None = field(metadata=HIDDEN)
+
+    also: ClassVar = {
+        "drives": "fitted.drives",
+        "places": "fitted.places",
+        "steps": "fitted.steps",
+        "log_scores": "log_scores",
+        "temporal": "temporal",
+    }
 
     @property
     def section(self) -> str:
         """The vehicle file's section ``[fusion.temporal]``."""
         return _section_of(self.fitted)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue fit temporal``."""
-        return {
-            "runs": self.runs,
-            "drives": self.fitted.drives,
-            "places": self.fitted.places,
-            "steps": self.fitted.steps,
-            "log_scores": [
-                {"exponent": exponent, "lapse": lapse, "log_score": value}
-                for (exponent, lapse), value in self.fitted.log_scores.items()
-            ],
-            "temporal": self.fitted.temporal.model_dump(mode="json"),
-        }
+    @property
+    def temporal(self) -> dict[str, Any]:
+        """The section as values."""
+        return self.fitted.temporal.model_dump(mode="json")
 
-    def __repr__(self) -> str:
-        end = self.section if self.path is None else f"written to {self.path}"
-        learned = self.fitted.temporal
-        score = self.fitted.log_scores.get((learned.exponent, learned.lapse))
+    @property
+    def log_scores(self) -> list[dict[str, float]]:
+        """Score of each exponent and lapse on held-out places, as in JSON."""
+        return [
+            {"exponent": exponent, "lapse": lapse, "log_score": value}
+            for (exponent, lapse), value in self.fitted.log_scores.items()
+        ]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the numbers of drives and places, the score, and the section."""
+        fitted, learned = self.fitted, self.fitted.temporal
+        score = fitted.log_scores.get((learned.exponent, learned.lapse))
         judged = (
             "too few places to score"
             if score is None
             else f"log score {score:.3f} on held-out places"
         )
-        return (
-            f"{self.runs} runs, {self.fitted.drives} drives at {self.fitted.places} places, "
-            f"{self.fitted.steps} steps\n"
-            f"exponent {learned.exponent:g}, lapse {learned.lapse:g}: {judged}\n\n{end}"
+        yield (
+            f"{self.runs} runs, {fitted.drives} drives at {fitted.places} places, "
+            f"{fitted.steps} steps"
         )
+        yield f"exponent {learned.exponent:g}, lapse {learned.lapse:g}: {judged}\n"
+        yield self.section if self.path is None else f"written to {self.path}"
 
 
 def _section_of(fit: TemporalFit) -> str:
@@ -97,33 +109,39 @@ def _chain_line(one: CueChain) -> str:
 
 def fit_temporal(
     runs: Sequence[Run | Path | str],
-    truth: Sequence[Path | str],
-    output: Path | str | None = None,
+    truth: Annotated[Sequence[Path | str], Option("--truth")],
+    output: Annotated[Path | str | None, Option(metavar="TOML")] = None,
     *,
     overwrite: bool = False,
-    on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> FittedTemporal:
-    """Learn the belief over time, for ``fusion.kind = "temporal"``.
+    """Fit the belief over time to annotated drives.
+
+    Pass finished runs and the truth of each, in the same order, including drives without an
+    intersection. The result is the section [fusion.temporal] of a vehicle file, for fusion.kind =
+    "temporal". It describes how each cue changes from step to step, by distance, with and without a
+    road.
+
+    Examples:
+        crosscue fit temporal runs/* --truth drives/*/truth.json -o temporal.toml
 
     Args:
         runs: Finished runs.
-        truth: The truth of each, in the same order.
-        output: TOML file for the section; default: it is only returned.
+        truth: Truth of each run, in the same order.
+        output: File to write the section to (default: print it).
         overwrite: Replace an existing file.
-        on_runs: Called with the number of runs read, and their total.
 
     Raises:
         UsageError: The numbers of runs and truth files differ, or runs have different cues.
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
-    path = check_arguments("fit temporal", len(runs), len(truth), output, overwrite=overwrite)
+    path = check_arguments(len(runs), len(truth), output, overwrite=overwrite)
     folders = [run_given(one).folder for one in runs]
     graph, vehicle = graph_of_runs(folders)
     drives: list[AnnotatedDrive] = []
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
         drives += annotated_drives(folder, load(Path(known), str(folder.path)), vehicle)
-        on_runs(done, len(folders))
+        emit(Progress("reading", done, len(folders), "runs"))
     try:
         fitted = fit_drives(drives, graph)
     except ValueError as error:

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 
-from crosscue.datasets.truth.box_labels import class_names_given, read_box_labels
+from crosscue.datasets.truth.box_labels import (
+    LabelFormat,
+    Meanings,
+    class_names_given,
+    read_box_labels,
+)
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.places import card_path, names
 from crosscue.eval.fit.detector.card_text import check_place, with_fit
@@ -26,15 +32,18 @@ from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, UsageError, visible, write_text
+from crosscue.replay.base import DEFAULT_LIMITS, UsageError, visible, write_text
+from crosscue.replay.limits import LimitsGiven
+from crosscue.results import HIDDEN, Result, json_key
+from crosscue.verb import Option, keywords
 
 CONFIDENCE: Final = 0.95
 YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedDetector:
-    """Thresholds and calibrations by class; its repr is the output of ``crosscue fit detector``.
+class FittedDetector(Result):
+    """Thresholds and calibrations by class; its repr has a paragraph for each class.
 
     Attributes:
         detector: The detector, as it ran.
@@ -47,44 +56,54 @@ class FittedDetector:
         is_whole: True if nothing was dropped when the runs were made.
     """
 
-    detector: DetectorRow
-    classes: tuple[ClassFit, ...]
+    detector: DetectorRow = field(metadata=HIDDEN)
+    classes: tuple[ClassFit, ...] = field(metadata=HIDDEN)
     precision: float
-    fitted_to: int
-    held_out: int
+    fitted_to: int = field(metadata=json_key("images_fitted_to"))
+    held_out: int = field(metadata=json_key("images_held_out"))
     left_out: Mapping[str, int]
     card: Path | None
-    is_whole: bool = True
+    is_whole: bool = field(default=True, metadata=HIDDEN)
+
+    also: ClassVar = {
+        "detector": "detector.name",
+        "classes": "classes_in_json",
+        "confidence": "confidence",
+    }
 
     @property
     def has_threshold(self) -> bool:
         """True if at least one class has a threshold."""
         return any(one.scores and one.scores.threshold is not None for one in self.classes)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue fit detector``."""
-        return {
-            "detector": self.detector.name,
-            "precision": self.precision,
-            "confidence": CONFIDENCE,
-            "images_fitted_to": self.fitted_to,
-            "images_held_out": self.held_out,
-            "left_out": dict(self.left_out),
-            "classes": [_class_tree(one) for one in self.classes],
-            "card": None if self.card is None else str(self.card),
-        }
+    @property
+    def exit_status(self) -> int:
+        """1 when no class gets a threshold, 3 when runs have drops."""
+        if not self.has_threshold:
+            return 1
+        return 0 if self.is_whole else 3
 
-    def __repr__(self) -> str:
-        lines = [
-            f"detector   {visible(self.detector.name)}, fitted to {self.fitted_to:,} images, "
-            f"{self.held_out:,} others held out",
-            *(f"left out   {count:,} {visible(why)}" for why, count in self.left_out.items()),
-        ]
+    @property
+    def confidence(self) -> float:
+        """Confidence of the bounds on precision."""
+        return CONFIDENCE
+
+    @property
+    def classes_in_json(self) -> list[dict[str, Any]]:
+        """Fit of each class, as in JSON."""
+        return [_class_tree(one) for one in self.classes]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the numbers of pictures, and the fit of each class."""
+        yield (
+            f"detector   {self.detector.name}, fitted to {self.fitted_to:,} images, "
+            f"{self.held_out:,} others held out"
+        )
+        yield from (f"left out   {count:,} {why}" for why, count in self.left_out.items())
         for one in self.classes:
-            lines += ["", *_class_lines(one, self.precision)]
+            yield from ("", *_class_lines(one, self.precision))
         if self.card is not None:
-            lines += ["", f"written to {visible(str(self.card))}"]
-        return "\n".join(lines)
+            yield from ("", f"written to {self.card}")
 
 
 def _class_lines(one: ClassFit, precision: float) -> list[str]:
@@ -144,52 +163,96 @@ def _class_tree(one: ClassFit) -> dict[str, Any]:
     }
 
 
-def fit_detector(
-    runs: Sequence[Run | Path | str] | Run | Path | str,
-    labels: Sequence[Path | str] | Path | str,
-    output: Path | str | None = None,
-    *,
-    precision: float = 0.95,
-    calibration: CalibrationKind = "platt",
-    test: Sequence[Run | Path | str] = (),
-    test_labels: Sequence[Path | str] = (),
-    hold_out: float = 0.5,
-    card: Path | str | None = None,
-    detector: str | None = None,
-    kind: str | None = None,
-    class_names: Sequence[str] | Path | str = (),
-    meanings: Mapping[str, str] | None = None,
-    overlap: float = 0.5,
-    date: str = "",
-    overwrite: bool = False,
-    logs: Path | str | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-) -> FittedDetector:
-    """Fit a detector's thresholds and calibrations to labelled boxes.
+@dataclass(frozen=True, slots=True)
+class DetectorFitSettings:
+    """How a detector is fitted to labels, and where the result is written.
 
-    Each class gets the lowest threshold whose one-sided bound on precision is high enough, and a
-    calibration from scores to probabilities. The result is tested on held-out pictures: those of
-    ``test``, or the last ones of each run.
+    Attributes:
+        output: Card to write; may be the same file (default: write none).
+        test: Other runs to test the result on.
+        test_labels: Labelled boxes of each run of --test, in the same order.
+        precision: Required precision.
+        calibration: Calibration from scores to probabilities.
+        hold_out: Last fraction of each run's images, held out to test the result.
+        card: The detector's card (default: the run's).
+        detector: Name of the detector, if the run has several.
+        kind: Format of the labels (default: detected).
+        class_names: Class names, one per line: for YOLO in index order, for VOC and KITTI all
+            classes.
+        meanings: Class that a label of the file or detector counts as; an empty one ignores it.
+        overlap: Min IoU of a correct detection with a label.
+        date: Date of the fit, to record in the card (default: that of the first picture).
+        logs: Folder that the run's logs have moved to; they are recognised by content.
+        limits: Limits for reading the logs.
+        overwrite: Replace another existing card.
+    """
+
+    output: Annotated[Path | str | None, Option(metavar="CARD.toml")] = None
+    _: KW_ONLY
+    test: Annotated[Sequence[Run | Path | str], Option(metavar="RUN")] = ()
+    test_labels: Annotated[Sequence[Path | str], Option(metavar="LABELS")] = ()
+    precision: float = 0.95
+    calibration: CalibrationKind = "platt"
+    hold_out: Annotated[float, Option(metavar="FRACTION")] = 0.5
+    card: Annotated[Path | str | None, Option(metavar="CARD.toml")] = None
+    detector: str | None = None
+    kind: Annotated[LabelFormat | None, Option("--format")] = None
+    class_names: Annotated[Path, Option(metavar="FILE")] | Sequence[str] | str = ()
+    meanings: Meanings = field(default_factory=lambda: MappingProxyType({}))
+    overlap: float = 0.5
+    date: Annotated[str, Option(metavar="DATE")] = ""
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
+    limits: LimitsGiven = DEFAULT_LIMITS
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Check numbers and names.
+
+        Raises:
+            UsageError: A value is out of range.
+        """
+        for name in ("precision", "hold_out"):
+            value: float = getattr(self, name)
+            if not 0.0 < value < 1.0:
+                raise UsageError(f"{name}: {value}, expected above 0 and below 1")
+        if self.calibration not in CALIBRATIONS:
+            names = ", ".join(CALIBRATIONS)
+            raise UsageError(f"calibration: {self.calibration}, expected one of {names}")
+        if not 0.0 < self.overlap <= 1.0:
+            raise UsageError(f"overlap: {self.overlap}, expected above 0, at most 1")
+        if len(self.test_labels) != len(self.test):
+            raise UsageError(
+                f"test_labels: {len(self.test_labels)} for {len(self.test)} runs; expected one for "
+                "each, in the same order"
+            )
+
+
+@keywords(DetectorFitSettings, 2)
+def fit_detector(
+    runs: Annotated[Sequence[Run | Path | str], Option()] | Run | Path | str,
+    labels: Annotated[Sequence[Path | str], Option("--labels")] | Path | str,
+    settings: DetectorFitSettings,
+) -> FittedDetector:
+    """Fit a detector's thresholds and calibration to labels.
+
+    Each class gets the lowest threshold that reaches the required precision. Precision is judged by
+    Clopper and Pearson's one-sided 95 % bound, corrected for the choice among eight thresholds.
+    Each class also gets a calibration, so that a score is the probability that a detection is
+    correct. The last part of each run's images is held out to test the result, unless --test names
+    other runs. A class with too few labelled boxes is reported and keeps its values. The result is
+    written into the detector's card.
+
+    The bounds assume that detections are independent, but those of neighbouring images are not.
+    Therefore, use several drives.
+
+    Examples:
+        crosscue fit detector runs/A-01 --labels labels.json -o my.toml
+        crosscue fit detector runs/* --labels labels/*.json --precision 0.98 -o my.toml
 
     Args:
         runs: Runs with stored, uncalibrated detections of one detector.
-        labels: Labels of each run, in the same order; see ``score_detector``.
-        output: Card to write; None for none.
-        precision: Required precision, in (0, 1).
-        calibration: ``platt``, ``isotonic`` or ``none``.
-        test: Other runs to test the result on.
-        test_labels: Labels of each run of ``test``, in the same order.
-        hold_out: Fraction of each run's pictures, at its end, to hold out if ``test`` is empty.
-        card: Card of the detector, if the run does not name it.
-        detector: Name of the detector, if the runs have several.
-        kind: Format of the labels; default: detected.
-        class_names: Class names of YOLO labels in their order, or a file with one per line.
-        meanings: Class that a class of the labels or of the detector counts as.
-        overlap: Min IoU of a correct detection with a label.
-        date: Date of the fit, for the card; default: the date of the first picture.
-        overwrite: Replace an existing card.
-        logs: Folder that the runs' logs have moved to.
-        limits: Limits for reading the logs.
+        labels: Labelled boxes of each run's images, in the same order.
+        settings: How to fit.
 
     Raises:
         UsageError: A value is out of range, runs have different detectors, or scores are already
@@ -198,65 +261,54 @@ def fit_detector(
         VehicleError: The card cannot be read.
         OutputError: The card cannot be written.
     """
-    _check(precision, calibration, hold_out, overlap)
     given = [runs] if isinstance(runs, Run | Path | str) else list(runs)
     theirs = [labels] if isinstance(labels, Path | str) else list(labels)
-    if len(theirs) != len(given) or len(test_labels) != len(test):
+    if len(theirs) != len(given):
         raise UsageError(
-            f"--labels: {len(theirs)} for {len(given)} runs, --test-labels: {len(test_labels)} for "
-            f"{len(test)}; expected one for each, in the same order"
+            f"labels: {len(theirs)} for {len(given)} runs; expected one for each, in the same order"
         )
-
+    output, card = settings.output, settings.card
     if card is not None:
         # Errors in the card are reported before any run is opened.
         read_card(Path(card))
-    places = [run.path if isinstance(run, Run) else run for run in (*given, *test)]
-    folders = [open_run(place, logs, limits=limits).folder for place in places]
-    listed = class_names_given(class_names)
-    read = [read_box_labels(Path(path), kind, listed) for path in (*theirs, *test_labels)]
+    places = [run.path if isinstance(run, Run) else run for run in (*given, *settings.test)]
+    folders = [open_run(place, settings.logs, limits=settings.limits).folder for place in places]
+    listed = class_names_given(settings.class_names)
+    theirs += settings.test_labels
+    read = [read_box_labels(Path(path), settings.kind, listed) for path in theirs]
     whole = [
-        labelled_run(folder, one, detector, meanings)
+        labelled_run(folder, one, settings.detector, dict(settings.meanings))
         for folder, one in zip(folders, read, strict=True)
     ]
     row = _one_detector(whole)
     source = _card_of(row, card, is_needed=output is not None)
     if output is not None and source is not None:
-        check_place(read_card(source), source, Path(output), overwrite=overwrite)
-    fitted, held = _split(whole[: len(given)], whole[len(given) :], hold_out)
+        check_place(read_card(source), source, Path(output), overwrite=settings.overwrite)
+    fitted, held = _split(whole[: len(given)], whole[len(given) :], settings.hold_out)
     fits = tuple(
         fit_class(
             name,
             whole[0].members[name],
-            fitted.judged(name, overlap),
-            held.judged(name, overlap),
-            precision,
+            fitted.judged(name, settings.overlap),
+            held.judged(name, settings.overlap),
+            settings.precision,
             CONFIDENCE,
-            calibration,
+            settings.calibration,
         )
         for name in _common(whole)
     )
     written = None
     if output is not None and source is not None and any(one.scores for one in fits):
         written = Path(output)
-        counts = f"{len(fitted)} images fitted to, {len(held)} held out"
-        pictures = f"{counts}, of {_log_names(whole)}{_date_of(fitted.runs)}"
-        aim = f"precision {precision:g} with {CONFIDENCE:.0%} confidence"
-        text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, date, aim)
+        numbers = f"{len(fitted)} images fitted to, {len(held)} held out"
+        pictures = f"{numbers}, of {_log_names(whole)}{_date_of(fitted.runs)}"
+        aim = f"precision {settings.precision:g} with {CONFIDENCE:.0%} confidence"
+        text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, settings.date, aim)
         write_text(written, text)
     left_out = sum((Counter(part.left_out) for part in whole), Counter[str]())
     is_whole = all(part.is_whole for part in whole)
-    return FittedDetector(row, fits, precision, len(fitted), len(held), left_out, written, is_whole)
-
-
-def _check(precision: float, calibration: str, hold_out: float, overlap: float) -> None:
-    if not 0.0 < precision < 1.0:
-        raise UsageError(f"--precision {precision}: expected above 0 and below 1")
-    if calibration not in CALIBRATIONS:
-        raise UsageError(f"--calibration {calibration}: expected one of {', '.join(CALIBRATIONS)}")
-    if not 0.0 < hold_out < 1.0:
-        raise UsageError(f"--hold-out {hold_out}: expected above 0 and below 1")
-    if not 0.0 < overlap <= 1.0:
-        raise UsageError(f"--overlap {overlap}: expected above 0, at most 1")
+    counts = len(fitted), len(held), left_out
+    return FittedDetector(row, fits, settings.precision, *counts, written, is_whole)
 
 
 def _one_detector(parts: Sequence[LabelledRun]) -> DetectorRow:
@@ -284,7 +336,7 @@ def _card_of(row: DetectorRow, card: Path | str | None, *, is_needed: bool) -> P
     if row.kind in names():
         return card_path(row.kind)
     if is_needed:
-        raise UsageError(f"-o: {row.name} has no model card; name one with --card, or omit -o")
+        raise UsageError(f"card: {row.name} has no model card; name one, or omit the output")
     return None
 
 

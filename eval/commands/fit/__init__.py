@@ -1,1 +1,0 @@
-"""``crosscue fit ...``: fit sensors, detectors and beliefs to drives."""

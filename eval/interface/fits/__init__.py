@@ -1,1 +1,0 @@
-"""Fit sensors, detectors, ranges and beliefs to drives."""
