@@ -82,19 +82,6 @@ from crosscue.eval.interface.models.cards import check_card as check_card
 from crosscue.eval.interface.models.cards import draft_card as draft_card
 from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
 from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
-from crosscue.eval.interface.studies.drive import StudyDrive as StudyDrive
-from crosscue.eval.interface.studies.drive import run_study_drive as run_study_drive
-from crosscue.eval.interface.studies.intersections import IntersectionResult as IntersectionResult
-from crosscue.eval.interface.studies.intersections import (
-    run_intersection_study as run_intersection_study,
-)
-from crosscue.eval.interface.studies.layouts import LayoutResult as LayoutResult
-from crosscue.eval.interface.studies.layouts import run_layout_study as run_layout_study
-from crosscue.eval.interface.studies.town import FieldResult as FieldResult
-from crosscue.eval.interface.studies.town import StudyResult as StudyResult
-from crosscue.eval.interface.studies.town import calibrate_study as calibrate_study
-from crosscue.eval.interface.studies.town import run_field_study as run_field_study
-from crosscue.eval.interface.studies.town import run_study as run_study
 from crosscue.eval.interface.truth import truth_from_gnss as truth_from_gnss
 from crosscue.eval.interface.truth import truth_schema as truth_schema
 from crosscue.eval.interface.truth import write_truth as write_truth
@@ -121,8 +108,14 @@ from crosscue.eval.pipeline.run import load_vehicle as load_vehicle
 from crosscue.eval.pipeline.run import open_run as open_run
 from crosscue.eval.pipeline.run import run_schema as run_schema
 from crosscue.eval.recording.view import save_recording as save_recording
+from crosscue.eval.studies.intersections.run import run_intersection_study as run_intersection_study
 from crosscue.eval.studies.intersections.settings import IntersectionStudy as IntersectionStudy
+from crosscue.eval.studies.layouts.run import run_layout_study as run_layout_study
 from crosscue.eval.studies.layouts.settings import LayoutStudy as LayoutStudy
+from crosscue.eval.studies.town.field_study import run_field_study as run_field_study
+from crosscue.eval.studies.town.replayed import run_study_drive as run_study_drive
+from crosscue.eval.studies.town.run import run_landmark_study as run_landmark_study
+from crosscue.eval.studies.town.run import run_range_study as run_range_study
 from crosscue.eval.studies.town.settings import FieldStudy as FieldStudy
 from crosscue.eval.studies.town.settings import LandmarkStudy as LandmarkStudy
 from crosscue.eval.studies.town.settings import RangeStudy as RangeStudy

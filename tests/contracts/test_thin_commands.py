@@ -25,15 +25,6 @@ CALLS: Final = {
     "browse": ("browse",),
     "export": ("export",),
     "truth from-gnss": ("truth_from_gnss",),
-    "study range": (
-        "run_study",
-        "calibrate_study",
-    ),
-    "study landmarks": ("run_study",),
-    "study field": ("run_field_study",),
-    "study drive": ("run_study_drive",),
-    "study intersections": ("run_intersection_study",),
-    "study layouts": ("run_layout_study",),
     "model init": ("draft_card",),
     "model check": ("check_card",),
 }

@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
 import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.command_line import Call, fill, with_options
-from crosscue.eval.terminal import print_found
+from crosscue.eval.terminal import print_found, watched
 from crosscue.replay.errors import UsageError
-from crosscue.results import Result, json_key
+from crosscue.replay.progress import emit
+from crosscue.results import Result, json_key, plain
 from crosscue.verb import HIDDEN, Option, compared, keywords
 
 
@@ -134,6 +136,7 @@ def test_help_comes_from_the_docstrings() -> None:
     )
     assert "width of a box, in percent of nothing; 100 % of it" in text
     assert "(default: 2.5)" in text
+    assert "number of workers (default: 1)" in text
     assert "--width-m M" in text
     assert "--colour {red,blue}" in text
     assert "--from L" in text
@@ -155,6 +158,29 @@ def test_errors_about_arguments_name_options(words: str, message: str) -> None:
         call(args)
 
     assert with_options(str(error.value), parser) == message
+
+
+def test_value_with_commas_is_named_with_its_option() -> None:
+    _, parser, _ = parsed("a")
+
+    assert with_options("label: 1,2, expected x,y", parser) == "--from 1,2: expected x,y"
+
+
+def test_message_of_the_work_leaves_json_on_stdout_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for has_json, quiet in ((False, False), (True, False), (False, True)):
+        with watched(argparse.Namespace(json=has_json, quiet=quiet)):
+            emit("step 1")
+
+    assert capsys.readouterr() == ("step 1\n", "step 1\n")
+
+
+def test_arrays_of_numpy_are_lists_in_json() -> None:
+    assert plain({"xy_m": np.array([1.0, 2.0]), "count": np.int64(3)}) == {
+        "xy_m": [1.0, 2.0],
+        "count": 3,
+    }
 
 
 def test_function_takes_fields_of_its_record_as_keywords() -> None:

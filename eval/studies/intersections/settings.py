@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED
 from crosscue.replay.errors import UsageError
+from crosscue.verb import Option
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,20 +23,22 @@ class IntersectionStudy:
     """Settings of the study of intersections.
 
     Attributes:
-        layouts: Names of the layouts.
-        runs: Number of drives per layout.
-        seed: Seed of everything that differs between runs.
-        width_px: Width of the pictures; the height is 9/16 of it.
-        vehicle: Vehicle file to replay with; default: that of each drive.
-        detectors: Comma-separated names, as for ``crosscue replay``.
+        layouts: Comma-separated layouts, A to H (default: all).
+        runs: Runs per layout.
+        seed: Random seed.
+        width_px: Image width in pixels; height is 9/16.
+        vehicle: Vehicle file (default: that of each drive).
+        detectors: Comma-separated names.
     """
 
-    layouts: tuple[str, ...] = tuple(SCORED)
-    runs: int = 10
+    layouts: Annotated[
+        tuple[str, ...], Option(metavar="NAMES", convert=_names, is_one_word=True)
+    ] = tuple(SCORED)
+    runs: Annotated[int, Option(metavar="N")] = 10
     seed: int = 0
-    width_px: int = 1280
+    width_px: Annotated[int, Option("--width")] = 1280
     vehicle: Path | None = None
-    detectors: str = EMBEDDED
+    detectors: Annotated[str, Option(metavar="NAMES")] = EMBEDDED
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -43,7 +51,9 @@ class IntersectionStudy:
                 f"runs {self.runs}, seed {self.seed}: expected 1 or more runs, a seed of 0 or more"
             )
         if not 64 <= self.width_px <= 3840 or self.width_px % 16:
-            raise UsageError(f"width {self.width_px}: expected a multiple of 16 from 64 to 3840")
+            raise UsageError(
+                f"width_px: {self.width_px}, expected a multiple of 16 from 64 to 3840"
+            )
         unknown = [name for name in self.layouts if name not in SCORED]
         if unknown or len(set(self.layouts)) != len(self.layouts) or not self.layouts:
             raise UsageError(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
 
 from crosscue.datasets.scenes.layout import KINDS, mixed_layout
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.replay.errors import UsageError
+from crosscue.verb import Option
 
 MIN_FOLDS: Final = 2
 Perception = Literal["pixels", "faults"]
@@ -22,21 +23,20 @@ class LayoutStudy:
     once, so a fold consists of complete blocks.
 
     Attributes:
-        perception: ``pixels``: the embedded networks process rendered photographs. ``faults``: no
-            network runs, and ``faulty_labels`` adds faults to the renderer's masks.
-        blocks: Number of blocks of thirteen layouts.
-        runs: Number of drives per layout, under different conditions.
-        folds: Number of folds; each is tested with fits to the others.
-        seed: Seed of everything that differs between runs.
-        width_px: Width of the pictures; the height is 9/16 of it.
+        perception: Detections from networks on pixels, or from simulated faults.
+        blocks: Blocks of thirteen layouts.
+        runs: Drives per layout.
+        folds: Folds, by layout.
+        seed: Random seed.
+        width_px: Image width in pixels; height is 9/16.
     """
 
     perception: Perception = "pixels"
     blocks: int = 8
-    runs: int = 2
+    runs: Annotated[int, Option(metavar="N")] = 2
     folds: int = 4
     seed: int = 0
-    width_px: int = 960
+    width_px: Annotated[int, Option("--width")] = 960
 
     def __post_init__(self) -> None:
         """Check the values.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.vehicle.cue_table import groups
 
 from .beliefs import (
@@ -19,28 +20,20 @@ from .drives import StudyDrive
 from .learning import Learned, learn, lessons_of
 from .score import DriveBelief, LayoutDifference, LayoutScores, difference, score_layouts
 
-OnStep = Callable[[str, int, int], None]
 
-
-def score_study(
-    drives: Sequence[StudyDrive],
-    *,
-    ablation: bool = True,
-    on_step: OnStep = lambda what, done, of: None,
-) -> LayoutScores:
+def score_study(drives: Sequence[StudyDrive], *, ablation: bool = True) -> LayoutScores:
     """Score the drives of each fold with beliefs fitted to the other folds, then run ablations.
 
     Args:
         drives: Finished drives.
         ablation: True to also leave out each cue and each rule.
-        on_step: Called with the name of the current step, the amount done, and the total.
     """
     lessons = lessons_of(drives)
     folds = sorted({one.fold for one in drives})
     learned = {}
     for done, fold in enumerate(folds, 1):
         learned[fold] = learn([one for one in drives if one.fold != fold], lessons)
-        on_step("folds", done, len(folds))
+        emit(Progress("learning", done, len(folds), "folds"))
 
     def of_kind(kind: str) -> list[DriveBelief]:
         return _all(
@@ -50,7 +43,7 @@ def score_study(
                 with_fusion(one, learned[one.fold].fusions[kind]),
                 learned[one.fold].base_rates,
             ),
-            lambda done, of: on_step(kind, done, of),
+            f"scoring {kind}",
         )
 
     kinds = {kind: of_kind(kind) for kind in KINDS}
@@ -66,8 +59,8 @@ def score_study(
     for done, (group, some) in enumerate(groups().items() if ablation else (), 1):
         left = without(frozenset(cue.name for cue in some))
         cues[group] = difference(kinds[EVERYWHERE], left)
-        on_step("cues", done, len(groups()))
-    rules = _by_rule(drives, learned, on_step) if ablation else {}
+        emit(Progress("leaving out cues", done, len(groups()), "cues"))
+    rules = _by_rule(drives, learned) if ablation else {}
     return LayoutScores(
         {kind: score_layouts(some) for kind, some in kinds.items()},
         {
@@ -89,7 +82,7 @@ def score_study(
 
 
 def _by_rule(
-    drives: Sequence[StudyDrive], learned: Mapping[int, Learned], on_step: OnStep
+    drives: Sequence[StudyDrive], learned: Mapping[int, Learned]
 ) -> dict[str, list[DriveBelief]]:
     return {
         rule: _all(
@@ -97,9 +90,7 @@ def _by_rule(
             lambda one, rule=rule: believed(  # type: ignore[misc]
                 one, with_rules(one, rule or None), learned[one.fold].base_rates
             ),
-            lambda done, of, rule=rule: on_step(  # type: ignore[misc]
-                f"without {rule or 'nothing'}", done, of
-            ),
+            f"without {rule or 'nothing'}",
         )
         for rule in ("", *RULES)
     }
@@ -108,10 +99,10 @@ def _by_rule(
 def _all(
     drives: Sequence[StudyDrive],
     belief_of: Callable[[StudyDrive], DriveBelief],
-    on_drive: Callable[[int, int], None],
+    doing: str,
 ) -> list[DriveBelief]:
     found = []
     for done, one in enumerate(drives, 1):
         found.append(belief_of(one))
-        on_drive(done, len(drives))
+        emit(Progress(doing, done, len(drives), "drives"))
     return found

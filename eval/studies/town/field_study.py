@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
 import numpy as np
 
@@ -25,11 +25,15 @@ from crosscue.eval.studies.words import percent
 from crosscue.localization.town.drive import Traced
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import RunError, door, json_tree, strict_json, write_text
+from crosscue.replay.base import RunError, UsageError, door, json_tree, strict_json, write_text
 from crosscue.replay.processes import in_processes
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import Result
+from crosscue.verb import Option
 
 from .range_study import implied_m
-from .settings import FieldStudy
+from .settings import FieldStudy, study_of
+from .work import workers_of
 
 SUMMARY: Final = "summary.json"
 PAGE: Final = "study.html"
@@ -127,6 +131,110 @@ class _Job:
     name: str
     number: int
     has_landmarks: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FieldResult(Result):
+    """Results of the simulated field protocol; its repr is tables with the published numbers.
+
+    Attributes:
+        folder: Folder of runs, picture and page.
+        runs: Outcome of each run.
+        tables: Results as text.
+    """
+
+    folder: Path
+    runs: tuple[FieldRun, ...]
+    tables: tuple[Table, ...]
+
+    @property
+    def page(self) -> Path:
+        """The page with tables and picture."""
+        return self.folder / PAGE
+
+    @property
+    def exit_status(self) -> int:
+        """0, or 3 when something of a run's log was dropped."""
+        return 0 if all(one.is_whole for one in self.runs) else 3
+
+    def as_dict(self) -> list[dict[str, object]]:
+        """Return the JSON output of ``crosscue study field``: a record for each run."""
+        return [asdict(one) for one in self.runs]
+
+    def lines(self) -> Iterator[str]:
+        """Yield the tables, notes on them, and the path of the page."""
+        yield "\n\n".join(table.as_text() for table in self.tables)
+        yield from ("", *NOTES)
+        yield f"\npage       {self.page}"
+
+
+def field_study_of(
+    *,
+    settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
+    seed: int | None = None,
+    range_runs: int | None = None,
+    landmark_runs: int | None = None,
+    minutes: Annotated[float | None, Option(metavar="M")] = None,
+) -> FieldStudy:
+    """Return the settings of a study of the field protocol.
+
+    Args:
+        settings: Settings of your own study.
+        seed: Random seed.
+        range_runs: Runs without landmarks.
+        landmark_runs: Runs with landmarks.
+        minutes: Max duration of a run, in minutes.
+    """
+    return study_of(
+        FieldStudy,
+        settings,
+        seed=seed,
+        range_runs=range_runs,
+        landmark_runs=landmark_runs,
+        minutes=minutes,
+    )
+
+
+def run_field_study(
+    study: Annotated[FieldStudy, Option(made_by=field_study_of)],
+    output: Path | str = "study-field",
+    *,
+    workers: int | None = None,
+    overwrite: bool = False,
+) -> FieldResult:
+    """Simulate the field protocol: drives to successive goals, written as logs.
+
+    The town has 1 km2. There are 33 range runs without landmarks, and 10 runs with at most one
+    landmark at a time. Each lasts up to 75 minutes, with a compass of 25 degrees. Each run is a
+    log, a vehicle file and a truth file, replayed and scored by the same code as a real drive;
+    crosscue view shows it. An interrupted study continues with the missing runs. A run takes
+    between seconds and a minute to compute.
+
+    Examples:
+        crosscue study field -o field
+        crosscue study field --range-runs 4 --landmark-runs 2 --minutes 20 -o field
+        crosscue replay field/range_000/drive.mcap --vehicle field/range_000/vehicle.toml -o again
+
+    Args:
+        study: Settings of the study.
+        output: Folder for drives, summary, figures and page.
+        workers: Number of threads (default: all cores).
+        overwrite: Replace existing results of another study.
+
+    Raises:
+        UsageError: A value is out of range, or the study has no runs.
+        RunError: The folder contains another study's results.
+    """
+    from .replayed import through_log
+
+    if not study.range_runs + study.landmark_runs:
+        raise UsageError("study field: no runs; set --range-runs or --landmark-runs")
+    folder, runs = Path(output), []
+    driven = drive_field(study, folder, workers_of(workers), through_log, overwrite=overwrite)
+    for done, one in driven:
+        runs.append(one)
+        emit(Progress("driving and replaying", 100.0 * done, 100.0, "percent"))
+    return FieldResult(folder, tuple(runs), finish_field(study, runs, folder))
 
 
 def drive_field(

@@ -6,18 +6,26 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal, overload
 
 from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.page import Table, write_page
+from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.words import km, percent
-from crosscue.localization.town.drive import Result
+from crosscue.localization.town.drive import Result as DriveResult
+from crosscue.localization.town.drive import drive_traced
 from crosscue.replay.base import RunError, door, json_tree, strict_json, write_text
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import Result
+from crosscue.verb import Option
 
-from . import landmark_figure, landmark_study, range_figure, range_study
+from . import drive_figure, landmark_figure, landmark_study, range_figure, range_study
 from .cases import split
-from .settings import LandmarkStudy, RangeStudy
-from .work import DRIVES, assemble, chunks_of, run
+from .settings import LandmarkStudy, RangeStudy, study_of
+from .work import DRIVES, assemble, chunks_of, run, workers_of
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 SUMMARY: Final = "summary.json"
 PAGE: Final = "study.html"
@@ -42,6 +50,201 @@ class Made:
     folder: Path
     tables: tuple[Table, ...]
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class StudyResult(StoredResult):
+    """A finished study; its repr is tables with the published numbers.
+
+    Attributes:
+        study: Settings of the study.
+        made: Folder, tables as text, and notes on them.
+    """
+
+    study: RangeStudy | LandmarkStudy
+    made: Made
+
+    @property
+    def folder(self) -> Path:
+        """Folder of drives, figures and page."""
+        return self.made.folder
+
+    @property
+    def stored(self) -> Path:
+        """Its summary."""
+        return self.folder / SUMMARY
+
+    @property
+    def page(self) -> Path:
+        """The page with tables and figures."""
+        return self.folder / PAGE
+
+    @property
+    def drives(self) -> pa.Table:
+        """Table with one row per drive."""
+        return RunFolder(self.folder).table(DRIVES)
+
+    def draw_drive(self, row: int) -> Path:
+        """Draw the drive of a row of ``drives``; return the picture in the study's folder."""
+        drives = self.drives
+        settings = self.study.cases()[drives["case"][row].as_py()].settings
+        seed = drives["seed"][row].as_py()
+        return drive_figure.draw(settings, drive_traced(settings, seed), seed, self.folder)
+
+    def lines(self) -> Iterator[str]:
+        """Yield the tables, notes on them, and the paths of the page and the drives."""
+        yield "\n\n".join(table.as_text() for table in self.made.tables)
+        yield from ("", *self.made.notes)
+        yield f"\npage       {self.page}\ndrives     {self.folder / 'drives.parquet'}"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Calibration(Result):
+    """The compass interval with which the mean range equals the published one.
+
+    Attributes:
+        compass_interval_m: Distance between two independent readings.
+    """
+
+    compass_interval_m: float
+
+    def lines(self) -> Iterator[str]:
+        """Yield the setting of a study file."""
+        yield f"[drive.sensors]\ncompass_interval_m = {self.compass_interval_m:.4f}"
+
+
+def range_study_of(
+    *,
+    settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
+    seed: int | None = None,
+    drives: int | None = None,
+) -> RangeStudy:
+    """Return the settings of a study of the range.
+
+    Args:
+        settings: Settings of your own study.
+        seed: Random seed.
+        drives: Drives per combination.
+    """
+    return study_of(RangeStudy, settings, seed=seed, drives=drives)
+
+
+def landmark_study_of(
+    *,
+    settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
+    seed: int | None = None,
+    drives: int | None = None,
+) -> LandmarkStudy:
+    """Return the settings of a study of landmarks.
+
+    Args:
+        settings: Settings of your own study.
+        seed: Random seed.
+        drives: Drives per combination.
+    """
+    return study_of(LandmarkStudy, settings, seed=seed, drives=drives)
+
+
+@overload
+def run_range_study(
+    study: RangeStudy,
+    output: Path | str = ...,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    overwrite: bool = False,
+) -> StudyResult: ...
+@overload
+def run_range_study(
+    study: RangeStudy, *, workers: int | None = None, calibrate: Literal[True]
+) -> Calibration: ...
+def run_range_study(
+    study: Annotated[RangeStudy, Option(made_by=range_study_of)],
+    output: Path | str = "study-range",
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    overwrite: bool = False,
+    calibrate: bool = False,
+) -> StudyResult | Calibration:
+    """Measure the range without landmarks on 4,000 simulated drives.
+
+    There are drives with three compasses and with none. Each goes from goal to goal until its
+    2-sigma ellipse is longer than 100 m. Results are shown next to the published ones. An
+    interrupted study continues where it stopped. The result does not depend on the number of
+    workers.
+
+    Examples:
+        crosscue study range -o range
+        crosscue study range --drives 50 --workers 2
+        crosscue study range --settings my_car.toml -o mine
+        crosscue study range --calibrate
+
+    Args:
+        study: Settings of the study.
+        output: Folder for drives, summary, figures and page.
+        workers: Number of threads (default: all cores).
+        ray: Run on a Ray cluster: its address, auto, or local.
+        overwrite: Replace existing results of another study.
+        calibrate: Find the compass interval that yields the published 9.3 km at 30 degrees, with
+            separate seeds, instead of running the study.
+
+    Raises:
+        UsageError: A value is out of range.
+        RunError: The folder contains another study's results.
+    """
+    if calibrate:
+        return Calibration(range_study.calibrate(study.drive, workers_of(workers)))
+    folder = _driven(study, Path(output), workers, ray, overwrite=overwrite)
+    return StudyResult(study, finish_range(study, folder))
+
+
+def run_landmark_study(
+    study: Annotated[LandmarkStudy, Option(made_by=landmark_study_of)],
+    output: Path | str = "study-landmarks",
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    overwrite: bool = False,
+) -> StudyResult:
+    """Measure the success rate of 3 strategies with landmarks.
+
+    The study has 52,500 drives, 700 for each of 5 landmark densities and 5 detection rates. It
+    reports the success rate by distance to the goal, the range at 80 % success, and how much
+    farther the strategies drive, next to the published numbers. An interrupted study continues
+    where it stopped. The result does not depend on the number of workers.
+
+    Examples:
+        crosscue study landmarks -o landmarks
+        crosscue study landmarks --drives 50 --workers 2
+        crosscue study landmarks --settings my_car.toml -o mine
+
+    Args:
+        study: Settings of the study.
+        output: Folder for drives, summary, figures and page.
+        workers: Number of threads (default: all cores).
+        ray: Run on a Ray cluster: its address, auto, or local.
+        overwrite: Replace existing results of another study.
+
+    Raises:
+        UsageError: A value is out of range.
+        RunError: The folder contains another study's results.
+    """
+    folder = _driven(study, Path(output), workers, ray, overwrite=overwrite)
+    return StudyResult(study, finish_landmarks(study, folder))
+
+
+def _driven(
+    study: RangeStudy | LandmarkStudy,
+    folder: Path,
+    workers: int | None,
+    ray: str | None,
+    *,
+    overwrite: bool,
+) -> Path:
+    for done in drive_study(study, folder, workers_of(workers), ray, overwrite=overwrite):
+        emit(Progress("driving", 100.0 * done, 100.0, "percent"))
+    return folder
 
 
 def drive_study(
@@ -213,7 +416,7 @@ def _finish(
         "notes": notes,
         "results": results,
         **more,
-        "columns": ["case", "drive", "seed", *Result._fields],
+        "columns": ["case", "drive", "seed", *DriveResult._fields],
     }
     write_page(folder / PAGE, f"{title}: simulated study", notes, tables, pictures)
     write_text(folder / SUMMARY, strict_json(summary) + "\n")

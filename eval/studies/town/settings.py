@@ -20,7 +20,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Drive, Proportion
-from crosscue.replay.base import StudyFileError, read_at_most, toml_tree
+from crosscue.replay.base import StudyFileError, UsageError, read_at_most, toml_tree
 from crosscue.replay.vehicle.section import Section, tuples
 from crosscue.replay.vehicle.validation_errors import explain
 
@@ -237,6 +237,28 @@ def load_study(path: Path, kind: type[Study]) -> Study:
         return TypeAdapter(kind).validate_python(tuples(tree))
     except ValidationError as error:
         raise StudyFileError(explain(error, text, str(path), kind)) from None
+
+
+def study_of(kind: type[Study], settings: Path | None, **given: object) -> Study:
+    """Return the settings of a file or of the published study, with others in their place.
+
+    Args:
+        kind: Kind of the study.
+        settings: The file; None for the published study.
+        given: The settings to replace; None for none.
+
+    Raises:
+        UsageError: A value is out of range.
+        StudyFileError: The file is not valid.
+    """
+    study = kind() if settings is None else load_study(settings, kind)
+    changed = {name: value for name, value in given.items() if value is not None}
+    try:
+        return kind.model_validate({**dict(study), **changed})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0])
+        raise UsageError(f"{name}: {changed.get(name)}, {first['msg'].lower()}") from None
 
 
 def _misfit(why: str, given: object, *keys: str) -> ValidationError:

@@ -91,9 +91,15 @@ def chunks_of(cases: Sequence[Case], drives: int, study_seed: int) -> list[Chunk
     ]
 
 
-def default_workers() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+def workers_of(workers: int | None) -> int:
+    """Return the number of workers, by default one for each core that this process may use.
+
+    Raises:
+        UsageError: The number is below 1.
+    """
+    if workers is not None and workers < 1:
+        raise UsageError(f"workers: {workers}, expected 1 or more")
+    return workers or len(os.sched_getaffinity(0))
 
 
 def run(

@@ -10,8 +10,8 @@ import pytest
 
 from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
-from crosscue.eval.interface.studies import intersections as study_intersections
 from crosscue.eval.studies import simulated_drives
+from crosscue.eval.studies.intersections import run as study_intersections
 from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_table import groups
 from crosscue.replay.vehicle.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
 from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import exit_status_of
-from crosscue.eval.studies.layouts.drives import open_drive
-from crosscue.eval.studies.layouts.report import (
-    LayoutFiles,
-    LayoutScores,
-    tables_of,
-    write_layout_study,
-)
-from crosscue.eval.studies.layouts.settings import LayoutStudy, Perception
-from crosscue.eval.studies.layouts.study import OnStep, score_study
+from crosscue.eval.batch.jobs import Done, exit_status_of
+from crosscue.eval.pipeline.outcome import Outcome
+from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
-from crosscue.replay.base import RunError, door, json_tree
+from crosscue.replay.base import RunError
+from crosscue.verb import Option
+
+from .drives import open_drive
+from .report import LayoutFiles, LayoutScores, tables_of, write_layout_study
+from .settings import LayoutStudy, Perception
+from .study import score_study
 
 SEEN_BY: Final = {
     "pixels": SPARSE_AND_EMBEDDED,
@@ -30,57 +30,69 @@ IN_WORDS: Final = {"pixels": "perceived by networks", "faults": "simulated detec
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class LayoutResult:
+class LayoutResult(StoredResult):
     """Scores of beliefs on layouts that they were not fitted to; its repr is tables.
 
     Attributes:
         perception: Source of detections, ``pixels`` or ``faults``.
         scores: Scores of each belief, and of its ablations of cues and rules.
         files: The page, and its tables as JSON.
-        failures: Reasons by name of the drives that failed.
-        exit_status: 0 if all drives are complete; 3 if a drive failed or something was dropped.
+        drives: Outcome of each drive.
     """
 
     perception: Perception
     scores: LayoutScores
     files: LayoutFiles
-    failures: dict[str, str]
-    exit_status: int
+    drives: tuple[Done[Outcome], ...]
 
-    def as_dict(self) -> object:
-        """Return the JSON output of ``crosscue study layouts``: the tables in its folder."""
-        return json_tree(door.read(self.files.tables))
+    @property
+    def exit_status(self) -> int:
+        """0 if all drives are complete; 3 if a drive failed or something was dropped."""
+        return exit_status_of(self.drives)
 
-    def __repr__(self) -> str:
-        parts = [
+    @property
+    def stored(self) -> Path:
+        """Its tables as JSON."""
+        return self.files.tables
+
+    def lines(self) -> Iterator[str]:
+        """Yield the tables."""
+        yield (
             f"{self.scores.drives} simulated drives over {self.scores.layouts} layouts, "
-            f"{IN_WORDS[self.perception]}",
-            *(f"  failed {name}: {why}" for name, why in self.failures.items()),
-            *("\n" + table.as_text() for table in tables_of(self.scores)),
-            f"\nwritten to {self.files.page}",
-        ]
-        return "\n".join(parts)
+            f"{IN_WORDS[self.perception]}"
+        )
+        yield from (f"  failed {name}: {why}" for name, why in _failures(self.drives).items())
+        yield from ("\n" + table.as_text() for table in tables_of(self.scores))
+        yield f"\nwritten to {self.files.page}"
+
+
+def _failures(drives: tuple[Done[Outcome], ...]) -> dict[str, str]:
+    return {one.job.name: one.error for one in drives if one.error is not None}
 
 
 def run_layout_study(
     study: LayoutStudy,
     output: Path | str,
-    workers: int = 1,
     *,
-    ablation: bool = True,
-    on_step: OnStep = lambda what, done, of: None,
+    workers: int = 1,
+    ablation: Annotated[bool, Option("--no-ablation")] = True,
 ) -> LayoutResult:
-    """Simulate every drive, find its cues, and score beliefs by cross-validation over layouts.
+    """Fit beliefs to random simulated layouts, and test them on other layouts.
 
-    An interrupted study continues with the missing drives. Drives are kept, so that beliefs can be
-    scored again in minutes.
+    There are thirteen kinds of layouts, five of them without an intersection. Every drive is
+    rendered and processed by the embedded networks, and each belief is scored on layouts that it
+    was not fitted to. With --perception faults, no network runs: the renderer's masks are used,
+    with simulated faults. Writes study.html and study.json. A second start processes only the
+    missing drives.
+
+    Example:
+        crosscue study layouts -o layouts --workers 2
 
     Args:
-        study: ``LayoutStudy()``, with any fields changed.
+        study: Settings of the study.
         output: Folder for drives, runs, tables and page.
         workers: Number of drives in parallel.
-        ablation: Run an ablation of each cue and each rule.
-        on_step: Called with the name of the current step, the amount done, and the total.
+        ablation: Skip the ablation of cues and rules.
 
     Raises:
         UsageError: ``workers`` is below 1.
@@ -96,7 +108,7 @@ def run_layout_study(
         engine_of(workers, None),
         imager=imager,
     )
-    failures = {one.job.name: one.error for one in done if one.error is not None}
+    failures = _failures(done)
     drives = [
         open_drive(
             folder,
@@ -112,6 +124,6 @@ def run_layout_study(
     if len(folds) < study.folds:
         first = next(iter(failures.items()))
         raise RunError(f"{folder}: all drives of a fold failed; the first: {': '.join(first)}")
-    scores = score_study(drives, ablation=ablation, on_step=on_step)
+    scores = score_study(drives, ablation=ablation)
     files = write_layout_study(folder, study, scores, failures)
-    return LayoutResult(study.perception, scores, files, failures, exit_status_of(done))
+    return LayoutResult(study.perception, scores, files, done)

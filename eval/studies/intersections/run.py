@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from crosscue.detectors.registry import check, chosen
 from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import Done, exit_status_of
-from crosscue.eval.drives.replay import choices_for
+from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.studies.intersections.report import StudyFiles, summary, write_study
-from crosscue.eval.studies.intersections.settings import IntersectionStudy
-from crosscue.eval.studies.intersections.study import score_study
-from crosscue.eval.studies.intersections.tables import StudyScores
+from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import run_drives
-from crosscue.replay.base import RunError, door, json_tree, visible
+from crosscue.replay.base import RunError
 from crosscue.replay.vehicle.vehicle import vehicle_given
+from crosscue.verb import Option
+
+from .report import StudyFiles, summary, write_study
+from .settings import IntersectionStudy
+from .study import score_study
+from .tables import StudyScores
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class IntersectionResult:
+class IntersectionResult(StoredResult):
     """Results of the simulated experiment; its repr is tables with the published numbers.
 
     Attributes:
@@ -37,33 +43,39 @@ class IntersectionResult:
         """0 if all drives are complete; 3 if a drive failed or something was dropped."""
         return exit_status_of(self.drives)
 
-    def as_dict(self) -> object:
-        """Return the JSON output of ``crosscue study intersections``: the tables in its folder."""
-        return json_tree(door.read(self.files.tables))
+    @property
+    def stored(self) -> Path:
+        """Its tables as JSON."""
+        return self.files.tables
 
-    def __repr__(self) -> str:
-        text = summary(self.drives, self.scored, self.files)
-        return "\n".join(map(visible, text.split("\n")))
+    def lines(self) -> Iterator[str]:
+        """Yield the tables."""
+        yield summary(self.drives, self.scored, self.files)
 
 
 def run_intersection_study(
     study: IntersectionStudy,
     output: Path | str,
-    workers: int = 1,
     *,
+    workers: int = 1,
     ray: str | None = None,
-    attribution: bool = True,
+    attribution: Annotated[bool, Option("--no-attribution")] = True,
 ) -> IntersectionResult:
-    """Simulate every drive of a study, replay it from its pictures, and score it.
+    """Repeat the published experiment on simulated drives, and compare results.
 
-    An interrupted study continues with the missing drives.
+    Simulates each drive, replays it from its pictures with the embedded detectors, scores it, and
+    writes study.html, study.json and score/metrics.json. Distances, cues and beliefs are shown next
+    to the published ones. A second start processes only the missing drives.
+
+    Example:
+        crosscue study intersections -o study --runs 10 --workers 2
 
     Args:
-        study: ``IntersectionStudy()``, with any fields changed.
+        study: Settings of the study.
         output: Folder for drives, runs, tables and page.
         workers: Number of drives in parallel.
-        ray: Address of a Ray cluster that shares ``output``.
-        attribution: Run an ablation of each cue.
+        ray: Run on a Ray cluster that shares DIR: its address, auto, or local.
+        attribution: Skip the ablation of each cue.
 
     Raises:
         UsageError: ``workers`` is below 1, or a detector does not exist.
@@ -71,7 +83,9 @@ def run_intersection_study(
         RunError: Every drive failed; the message contains the first reason.
         OutputError: A file cannot be written.
     """
-    choices_for(vehicle_given(study.vehicle), study.detectors.split(","))
+    vehicle = vehicle_given(study.vehicle)
+    for choice in chosen(study.detectors.split(","), choices_of(vehicle)):
+        check(choice)
     folder = Path(output)
     done = run_drives(
         folder,

@@ -1,1 +1,0 @@
-"""``crosscue study ...``: simulated studies."""
