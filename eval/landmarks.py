@@ -5,10 +5,10 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
 
 from crosscue.eval.fit.landmarks.database import (
     AddCounts,
@@ -46,18 +46,15 @@ class AddedLandmarks(Result):
         is_whole: True if nothing of the log was dropped.
     """
 
-    path: Path
-    counts: AddCounts
-    is_whole: bool = True
+    path: Path = field(metadata=json_key("database"))
+    counts: AddCounts = field(metadata=HIDDEN)
+    is_whole: bool = field(metadata=HIDDEN, default=True)
+    also: ClassVar = {one.name: f"counts.{one.name}" for one in fields(AddCounts)}
 
     @property
     def exit_status(self) -> int:
         """0, or 3 when something of the log was dropped."""
         return 0 if self.is_whole else 3
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue landmarks add``."""
-        return {"database": visible(str(self.path)), **asdict(self.counts)}
 
     def lines(self) -> Iterator[str]:
         """Yield the numbers of pictures."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, overload
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, overload
 
 from crosscue.detectors.training.summary import measured_text, measured_tree
 from crosscue.eval.training.inputs import Device, check_place
 from crosscue.replay.base import UsageError
 from crosscue.replay.files.made_of import made_of
 from crosscue.replay.progress import Progress, emit
-from crosscue.results import Result
+from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
 if TYPE_CHECKING:
@@ -128,12 +128,13 @@ class MeasuredMaskRcnn(Result):
 
     network: str
     pictures: int
-    by_proposals: dict[int, Measured]
+    by_proposals: dict[int, Measured] = field(metadata=HIDDEN)
+    also: ClassVar = {"measured": "measured"}
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the JSON output of ``crosscue train mask-rcnn --measure``."""
-        measured = [measured_tree(count, reached) for count, reached in self.by_proposals.items()]
-        return {"network": self.network, "pictures": self.pictures, "measured": measured}
+    @property
+    def measured(self) -> list[dict[str, Any]]:
+        """What was measured with each number of proposals."""
+        return [measured_tree(count, reached) for count, reached in self.by_proposals.items()]
 
     def lines(self) -> Iterator[str]:
         """Yield a table for each number of proposals."""
