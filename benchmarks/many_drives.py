@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -290,4 +291,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    # Worker processes cannot import functions of ``__main__``.
+    import_module("many_drives").main()

@@ -7,26 +7,19 @@ too. The standard library's pool would lose every drive in progress.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-import signal
-import sys
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pickle import PicklingError
-from types import FrameType
-from typing import Any, Final, NoReturn
+from typing import Any, Final
+
+from crosscue.replay.processes import Worker, stop
 
 from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
 
 TICK_S: Final = 1.0
-GRACE_S: Final = 5.0
-"""Time for a stopped worker to remove its incomplete files, seconds."""
 THREAD_VARIABLES: Final = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -88,20 +81,14 @@ class Processes:
                 if not ready:
                     yield None
         finally:
-            _stop(idle, busy)
+            stop(idle, busy)
 
 
-class _Worker:
+class _Worker(Worker):
     """A process and its current job."""
 
     def __init__(self, work: Callable[[Job], Any], threads: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, theirs = context.Pipe()
-        self.process: BaseProcess = context.Process(
-            target=_serve, args=(theirs, threads), daemon=True
-        )
-        self.process.start()
-        theirs.close()
+        super().__init__(_serve, threads)
         self._work = work
         self.job: Job
         self.number = 0
@@ -124,71 +111,19 @@ class _Worker:
             done = self.pipe.recv()
         except (EOFError, OSError):
             self.pipe.close()
-            self.process.join(GRACE_S)
-            return _cause_of_death(self.process.exitcode)
+            return self.end()
         return replace(done, attempts=self.number) if isinstance(done, Done) else str(done)
 
 
-def _cause_of_death(code: int | None) -> str:
-    if code is not None and code < 0:
-        why = " (out of memory?)" if code == -signal.SIGKILL else ""
-        return f"was killed by {signal.Signals(-code).name}{why}"
-    return f"ended with status {code}"
-
-
-def _stop(idle: Sequence[_Worker], busy: Sequence[_Worker]) -> None:
-    """Stop all processes: idle ones by closing their pipe, busy ones by SIGTERM, then SIGKILL."""
-    for worker in busy:
-        worker.process.terminate()
-    for worker in idle:
-        worker.pipe.close()
-    until = time.monotonic() + GRACE_S
-    for worker in (*busy, *idle):
-        worker.process.join(max(0.0, until - time.monotonic()))
-        if worker.process.is_alive():
-            worker.process.kill()
-            worker.process.join()
-        worker.pipe.close()
-        worker.process.close()
-
-
-class _StoppedError(BaseException):
-    """Raised in a worker on SIGTERM; a BaseException, so that only cleanup code handles it."""
-
-
-def _raise_stopped(number: int, frame: FrameType | None) -> NoReturn:
-    raise _StoppedError
-
-
 def _serve(pipe: Connection, threads: int) -> None:
-    """Process jobs from the pipe until it closes; the main function of a worker."""
+    """Process jobs from the pipe until it closes."""
     # Libraries read these when loaded; nothing numerical has been loaded here yet.
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
-    # Ctrl-C reaches the whole foreground process group; only the parent reacts to it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _raise_stopped)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-    try:
-        work = pipe.recv()
-        while True:
-            job: Job = pipe.recv()
-            done = attempt(work, job)
-            try:
-                pipe.send(done)
-            except (PicklingError, AttributeError, TypeError) as error:
-                pipe.send(Done(job, *reported_error(error)))
-    except (EOFError, OSError):
-        # The parent was killed, and its end of the pipe is gone.
-        return
-    except _StoppedError:
-        sys.exit(143)
-    finally:
-        # A signal that arrives later must not interrupt the exit with a traceback.
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)
+    work = pipe.recv()
+    while True:
+        job: Job = pipe.recv()
+        done = attempt(work, job)
+        try:
+            pipe.send(done)
+        except (PicklingError, AttributeError, TypeError) as error:
+            pipe.send(Done(job, *reported_error(error)))

@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from crosscue.eval.runs.folder import LOCK
+from crosscue.replay.processes import GRACE_S
 
 from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
-from .processes import GRACE_S, THREAD_VARIABLES, TICK_S
+from .processes import THREAD_VARIABLES, TICK_S
 from .ray_cluster import GIB, LOCAL, check_fits, joined
 
 MEMORY_BYTES: Final = 2 * GIB

@@ -258,22 +258,28 @@ def test_signal_to_the_parent_stops_all_workers(
     assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
 
 
-def test_worker_whose_parent_was_killed_exits_without_traceback() -> None:
+def test_worker_whose_parent_was_killed_exits_without_traceback(tmp_path: Path) -> None:
     script = (
-        "import time\n"
+        "import os\n"
         "from pathlib import Path\n"
         "from crosscue.eval.batch.jobs import Job\n"
         "from crosscue.eval.batch.processes import _serve\n"
+        "from crosscue.replay.processes import serve_pipe\n"
         "class Pipe:\n"
-        "    sent = [len, Job('a', (), Path('gone'), '')]\n"
+        "    sent = [(_serve, (1,)), len, Job('a', (), Path('gone'), '')]\n"
         "    def recv(self):\n"
         "        return self.sent.pop(0)\n"
         "    def send(self, done):\n"
         "        raise ConnectionResetError(104, 'Connection reset by peer')\n"
-        "_serve(Pipe(), 1)\n"
+        "serve_pipe(Pipe(), os.getppid())\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        cwd=tmp_path,
     )
 
     assert (done.returncode, done.stderr) == (0, "")
